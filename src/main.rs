@@ -1,0 +1,3 @@
+//! The `sci-recon` program.
+
+fn main() {}

@@ -1,0 +1,1 @@
+//! The reconstruction core: arrays in, arrays out.
