@@ -1,6 +1,7 @@
 //! Snapshot compressive imaging, from coded measurement to video, as an HTTP service.
 //!
-//! The modules follow the way of the data: bytes become arrays in `formats`, arrays
+//! The modules follow the way of the data: bytes become arrays in [`formats`], arrays
 //! become video in [`recon`].
 
+pub mod formats;
 pub mod recon;

@@ -1,0 +1,9 @@
+//! NumPy's array files: stacks are read frame by frame, f32 stacks are written.
+
+mod header;
+mod read;
+mod write;
+
+pub(super) use header::MAGIC;
+pub(super) use read::NpyReader;
+pub use write::{F32StackWriter, write_f32};

@@ -1,0 +1,182 @@
+//! Reading npy stacks frame by frame.
+
+use std::fs::File;
+use std::io::{self, Read};
+
+use ndarray::Array2;
+
+use super::header::{Header, MAGIC, MAX_HEADER_BYTES, unsupported};
+use crate::formats::samples::{self, ByteOrder};
+use crate::formats::{Format, FormatError, FrameReader, Limits, StackInfo};
+
+/// An npy file of shape (frame, row, column) or (row, column).
+#[derive(Debug)]
+pub(in crate::formats) struct NpyReader {
+    file: File,
+    info: StackInfo,
+    order: ByteOrder,
+    /// A two-dimensional array in Fortran order: its columns lie one after another.
+    by_columns: bool,
+    next: usize,
+    bytes: Vec<u8>,
+}
+
+impl NpyReader {
+    /// Reads the header of `file` (positioned at its start, `length` bytes long) and checks it
+    /// against the limits and the length.
+    pub(in crate::formats) fn open(
+        mut file: File,
+        length: u64,
+        limits: &Limits,
+    ) -> Result<Self, FormatError> {
+        let (header, data_start) = read_header(&mut file, length)?;
+        let (frames, height, width) = match *header.shape {
+            [height, width] => (1, height, width),
+            [frames, height, width] => (frames, height, width),
+            _ => {
+                return Err(unsupported(format!(
+                    "an array of {} dimensions",
+                    header.shape.len()
+                )));
+            }
+        };
+        limits.check_shape(Format::Npy, frames, height, width)?;
+        let by_columns = header.fortran_order;
+        if by_columns && header.shape.len() == 3 {
+            // Its frames are scattered over the whole file: no way to read one at a time.
+            return Err(FormatError::Unsupported {
+                format: Format::Npy,
+                found: "a three-dimensional array in Fortran order".to_owned(),
+                accepted: "C order (save numpy.ascontiguousarray(stack))",
+            });
+        }
+        // The limits bound each axis below 2^32 only where they are sane; they are settings.
+        let [frames, height, width] =
+            [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
+        let info = StackInfo::new(Format::Npy, header.sample, frames, height, width);
+        check_length(&info, length.saturating_sub(data_start))?;
+        Ok(Self {
+            file,
+            info,
+            order: header.order,
+            by_columns,
+            next: 0,
+            bytes: vec![0; height * width * header.sample.bytes()],
+        })
+    }
+}
+
+impl FrameReader for NpyReader {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+        if self.next == self.info.frames {
+            return Ok(None);
+        }
+        self.file
+            .read_exact(&mut self.bytes)
+            .map_err(FormatError::io("read the frame"))?;
+        self.next += 1;
+        let values = samples::decode(&self.bytes, self.info.sample, self.order);
+        let (height, width) = (self.info.height, self.info.width);
+        if self.by_columns {
+            let columns = samples::frame(width, height, values)?;
+            return Ok(Some(columns.t().as_standard_layout().into_owned()));
+        }
+        samples::frame(height, width, values).map(Some)
+    }
+}
+
+/// The header and the offset of the first sample.
+fn read_header(file: &mut File, length: u64) -> Result<(Header, u64), FormatError> {
+    let mut start = [0u8; 8];
+    fill(file, &mut start)?;
+    let [magic @ .., major, minor] = start;
+    if magic != MAGIC {
+        return Err(FormatError::malformed(
+            Format::Npy,
+            "the signature is wrong",
+        ));
+    }
+    let (header_bytes, prefix) = match major {
+        1 => {
+            let mut size = [0; 2];
+            fill(file, &mut size)?;
+            (u64::from(u16::from_le_bytes(size)), 10)
+        }
+        2 | 3 => {
+            let mut size = [0; 4];
+            fill(file, &mut size)?;
+            (u64::from(u32::from_le_bytes(size)), 12)
+        }
+        _ => {
+            return Err(FormatError::Unsupported {
+                format: Format::Npy,
+                found: format!("npy version {major}.{minor}"),
+                accepted: "versions 1.0, 2.0 and 3.0",
+            });
+        }
+    };
+    let data_start = prefix + header_bytes;
+    if data_start > length {
+        return Err(FormatError::Truncated {
+            format: Format::Npy,
+            promised: format!("a header of {header_bytes} bytes"),
+            present: format!("{length} bytes in all"),
+        });
+    }
+    if header_bytes > MAX_HEADER_BYTES {
+        return Err(FormatError::OverLimit {
+            format: Format::Npy,
+            what: "the header's length in bytes",
+            value: header_bytes,
+            limit: MAX_HEADER_BYTES,
+        });
+    }
+    let mut text = vec![0; header_bytes as usize];
+    fill(file, &mut text)?;
+    Ok((Header::parse(&text)?, data_start))
+}
+
+fn fill(file: &mut File, bytes: &mut [u8]) -> Result<(), FormatError> {
+    file.read_exact(bytes).map_err(|source| {
+        if source.kind() == io::ErrorKind::UnexpectedEof {
+            FormatError::malformed(Format::Npy, "the file ends inside the header")
+        } else {
+            FormatError::Io {
+                action: "read the header",
+                source,
+            }
+        }
+    })
+}
+
+/// The file must hold exactly what the header promises.
+fn check_length(info: &StackInfo, present: u64) -> Result<(), FormatError> {
+    let frame_bytes = (info.height as u64)
+        .saturating_mul(info.width as u64)
+        .saturating_mul(info.sample.bytes() as u64);
+    let promised = frame_bytes.saturating_mul(info.frames as u64);
+    if present < promised {
+        return Err(FormatError::Truncated {
+            format: Format::Npy,
+            promised: format!(
+                "{} frames of {}x{} {} ({promised} bytes)",
+                info.frames, info.height, info.width, info.sample
+            ),
+            present: format!("{} whole frames ({present} bytes)", present / frame_bytes),
+        });
+    }
+    if present > promised {
+        return Err(FormatError::malformed(
+            Format::Npy,
+            format!(
+                "{} bytes follow the {promised} bytes that the header promises",
+                present - promised
+            ),
+        ));
+    }
+    Ok(())
+}

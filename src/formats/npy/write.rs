@@ -1,0 +1,72 @@
+//! Writing f32 stacks as npy.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use ndarray::{ArrayView2, ArrayView3};
+
+use super::header::MAGIC;
+use crate::formats::FormatError;
+use crate::formats::samples::FrameSink;
+
+/// Writes an npy file of shape (frame, row, column), little-endian float32, frame by frame.
+#[derive(Debug)]
+pub struct F32StackWriter<W> {
+    sink: FrameSink<W>,
+}
+
+impl<W: Write> F32StackWriter<W> {
+    /// Writes the header. `writer` should be buffered.
+    pub fn new(
+        mut writer: W,
+        frames: usize,
+        height: usize,
+        width: usize,
+    ) -> Result<Self, FormatError> {
+        writer
+            .write_all(&header(&format!("({frames}, {height}, {width})")))
+            .map_err(FormatError::io("write the npy header"))?;
+        Ok(Self {
+            sink: FrameSink::new(writer, frames, height, width),
+        })
+    }
+
+    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
+    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+        self.sink.write_frame(frame)
+    }
+
+    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
+    pub fn finish(self) -> Result<W, FormatError> {
+        self.sink.finish()
+    }
+}
+
+/// Writes (or overwrites) the file `path` with `stack`, axes (frame, row, column).
+pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<(), FormatError> {
+    let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
+    let (frames, height, width) = stack.dim();
+    let mut writer = F32StackWriter::new(BufWriter::new(file), frames, height, width)?;
+    for frame in stack.outer_iter() {
+        writer.write_frame(frame)?;
+    }
+    writer.finish()?;
+    Ok(())
+}
+
+/// A version 1.0 header, padded as NumPy does so that the data starts at a multiple of 64.
+fn header(shape: &str) -> Vec<u8> {
+    let mut text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+    let prefix = MAGIC.len() + 4;
+    while !(prefix + text.len() + 1).is_multiple_of(64) {
+        text.push(' ');
+    }
+    text.push('\n');
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend([1, 0]);
+    // Three numbers of at most 20 digits: far below the 65535 bytes of version 1.0.
+    bytes.extend((text.len() as u16).to_le_bytes());
+    bytes.extend(text.as_bytes());
+    bytes
+}

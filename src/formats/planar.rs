@@ -1,0 +1,194 @@
+//! Prepared arrays: raw f32 frames behind a small header, from which a window is read without
+//! reading the rest.
+//!
+//! Layout, all little-endian: the magic `SCIPLNR\0`, then u32 version (1), frames, height, width,
+//! then two reserved u32 (zero), then the samples as f32 in the order (frame, row, column).
+//! Whoever writes such a file makes it appear at once (temporary file, fsync, rename).
+
+use std::fs::File;
+use std::io::Write;
+use std::ops::Range;
+use std::os::unix::fs::FileExt;
+use std::path::Path;
+
+use ndarray::{Array3, ArrayView2};
+
+use super::samples::{self, ByteOrder, FrameSink};
+use super::{Format, FormatError, Limits, SampleType, StackInfo};
+
+/// The first bytes of every prepared array.
+pub(super) const MAGIC: &[u8] = b"SCIPLNR\0";
+const VERSION: u32 = 1;
+const HEADER_BYTES: u64 = 32;
+const SAMPLE_BYTES: u64 = 4;
+
+/// Writes a prepared array frame by frame.
+#[derive(Debug)]
+pub struct Writer<W> {
+    sink: FrameSink<W>,
+}
+
+impl<W: Write> Writer<W> {
+    /// Writes the header. `writer` should be buffered; it only ever moves forward, so it may hash
+    /// what passes.
+    pub fn new(
+        mut writer: W,
+        frames: usize,
+        height: usize,
+        width: usize,
+    ) -> Result<Self, FormatError> {
+        let mut header = MAGIC.to_vec();
+        header.extend(VERSION.to_le_bytes());
+        for axis in [frames, height, width] {
+            let axis = u32::try_from(axis)
+                .map_err(|_| FormatError::Internal(format!("an axis of {axis}")))?;
+            header.extend(axis.to_le_bytes());
+        }
+        header.extend([0; 8]);
+        writer
+            .write_all(&header)
+            .map_err(FormatError::io("write the header"))?;
+        Ok(Self {
+            sink: FrameSink::new(writer, frames, height, width),
+        })
+    }
+
+    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
+    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+        self.sink.write_frame(frame)
+    }
+
+    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
+    pub fn finish(self) -> Result<W, FormatError> {
+        self.sink.finish()
+    }
+}
+
+/// An open prepared array. Reads at positions, so it may be shared between threads.
+#[derive(Debug)]
+pub struct Reader {
+    file: File,
+    info: StackInfo,
+}
+
+impl Reader {
+    /// Opens `path` and checks its header against the limits and the file's length.
+    pub fn open(path: &Path, limits: &Limits) -> Result<Self, FormatError> {
+        let file = File::open(path).map_err(FormatError::io("open the prepared array"))?;
+        let length = file
+            .metadata()
+            .map_err(FormatError::io("read the file's length"))?
+            .len();
+        limits.check_file(Format::Planar, length)?;
+        let mut header = [0; HEADER_BYTES as usize];
+        if length < HEADER_BYTES {
+            return Err(FormatError::malformed(
+                Format::Planar,
+                format!("{length} bytes are less than a header of {HEADER_BYTES}"),
+            ));
+        }
+        file.read_exact_at(&mut header, 0)
+            .map_err(FormatError::io("read the header"))?;
+        let info = parse_header(&header)?;
+        limits.check_info(&info)?;
+        let promised = HEADER_BYTES + info.voxels() * SAMPLE_BYTES;
+        let shape = format!("{} frames of {}x{}", info.frames, info.height, info.width);
+        if length < promised {
+            return Err(FormatError::Truncated {
+                format: Format::Planar,
+                promised: format!("{shape} ({promised} bytes with the header)"),
+                present: format!("{length} bytes"),
+            });
+        }
+        if length > promised {
+            return Err(FormatError::malformed(
+                Format::Planar,
+                format!("{} bytes follow the {shape}", length - promised),
+            ));
+        }
+        Ok(Self { file, info })
+    }
+
+    /// Shape and type (always float32 on the scale that the writer chose).
+    pub fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    /// Reads a window; the result has the axes (frame, row, column) of the ranges.
+    ///
+    /// Errors: I/O, or [`FormatError::Internal`] for a window that is not inside the stack.
+    pub fn read_window(
+        &self,
+        frames: Range<usize>,
+        rows: Range<usize>,
+        columns: Range<usize>,
+    ) -> Result<Array3<f32>, FormatError> {
+        let (height, width) = (self.info.height, self.info.width);
+        let inside = |range: &Range<usize>, axis| range.start <= range.end && range.end <= axis;
+        if !(inside(&frames, self.info.frames) && inside(&rows, height) && inside(&columns, width))
+        {
+            return Err(FormatError::Internal(format!(
+                "window {frames:?} x {rows:?} x {columns:?} of a stack {} x {height} x {width}",
+                self.info.frames
+            )));
+        }
+        let shape = (frames.len(), rows.len(), columns.len());
+        // Whole rows lie one after another and are read in one go.
+        let segments = if columns.len() == width {
+            1
+        } else {
+            rows.len()
+        };
+        let segment_samples = rows.len() * columns.len() / segments.max(1);
+        let mut bytes = vec![0; segment_samples * SAMPLE_BYTES as usize];
+        let mut values = Vec::with_capacity(shape.0 * shape.1 * shape.2);
+        for frame in frames {
+            for segment in 0..segments {
+                let sample = (frame * height + rows.start + segment) * width + columns.start;
+                self.file
+                    .read_exact_at(&mut bytes, HEADER_BYTES + sample as u64 * SAMPLE_BYTES)
+                    .map_err(FormatError::io("read the window"))?;
+                values.extend(samples::decode(&bytes, SampleType::F32, ByteOrder::Little));
+            }
+        }
+        Array3::from_shape_vec(shape, values)
+            .map_err(|error| FormatError::Internal(error.to_string()))
+    }
+}
+
+/// Opens `path` and reads one window; see [`Reader::read_window`].
+pub fn read_window(
+    path: &Path,
+    frames: Range<usize>,
+    rows: Range<usize>,
+    columns: Range<usize>,
+    limits: &Limits,
+) -> Result<Array3<f32>, FormatError> {
+    Reader::open(path, limits)?.read_window(frames, rows, columns)
+}
+
+fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo, FormatError> {
+    if !header.starts_with(MAGIC) {
+        return Err(FormatError::malformed(
+            Format::Planar,
+            "the signature is wrong",
+        ));
+    }
+    let (words, _) = header[MAGIC.len()..].as_chunks::<4>();
+    let word = |i: usize| words.get(i).map_or(0, |w| u32::from_le_bytes(*w));
+    if word(0) != VERSION {
+        return Err(FormatError::Unsupported {
+            format: Format::Planar,
+            found: format!("version {}", word(0)),
+            accepted: "version 1",
+        });
+    }
+    let [frames, height, width] = [1, 2, 3].map(|i| word(i) as usize);
+    Ok(StackInfo::new(
+        Format::Planar,
+        SampleType::F32,
+        frames,
+        height,
+        width,
+    ))
+}

@@ -1,0 +1,109 @@
+//! Samples as bytes: from any accepted type to f32, and from f32 to little-endian bytes.
+
+use std::io::{self, Write};
+
+use ndarray::{Array2, ArrayView2};
+
+use super::{FormatError, SampleType};
+
+/// The order of the bytes of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ByteOrder {
+    Little,
+    Big,
+}
+
+/// Decodes whole samples; a remainder shorter than a sample is ignored by construction of the callers.
+pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<f32> {
+    use ByteOrder::{Big, Little};
+    match (sample, order) {
+        (SampleType::Bool, _) => bytes.iter().map(|&b| f32::from(u8::from(b != 0))).collect(),
+        (SampleType::U8, _) => bytes.iter().map(|&b| f32::from(b)).collect(),
+        (SampleType::U16, Little) => each(bytes, |b| f32::from(u16::from_le_bytes(b))),
+        (SampleType::U16, Big) => each(bytes, |b| f32::from(u16::from_be_bytes(b))),
+        (SampleType::F32, Little) => each(bytes, f32::from_le_bytes),
+        (SampleType::F32, Big) => each(bytes, f32::from_be_bytes),
+        (SampleType::F64, Little) => each(bytes, |b| f64::from_le_bytes(b) as f32),
+        (SampleType::F64, Big) => each(bytes, |b| f64::from_be_bytes(b) as f32),
+    }
+}
+
+fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f32) -> Vec<f32> {
+    let (samples, _) = bytes.as_chunks::<N>();
+    samples.iter().map(|&sample| convert(sample)).collect()
+}
+
+/// A frame from its samples in row order.
+pub(super) fn frame(
+    height: usize,
+    width: usize,
+    samples: Vec<f32>,
+) -> Result<Array2<f32>, FormatError> {
+    let count = samples.len();
+    Array2::from_shape_vec((height, width), samples).map_err(|_| {
+        FormatError::Internal(format!("{count} samples for a frame of {height}x{width}"))
+    })
+}
+
+/// Writes f32 frames of one size as little-endian rows, and counts them.
+#[derive(Debug)]
+pub(super) struct FrameSink<W> {
+    writer: W,
+    frames: usize,
+    height: usize,
+    width: usize,
+    written: usize,
+    row: Vec<u8>,
+}
+
+impl<W: Write> FrameSink<W> {
+    pub(super) fn new(writer: W, frames: usize, height: usize, width: usize) -> Self {
+        Self {
+            writer,
+            frames,
+            height,
+            width,
+            written: 0,
+            row: Vec::with_capacity(width * 4),
+        }
+    }
+
+    pub(super) fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+        if frame.dim() != (self.height, self.width) || self.written == self.frames {
+            return Err(FormatError::Internal(format!(
+                "frame {} of size {:?} written to a stack of {} frames of {}x{}",
+                self.written,
+                frame.dim(),
+                self.frames,
+                self.height,
+                self.width
+            )));
+        }
+        self.write_rows(frame)
+            .map_err(FormatError::io("write the frame"))?;
+        self.written += 1;
+        Ok(())
+    }
+
+    fn write_rows(&mut self, frame: ArrayView2<'_, f32>) -> io::Result<()> {
+        for row in frame.rows() {
+            self.row.clear();
+            self.row.extend(row.iter().flat_map(|v| v.to_le_bytes()));
+            self.writer.write_all(&self.row)?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn finish(mut self) -> Result<W, FormatError> {
+        if self.written != self.frames {
+            return Err(FormatError::Internal(format!(
+                "{} of {} frames written",
+                self.written, self.frames
+            )));
+        }
+        self.writer
+            .flush()
+            .map_err(FormatError::io("write the file"))?;
+        Ok(self.writer)
+    }
+}

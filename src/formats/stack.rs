@@ -1,0 +1,215 @@
+//! What a stack of frames is, whatever file it lies in.
+
+use std::fmt;
+
+use ndarray::Array2;
+
+use super::FormatError;
+
+/// A file format that is read or written here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Format {
+    /// NumPy's array file.
+    Npy,
+    /// TIFF and BigTIFF, one frame a page.
+    Tiff,
+    /// PNG, one frame.
+    Png,
+    /// MATLAB's level 5 array file.
+    Mat,
+    /// OpenEXR.
+    Exr,
+    /// Our own prepared arrays ([`super::planar`]).
+    Planar,
+}
+
+impl Format {
+    /// The name in messages and records.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Npy => "npy",
+            Self::Tiff => "TIFF",
+            Self::Png => "PNG",
+            Self::Mat => ".mat",
+            Self::Exr => "EXR",
+            Self::Planar => "planar",
+        }
+    }
+
+    /// The format whose signature these first bytes (128 suffice) carry.
+    pub(super) fn sniff(head: &[u8]) -> Option<Self> {
+        const BIG_ENDIAN_MAT: &[u8] = &[1, 0, b'M', b'I'];
+        const LITTLE_ENDIAN_MAT: &[u8] = &[0, 1, b'I', b'M'];
+        let tiff: [&[u8]; 4] = [b"II\x2a\0", b"II\x2b\0", b"MM\0\x2a", b"MM\0\x2b"];
+        if head.starts_with(super::npy::MAGIC) {
+            Some(Self::Npy)
+        } else if tiff.iter().any(|magic| head.starts_with(magic)) {
+            Some(Self::Tiff)
+        } else if head.starts_with(b"\x89PNG\r\n\x1a\n") {
+            Some(Self::Png)
+        } else if head.starts_with(&[0x76, 0x2f, 0x31, 0x01]) {
+            Some(Self::Exr)
+        } else if head.starts_with(super::planar::MAGIC) {
+            Some(Self::Planar)
+        } else {
+            match head.get(124..128) {
+                Some(version) if version == LITTLE_ENDIAN_MAT || version == BIG_ENDIAN_MAT => {
+                    Some(Self::Mat)
+                }
+                _ => None,
+            }
+        }
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// How one sample is stored in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SampleType {
+    /// One byte, 0 or 1.
+    Bool,
+    /// Unsigned 8 bit.
+    U8,
+    /// Unsigned 16 bit.
+    U16,
+    /// 32-bit float.
+    F32,
+    /// 64-bit float, rounded to 32 bit when read.
+    F64,
+}
+
+impl SampleType {
+    /// NumPy's name of the type.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Bool => "bool",
+            Self::U8 => "uint8",
+            Self::U16 => "uint16",
+            Self::F32 => "float32",
+            Self::F64 => "float64",
+        }
+    }
+
+    /// Bytes a sample.
+    pub fn bytes(self) -> usize {
+        match self {
+            Self::Bool | Self::U8 => 1,
+            Self::U16 => 2,
+            Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    /// What means 1.0 where nobody states a full scale: the type's maximum for integers, 1 for
+    /// floats and truth values.
+    pub fn default_full_scale(self) -> FullScale {
+        match self {
+            Self::U8 => FullScale(255.0),
+            Self::U16 => FullScale(65535.0),
+            Self::Bool | Self::F32 | Self::F64 => FullScale(1.0),
+        }
+    }
+}
+
+impl fmt::Display for SampleType {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// The value of the stored numbers that means 1.0. Finite and above 0.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct FullScale(f32);
+
+impl FullScale {
+    /// Numbers that are on [0,1] already.
+    pub const ONE: Self = Self(1.0);
+    /// Eight-bit grey values, the community's .mat scenes.
+    pub const EIGHT_BIT: Self = Self(255.0);
+
+    /// Errors: [`FormatError::FullScale`] for NaN, infinities, zero, negative and subnormal numbers.
+    pub fn new(value: f32) -> Result<Self, FormatError> {
+        // A subnormal scale would turn every ordinary value into an infinity.
+        if value.is_normal() && value > 0.0 {
+            Ok(Self(value))
+        } else {
+            Err(FormatError::FullScale(value))
+        }
+    }
+
+    /// The number itself.
+    pub fn value(self) -> f32 {
+        self.0
+    }
+}
+
+/// What a file says about its stack; a two-dimensional file has one frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StackInfo {
+    /// Frames (masks, snapshots), at least 1.
+    pub frames: usize,
+    /// Rows of a frame.
+    pub height: usize,
+    /// Columns of a frame.
+    pub width: usize,
+    /// How the samples are stored.
+    pub sample: SampleType,
+    /// The file's format.
+    pub format: Format,
+    /// What means 1.0 unless stated: [`SampleType::default_full_scale`], but 255 for the meas and
+    /// orig arrays of a .mat scene, whatever their type.
+    pub default_full_scale: FullScale,
+}
+
+impl StackInfo {
+    /// An info with the sample type's own full scale.
+    pub(super) fn new(
+        format: Format,
+        sample: SampleType,
+        frames: usize,
+        height: usize,
+        width: usize,
+    ) -> Self {
+        Self {
+            frames,
+            height,
+            width,
+            sample,
+            format,
+            default_full_scale: sample.default_full_scale(),
+        }
+    }
+
+    /// Frames x height x width.
+    pub fn voxels(&self) -> u64 {
+        (self.frames as u64)
+            .saturating_mul(self.height as u64)
+            .saturating_mul(self.width as u64)
+    }
+}
+
+/// A stack of frames that is read one frame at a time, so that memory holds one frame.
+pub trait FrameReader {
+    /// The shape and type, known before the first frame is read.
+    fn info(&self) -> &StackInfo;
+
+    /// The next frame (row, column) as stored, not scaled; `None` after the last.
+    ///
+    /// Errors: whatever is wrong with this frame's bytes. After an error the reader is spent.
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError>;
+}
+
+impl<R: FrameReader + ?Sized> FrameReader for Box<R> {
+    fn info(&self) -> &StackInfo {
+        (**self).info()
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+        (**self).next_frame()
+    }
+}
