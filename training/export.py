@@ -1,0 +1,177 @@
+"""Write a trained model as ONNX and check it against PyTorch.
+
+    python export.py run/full.pt ../models/fastdvdnet-gray      # stage1.onnx, stage2.onnx
+    python export.py run/ffdnet.pt ../models/ffdnet-gray        # model.onnx
+
+The graphs are built node by node: they hold what the runtime needs and nothing that an exporter adds.
+"""
+import argparse
+import os
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+import model
+
+OPSET = 17
+
+
+class Graph:
+    """Nodes and constants in the order of the calls; every method returns the name of its output."""
+
+    def __init__(self):
+        self.nodes, self.constants, self.count = [], [], 0
+
+    def constant(self, value):
+        name = f'c{len(self.constants)}'
+        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
+        return name
+
+    def add(self, op, *inputs, **attributes):
+        self.count += 1
+        name = f'{op.lower()}{self.count}'
+        self.nodes.append(helper.make_node(op, list(inputs), [name], name, **attributes))
+        return name
+
+    def conv(self, x, weight, bias, stride=1, relu=True):
+        y = self.add('Conv', x, self.constant(weight), self.constant(bias), kernel_shape=[3, 3],
+                     strides=[stride, stride], pads=[1, 1, 1, 1])
+        return self.add('Relu', y) if relu else y
+
+    def layer(self, x, module, relu=True, sign=1.):
+        return self.conv(x, sign * module.weight.numpy(), sign * module.bias.numpy(), module.stride[0], relu)
+
+    def sequence(self, x, modules):
+        """Convolutions with the ReLU or the pixel shuffle that follows each."""
+        modules = list(modules)
+        for m, after in zip(modules, modules[1:] + [None]):
+            if isinstance(m, torch.nn.Conv2d):
+                x = self.layer(x, m, relu=isinstance(after, torch.nn.ReLU))
+            elif isinstance(m, torch.nn.PixelShuffle):
+                x = self.add('DepthToSpace', x, blocksize=2, mode='CRD')
+        return x
+
+    def noise_map(self, x, sigma):
+        """The scalar sigma as one channel of the size of x."""
+        shape = self.add('Shape', x)
+        size = self.add('Concat', self.add('Slice', shape, *map(self.ints, ([0], [1]))), self.ints([1]),
+                        self.add('Slice', shape, *map(self.ints, ([2], [4]))), axis=0)
+        return self.add('Expand', sigma, size)
+
+    def ints(self, values):
+        return self.constant(np.array(values, np.int64))
+
+    def save(self, path, result, axes, notes):
+        self.nodes.append(helper.make_node('Identity', [result], ['denoised']))
+        frames, denoised = axes
+        graph = helper.make_graph(
+            self.nodes, 'denoiser',
+            [helper.make_tensor_value_info('frames', TensorProto.FLOAT, [frames, 1, 'height', 'width']),
+             helper.make_tensor_value_info('sigma', TensorProto.FLOAT, [])],
+            [helper.make_tensor_value_info('denoised', TensorProto.FLOAT, [denoised, 1, 'height', 'width'])],
+            self.constants)
+        m = helper.make_model(graph, opset_imports=[helper.make_opsetid('', OPSET)], ir_version=8, producer_name='sci-recon training')
+        m.doc_string = notes
+        onnx.checker.check_model(m, full_check=True)
+        onnx.save(m, path)
+
+
+def dense_input_weight(grouped):
+    """The grouped input layer [90,2,3,3] on (f0,n), (f1,n), (f2,n) as a dense one [90,4,3,3] on (f0,f1,f2,n).
+
+    The three groups share one noise map. A dense layer costs 1 % more arithmetic, and runtimes have faster kernels for it.
+    """
+    groups = grouped.reshape(3, 30, 2, 3, 3)
+    dense = np.zeros((3, 30, 4, 3, 3), np.float32)
+    for k in range(3):
+        dense[k, :, k] = groups[k, :, 0]
+    dense[:, :, 3] = groups[:, :, 1]
+    return dense.reshape(90, 4, 3, 3)
+
+
+def padded_to_16(weight, bias, following):
+    """Zero channels up to a multiple of 16 between two layers: the runtime's blocked kernels want whole blocks."""
+    extra = -len(weight) % 16
+    return (np.pad(weight, ((0, extra), (0, 0), (0, 0), (0, 0))), np.pad(bias, (0, extra)),
+            np.pad(following, ((0, 0), (0, extra), (0, 0), (0, 0))))
+
+
+def block_graph(block):
+    """One block over a clip: frames [n+2,1,H,W] and sigma -> the middle frames of all triplets, [n,1,H,W]."""
+    g = Graph()
+    last = np.iinfo(np.int64).max
+    f = [g.add('Slice', 'frames', g.ints([start]), g.ints([end]), g.ints([0])) for start, end in ((0, -2), (1, -1), (2, last))]
+    x = g.add('Concat', *f, g.noise_map(f[1], 'sigma'), axis=1)
+    first, second = block.inc[0], block.inc[2]
+    w, b, w2 = padded_to_16(dense_input_weight(first.weight.numpy()), first.bias.numpy(), second.weight.numpy())
+    x0 = g.conv(g.conv(x, w, b), w2, second.bias.numpy())
+    x1 = g.sequence(x0, block.d0)
+    x1 = g.add('Add', g.sequence(g.sequence(x1, block.d1), block.u2), x1)
+    x0 = g.add('Add', g.sequence(x1, block.u1), x0)
+    # The network predicts the noise; with the sign in the last weights the residual is an addition, which runtimes fuse.
+    y = g.layer(g.layer(x0, block.out[0]), block.out[2], relu=False, sign=-1.)
+    return g, g.add('Add', y, f[1])
+
+
+def ffdnet_graph(net):
+    """frames [n,1,H,W] and sigma -> [n,1,H,W]."""
+    g = Graph()
+    half = g.add('SpaceToDepth', 'frames', blocksize=2)   # one channel: the same order as PyTorch's pixel_unshuffle
+    x = g.add('Concat', half, g.noise_map(half, 'sigma'), axis=1)
+    layers = list(net.body)
+    x = g.sequence(x, layers[:-1])
+    y = g.add('DepthToSpace', g.layer(x, layers[-1], relu=False, sign=-1.), blocksize=2, mode='CRD')
+    return g, g.add('Add', y, 'frames')
+
+
+def session(path, threads=1):
+    import onnxruntime as ort
+    o = ort.SessionOptions()
+    o.intra_op_num_threads = threads
+    return ort.InferenceSession(path, o, providers=['CPUExecutionProvider'])
+
+
+def run(path, frames, sigma):
+    return session(path).run(None, {'frames': frames, 'sigma': np.array(sigma, np.float32)})[0]
+
+
+@torch.no_grad()
+def export(net, folder, notes=''):
+    """Write the graphs and return the greatest difference from PyTorch over clips of several sizes and lengths."""
+    os.makedirs(folder, exist_ok=True)
+    path = lambda name: os.path.join(folder, name)
+    if isinstance(net, model.FFDNet):
+        g, y = ffdnet_graph(net)
+        g.save(path('model.onnx'), y, ('frames', 'frames'), notes)
+    else:
+        for name, block in (('stage1.onnx', net.t1), ('stage2.onnx', net.t2)):
+            g, y = block_graph(block)
+            g.save(path(name), y, ('frames_and_two', 'frames'), notes)
+    worst = 0.
+    for b, h, w, sigma in ((3, 32, 48, 50 / 255), (8, 64, 64, 6 / 255), (10, 36, 20, 100 / 255)):
+        x = torch.rand(1, b, h, w, generator=torch.Generator().manual_seed(b))
+        expected = net.clips(x, torch.full((1, 1, 1, 1), sigma))[0].numpy()
+        if isinstance(net, model.FFDNet):
+            got = run(path('model.onnx'), x[0, :, None].numpy(), sigma)
+        else:
+            reflected = x[0, [2, 1, *range(b), b - 2, b - 3], None].numpy()
+            got = run(path('stage2.onnx'), run(path('stage1.onnx'), reflected, sigma), sigma)
+        worst = max(worst, float(np.abs(got[:, 0] - expected).max()))
+    return worst
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('weights')
+    p.add_argument('folder')
+    a = p.parse_args()
+    worst = export(model.load(a.weights), a.folder)
+    print(f'greatest difference from PyTorch: {worst:.1e}')
+    if worst > 1e-5:
+        raise SystemExit('the ONNX graph does not compute what PyTorch does')
+
+
+if __name__ == '__main__':
+    main()
