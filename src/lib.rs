@@ -3,4 +3,5 @@
 //! The modules follow the way of the data: bytes become arrays in `formats`, arrays
 //! become video in [`recon`].
 
+pub mod models;
 pub mod recon;
