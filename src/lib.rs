@@ -4,4 +4,5 @@
 //! become video in [`recon`].
 
 pub mod formats;
+pub mod models;
 pub mod recon;

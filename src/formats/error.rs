@@ -174,10 +174,7 @@ impl FormatError {
     }
 
     pub(super) fn malformed(format: Format, problem: impl Into<String>) -> Self {
-        Self::Malformed {
-            format,
-            problem: problem.into(),
-        }
+        Self::Malformed { format, problem: problem.into() }
     }
 
     /// For `map_err` on I/O: `.map_err(FormatError::io("read the frame"))`.

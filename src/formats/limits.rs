@@ -22,24 +22,14 @@ impl Default for Limits {
     /// 8 GiB, 4096 frames, 8192 pixels a side, 2^31 voxels: a 3200x3200 camera's day fits, and one
     /// frame in memory stays below 0.8 GiB.
     fn default() -> Self {
-        Self {
-            max_file_bytes: 8 << 30,
-            max_frames: 4096,
-            max_side: 8192,
-            max_voxels: 1 << 31,
-        }
+        Self { max_file_bytes: 8 << 30, max_frames: 4096, max_side: 8192, max_voxels: 1 << 31 }
     }
 }
 
 impl Limits {
     /// Checks the length of a file. Errors: [`FormatError::OverLimit`].
     pub(super) fn check_file(&self, format: Format, bytes: u64) -> Result<(), FormatError> {
-        within(
-            format,
-            "the file's length in bytes",
-            bytes,
-            self.max_file_bytes,
-        )
+        within(format, "the file's length in bytes", bytes, self.max_file_bytes)
     }
 
     /// Checks a claimed shape. Errors: [`FormatError::OverLimit`], or [`FormatError::Malformed`]
@@ -58,12 +48,7 @@ impl Limits {
             ));
         }
         let side = self.max_side as u64;
-        within(
-            format,
-            "the number of frames",
-            frames,
-            self.max_frames as u64,
-        )?;
+        within(format, "the number of frames", frames, self.max_frames as u64)?;
         within(format, "the height in pixels", height, side)?;
         within(format, "the width in pixels", width, side)?;
         // Cannot overflow for sane limits, but limits are settings.
@@ -72,23 +57,13 @@ impl Limits {
     }
 
     pub(super) fn check_info(&self, info: &StackInfo) -> Result<(), FormatError> {
-        self.check_shape(
-            info.format,
-            info.frames as u64,
-            info.height as u64,
-            info.width as u64,
-        )
+        self.check_shape(info.format, info.frames as u64, info.height as u64, info.width as u64)
     }
 }
 
 fn within(format: Format, what: &'static str, value: u64, limit: u64) -> Result<(), FormatError> {
     if value > limit {
-        return Err(FormatError::OverLimit {
-            format,
-            what,
-            value,
-            limit,
-        });
+        return Err(FormatError::OverLimit { format, what, value, limit });
     }
     Ok(())
 }

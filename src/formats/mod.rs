@@ -40,10 +40,7 @@ pub fn open_stack(
     limits.check_file(format, length)?;
     match format {
         Format::Npy => Ok(Box::new(npy::NpyReader::open(file, length, limits)?)),
-        other => Err(FormatError::UnknownFormat {
-            found: format!("{other}"),
-            accepted: ACCEPTED,
-        }),
+        other => Err(FormatError::UnknownFormat { found: format!("{other}"), accepted: ACCEPTED }),
     }
 }
 
@@ -74,13 +71,8 @@ pub fn collect(
 /// Opens a file and tells its length and format.
 fn open(path: &Path) -> Result<(File, u64, Format), FormatError> {
     let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
-    let metadata = file
-        .metadata()
-        .map_err(FormatError::io("read the file's length"))?;
-    let unknown = |found: String| FormatError::UnknownFormat {
-        found,
-        accepted: ACCEPTED,
-    };
+    let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
+    let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };
     if !metadata.is_file() {
         return Err(unknown("it is no regular file".to_owned()));
     }
@@ -88,10 +80,7 @@ fn open(path: &Path) -> Result<(File, u64, Format), FormatError> {
         return Err(unknown("it is empty".to_owned()));
     }
     let mut head = Vec::with_capacity(128);
-    (&mut file)
-        .take(128)
-        .read_to_end(&mut head)
-        .map_err(FormatError::io("read the file"))?;
+    (&mut file).take(128).read_to_end(&mut head).map_err(FormatError::io("read the file"))?;
     file.rewind().map_err(FormatError::io("read the file"))?;
     let format = Format::sniff(&head).ok_or_else(|| unknown(describe(&head)))?;
     Ok((file, metadata.len(), format))

@@ -45,12 +45,8 @@ impl<W: Write> Writer<W> {
             header.extend(axis.to_le_bytes());
         }
         header.extend([0; 8]);
-        writer
-            .write_all(&header)
-            .map_err(FormatError::io("write the header"))?;
-        Ok(Self {
-            sink: FrameSink::new(writer, frames, height, width),
-        })
+        writer.write_all(&header).map_err(FormatError::io("write the header"))?;
+        Ok(Self { sink: FrameSink::new(writer, frames, height, width) })
     }
 
     /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
@@ -75,10 +71,7 @@ impl Reader {
     /// Opens `path` and checks its header against the limits and the file's length.
     pub fn open(path: &Path, limits: &Limits) -> Result<Self, FormatError> {
         let file = File::open(path).map_err(FormatError::io("open the prepared array"))?;
-        let length = file
-            .metadata()
-            .map_err(FormatError::io("read the file's length"))?
-            .len();
+        let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
         limits.check_file(Format::Planar, length)?;
         let mut header = [0; HEADER_BYTES as usize];
         if length < HEADER_BYTES {
@@ -87,8 +80,7 @@ impl Reader {
                 format!("{length} bytes are less than a header of {HEADER_BYTES}"),
             ));
         }
-        file.read_exact_at(&mut header, 0)
-            .map_err(FormatError::io("read the header"))?;
+        file.read_exact_at(&mut header, 0).map_err(FormatError::io("read the header"))?;
         let info = parse_header(&header)?;
         limits.check_info(&info)?;
         let promised = HEADER_BYTES + info.voxels() * SAMPLE_BYTES;
@@ -134,11 +126,7 @@ impl Reader {
         }
         let shape = (frames.len(), rows.len(), columns.len());
         // Whole rows lie one after another and are read in one go.
-        let segments = if columns.len() == width {
-            1
-        } else {
-            rows.len()
-        };
+        let segments = if columns.len() == width { 1 } else { rows.len() };
         let segment_samples = rows.len() * columns.len() / segments.max(1);
         let mut bytes = vec![0; segment_samples * SAMPLE_BYTES as usize];
         let mut values = Vec::with_capacity(shape.0 * shape.1 * shape.2);
@@ -169,10 +157,7 @@ pub fn read_window(
 
 fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo, FormatError> {
     if !header.starts_with(MAGIC) {
-        return Err(FormatError::malformed(
-            Format::Planar,
-            "the signature is wrong",
-        ));
+        return Err(FormatError::malformed(Format::Planar, "the signature is wrong"));
     }
     let (words, _) = header[MAGIC.len()..].as_chunks::<4>();
     let word = |i: usize| words.get(i).map_or(0, |w| u32::from_le_bytes(*w));
@@ -184,11 +169,5 @@ fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo, Forma
         });
     }
     let [frames, height, width] = [1, 2, 3].map(|i| word(i) as usize);
-    Ok(StackInfo::new(
-        Format::Planar,
-        SampleType::F32,
-        frames,
-        height,
-        width,
-    ))
+    Ok(StackInfo::new(Format::Planar, SampleType::F32, frames, height, width))
 }

@@ -58,14 +58,7 @@ pub(super) struct FrameSink<W> {
 
 impl<W: Write> FrameSink<W> {
     pub(super) fn new(writer: W, frames: usize, height: usize, width: usize) -> Self {
-        Self {
-            writer,
-            frames,
-            height,
-            width,
-            written: 0,
-            row: Vec::with_capacity(width * 4),
-        }
+        Self { writer, frames, height, width, written: 0, row: Vec::with_capacity(width * 4) }
     }
 
     pub(super) fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
@@ -79,8 +72,7 @@ impl<W: Write> FrameSink<W> {
                 self.width
             )));
         }
-        self.write_rows(frame)
-            .map_err(FormatError::io("write the frame"))?;
+        self.write_rows(frame).map_err(FormatError::io("write the frame"))?;
         self.written += 1;
         Ok(())
     }
@@ -101,9 +93,7 @@ impl<W: Write> FrameSink<W> {
                 self.written, self.frames
             )));
         }
-        self.writer
-            .flush()
-            .map_err(FormatError::io("write the file"))?;
+        self.writer.flush().map_err(FormatError::io("write the file"))?;
         Ok(self.writer)
     }
 }

@@ -187,9 +187,7 @@ impl StackInfo {
 
     /// Frames x height x width.
     pub fn voxels(&self) -> u64 {
-        (self.frames as u64)
-            .saturating_mul(self.height as u64)
-            .saturating_mul(self.width as u64)
+        (self.frames as u64).saturating_mul(self.height as u64).saturating_mul(self.width as u64)
     }
 }
 

@@ -1,1 +1,17 @@
 //! The reconstruction core: arrays in, arrays out.
+//!
+//! A snapshot `y = sum_k C_k x_k` of `B` frames goes through a [`sensing::SensingOperator`];
+//! [`gap::reconstruct`] alternates its projection with the priors that a
+//! [`schedule::Schedule`] names. All arrays are `f32` with axes (frame, row, column); frames
+//! and masks live on \[0,1\].
+
+pub mod denoise;
+pub mod error;
+pub mod gap;
+pub mod metrics;
+pub mod scale;
+pub mod schedule;
+pub mod sensing;
+pub mod tile;
+
+pub use error::ReconError;

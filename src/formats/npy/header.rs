@@ -49,16 +49,9 @@ impl Header {
         let (Some((sample, order)), Some(fortran_order), Some(shape)) =
             (descr, fortran_order, shape)
         else {
-            return Err(malformed(
-                "the header lacks one of the keys descr, fortran_order, shape",
-            ));
+            return Err(malformed("the header lacks one of the keys descr, fortran_order, shape"));
         };
-        Ok(Self {
-            sample,
-            order,
-            fortran_order,
-            shape,
-        })
+        Ok(Self { sample, order, fortran_order, shape })
     }
 }
 
@@ -107,10 +100,7 @@ impl<'a> Cursor<'a> {
     fn word(&mut self) -> &'a [u8] {
         self.peek();
         let rest = self.text.get(self.at..).unwrap_or_default();
-        let length = rest
-            .iter()
-            .position(|b| !b.is_ascii_alphanumeric())
-            .unwrap_or(rest.len());
+        let length = rest.iter().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(rest.len());
         self.at += length;
         &rest[..length]
     }
@@ -195,11 +185,7 @@ fn dtype_name(code: &[u8], descr: &[u8]) -> String {
 }
 
 pub(super) fn unsupported(found: String) -> FormatError {
-    FormatError::Unsupported {
-        format: Format::Npy,
-        found,
-        accepted: ACCEPTED_TYPES,
-    }
+    FormatError::Unsupported { format: Format::Npy, found, accepted: ACCEPTED_TYPES }
 }
 
 fn malformed(problem: &str) -> FormatError {

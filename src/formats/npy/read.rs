@@ -34,10 +34,7 @@ impl NpyReader {
             [height, width] => (1, height, width),
             [frames, height, width] => (frames, height, width),
             _ => {
-                return Err(unsupported(format!(
-                    "an array of {} dimensions",
-                    header.shape.len()
-                )));
+                return Err(unsupported(format!("an array of {} dimensions", header.shape.len())));
             }
         };
         limits.check_shape(Format::Npy, frames, height, width)?;
@@ -75,9 +72,7 @@ impl FrameReader for NpyReader {
         if self.next == self.info.frames {
             return Ok(None);
         }
-        self.file
-            .read_exact(&mut self.bytes)
-            .map_err(FormatError::io("read the frame"))?;
+        self.file.read_exact(&mut self.bytes).map_err(FormatError::io("read the frame"))?;
         self.next += 1;
         let values = samples::decode(&self.bytes, self.info.sample, self.order);
         let (height, width) = (self.info.height, self.info.width);
@@ -95,10 +90,7 @@ fn read_header(file: &mut File, length: u64) -> Result<(Header, u64), FormatErro
     fill(file, &mut start)?;
     let [magic @ .., major, minor] = start;
     if magic != MAGIC {
-        return Err(FormatError::malformed(
-            Format::Npy,
-            "the signature is wrong",
-        ));
+        return Err(FormatError::malformed(Format::Npy, "the signature is wrong"));
     }
     let (header_bytes, prefix) = match major {
         1 => {
@@ -145,10 +137,7 @@ fn fill(file: &mut File, bytes: &mut [u8]) -> Result<(), FormatError> {
         if source.kind() == io::ErrorKind::UnexpectedEof {
             FormatError::malformed(Format::Npy, "the file ends inside the header")
         } else {
-            FormatError::Io {
-                action: "read the header",
-                source,
-            }
+            FormatError::Io { action: "read the header", source }
         }
     })
 }

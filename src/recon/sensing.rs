@@ -1,0 +1,303 @@
+//! The sensing operator of a snapshot camera and its projection.
+
+use multiversion::multiversion;
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
+
+use super::error::{ReconError, shape_text};
+
+/// `H` of `y = Hx = sum_k C_k x_k`, for one set of masks `C` \[B,H,W\] on \[0,1\].
+///
+/// `H H^T` is diagonal with `sum_k C_k^2` on it (the sum of *squares*: the sum of the masks
+/// is the same only if they are binary). Where it is 0 the pixel is dead: no frame reaches
+/// it, and the projection leaves it alone.
+#[derive(Debug, Clone)]
+pub struct SensingOperator {
+    masks: Array3<f32>,
+    gram: Array2<f32>,
+    inverse_gram: Array2<f32>,
+    gamma: f32,
+}
+
+impl SensingOperator {
+    /// Takes masks \[B,H,W\], all finite and not all 0.
+    pub fn new(masks: Array3<f32>) -> Result<Self, ReconError> {
+        let (frames, height, width) = masks.dim();
+        if frames == 0 || height == 0 || width == 0 {
+            return Err(ReconError::Shape {
+                what: "the mask stack",
+                found: shape_text(masks.shape()),
+                expected: "at least one frame of one pixel".into(),
+            });
+        }
+        if let Some(((k, i, j), value)) = masks.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            return Err(ReconError::Parameter {
+                name: "a mask value",
+                value: format!("{value} at frame {k}, row {i}, column {j}"),
+                range: "finite",
+            });
+        }
+        let masks = masks.as_standard_layout().into_owned();
+        let mut gram = Array2::zeros((height, width));
+        for mask in masks.outer_iter() {
+            gram.zip_mut_with(&mask, |sum: &mut f32, &c| *sum += c * c);
+        }
+        if gram.iter().all(|&g| g == 0.0) {
+            return Err(ReconError::DarkMasks { frames });
+        }
+        let inverse_gram = invert(&gram, 0.0);
+        Ok(Self { masks, gram, inverse_gram, gamma: 0.0 })
+    }
+
+    /// Replaces `(H H^T)^-1` by `(H H^T + gamma)^-1`, for measurements with noise: plain GAP
+    /// then no longer forces `y = Hx`. `gamma` is in units of the gram diagonal, >= 0.
+    pub fn with_gamma(mut self, gamma: f32) -> Result<Self, ReconError> {
+        if !gamma.is_finite() || gamma < 0.0 {
+            return Err(ReconError::Parameter {
+                name: "gamma",
+                value: gamma.to_string(),
+                range: "a finite number of at least 0",
+            });
+        }
+        self.inverse_gram = invert(&self.gram, gamma);
+        self.gamma = gamma;
+        Ok(self)
+    }
+
+    /// The noise term that the projection adds to the gram diagonal.
+    pub fn gamma(&self) -> f32 {
+        self.gamma
+    }
+
+    /// The masks \[B,H,W\].
+    pub fn masks(&self) -> ArrayView3<'_, f32> {
+        self.masks.view()
+    }
+
+    /// (frames, height, width).
+    pub fn dim(&self) -> (usize, usize, usize) {
+        self.masks.dim()
+    }
+
+    /// The diagonal of `H H^T` \[H,W\]: `sum_k C_k^2`.
+    pub fn gram(&self) -> ArrayView2<'_, f32> {
+        self.gram.view()
+    }
+
+    /// Pixels that no mask reaches.
+    pub fn dead_pixels(&self) -> usize {
+        self.gram.iter().filter(|&&g| g == 0.0).count()
+    }
+
+    /// `Hx` \[H,W\] of frames `x` \[B,H,W\].
+    pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array2<f32>, ReconError> {
+        self.check("the frame stack", frames.shape(), self.masks.shape())?;
+        let mut y = Array2::zeros(self.gram.raw_dim());
+        for (mask, frame) in self.masks.outer_iter().zip(frames.outer_iter()) {
+            ndarray::azip!((sum in &mut y, &c in &mask, &x in &frame) *sum += c * x);
+        }
+        Ok(y)
+    }
+
+    /// `H^T y` \[B,H,W\] of a measurement `y` \[H,W\].
+    pub fn adjoint(&self, y: ArrayView2<'_, f32>) -> Result<Array3<f32>, ReconError> {
+        self.check("the measurement", y.shape(), self.gram.shape())?;
+        let mut frames = self.masks.clone();
+        for mut frame in frames.outer_iter_mut() {
+            frame *= &y;
+        }
+        Ok(frames)
+    }
+
+    /// One projection of GAP: `x = v + H^T (H H^T + gamma)^-1 (t - H v)` with the target
+    /// `t = y`, or, accelerated, `t = y1` after `y1 += y - H v` (Liao et al. 2014).
+    ///
+    /// `y` and `y1` are \[H,W\], `v` and `x` \[B,H,W\], all of the operator's size and in
+    /// standard layout. Returns `||y - H v||^2`.
+    pub(super) fn project(
+        &self,
+        y: &Array2<f32>,
+        y1: Option<&mut Array2<f32>>,
+        v: &Array3<f32>,
+        x: &mut Array3<f32>,
+    ) -> f64 {
+        let (frames, height, width) = self.masks.dim();
+        let plane = height * width;
+        let (Some(masks), Some(inverse), Some(y), Some(v), Some(x)) = (
+            self.masks.as_slice(),
+            self.inverse_gram.as_slice(),
+            y.as_slice(),
+            v.as_slice(),
+            x.as_slice_mut(),
+        ) else {
+            unreachable!("arrays of the solver are in standard layout")
+        };
+        let mut accelerated = y1.and_then(|a| a.as_slice_mut());
+        let mut sum = vec![0.0f32; width];
+        let mut squares = 0.0f64;
+        // Row by row over all frames: a row of v and of the masks is still in cache when the
+        // correction is added.
+        for start in (0..plane).step_by(width) {
+            let row = start..start + width;
+            let stack = Stack { plane, start, width, frames };
+            let target = accelerated.as_deref_mut().map(|a| &mut a[row.clone()]);
+            squares +=
+                project_row(stack, masks, v, x, &y[row.clone()], target, &inverse[row], &mut sum);
+        }
+        squares
+    }
+
+    fn check(
+        &self,
+        what: &'static str,
+        found: &[usize],
+        expected: &[usize],
+    ) -> Result<(), ReconError> {
+        if found == expected {
+            return Ok(());
+        }
+        Err(ReconError::Shape { what, found: shape_text(found), expected: shape_text(expected) })
+    }
+}
+
+fn invert(gram: &Array2<f32>, gamma: f32) -> Array2<f32> {
+    gram.mapv(|g| if g > 0.0 { 1.0 / (g + gamma) } else { 0.0 })
+}
+
+/// One row through all frames of a stack in standard layout.
+#[derive(Clone, Copy)]
+struct Stack {
+    plane: usize,
+    start: usize,
+    width: usize,
+    frames: usize,
+}
+
+#[allow(clippy::too_many_arguments)] // one kernel over plain slices, so that it vectorises
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn project_row(
+    stack: Stack,
+    masks: &[f32],
+    v: &[f32],
+    x: &mut [f32],
+    y: &[f32],
+    y1: Option<&mut [f32]>,
+    inverse: &[f32],
+    sum: &mut [f32],
+) -> f64 {
+    let Stack { plane, start, width, frames } = stack;
+    sum.fill(0.0);
+    for k in 0..frames {
+        let row = k * plane + start..k * plane + start + width;
+        for ((s, &c), &value) in sum.iter_mut().zip(&masks[row.clone()]).zip(&v[row]) {
+            *s += c * value;
+        }
+    }
+    let mut squares = 0.0f32;
+    match y1 {
+        Some(y1) => {
+            for (((s, &y), t), &inverse) in sum.iter_mut().zip(y).zip(y1).zip(inverse) {
+                let residual = y - *s;
+                squares += residual * residual;
+                *t += residual;
+                *s = (*t - *s) * inverse;
+            }
+        }
+        None => {
+            for ((s, &y), &inverse) in sum.iter_mut().zip(y).zip(inverse) {
+                let residual = y - *s;
+                squares += residual * residual;
+                *s = residual * inverse;
+            }
+        }
+    }
+    for k in 0..frames {
+        let row = k * plane + start..k * plane + start + width;
+        let (masks, v, x) = (&masks[row.clone()], &v[row.clone()], &mut x[row]);
+        for (((x, &v), &c), &s) in x.iter_mut().zip(v).zip(masks).zip(&*sum) {
+            *x = v + c * s;
+        }
+    }
+    f64::from(squares)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::SensingOperator;
+    use ndarray::{Array2, Array3};
+    use proptest::prelude::{any, proptest};
+
+    fn random(seed: u64, dim: (usize, usize, usize)) -> Array3<f32> {
+        use rand::{Rng, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        Array3::from_shape_fn(dim, |_| rng.random::<f32>())
+    }
+
+    proptest! {
+        #[test]
+        fn adjoint_is_the_adjoint(
+            seed in any::<u64>(),
+            dim in (1usize..5, 1usize..9, 1usize..9),
+        ) {
+            let op = SensingOperator::new(random(seed, dim)).unwrap();
+            let x = random(seed ^ 1, dim);
+            let y = random(seed ^ 2, (1, dim.1, dim.2)).remove_axis_first();
+            let left: f32 = (&op.forward(x.view()).unwrap() * &y).sum();
+            let right: f32 = (&op.adjoint(y.view()).unwrap() * &x).sum();
+            assert!((left - right).abs() <= 1e-4 * left.abs().max(1.0), "{left} {right}");
+        }
+
+        #[test]
+        fn plain_projection_meets_the_measurement(
+            seed in any::<u64>(),
+            dim in (1usize..5, 1usize..9, 1usize..20),
+        ) {
+            let op = SensingOperator::new(random(seed, dim)).unwrap();
+            let truth = random(seed ^ 1, dim);
+            let y = op.forward(truth.view()).unwrap();
+            let v = random(seed ^ 2, dim);
+            let mut x = Array3::zeros(dim);
+            let squares = op.project(&y, None, &v, &mut x);
+            let before = &y - &op.forward(v.view()).unwrap();
+            let after = &y - &op.forward(x.view()).unwrap();
+            let expected: f64 = before.iter().map(|&r| f64::from(r * r)).sum();
+            assert!((squares - expected).abs() <= 1e-4 * expected.max(1e-3));
+            for (residual, gram) in after.iter().zip(op.gram()) {
+                assert!(residual.abs() < 1e-4 || *gram < 1e-4, "{residual} {gram}");
+            }
+        }
+    }
+
+    trait FirstFrame {
+        fn remove_axis_first(self) -> Array2<f32>;
+    }
+
+    impl FirstFrame for Array3<f32> {
+        fn remove_axis_first(self) -> Array2<f32> {
+            self.index_axis_move(ndarray::Axis(0), 0)
+        }
+    }
+
+    #[test]
+    fn dead_pixels_are_left_alone() {
+        let mut masks = random(3, (2, 3, 3));
+        masks.slice_mut(ndarray::s![.., 1, 1]).fill(0.0);
+        let op = SensingOperator::new(masks).unwrap();
+        assert_eq!(op.dead_pixels(), 1);
+        let v = random(4, (2, 3, 3));
+        let mut x = Array3::zeros((2, 3, 3));
+        let mut y1 = Array2::from_elem((3, 3), 5.0);
+        op.project(&Array2::from_elem((3, 3), 1.0), Some(&mut y1), &v, &mut x);
+        assert_eq!(x[[0, 1, 1]], v[[0, 1, 1]]);
+        assert!(x.iter().all(|value| value.is_finite()));
+    }
+
+    #[test]
+    fn dark_and_broken_masks_are_refused() {
+        let dark = SensingOperator::new(Array3::zeros((4, 2, 2))).unwrap_err();
+        assert!(dark.to_string().contains("all 4 frames"), "{dark}");
+        let mut masks = Array3::ones((1, 2, 2));
+        masks[[0, 1, 0]] = f32::NAN;
+        let broken = SensingOperator::new(masks).unwrap_err();
+        assert!(broken.to_string().contains("frame 0, row 1, column 0"), "{broken}");
+    }
+}

@@ -1,0 +1,227 @@
+//! Tiles with overlap and smooth blending: pure arithmetic.
+
+use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
+
+use super::error::ReconError;
+
+/// One tile: the pixels `row..row+height` x `column..column+width`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Tile {
+    /// Position in the plan.
+    pub index: usize,
+    /// First row.
+    pub row: usize,
+    /// First column.
+    pub column: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+}
+
+/// How a picture is cut. It depends on the picture's size and the parameters alone, never on
+/// the number of workers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TilePlan {
+    height: usize,
+    width: usize,
+    size: usize,
+    overlap: usize,
+    rows: Vec<Span>,
+    columns: Vec<Span>,
+}
+
+/// A stretch of one axis with its blending weights, which add up to 1 over all spans.
+#[derive(Debug, Clone, PartialEq)]
+struct Span {
+    start: usize,
+    weights: Vec<f32>,
+}
+
+impl TilePlan {
+    /// Cuts `height` x `width` pixels into tiles of at most `size` x `size` that share at least
+    /// `overlap` pixels with each neighbour. A side that fits into one tile is not cut.
+    ///
+    /// # Errors
+    /// `size` below 16 or above 8192, or `overlap` of more than half of `size`.
+    pub fn new(
+        height: usize,
+        width: usize,
+        size: usize,
+        overlap: usize,
+    ) -> Result<Self, ReconError> {
+        if height == 0 || width == 0 {
+            return Err(ReconError::Shape {
+                what: "a picture to be tiled",
+                found: format!("{height}x{width}"),
+                expected: "at least one pixel".into(),
+            });
+        }
+        if !(16..=8192).contains(&size) {
+            return Err(ReconError::Parameter {
+                name: "tile size",
+                value: size.to_string(),
+                range: "from 16 to 8192 pixels",
+            });
+        }
+        if overlap * 2 > size {
+            return Err(ReconError::Parameter {
+                name: "tile overlap",
+                value: overlap.to_string(),
+                range: "at most half of the tile size",
+            });
+        }
+        let (rows, columns) = (spans(height, size, overlap), spans(width, size, overlap));
+        Ok(Self { height, width, size, overlap, rows, columns })
+    }
+
+    /// Rows and columns of the whole picture.
+    pub fn dim(&self) -> (usize, usize) {
+        (self.height, self.width)
+    }
+
+    /// Largest side of a tile.
+    pub fn size(&self) -> usize {
+        self.size
+    }
+
+    /// Least overlap of neighbours.
+    pub fn overlap(&self) -> usize {
+        self.overlap
+    }
+
+    /// Number of tiles.
+    pub fn len(&self) -> usize {
+        self.rows.len() * self.columns.len()
+    }
+
+    /// A plan has at least one tile.
+    pub fn is_empty(&self) -> bool {
+        false
+    }
+
+    /// The tile at `index`, row by row; none past the end.
+    pub fn tile(&self, index: usize) -> Option<Tile> {
+        let row = self.rows.get(index / self.columns.len())?;
+        let column = self.columns.get(index % self.columns.len())?;
+        Some(Tile {
+            index,
+            row: row.start,
+            column: column.start,
+            height: row.weights.len(),
+            width: column.weights.len(),
+        })
+    }
+
+    /// All tiles.
+    pub fn tiles(&self) -> impl Iterator<Item = Tile> + '_ {
+        (0..self.len()).filter_map(|index| self.tile(index))
+    }
+
+    /// Blending weights \[height,width\] of a tile; over all tiles they add up to 1 at every
+    /// pixel. They rise as a squared sine over the shared pixels and are separable.
+    pub fn weights(&self, tile: &Tile) -> Array2<f32> {
+        let rows = &self.rows[tile.index / self.columns.len()].weights;
+        let columns = &self.columns[tile.index % self.columns.len()].weights;
+        Array2::from_shape_fn((tile.height, tile.width), |(i, j)| rows[i] * columns[j])
+    }
+
+    /// Adds a frame of a tile, with its weights, to the whole frame \[H,W\] (0 at first).
+    pub fn blend(&self, tile: &Tile, part: ArrayView2<'_, f32>, mut whole: ArrayViewMut2<'_, f32>) {
+        let weights = self.weights(tile);
+        let mut window = whole
+            .slice_mut(s![tile.row..tile.row + tile.height, tile.column..tile.column + tile.width]);
+        ndarray::azip!((sum in &mut window, &value in &part, &weight in &weights) {
+            *sum += weight * value;
+        });
+    }
+}
+
+/// Cuts an axis into as few spans as possible, as even as possible, and gives each its weights.
+fn spans(length: usize, size: usize, overlap: usize) -> Vec<Span> {
+    let size = size.min(length);
+    let count = 1 + (length - size).div_ceil((size - overlap.min(size / 2)).max(1));
+    let start = |k: usize| if k == 0 { 0 } else { k * (length - size) / (count - 1) };
+    let mut spans: Vec<Span> = (0..count)
+        .map(|k| {
+            let before = if k == 0 { 0 } else { start(k - 1) + size - start(k) };
+            let after = if k + 1 == count { 0 } else { start(k) + size - start(k + 1) };
+            Span { start: start(k), weights: tapered(size, before, after) }
+        })
+        .collect();
+    // Even spacing can make three spans meet, so the ramps alone need not add up to 1.
+    let mut sums = vec![0.0f32; length];
+    for span in &spans {
+        sums[span.start..].iter_mut().zip(&span.weights).for_each(|(sum, weight)| *sum += weight);
+    }
+    for span in &mut spans {
+        span.weights.iter_mut().zip(&sums[span.start..]).for_each(|(weight, sum)| *weight /= sum);
+    }
+    spans
+}
+
+/// 1 inside, and a squared sine over the `before` first and `after` last of `length` pixels.
+fn tapered(length: usize, before: usize, after: usize) -> Vec<f32> {
+    let ramp = |step: usize, shared: usize| {
+        let share = ((step as f64 + 0.5) / shared.max(1) as f64).min(1.0);
+        (std::f64::consts::FRAC_PI_2 * share).sin().powi(2)
+    };
+    let edge = |step: usize, shared: usize| if shared == 0 { 1.0 } else { ramp(step, shared) };
+    (0..length).map(|i| (edge(i, before) * edge(length - 1 - i, after)) as f32).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::TilePlan;
+    use ndarray::Array2;
+    use proptest::prelude::proptest;
+
+    proptest! {
+        #[test]
+        fn weights_add_up_to_one(
+            height in 1usize..300,
+            width in 1usize..300,
+            size in 16usize..128,
+            share in 0usize..8,
+        ) {
+            let plan = TilePlan::new(height, width, size, size * share / 16).unwrap();
+            let mut whole = Array2::zeros((height, width));
+            for tile in plan.tiles() {
+                assert!(tile.height <= size && tile.width <= size);
+                let part = Array2::ones((tile.height, tile.width));
+                plan.blend(&tile, part.view(), whole.view_mut());
+            }
+            for sum in &whole {
+                assert!((sum - 1.0f32).abs() < 1e-5, "{sum}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_picture_that_fits_is_one_tile() {
+        let plan = TilePlan::new(256, 200, 256, 32).unwrap();
+        assert_eq!(plan.len(), 1);
+        assert!(plan.weights(&plan.tile(0).unwrap()).iter().all(|&w| w == 1.0));
+        assert_eq!(plan.tile(1), None);
+    }
+
+    #[test]
+    fn neighbours_share_at_least_the_overlap() {
+        let plan = TilePlan::new(3200, 1024, 256, 32).unwrap();
+        for axis in [&plan.rows, &plan.columns] {
+            for pair in axis.windows(2) {
+                let shared = pair[0].start + pair[0].weights.len() - pair[1].start;
+                assert!(shared >= 32, "{shared}");
+            }
+        }
+    }
+
+    #[test]
+    fn bad_parameters_are_named() {
+        for (size, overlap, word) in [(8, 0, "tile size"), (64, 33, "tile overlap")] {
+            let error = TilePlan::new(100, 100, size, overlap).unwrap_err().to_string();
+            assert!(error.contains(word), "{error}");
+        }
+        assert!(TilePlan::new(0, 5, 64, 8).is_err());
+    }
+}
