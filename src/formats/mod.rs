@@ -14,6 +14,9 @@ mod stack;
 
 pub mod npy;
 pub mod planar;
+pub mod png;
+mod tiff;
+pub mod validate;
 
 use std::fs::File;
 use std::io::{Read, Seek};
@@ -40,6 +43,8 @@ pub fn open_stack(
     limits.check_file(format, length)?;
     match format {
         Format::Npy => Ok(Box::new(npy::NpyReader::open(file, length, limits)?)),
+        Format::Tiff => Ok(Box::new(tiff::TiffReader::open(file, length, limits)?)),
+        Format::Png => Ok(Box::new(png::PngReader::open(file, length, limits)?)),
         other => Err(FormatError::UnknownFormat { found: format!("{other}"), accepted: ACCEPTED }),
     }
 }

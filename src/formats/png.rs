@@ -1,0 +1,142 @@
+//! PNG: one grey frame in, 16-bit frames out.
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, ErrorKind, Write};
+use std::path::Path;
+
+use ::png::{
+    BitDepth, ColorType, Compression, Decoder, DecodingError, Encoder, EncodingError,
+    Limits as DecoderLimits, Transformations,
+};
+use ndarray::{Array2, ArrayView2};
+
+use super::samples::{self, ByteOrder};
+use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+
+/// Deflate expands a byte to at most 1032.
+const MAX_EXPANSION: u64 = 1032;
+
+/// Room for the decoder's own buffers and for chunks that are not pixels.
+const DECODER_BYTES: usize = 16 << 20;
+
+/// A grey PNG, a stack of one frame.
+pub(super) struct PngReader {
+    decoder: Option<::png::Reader<BufReader<File>>>,
+    info: StackInfo,
+}
+
+impl PngReader {
+    /// Reads the header of `file` (`length` bytes long) and checks it against the limits and the
+    /// length. Gamma and colour profiles are not applied: the stored numbers count.
+    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self, FormatError> {
+        let decoder_limits = DecoderLimits { bytes: DECODER_BYTES };
+        let mut decoder = Decoder::new_with_limits(BufReader::new(file), decoder_limits);
+        decoder.set_transformations(Transformations::IDENTITY);
+        decoder.set_ignore_text_chunk(true);
+        decoder.set_ignore_iccp_chunk(true);
+        let header = decoder.read_header_info().map_err(decoding_error)?;
+        let (height, width) = (header.height, header.width);
+        let sample = match (header.color_type, header.bit_depth) {
+            (ColorType::Grayscale, BitDepth::Eight) => SampleType::U8,
+            (ColorType::Grayscale, BitDepth::Sixteen) => SampleType::U16,
+            (color, depth) => return Err(unsupported(format!("{color:?}, {depth:?} bit"))),
+        };
+        limits.check_shape(Format::Png, 1, height.into(), width.into())?;
+        let info = StackInfo::new(Format::Png, sample, 1, height as usize, width as usize);
+        let promised = info.voxels() * sample.bytes() as u64;
+        if length.saturating_mul(MAX_EXPANSION) < promised {
+            return Err(FormatError::Truncated {
+                format: Format::Png,
+                promised: format!("{height}x{width} {sample} ({promised} bytes of pixels)"),
+                present: format!("{length} bytes, too few even for perfect compression"),
+            });
+        }
+        let reader = decoder.read_info().map_err(decoding_error)?;
+        if reader.info().animation_control.is_some() {
+            return Err(unsupported("an animation".to_owned()));
+        }
+        Ok(Self { decoder: Some(reader), info })
+    }
+}
+
+impl FrameReader for PngReader {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+        let Some(mut decoder) = self.decoder.take() else {
+            return Ok(None);
+        };
+        let StackInfo { height, width, sample, .. } = self.info;
+        let mut bytes = vec![0; height * width * sample.bytes()];
+        decoder.next_frame(&mut bytes).map_err(decoding_error)?;
+        samples::frame(height, width, samples::decode(&bytes, sample, ByteOrder::Big)).map(Some)
+    }
+}
+
+/// Writes (or overwrites) `path` with a 16-bit grey PNG for looking at: `black` becomes 0, `white`
+/// 65535, linear between, clipped outside; NaN becomes 0. `frame` has the axes (row, column).
+///
+/// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
+pub fn write_u16(
+    path: &Path,
+    frame: ArrayView2<'_, f32>,
+    black: f32,
+    white: f32,
+) -> Result<(), FormatError> {
+    let file = File::create(path).map_err(FormatError::io("create the PNG"))?;
+    encode_u16(BufWriter::new(file), frame, black, white)
+}
+
+fn encode_u16(
+    writer: impl Write,
+    frame: ArrayView2<'_, f32>,
+    black: f32,
+    white: f32,
+) -> Result<(), FormatError> {
+    if !(black.is_finite() && white.is_finite() && black < white) {
+        return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
+    }
+    let [height, width] = [frame.nrows(), frame.ncols()].map(|n| u32::try_from(n).unwrap_or(0));
+    let mut encoder = Encoder::new(writer, width, height);
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(BitDepth::Sixteen);
+    // The low byte is noise: more effort buys little.
+    encoder.set_compression(Compression::Fast);
+    let factor = 65535.0 / (white - black);
+    let bytes: Vec<u8> =
+        frame.iter().flat_map(|v| (((v - black) * factor).round() as u16).to_be_bytes()).collect();
+    let mut png = encoder.write_header().map_err(encoding_error)?;
+    png.write_image_data(&bytes).map_err(encoding_error)?;
+    png.finish().map_err(encoding_error)
+}
+
+fn unsupported(found: String) -> FormatError {
+    FormatError::Unsupported {
+        format: Format::Png,
+        found,
+        accepted: "Grayscale without alpha, Eight or Sixteen bit, one image",
+    }
+}
+
+fn decoding_error(error: DecodingError) -> FormatError {
+    match error {
+        DecodingError::IoError(source) if source.kind() == ErrorKind::UnexpectedEof => {
+            FormatError::Truncated {
+                format: Format::Png,
+                promised: "a whole image".to_owned(),
+                present: "only its beginning".to_owned(),
+            }
+        }
+        DecodingError::IoError(source) => FormatError::Io { action: "read the PNG", source },
+        other => FormatError::malformed(Format::Png, other.to_string()),
+    }
+}
+
+fn encoding_error(error: EncodingError) -> FormatError {
+    match error {
+        EncodingError::IoError(source) => FormatError::Io { action: "write the PNG", source },
+        other => FormatError::Internal(format!("PNG: {other}")),
+    }
+}

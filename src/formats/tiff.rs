@@ -1,0 +1,250 @@
+//! TIFF and BigTIFF stacks: one grey frame a page, read page by page.
+
+use std::fs::File;
+use std::io::{BufReader, ErrorKind};
+
+use ::tiff::decoder::{Decoder, DecodingResult, Limits as DecoderLimits};
+use ::tiff::tags::{PhotometricInterpretation, Tag};
+use ::tiff::{ColorType, TiffError};
+use ndarray::Array2;
+
+use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
+
+const ACCEPTED_SAMPLES: &str =
+    "one grey sample a pixel (BlackIsZero): unsigned 8 or 16 bit, or 32-bit float";
+const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits";
+
+/// TIFF's numbers for the lossless compressions that are read.
+const UNCOMPRESSED: u16 = 1;
+const LOSSLESS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, 32773];
+
+/// No compression of TIFF expands more: LZW reaches 2560 bytes a byte at the very most.
+const MAX_EXPANSION: u64 = 4096;
+
+/// A TIFF file whose pages are frames of one size and type.
+pub(super) struct TiffReader {
+    decoder: Decoder<BufReader<File>>,
+    info: StackInfo,
+    next: usize,
+}
+
+impl TiffReader {
+    /// Walks over all page headers of `file` (`length` bytes long) and checks them against the
+    /// limits, the length and each other. Pixels are not read.
+    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self, FormatError> {
+        let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
+        let first = read_page(&mut decoder, 0, length, limits)?;
+        check_imagej(&mut decoder)?;
+        let mut frames = 1;
+        while decoder.more_images() {
+            limits.check_shape(Format::Tiff, frames as u64 + 1, 1, 1)?;
+            decoder.next_image().map_err(|e| in_page(frames, e))?;
+            let page = read_page(&mut decoder, frames, length, limits)?;
+            if page != first {
+                return Err(malformed(format!(
+                    "page {frames} is {}x{} {}, but page 0 is {}x{} {} (counted from 0); \
+                     all pages must be alike",
+                    page.height, page.width, page.sample, first.height, first.width, first.sample
+                )));
+            }
+            frames += 1;
+        }
+        let info = StackInfo { frames, ..first };
+        limits.check_info(&info)?;
+        let mut decoder_limits = DecoderLimits::default();
+        decoder_limits.decoding_buffer_size = info.height * info.width * info.sample.bytes();
+        decoder_limits.intermediate_buffer_size = usize::try_from(length).unwrap_or(usize::MAX);
+        Ok(Self { decoder: decoder.with_limits(decoder_limits), info, next: 0 })
+    }
+}
+
+impl FrameReader for TiffReader {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+        let page = self.next;
+        if page == self.info.frames {
+            return Ok(None);
+        }
+        self.next += 1;
+        self.decoder.seek_to_image(page).map_err(|e| in_page(page, e))?;
+        let values = match self.decoder.read_image().map_err(|e| in_page(page, e))? {
+            DecodingResult::U8(values) => values.into_iter().map(f32::from).collect(),
+            DecodingResult::U16(values) => values.into_iter().map(f32::from).collect(),
+            DecodingResult::F32(values) => values,
+            _ => return Err(FormatError::Internal(format!("samples of TIFF page {page}"))),
+        };
+        samples::frame(self.info.height, self.info.width, values).map(Some)
+    }
+}
+
+/// Checks the header of the page that the decoder stands on; the result has one frame.
+fn read_page(
+    decoder: &mut Decoder<BufReader<File>>,
+    page: usize,
+    length: u64,
+    limits: &Limits,
+) -> Result<StackInfo, FormatError> {
+    let (width, height) = decoder.dimensions().map_err(|e| in_page(page, e))?;
+    limits.check_shape(Format::Tiff, 1, height.into(), width.into())?;
+    let sample = sample_type(decoder, page)?;
+    let info = StackInfo::new(Format::Tiff, sample, 1, height as usize, width as usize);
+    check_chunks(decoder, page, &info, length, limits)?;
+    Ok(info)
+}
+
+fn sample_type(
+    decoder: &mut Decoder<BufReader<File>>,
+    page: usize,
+) -> Result<SampleType, FormatError> {
+    let tag = |decoder: &mut Decoder<_>, tag, default: u16| {
+        decoder.find_tag_unsigned(tag).map(|v| v.unwrap_or(default)).map_err(|e| in_page(page, e))
+    };
+    let unsupported = |found: String| FormatError::Unsupported {
+        format: Format::Tiff,
+        found: format!("{found} (page {page})"),
+        accepted: ACCEPTED_SAMPLES,
+    };
+    let black_is_zero = PhotometricInterpretation::BlackIsZero.to_u16();
+    let photometric = tag(decoder, Tag::PhotometricInterpretation, black_is_zero)?;
+    if photometric != black_is_zero {
+        return Err(unsupported(match PhotometricInterpretation::from_u16(photometric) {
+            Some(name) => format!("{name:?} colours"),
+            None => format!("photometric interpretation {photometric}"),
+        }));
+    }
+    let bits = match decoder.colortype().map_err(|e| in_page(page, e))? {
+        ColorType::Gray(bits) => bits,
+        other => return Err(unsupported(format!("{other:?}"))),
+    };
+    let formats: Vec<u16> = decoder
+        .find_tag_unsigned_vec(Tag::SampleFormat)
+        .map_err(|e| in_page(page, e))?
+        .unwrap_or_else(|| vec![1]);
+    match (formats.first().copied(), bits) {
+        (Some(1), 8) => Ok(SampleType::U8),
+        (Some(1), 16) => Ok(SampleType::U16),
+        (Some(3), 32) => Ok(SampleType::F32),
+        (Some(1), _) => Err(unsupported(format!("unsigned {bits}-bit samples"))),
+        (Some(2), _) => Err(unsupported(format!("signed {bits}-bit samples"))),
+        (Some(3), _) => Err(unsupported(format!("{bits}-bit float samples"))),
+        _ => Err(unsupported(format!("sample format {formats:?}"))),
+    }
+}
+
+/// Checks that the strips or tiles of a page lie in the file and can hold the page.
+fn check_chunks(
+    decoder: &mut Decoder<BufReader<File>>,
+    page: usize,
+    info: &StackInfo,
+    length: u64,
+    limits: &Limits,
+) -> Result<(), FormatError> {
+    let compression: u16 = decoder
+        .find_tag_unsigned(Tag::Compression)
+        .map_err(|e| in_page(page, e))?
+        .unwrap_or(UNCOMPRESSED);
+    if !LOSSLESS.contains(&compression) {
+        return Err(FormatError::Unsupported {
+            format: Format::Tiff,
+            found: format!("compression number {compression} (page {page})"),
+            accepted: ACCEPTED_COMPRESSION,
+        });
+    }
+    // The decoder makes room for a row of a tile, and skips what lies outside the page.
+    let (chunk_width, _) = decoder.chunk_dimensions();
+    if u64::from(chunk_width) > 2 * limits.max_side as u64 {
+        return Err(malformed(format!("page {page} has tiles of width {chunk_width}")));
+    }
+    let mut stored = 0u64;
+    for (index, (offset, bytes)) in chunk_ranges(decoder, page)?.into_iter().enumerate() {
+        let end = offset.saturating_add(bytes);
+        if end > length {
+            return Err(FormatError::Truncated {
+                format: Format::Tiff,
+                promised: format!(
+                    "strip or tile {index} of page {page} at bytes {offset} to {end}"
+                ),
+                present: format!("{length} bytes in all"),
+            });
+        }
+        stored = stored.saturating_add(bytes);
+    }
+    let needed = info.voxels() * info.sample.bytes() as u64;
+    let expansion = if compression == UNCOMPRESSED { 1 } else { MAX_EXPANSION };
+    if stored.saturating_mul(expansion) < needed {
+        return Err(FormatError::Truncated {
+            format: Format::Tiff,
+            promised: format!(
+                "{}x{} {} in page {page} ({needed} bytes)",
+                info.height, info.width, info.sample
+            ),
+            present: format!("{stored} stored bytes for it"),
+        });
+    }
+    Ok(())
+}
+
+/// Offset and length of each strip or tile.
+fn chunk_ranges(
+    decoder: &mut Decoder<BufReader<File>>,
+    page: usize,
+) -> Result<Vec<(u64, u64)>, FormatError> {
+    let mut find = |tag| decoder.find_tag_unsigned_vec::<u64>(tag).map_err(|e| in_page(page, e));
+    let (offsets, counts) = match find(Tag::StripOffsets)? {
+        Some(offsets) => (Some(offsets), find(Tag::StripByteCounts)?),
+        None => (find(Tag::TileOffsets)?, find(Tag::TileByteCounts)?),
+    };
+    match (offsets, counts) {
+        (Some(offsets), Some(counts)) if offsets.len() == counts.len() => {
+            Ok(offsets.into_iter().zip(counts).collect())
+        }
+        _ => Err(malformed(format!("page {page} does not say where its pixels lie"))),
+    }
+}
+
+/// ImageJ stores stacks above 4 GB behind a single page header; reading one frame of many would be
+/// a silent loss.
+fn check_imagej(decoder: &mut Decoder<BufReader<File>>) -> Result<(), FormatError> {
+    let description = match decoder.get_tag_ascii_string(Tag::ImageDescription) {
+        Ok(description) if description.starts_with("ImageJ=") => description,
+        _ => return Ok(()),
+    };
+    let images = description.lines().find_map(|line| line.strip_prefix("images="));
+    match images.and_then(|count| count.trim().parse::<u64>().ok()) {
+        Some(count) if count > 1 && !decoder.more_images() => Err(FormatError::Unsupported {
+            format: Format::Tiff,
+            found: format!("an ImageJ stack of {count} images behind one page header"),
+            accepted: "one page a frame (BigTIFF for more than 4 GB), or npy",
+        }),
+        _ => Ok(()),
+    }
+}
+
+fn malformed(problem: String) -> FormatError {
+    FormatError::malformed(Format::Tiff, problem)
+}
+
+fn in_page(page: usize, error: TiffError) -> FormatError {
+    match error {
+        // Decompressors report bad data as I/O errors too: only the system's own carry a number.
+        TiffError::IoError(source) if source.raw_os_error().is_some() => {
+            FormatError::Io { action: "read the TIFF page", source }
+        }
+        TiffError::IoError(source) if source.kind() == ErrorKind::UnexpectedEof => {
+            FormatError::Truncated {
+                format: Format::Tiff,
+                promised: format!("page {page} (counted from 0)"),
+                present: "only a part of it".to_owned(),
+            }
+        }
+        TiffError::UnsupportedError(what) => FormatError::Unsupported {
+            format: Format::Tiff,
+            found: format!("page {page}: {what}"),
+            accepted: ACCEPTED_SAMPLES,
+        },
+        other => malformed(format!("page {page}: {other}")),
+    }
+}
