@@ -12,6 +12,7 @@ mod limits;
 mod samples;
 mod stack;
 
+pub mod exr;
 pub mod npy;
 pub mod planar;
 pub mod png;
