@@ -13,6 +13,7 @@ mod samples;
 mod stack;
 
 pub mod exr;
+pub mod mat;
 pub mod npy;
 pub mod planar;
 pub mod png;
@@ -46,7 +47,15 @@ pub fn open_stack(
         Format::Npy => Ok(Box::new(npy::NpyReader::open(file, length, limits)?)),
         Format::Tiff => Ok(Box::new(tiff::TiffReader::open(file, length, limits)?)),
         Format::Png => Ok(Box::new(png::PngReader::open(file, length, limits)?)),
-        other => Err(FormatError::UnknownFormat { found: format!("{other}"), accepted: ACCEPTED }),
+        Format::Mat => Err(FormatError::Unsupported {
+            format,
+            found: "a scene of several arrays".to_owned(),
+            accepted: "one stack a file here; name the file as a .mat scene",
+        }),
+        Format::Exr | Format::Planar => Err(FormatError::UnknownFormat {
+            found: format!("it is a {format} file"),
+            accepted: ACCEPTED,
+        }),
     }
 }
 

@@ -28,7 +28,8 @@ pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<
     }
 }
 
-fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f32) -> Vec<f32> {
+/// Converts whole samples of N bytes.
+pub(super) fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f32) -> Vec<f32> {
     let (samples, _) = bytes.as_chunks::<N>();
     samples.iter().map(|&sample| convert(sample)).collect()
 }

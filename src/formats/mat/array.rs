@@ -1,0 +1,226 @@
+//! The inner structure of an array: flags, dimensions, name, numbers.
+
+use std::io::BufRead;
+
+use super::element::{Content, malformed};
+use crate::formats::samples::{ByteOrder, each};
+use crate::formats::{Format, FormatError, SampleType};
+
+const INT8: u32 = 1;
+const INT32: u32 = 5;
+const UINT32: u32 = 6;
+
+/// MATLAB's own limit is 63.
+const MAX_NAME_BYTES: u32 = 255;
+/// More axes than any sensible array has.
+const MAX_AXES: u32 = 16;
+/// The largest class that begins with flags, dimensions and a name (15, uint64).
+const LAST_ORDINARY_CLASS: u8 = 15;
+
+const COMPLEX: u32 = 0x0800;
+const LOGICAL: u32 = 0x0200;
+
+/// What an array says before its numbers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct ArrayHeader {
+    pub(super) name: String,
+    /// Sizes of the axes, the one that varies fastest first.
+    pub(super) dimensions: Vec<u64>,
+    class: u8,
+    flags: u32,
+}
+
+impl ArrayHeader {
+    /// Reads the header. Arrays without one (empty, or of MATLAB's opaque classes) have no name.
+    pub(super) fn read<R: BufRead>(content: &mut Content<R>) -> Result<Self, FormatError> {
+        let mut header = Self { name: String::new(), dimensions: Vec::new(), class: 0, flags: 0 };
+        if content.is_empty() {
+            return Ok(header);
+        }
+        let flags = Part::read(content, "flags", 8)?.expect_type(UINT32)?;
+        let flags = flags.words(content.order()).next().unwrap_or_default();
+        header.flags = flags;
+        header.class = (flags & 0xff) as u8;
+        if header.class > LAST_ORDINARY_CLASS {
+            return Ok(header);
+        }
+        let dimensions = Part::read(content, "dimensions", 4 * MAX_AXES)?.expect_type(INT32)?;
+        header.dimensions = dimensions
+            .words(content.order())
+            .map(|axis| u64::try_from(axis as i32).map_err(|_| malformed("a negative dimension")))
+            .collect::<Result<_, _>>()?;
+        let name = Part::read(content, "name", MAX_NAME_BYTES)?.expect_type(INT8)?;
+        header.name = String::from_utf8_lossy(&name.bytes).into_owned();
+        Ok(header)
+    }
+
+    /// How the array's numbers are meant. Errors: a class that is not accepted.
+    pub(super) fn sample_type(&self) -> Result<SampleType, FormatError> {
+        let refused = match self.class {
+            _ if self.flags & COMPLEX != 0 => "complex numbers",
+            6 => return Ok(SampleType::F64),
+            7 => return Ok(SampleType::F32),
+            9 if self.flags & LOGICAL != 0 => return Ok(SampleType::Bool),
+            9 => return Ok(SampleType::U8),
+            11 => return Ok(SampleType::U16),
+            1 => "a cell array",
+            2 => "a struct",
+            3 => "an object",
+            4 => "text",
+            5 => "a sparse matrix",
+            8 => "int8",
+            10 => "int16",
+            12 => "int32",
+            13 => "uint32",
+            14 => "int64",
+            15 => "uint64",
+            _ => "an array of an unknown class",
+        };
+        Err(FormatError::Unsupported {
+            format: Format::Mat,
+            found: format!("{refused} in '{}'", self.name),
+            accepted: "double, single, uint8, uint16, logical",
+        })
+    }
+}
+
+/// Reads the tag of the numbers: how they are stored, and how many bytes follow, checked against
+/// the dimensions.
+pub(super) fn read_data_tag<R: BufRead>(
+    content: &mut Content<R>,
+    header: &ArrayHeader,
+) -> Result<(Storage, u64), FormatError> {
+    let (kind, bytes) = content.tag()?;
+    let name = &header.name;
+    if kind > 0xffff {
+        return Err(FormatError::Unsupported {
+            format: Format::Mat,
+            found: format!("'{name}' with at most four bytes of numbers"),
+            accepted: "frames of some size",
+        });
+    }
+    let storage = Storage::from_type(kind)
+        .ok_or_else(|| malformed(format!("'{name}' stores numbers as type {kind}")))?;
+    let count = header.dimensions.iter().fold(1u64, |product, axis| product.saturating_mul(*axis));
+    let promised = count.saturating_mul(storage.bytes() as u64);
+    if promised != u64::from(bytes) {
+        return Err(malformed(format!(
+            "'{name}' of {:?} needs {promised} bytes of numbers, but has {bytes}",
+            header.dimensions
+        )));
+    }
+    Ok((storage, promised))
+}
+
+/// A part of an array's header with its bytes.
+struct Part {
+    what: &'static str,
+    kind: u32,
+    bytes: Vec<u8>,
+}
+
+impl Part {
+    /// Reads a part of at most `limit` bytes, and its padding.
+    fn read<R: BufRead>(
+        content: &mut Content<R>,
+        what: &'static str,
+        limit: u32,
+    ) -> Result<Self, FormatError> {
+        let (kind, size) = content.tag()?;
+        if kind > 0xffff {
+            // At most four bytes: they stand in the tag, where the size would be.
+            let length = (kind >> 16) as usize;
+            let packed = match content.order() {
+                ByteOrder::Little => size.to_le_bytes(),
+                ByteOrder::Big => size.to_be_bytes(),
+            };
+            let bytes = packed.get(..length).ok_or_else(|| {
+                malformed(format!("the {what} of an array: {length} bytes in the tag"))
+            })?;
+            return Ok(Self { what, kind: kind & 0xffff, bytes: bytes.to_vec() });
+        }
+        if size > limit {
+            return Err(malformed(format!(
+                "the {what} of an array: {size} bytes, at most {limit} are expected"
+            )));
+        }
+        let mut bytes = vec![0; size.next_multiple_of(8) as usize];
+        content.fill(&mut bytes)?;
+        bytes.truncate(size as usize);
+        Ok(Self { what, kind, bytes })
+    }
+
+    fn expect_type(self, kind: u32) -> Result<Self, FormatError> {
+        if self.kind == kind {
+            return Ok(self);
+        }
+        Err(malformed(format!("the {} of an array: type {}, not {kind}", self.what, self.kind)))
+    }
+
+    fn words(&self, order: ByteOrder) -> impl Iterator<Item = u32> + '_ {
+        let (words, _) = self.bytes.as_chunks::<4>();
+        words.iter().map(move |word| match order {
+            ByteOrder::Little => u32::from_le_bytes(*word),
+            ByteOrder::Big => u32::from_be_bytes(*word),
+        })
+    }
+}
+
+/// How numbers are stored; MATLAB stores small whole doubles as integers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Storage {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Storage {
+    fn from_type(kind: u32) -> Option<Self> {
+        Some(match kind {
+            INT8 => Self::I8,
+            2 => Self::U8,
+            3 => Self::I16,
+            4 => Self::U16,
+            INT32 => Self::I32,
+            UINT32 => Self::U32,
+            7 => Self::F32,
+            9 => Self::F64,
+            _ => return None,
+        })
+    }
+
+    pub(super) fn bytes(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    /// Whole numbers to f32; what f32 cannot hold exactly is rounded.
+    pub(super) fn decode(self, bytes: &[u8], order: ByteOrder) -> Vec<f32> {
+        use ByteOrder::{Big, Little};
+        match (self, order) {
+            (Self::I8, _) => each(bytes, |b| f32::from(i8::from_le_bytes(b))),
+            (Self::U8, _) => each(bytes, |b| f32::from(u8::from_le_bytes(b))),
+            (Self::I16, Little) => each(bytes, |b| f32::from(i16::from_le_bytes(b))),
+            (Self::I16, Big) => each(bytes, |b| f32::from(i16::from_be_bytes(b))),
+            (Self::U16, Little) => each(bytes, |b| f32::from(u16::from_le_bytes(b))),
+            (Self::U16, Big) => each(bytes, |b| f32::from(u16::from_be_bytes(b))),
+            (Self::I32, Little) => each(bytes, |b| i32::from_le_bytes(b) as f32),
+            (Self::I32, Big) => each(bytes, |b| i32::from_be_bytes(b) as f32),
+            (Self::U32, Little) => each(bytes, |b| u32::from_le_bytes(b) as f32),
+            (Self::U32, Big) => each(bytes, |b| u32::from_be_bytes(b) as f32),
+            (Self::F32, Little) => each(bytes, f32::from_le_bytes),
+            (Self::F32, Big) => each(bytes, f32::from_be_bytes),
+            (Self::F64, Little) => each(bytes, |b| f64::from_le_bytes(b) as f32),
+            (Self::F64, Big) => each(bytes, |b| f64::from_be_bytes(b) as f32),
+        }
+    }
+}

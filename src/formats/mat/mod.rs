@@ -1,0 +1,198 @@
+//! The community's benchmark scenes: MATLAB level 5 files with the arrays `mask`, `meas`, `orig`.
+//!
+//! The frame axis is the last one in MATLAB and the first one here; rows and columns stay what they
+//! are. MATLAB stores columns one after another, so a frame is contiguous and is read alone.
+//!
+//! The reader is our own: the crate `matfile` inflates compressed arrays without a bound, keeps
+//! all of them in memory, passes over damaged ones in silence and can panic on hostile sizes.
+//! It serves the tests as a second opinion.
+
+mod array;
+mod element;
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use ndarray::{Array2, Array3};
+
+use array::{ArrayHeader, Storage};
+use element::{Content, Elements};
+
+use super::{Format, FormatError, FrameReader, FullScale, Limits, StackInfo, collect, samples};
+
+/// An array of a scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SceneArray {
+    /// `mask`, (row, column, mask), on [0,1].
+    Masks,
+    /// `meas`, (row, column, snapshot), raw: 255 means 1.
+    Measurements,
+    /// `orig`, (row, column, frame), raw: 255 means 1.
+    Truth,
+}
+
+impl SceneArray {
+    /// The name of the array in the file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Masks => "mask",
+            Self::Measurements => "meas",
+            Self::Truth => "orig",
+        }
+    }
+
+    /// What means 1.0 in this array unless stated, whatever its type.
+    pub fn default_full_scale(self) -> FullScale {
+        match self {
+            Self::Masks => FullScale::ONE,
+            Self::Measurements | Self::Truth => FullScale::EIGHT_BIT,
+        }
+    }
+}
+
+/// A whole scene in memory, axes (frame, row, column), values as stored.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatScene {
+    /// The masks, on [0,1] (not checked here).
+    pub masks: Array3<f32>,
+    /// The snapshots; 255 means 1.
+    pub measurements: Array3<f32>,
+    /// The frames that were measured, snapshot after snapshot; 255 means 1.
+    pub truth: Option<Array3<f32>>,
+}
+
+/// True for a MATLAB level 5 file, told by its first bytes. Errors: I/O.
+pub fn is_mat(path: &Path) -> Result<bool, FormatError> {
+    match super::open(path) {
+        Ok((_, _, format)) => Ok(format == Format::Mat),
+        Err(FormatError::UnknownFormat { .. }) => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// Opens one array of a scene; its frames are read one at a time.
+///
+/// A two-dimensional array has one frame. [`StackInfo::default_full_scale`] is
+/// [`SceneArray::default_full_scale`]. Errors: [`FormatError::MissingArray`]; a file that is no
+/// .mat, is damaged or too large; an array of another class than double, single, uint8, uint16 or
+/// logical.
+pub fn open_array(
+    path: &Path,
+    array: SceneArray,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>, FormatError> {
+    let (file, length, format) = super::open(path)?;
+    limits.check_file(format, length)?;
+    if format != Format::Mat {
+        return Err(FormatError::UnknownFormat {
+            found: format!("it is a {format} file"),
+            accepted: "a .mat level 5 scene",
+        });
+    }
+    let mut elements = Elements::new(BufReader::new(file), length)?;
+    let mut present = Vec::new();
+    while let Some(element) = elements.next()? {
+        let header = ArrayHeader::read(&mut elements.look_into(element)?)?;
+        if header.name == array.name() {
+            let content = elements.into_content(element)?;
+            return Ok(Box::new(MatReader::new(content, array, limits)?));
+        }
+        present.push(header.name);
+    }
+    Err(FormatError::MissingArray { name: array.name(), present: list(&present) })
+}
+
+/// Reads a scene: `mask` and `meas`, and `orig` where it is there.
+///
+/// For benchmark scenes, which are small; [`open_array`] reads frame by frame. Errors: as there.
+pub fn read_scene_mat(path: &Path, limits: &Limits) -> Result<MatScene, FormatError> {
+    let read = |array| Ok(collect(&mut *open_array(path, array, limits)?)?.1);
+    Ok(MatScene {
+        masks: read(SceneArray::Masks)?,
+        measurements: read(SceneArray::Measurements)?,
+        truth: match read(SceneArray::Truth) {
+            Ok(truth) => Some(truth),
+            Err(FormatError::MissingArray { .. }) => None,
+            Err(error) => return Err(error),
+        },
+    })
+}
+
+/// Names for a message, bounded in number.
+fn list(names: &[String]) -> String {
+    const SHOWN: usize = 20;
+    let quoted: Vec<String> = names.iter().take(SHOWN).map(|name| format!("'{name}'")).collect();
+    match (quoted.is_empty(), names.len().saturating_sub(SHOWN)) {
+        (true, _) => "no arrays".to_owned(),
+        (false, 0) => quoted.join(", "),
+        (false, more) => format!("{} and {more} more", quoted.join(", ")),
+    }
+}
+
+/// The frames of one array.
+struct MatReader {
+    content: Content<BufReader<File>>,
+    info: StackInfo,
+    storage: Storage,
+    next: usize,
+    bytes: Vec<u8>,
+}
+
+impl MatReader {
+    fn new(
+        mut content: Content<BufReader<File>>,
+        array: SceneArray,
+        limits: &Limits,
+    ) -> Result<Self, FormatError> {
+        let header = ArrayHeader::read(&mut content)?;
+        let sample = header.sample_type()?;
+        let (height, width, frames) = match *header.dimensions {
+            [height, width] => (height, width, 1),
+            [height, width, frames] => (height, width, frames),
+            _ => {
+                return Err(FormatError::Unsupported {
+                    format: Format::Mat,
+                    found: format!("'{}' with {} dimensions", header.name, header.dimensions.len()),
+                    accepted: "(row, column, frame) or (row, column)",
+                });
+            }
+        };
+        limits.check_shape(Format::Mat, frames, height, width)?;
+        let (storage, bytes) = array::read_data_tag(&mut content, &header)?;
+        content.check_can_hold(&header.name, bytes)?;
+        let [frames, height, width] =
+            [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
+        let info = StackInfo {
+            default_full_scale: array.default_full_scale(),
+            ..StackInfo::new(Format::Mat, sample, frames, height, width)
+        };
+        Ok(Self {
+            content,
+            info,
+            storage,
+            next: 0,
+            bytes: vec![0; height * width * storage.bytes()],
+        })
+    }
+}
+
+impl FrameReader for MatReader {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+        if self.next == self.info.frames {
+            return Ok(None);
+        }
+        self.content.fill(&mut self.bytes)?;
+        self.next += 1;
+        if self.next == self.info.frames {
+            self.content.finish()?;
+        }
+        let values = self.storage.decode(&self.bytes, self.content.order());
+        let columns = samples::frame(self.info.width, self.info.height, values)?;
+        Ok(Some(columns.t().as_standard_layout().into_owned()))
+    }
+}
