@@ -299,3 +299,6 @@ fn check_count(promised: usize, seen: usize) -> Result<(), FormatError> {
     }
     Err(FormatError::Internal(format!("{seen} of {promised} frames were checked")))
 }
+
+#[cfg(test)]
+mod tests;
