@@ -99,7 +99,10 @@ fn modules_know_only_what_they_may() {
             if exceptions.contains(&name.as_str()) {
                 continue;
             }
-            for (number, line) in fs::read_to_string(&file).unwrap().lines().enumerate() {
+            let text = fs::read_to_string(&file).unwrap();
+            // Unit tests stand at the end of a file and may use what they like.
+            let code = text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
+            for (number, line) in code.lines().enumerate() {
                 for word in forbidden.iter().filter(|word| names(line, word)) {
                     broken.push(format!("{name}:{}: {folder} must not know {word}", number + 1));
                 }
