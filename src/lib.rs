@@ -4,5 +4,7 @@
 //! become video in [`recon`].
 
 pub mod formats;
+pub mod job;
 pub mod models;
 pub mod recon;
+pub mod store;
