@@ -1,0 +1,6 @@
+//! The commands, one file each.
+
+mod logging;
+mod supervisor;
+
+pub mod serve;
