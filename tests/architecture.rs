@@ -1,5 +1,7 @@
 //! Holds the direction of the modules: who may know what.
 
+#![allow(clippy::unwrap_used)] // helpers of tests
+
 use std::fs;
 use std::path::{Path, PathBuf};
 

@@ -10,7 +10,6 @@ const TAU: f32 = 0.25;
 /// The dual fields of one frame, kept so that the loop allocates nothing.
 #[derive(Debug)]
 pub struct TotalVariation {
-    height: usize,
     width: usize,
     /// Dual field along rows (downwards), then along columns, one row pair after the other.
     down: Vec<f32>,
@@ -23,7 +22,6 @@ impl TotalVariation {
     /// For frames of `height` x `width` pixels.
     pub fn new(height: usize, width: usize) -> Self {
         Self {
-            height,
             width,
             down: vec![0.0; height * width],
             right: vec![0.0; height * width],
@@ -36,7 +34,7 @@ impl TotalVariation {
     /// place, with a fixed number of dual updates starting from 0 (scikit-image's
     /// `denoise_tv_chambolle` with `max_num_iter = updates + 1` does as many).
     pub fn denoise(&mut self, frames: &mut Array3<f32>, weight: f32, updates: usize) {
-        debug_assert_eq!(frames.dim().1, self.height);
+        debug_assert_eq!(frames.dim().1 * frames.dim().2, self.down.len());
         debug_assert_eq!(frames.dim().2, self.width);
         if weight <= 0.0 || updates == 0 {
             return;
@@ -49,46 +47,29 @@ impl TotalVariation {
     }
 
     fn denoise_frame(&mut self, image: &mut [f32], weight: f32, updates: usize) {
-        let Self { height, width, down, right, here, below } = self;
-        first_update(image, down, right, *height, *width, TAU / weight);
-        for _ in 1..updates {
-            update(image, down, right, here, below, *width, TAU / weight);
-        }
-        add_divergence(image, down, right, *width);
-    }
-}
-
-/// The first dual update, from fields of 0: the primal image is the input itself.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn first_update(
-    image: &[f32],
-    down: &mut [f32],
-    right: &mut [f32],
-    height: usize,
-    width: usize,
-    step: f32,
-) {
-    let rows = down.chunks_exact_mut(width).zip(right.chunks_exact_mut(width));
-    for (i, (down, right)) in rows.enumerate() {
-        let here = &image[i * width..][..width];
-        let below = if i + 1 < height { &image[(i + 1) * width..][..width] } else { here };
+        let Self { width, down, right, here, below, .. } = self;
         down.fill(0.0);
         right.fill(0.0);
-        update_row(here, below, down, right, step);
+        for k in 0..updates {
+            sweep(image, down, right, here, below, *width, TAU / weight, k + 1 == updates);
+        }
     }
 }
 
 /// One dual update. The primal rows `u = x + div p` are made as they are needed, two at a
-/// time, so that one sweep reads and writes everything once.
+/// time, so that one sweep reads and writes everything once. The last sweep also writes `u`
+/// of the updated field over the image, one row behind.
+#[allow(clippy::too_many_arguments)] // one kernel over plain slices, so that it vectorises
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn update(
-    image: &[f32],
+fn sweep(
+    image: &mut [f32],
     down: &mut [f32],
     right: &mut [f32],
     here: &mut Vec<f32>,
     below: &mut Vec<f32>,
     width: usize,
     step: f32,
+    last: bool,
 ) {
     let height = image.len() / width;
     primal_row(&image[..width], None, &down[..width], &right[..width], here);
@@ -107,47 +88,41 @@ fn update(
         } else {
             below.copy_from_slice(here);
         }
-        update_row(here, below, &mut down[row.clone()], &mut right[row], step);
+        update_row(here, below, &mut down[row.clone()], &mut right[row.clone()], step);
         std::mem::swap(here, below);
-    }
-}
-
-/// `u = x + div p`, in place of `x`.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn add_divergence(image: &mut [f32], down: &[f32], right: &[f32], width: usize) {
-    for (i, image) in image.chunks_exact_mut(width).enumerate() {
-        let row = i * width..(i + 1) * width;
-        let (down_here, right) = (&down[row.clone()], &right[row]);
-        for ((x, &d), &r) in image.iter_mut().zip(down_here).zip(right) {
-            *x -= d + r;
+        if last {
+            // Row i of the image is not needed any more; row i - 1 of the field is new too.
+            let above = (i > 0).then(|| &down[(i - 1) * width..i * width]);
+            add_divergence(&mut image[row.clone()], above, &down[row.clone()], &right[row]);
         }
-        if i > 0 {
-            let above = &down[(i - 1) * width..i * width];
-            image.iter_mut().zip(above).for_each(|(x, &a)| *x += a);
-        }
-        image[1..].iter_mut().zip(right).for_each(|(x, &r)| *x += r);
     }
 }
 
 /// A row of `u = x + div p`, given the rows of `p` and the row of its downward part above.
 #[inline(always)]
 fn primal_row(image: &[f32], above: Option<&[f32]>, down: &[f32], right: &[f32], out: &mut [f32]) {
-    let width = out.len();
-    let (image, down, right) = (&image[..width], &down[..width], &right[..width]);
-    match above {
+    out.copy_from_slice(image);
+    add_divergence(out, above, down, right);
+}
+
+/// `u = x + div p` for one row, in place of `x`.
+#[inline(always)]
+fn add_divergence(row: &mut [f32], above: Option<&[f32]>, down: &[f32], right: &[f32]) {
+    let width = row.len();
+    let (down, right) = (&down[..width], &right[..width]);
+    match above.map(|above| &above[..width]) {
         Some(above) => {
-            let above = &above[..width];
             for j in 0..width {
-                out[j] = image[j] - (down[j] + right[j]) + above[j];
+                row[j] += above[j] - down[j] - right[j];
             }
         }
         None => {
             for j in 0..width {
-                out[j] = image[j] - (down[j] + right[j]);
+                row[j] -= down[j] + right[j];
             }
         }
     }
-    out[1..].iter_mut().zip(right).for_each(|(u, &r)| *u += r);
+    row[1..].iter_mut().zip(right).for_each(|(u, &r)| *u += r);
 }
 
 /// `p = (p - tau grad u) / (1 + tau/weight |grad u|)` for one row; forward differences, 0 at

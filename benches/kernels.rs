@@ -1,0 +1,48 @@
+//! Cost of the kernels, single thread: `cargo bench --bench kernels`.
+//!
+//! Criterion's throughput is in voxels: ns per voxel = 1 / throughput. A total-variation row
+//! names its dual updates; divide by them for the cost of one.
+
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use ndarray::Array3;
+use rand::{Rng, SeedableRng};
+use sci_recon::recon::denoise::tv::TotalVariation;
+use sci_recon::recon::gap::reconstruct;
+use sci_recon::recon::schedule::Schedule;
+use sci_recon::recon::sensing::SensingOperator;
+use std::hint::black_box;
+
+const DIM: (usize, usize, usize) = (8, 256, 256);
+const ITERATIONS: usize = 40;
+
+fn random(seed: u64) -> Array3<f32> {
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    Array3::from_shape_fn(DIM, |_| rng.random::<f32>())
+}
+
+fn kernels(criterion: &mut Criterion) {
+    let voxels = (DIM.0 * DIM.1 * DIM.2) as u64;
+    let mut group = criterion.benchmark_group("8x256x256");
+    group.sample_size(20);
+
+    group.throughput(Throughput::Elements(voxels));
+    for updates in [1, 4, 20] {
+        let mut tv = TotalVariation::new(DIM.1, DIM.2);
+        let mut frames = random(1);
+        group.bench_function(format!("tv, {updates} dual updates"), |bencher| {
+            bencher.iter(|| tv.denoise(black_box(&mut frames), 0.1, updates));
+        });
+    }
+
+    let op = SensingOperator::new(random(2)).expect("random masks are valid");
+    let y = op.forward(random(3).view()).expect("sizes agree");
+    group.throughput(Throughput::Elements(voxels * ITERATIONS as u64));
+    group.bench_function(format!("gap-tv, {ITERATIONS} iterations"), |bencher| {
+        let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
+        bencher.iter(|| reconstruct(&op, black_box(y.view()), &schedule, None, &mut ()));
+    });
+    group.finish();
+}
+
+criterion_group!(benches, kernels);
+criterion_main!(benches);
