@@ -131,8 +131,7 @@ mod tests {
         assert!(message("gap-tv", "{").contains("schedule.json"));
         let sigma = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5}]}"#;
         assert!(message("pnp-tv-fastdvdnet", sigma).contains("/stages/0/sigma"));
-        let deep =
-            r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5, "sigma": [0.2, 0.1]}]}"#;
+        let deep = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5, "sigma": [0.2, 0.1]}]}"#;
         assert!(message("gap-tv", deep).contains("--algorithm pnp-tv-fastdvdnet"));
     }
 }

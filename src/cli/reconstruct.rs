@@ -9,10 +9,10 @@ use clap::Args;
 use ndarray::{Array2, Array3, s};
 use serde::Serialize;
 
+use super::CliError;
+use super::arguments::{EngineArguments, ScheduleArguments, checked};
 use super::input::{Scaled, Source};
 use super::progress::SnapshotBar;
-use super::arguments::{EngineArguments, ScheduleArguments, checked};
-use super::CliError;
 use crate::formats::mat::SceneArray;
 use crate::job::{Algorithm, ScheduleSpec, TileSpec, Timestamp};
 use crate::recon::metrics;
@@ -23,8 +23,8 @@ use crate::work::manifest::{
     frame_attributes,
 };
 use crate::work::{
-    NetworkSource, ResultSpec, SnapshotInput, TileOutcome, Usage, blended_frame,
-    check_output, peak_rss_bytes, replace_result, solve, write_result,
+    NetworkSource, ResultSpec, SnapshotInput, TileOutcome, Usage, blended_frame, check_output,
+    peak_rss_bytes, replace_result, solve, write_result,
 };
 
 /// Reconstruct the frames of one snapshot from files, without a server.

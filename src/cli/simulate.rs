@@ -77,8 +77,8 @@ struct Apertures {
     rows: usize,
     columns: usize,
     rank: usize,
-    /// For each frame, 1 for the open sub-apertures, row by row.
-    open: Vec<Vec<u8>>,
+    /// For each frame, `1` for each open sub-aperture and `0` for the others, row by row.
+    open: Vec<String>,
 }
 
 /// Runs the command.
@@ -137,7 +137,7 @@ fn make_masks(
         Pattern::RandomSquares => {
             let (masks, openings) = random_squares(frames, height, width, seed)?;
             let ApertureGrid { rows, columns } = ApertureGrid::for_frames(frames);
-            let ones = |row: &Vec<bool>| row.iter().map(|&open| u8::from(open)).collect();
+            let ones = |row: &Vec<bool>| row.iter().map(|&open| if open { '1' } else { '0' }).collect();
             let open = openings.rows().iter().map(ones).collect();
             (masks, Some(Apertures { rows, columns, rank: openings.rank(), open }))
         }

@@ -17,6 +17,8 @@ pub mod mat;
 pub mod npy;
 pub mod planar;
 pub mod png;
+#[cfg(test)]
+mod test_support;
 mod tiff;
 pub mod validate;
 

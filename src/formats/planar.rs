@@ -171,3 +171,6 @@ fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo, Forma
     let [frames, height, width] = [1, 2, 3].map(|i| word(i) as usize);
     Ok(StackInfo::new(Format::Planar, SampleType::F32, frames, height, width))
 }
+
+#[cfg(test)]
+mod tests;

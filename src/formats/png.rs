@@ -140,3 +140,6 @@ fn encoding_error(error: EncodingError) -> FormatError {
         other => FormatError::Internal(format!("PNG: {other}")),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -127,7 +127,7 @@ impl fmt::Display for SampleType {
 pub struct FullScale(f32);
 
 impl FullScale {
-    /// Numbers that are on [0,1] already.
+    /// Numbers that are on `[0,1]` already.
     pub const ONE: Self = Self(1.0);
     /// Eight-bit grey values, the community's .mat scenes.
     pub const EIGHT_BIT: Self = Self(255.0);

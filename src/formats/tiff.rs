@@ -1,5 +1,7 @@
 //! TIFF and BigTIFF stacks: one grey frame a page, read page by page.
 
+mod directory;
+
 use std::fs::File;
 use std::io::{BufReader, ErrorKind};
 
@@ -29,30 +31,29 @@ pub(super) struct TiffReader {
 }
 
 impl TiffReader {
-    /// Walks over all page headers of `file` (`length` bytes long) and checks them against the
-    /// limits, the length and each other. Pixels are not read.
+    /// Checks all page headers of `file` (`length` bytes long) against the limits, the length and
+    /// each other. Pixels are not read.
     pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self, FormatError> {
+        let frames = directory::count_pages(&file, length, limits)?;
         let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
         let first = read_page(&mut decoder, 0, length, limits)?;
-        check_imagej(&mut decoder)?;
-        let mut frames = 1;
-        while decoder.more_images() {
-            limits.check_shape(Format::Tiff, frames as u64 + 1, 1, 1)?;
-            decoder.next_image().map_err(|e| in_page(frames, e))?;
-            let page = read_page(&mut decoder, frames, length, limits)?;
+        for number in 1..frames {
+            decoder.next_image().map_err(|e| in_page(number, e))?;
+            let page = read_page(&mut decoder, number, length, limits)?;
             if page != first {
                 return Err(malformed(format!(
-                    "page {frames} is {}x{} {}, but page 0 is {}x{} {} (counted from 0); \
+                    "page {number} is {}x{} {}, but page 0 is {}x{} {} (counted from 0); \
                      all pages must be alike",
                     page.height, page.width, page.sample, first.height, first.width, first.sample
                 )));
             }
-            frames += 1;
         }
         let info = StackInfo { frames, ..first };
         limits.check_info(&info)?;
         let mut decoder_limits = DecoderLimits::default();
-        decoder_limits.decoding_buffer_size = info.height * info.width * info.sample.bytes();
+        // The decoder counts the values of a page header against this limit too.
+        let frame_bytes = info.height * info.width * info.sample.bytes();
+        decoder_limits.decoding_buffer_size = decoder_limits.decoding_buffer_size.max(frame_bytes);
         decoder_limits.intermediate_buffer_size = usize::try_from(length).unwrap_or(usize::MAX);
         Ok(Self { decoder: decoder.with_limits(decoder_limits), info, next: 0 })
     }
@@ -205,24 +206,6 @@ fn chunk_ranges(
     }
 }
 
-/// ImageJ stores stacks above 4 GB behind a single page header; reading one frame of many would be
-/// a silent loss.
-fn check_imagej(decoder: &mut Decoder<BufReader<File>>) -> Result<(), FormatError> {
-    let description = match decoder.get_tag_ascii_string(Tag::ImageDescription) {
-        Ok(description) if description.starts_with("ImageJ=") => description,
-        _ => return Ok(()),
-    };
-    let images = description.lines().find_map(|line| line.strip_prefix("images="));
-    match images.and_then(|count| count.trim().parse::<u64>().ok()) {
-        Some(count) if count > 1 && !decoder.more_images() => Err(FormatError::Unsupported {
-            format: Format::Tiff,
-            found: format!("an ImageJ stack of {count} images behind one page header"),
-            accepted: "one page a frame (BigTIFF for more than 4 GB), or npy",
-        }),
-        _ => Ok(()),
-    }
-}
-
 fn malformed(problem: String) -> FormatError {
     FormatError::malformed(Format::Tiff, problem)
 }
@@ -248,3 +231,6 @@ fn in_page(page: usize, error: TiffError) -> FormatError {
         other => malformed(format!("page {page}: {other}")),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,14 +1,14 @@
 //! From raw frames to masks and measurements: the scale that somebody stated is applied, and what
 //! cannot be a mask or a measurement is refused. Nothing is guessed.
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, ArrayViewMut1};
 
 use super::{FormatError, FrameReader, FullScale, StackInfo};
 
 /// Masks may exceed 1 by this much (rounding of their own normalisation); they are set to 1 then.
 const TOLERANCE: f32 = 1e-6;
 
-/// What was seen in a set of masks. Values on the scale [0,1].
+/// What was seen in a set of masks. Values on the scale `[0,1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaskStatistics {
     /// Number of masks, the compression ratio.
@@ -30,7 +30,7 @@ pub struct MaskStatistics {
 }
 
 /// What was seen in a sequence of snapshots. Values on the scale where an open mask passes the
-/// scene's own [0,1], so up to the number of masks.
+/// scene's own `[0,1]`, so up to the number of masks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasurementStatistics {
     /// Number of snapshots.
@@ -64,11 +64,10 @@ pub struct MaskCheck {
     zero_frames: usize,
 }
 
-/// A scaled value, its raw value, and where it is.
+/// A value as stored, and where it is.
 #[derive(Debug, Clone, Copy)]
 struct Located {
-    scaled: f32,
-    raw: f32,
+    value: f32,
     frame: usize,
     row: usize,
     column: usize,
@@ -84,13 +83,13 @@ impl MaskCheck {
             open: vec![false; info.height * info.width],
             clipped_negative: 0,
             sum: 0.0,
-            largest: Located { scaled: 0.0, raw: 0.0, frame: 0, row: 0, column: 0 },
+            largest: Located { value: 0.0, frame: 0, row: 0, column: 0 },
             first_zero_frame: None,
             zero_frames: 0,
         }
     }
 
-    /// Reads all frames, hands each one scaled to [0,1] to `sink`, and tells the statistics.
+    /// Reads all frames, hands each one scaled to `[0,1]` to `sink`, and tells the statistics.
     ///
     /// Errors: those of the reader and the sink; NaN or infinite values; and at the end (so that
     /// the message can name the largest value of all) values above the full scale, masks without
@@ -113,49 +112,52 @@ impl MaskCheck {
     /// Errors: [`FormatError::NotFinite`]; a frame of another size is [`FormatError::Internal`].
     pub fn frame(&mut self, mask: &mut Array2<f32>) -> Result<(), FormatError> {
         check_size(&self.info, self.next, mask)?;
-        let scale = self.full_scale.value();
-        let mut sum = 0.0;
         let mut frame_max = 0f32;
-        let mut open = self.open.iter_mut();
-        for ((row, column), value) in mask.indexed_iter_mut() {
-            let raw = *value;
-            if !raw.is_finite() {
-                return Err(not_finite("masks", raw, self.next, row, column));
+        for row in 0..self.info.height {
+            let raw = mask.row(row);
+            if let Some(column) = raw.iter().position(|value| !value.is_finite()) {
+                return Err(not_finite("masks", raw[column], self.next, row, column));
             }
-            let mut scaled = raw / scale;
-            if scaled < 0.0 {
-                self.clipped_negative += 1;
-                scaled = 0.0;
+            let row_max = raw.iter().fold(0f32, |max, value| max.max(*value));
+            if row_max > self.largest.value {
+                let column = raw.iter().position(|value| *value == row_max).unwrap_or_default();
+                self.largest = Located { value: row_max, frame: self.next, row, column };
             }
-            if scaled > self.largest.scaled {
-                self.largest = Located { scaled, raw, frame: self.next, row, column };
-            }
-            if scaled > 1.0 && scaled <= 1.0 + TOLERANCE {
-                scaled = 1.0;
-            }
-            if let Some(open) = open.next() {
-                *open |= scaled * scaled > 0.0;
-            }
-            frame_max = frame_max.max(scaled);
-            sum += f64::from(scaled);
-            *value = scaled;
+            frame_max = frame_max.max(row_max / self.full_scale.value());
+            self.scale_row(row, mask.row_mut(row));
         }
         if frame_max == 0.0 {
             self.first_zero_frame.get_or_insert(self.next);
             self.zero_frames += 1;
         }
-        self.sum += sum;
         self.next += 1;
         Ok(())
+    }
+
+    /// Scales and clips one row, and counts its negative values and open pixels.
+    fn scale_row(&mut self, row: usize, values: ArrayViewMut1<'_, f32>) {
+        let scale = self.full_scale.value();
+        let open = &mut self.open[row * self.info.width..][..self.info.width];
+        let mut negative = 0;
+        for (value, open) in values.into_iter().zip(open) {
+            let scaled = *value / scale;
+            negative += u64::from(scaled < 0.0);
+            // A rounding above 1 becomes 1; anything more is refused at the end.
+            *value = scaled.clamp(0.0, 1.0);
+            *open |= *value * *value > 0.0;
+            self.sum += f64::from(*value);
+        }
+        self.clipped_negative += negative;
     }
 
     /// The statistics, or why these are no masks; see [`MaskCheck::run`].
     pub fn finish(self) -> Result<MaskStatistics, FormatError> {
         let frames = self.info.frames;
         check_count(frames, self.next)?;
-        if self.largest.scaled > 1.0 + TOLERANCE {
+        let largest = self.largest.value / self.full_scale.value();
+        if largest > 1.0 + TOLERANCE {
             return Err(FormatError::AboveFullScale {
-                largest: self.largest.raw,
+                largest: self.largest.value,
                 frame: self.largest.frame,
                 row: self.largest.row,
                 column: self.largest.column,
@@ -176,7 +178,7 @@ impl MaskCheck {
             dead_pixels: self.open.iter().filter(|open| !**open).count() as u64,
             clipped_negative: self.clipped_negative,
             mean: self.sum / self.info.voxels() as f64,
-            max: self.largest.scaled.min(1.0),
+            max: largest.min(1.0),
         })
     }
 }
@@ -230,19 +232,20 @@ impl MeasurementCheck {
     pub fn snapshot(&mut self, snapshot: &mut Array2<f32>) -> Result<(), FormatError> {
         check_size(&self.info, self.next, snapshot)?;
         let scale = self.full_scale.value();
-        let mut sum = 0.0;
         let mut any = false;
-        for ((row, column), value) in snapshot.indexed_iter_mut() {
-            let scaled = *value / scale;
-            // A small full scale can push a finite value out of range: that is the same trouble.
-            if !scaled.is_finite() {
-                return Err(not_finite("measurement", *value, self.next, row, column));
+        for (row, mut values) in snapshot.rows_mut().into_iter().enumerate() {
+            for (column, value) in values.iter_mut().enumerate() {
+                let scaled = *value / scale;
+                // A small full scale can push a finite value out of range: that is the same trouble.
+                if !scaled.is_finite() {
+                    return Err(not_finite("measurement", *value, self.next, row, column));
+                }
+                any |= scaled != 0.0;
+                self.min = self.min.min(scaled);
+                self.max = self.max.max(scaled);
+                self.sum += f64::from(scaled);
+                *value = scaled;
             }
-            any |= scaled != 0.0;
-            self.min = self.min.min(scaled);
-            self.max = self.max.max(scaled);
-            sum += f64::from(scaled);
-            *value = scaled;
         }
         if !any {
             return Err(FormatError::SnapshotZero {
@@ -250,7 +253,6 @@ impl MeasurementCheck {
                 snapshots: self.info.frames,
             });
         }
-        self.sum += sum;
         self.next += 1;
         Ok(())
     }
@@ -299,3 +301,6 @@ fn check_count(promised: usize, seen: usize) -> Result<(), FormatError> {
     }
     Err(FormatError::Internal(format!("{seen} of {promised} frames were checked")))
 }
+
+#[cfg(test)]
+mod tests;

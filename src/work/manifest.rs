@@ -209,7 +209,8 @@ impl CameraRecord {
             (None, 0) => Some(0.0),
             (None, _) => None,
         };
-        let time = |start: f64| (0..frames).map(move |k| start + exposure * k as f64 / frames as f64);
+        let time =
+            |start: f64| (0..frames).map(move |k| start + exposure * k as f64 / frames as f64);
         Some(Self { fps, exposure_s, frame_times_s: start.map(|start| time(start).collect()) })
     }
 

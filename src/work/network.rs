@@ -77,8 +77,9 @@ impl NetworkSource {
         let executable = std::env::current_exe()
             .map_err(|error| NetworkError::Missing(format!("the program's own path: {error}")))?;
         let beside = executable.with_file_name(LIBRARY);
-        existing(&beside)
-            .ok_or_else(|| NetworkError::Missing("none is named and none is beside the program".into()))
+        existing(&beside).ok_or_else(|| {
+            NetworkError::Missing("none is named and none is beside the program".into())
+        })
     }
 }
 

@@ -142,11 +142,8 @@ mod tests {
     fn white_must_be_above_zero() {
         let (masks, _) = scene();
         for white in [0.0, -1.0, f32::NAN] {
-            let input = TileInput {
-                masks: masks.clone(),
-                measurement: Array2::ones((32, 32)),
-                white,
-            };
+            let input =
+                TileInput { masks: masks.clone(), measurement: Array2::ones((32, 32)), white };
             let error = reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap_err();
             assert!(error.to_string().contains("white level"), "{error}");
         }

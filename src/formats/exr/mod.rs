@@ -12,3 +12,6 @@ pub use write::{Attributes, write_frame, write_stack};
 const CHANNEL: &str = "Y";
 /// The attribute that holds a frame's time, a double, in seconds.
 const FRAME_TIME: &str = "frameTime";
+
+#[cfg(test)]
+mod tests;

@@ -24,7 +24,7 @@ use super::{Format, FormatError, FrameReader, FullScale, Limits, StackInfo, coll
 /// An array of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SceneArray {
-    /// `mask`, (row, column, mask), on [0,1].
+    /// `mask`, (row, column, mask), on `[0,1]`.
     Masks,
     /// `meas`, (row, column, snapshot), raw: 255 means 1.
     Measurements,
@@ -54,7 +54,7 @@ impl SceneArray {
 /// A whole scene in memory, axes (frame, row, column), values as stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatScene {
-    /// The masks, on [0,1] (not checked here).
+    /// The masks, on `[0,1]` (not checked here).
     pub masks: Array3<f32>,
     /// The snapshots; 255 means 1.
     pub measurements: Array3<f32>,
@@ -196,3 +196,6 @@ impl FrameReader for MatReader {
         Ok(Some(columns.t().as_standard_layout().into_owned()))
     }
 }
+
+#[cfg(test)]
+mod tests;

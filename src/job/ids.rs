@@ -1,0 +1,107 @@
+//! Identifiers: one type for each kind of thing, all version 7 UUIDs, so that they sort by time.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+/// The text given is not an identifier.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{text:?} is not an identifier; it should be a lower-case UUID with hyphens")]
+pub struct InvalidId {
+    /// What was given, cut to a length that can be shown.
+    pub text: String,
+}
+
+macro_rules! identifier {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[serde(try_from = "String", into = "String")]
+        pub struct $name(Uuid);
+
+        impl $name {
+            /// A new identifier, greater than all those made before it in this process.
+            #[must_use]
+            #[allow(clippy::new_without_default)] // two calls differ: a default should not
+            pub fn new() -> Self {
+                Self(Uuid::now_v7())
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                self.0.as_hyphenated().fmt(f)
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = InvalidId;
+
+            fn from_str(text: &str) -> Result<Self, InvalidId> {
+                // Only the form that we print: one thing has one address.
+                Uuid::parse_str(text)
+                    .ok()
+                    .filter(|id| id.as_hyphenated().to_string() == text)
+                    .map(Self)
+                    .ok_or_else(|| InvalidId { text: text.chars().take(60).collect() })
+            }
+        }
+
+        impl TryFrom<String> for $name {
+            type Error = InvalidId;
+
+            fn try_from(text: String) -> Result<Self, InvalidId> {
+                text.parse()
+            }
+        }
+
+        impl From<$name> for String {
+            fn from(id: $name) -> String {
+                id.to_string()
+            }
+        }
+    };
+}
+
+identifier!(
+    /// A calibration: the masks of one optical setting.
+    CalibrationId
+);
+identifier!(
+    /// A measurement: one or more snapshots taken with one calibration.
+    MeasurementId
+);
+identifier!(
+    /// A job: the reconstruction of some snapshots of one measurement.
+    JobId
+);
+identifier!(
+    /// A task: the piece of a job that one worker does in one go.
+    TaskId
+);
+identifier!(
+    /// A worker process, from its start to its end.
+    WorkerId
+);
+
+#[cfg(test)]
+mod tests {
+    use super::JobId;
+
+    #[test]
+    fn ids_print_parse_and_sort_by_time() {
+        let ids: Vec<JobId> = (0..100).map(|_| JobId::new()).collect();
+        assert!(ids.is_sorted());
+        assert_eq!(ids[3].to_string().parse::<JobId>().unwrap(), ids[3]);
+    }
+
+    #[test]
+    fn only_one_spelling_is_an_id() {
+        let id = JobId::new().to_string();
+        for bad in [id.to_uppercase(), id.replace('-', ""), format!("{{{id}}}"), String::new()] {
+            assert!(bad.parse::<JobId>().is_err(), "{bad}");
+        }
+    }
+}

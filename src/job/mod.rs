@@ -1,0 +1,18 @@
+//! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
+
+mod ids;
+mod request;
+mod schedule;
+mod state;
+mod task;
+mod text;
+
+pub use ids::{CalibrationId, InvalidId, JobId, MeasurementId, TaskId, WorkerId};
+pub use request::{
+    Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,
+    SnapshotSelection, TileSpec,
+};
+pub use schedule::{PriorSpec, ScheduleSpec, StageSpec};
+pub use state::{IllegalTransition, JobState};
+pub use task::{TaskKind, TaskProgress, TaskStage, TaskState};
+pub use text::{InvalidText, Label, Sha256, Timestamp};

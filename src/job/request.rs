@@ -1,0 +1,373 @@
+//! The request for a job as a user writes it, and the job as it is done after all checks.
+
+use serde::{Deserialize, Serialize};
+
+use super::ids::{CalibrationId, MeasurementId};
+use super::schedule::ScheduleSpec;
+use super::text::Label;
+use crate::recon::schedule::Schedule;
+use crate::recon::tile::TilePlan;
+
+/// The most tasks of one job; a larger one should be sent as several ranges of snapshots.
+pub const MAX_TASKS: usize = 50_000;
+
+/// The algorithms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Algorithm {
+    /// GAP with total variation.
+    GapTv,
+    /// GAP with total variation, then with TV and FastDVDNet.
+    #[serde(rename = "pnp-tv-fastdvdnet")]
+    PnpTvFastDvdNet,
+}
+
+impl Algorithm {
+    /// All algorithms.
+    pub const ALL: [Self; 2] = [Self::GapTv, Self::PnpTvFastDvdNet];
+
+    /// The name in JSON, on the command line and in the database.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::GapTv => "gap-tv",
+            Self::PnpTvFastDvdNet => "pnp-tv-fastdvdnet",
+        }
+    }
+
+    /// The schedule of a job that names none.
+    #[must_use]
+    pub fn default_schedule(self) -> ScheduleSpec {
+        ScheduleSpec::from(&match self {
+            Self::GapTv => Schedule::gap_tv(),
+            Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
+        })
+    }
+}
+
+/// One thing wrong with a request, and where it stands.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct InvalidField {
+    /// JSON pointer (RFC 6901) into the request.
+    pub pointer: String,
+    /// What is wrong and what would be right.
+    pub detail: String,
+}
+
+impl InvalidField {
+    /// `detail` is wrong at `pointer`.
+    pub fn new(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
+        Self { pointer: pointer.into(), detail: detail.into() }
+    }
+
+    /// The same error seen from one level further up.
+    #[must_use]
+    pub fn under(mut self, parent: &str) -> Self {
+        self.pointer.insert_str(0, parent);
+        self
+    }
+}
+
+/// Which snapshots a request means: `"all"`, one index, or `[first, last]` with both ends in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(try_from = "SelectionJson", into = "SelectionJson")]
+pub enum SnapshotSelection {
+    /// All snapshots of the measurement.
+    #[default]
+    All,
+    /// The snapshot with this index, from 0.
+    One(u32),
+    /// From the first to the last index, both included.
+    Range(u32, u32),
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum SelectionJson {
+    Word(String),
+    One(u32),
+    Range([u32; 2]),
+}
+
+impl TryFrom<SelectionJson> for SnapshotSelection {
+    type Error = &'static str;
+
+    fn try_from(json: SelectionJson) -> Result<Self, &'static str> {
+        match json {
+            SelectionJson::Word(word) if word == "all" => Ok(Self::All),
+            SelectionJson::Word(_) => {
+                Err("snapshots must be \"all\", one index, or [first, last] with both ends in")
+            }
+            SelectionJson::One(index) => Ok(Self::One(index)),
+            SelectionJson::Range([first, last]) => Ok(Self::Range(first, last)),
+        }
+    }
+}
+
+impl From<SnapshotSelection> for SelectionJson {
+    fn from(selection: SnapshotSelection) -> Self {
+        match selection {
+            SnapshotSelection::All => Self::Word("all".into()),
+            SnapshotSelection::One(index) => Self::One(index),
+            SnapshotSelection::Range(first, last) => Self::Range([first, last]),
+        }
+    }
+}
+
+/// Snapshots that stand side by side in a measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SnapshotRange {
+    /// Index of the first, from 0.
+    pub first: u32,
+    /// How many, at least 1.
+    pub count: u32,
+}
+
+impl SnapshotRange {
+    /// The indices.
+    pub fn indices(self) -> impl Iterator<Item = u32> {
+        self.first..self.first + self.count
+    }
+
+    /// True if the snapshot with this index is among them.
+    #[must_use]
+    pub fn contains(self, index: u32) -> bool {
+        index >= self.first && index - self.first < self.count
+    }
+}
+
+/// How pictures are cut: side and overlap in pixels (see [`TilePlan::new`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TileSpec {
+    /// The largest side of a tile.
+    pub size: usize,
+    /// The least that neighbours share.
+    pub overlap: usize,
+}
+
+impl Default for TileSpec {
+    fn default() -> Self {
+        Self { size: 256, overlap: 32 }
+    }
+}
+
+/// The sizes of a measurement and its calibration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SceneShape {
+    /// Frames that one snapshot codes (B).
+    pub frames: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// Snapshots of the measurement (S).
+    pub snapshots: u32,
+}
+
+/// The body of `POST /v1/jobs`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JobRequest {
+    /// The measurement to be reconstructed.
+    pub measurement: MeasurementId,
+    /// If given, it must be the measurement's own calibration: a check, not a choice.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<CalibrationId>,
+    /// The snapshots; all where it is left out.
+    #[serde(default)]
+    pub snapshots: SnapshotSelection,
+    /// The algorithm.
+    pub algorithm: Algorithm,
+    /// The schedule; the algorithm's own where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub schedule: Option<ScheduleSpec>,
+    /// The tiles; 256 with 32 shared where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tile: Option<TileSpec>,
+    /// Jobs of higher priority are served first; from -100 to 100.
+    #[serde(default)]
+    pub priority: i32,
+    /// A name to find the job by.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub label: Option<Label>,
+}
+
+/// A job after all checks: nothing is left open, and it is stored and recorded as it stands here.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct JobSpec {
+    /// The calibration of the measurement.
+    pub calibration: CalibrationId,
+    /// The measurement.
+    pub measurement: MeasurementId,
+    /// The sizes of both.
+    pub shape: SceneShape,
+    /// The snapshots to be reconstructed.
+    pub snapshots: SnapshotRange,
+    /// The algorithm.
+    pub algorithm: Algorithm,
+    /// The schedule.
+    pub schedule: ScheduleSpec,
+    /// The tiles.
+    pub tile: TileSpec,
+    /// The priority.
+    pub priority: i32,
+    /// The label.
+    pub label: Option<Label>,
+}
+
+impl JobRequest {
+    /// Checks the request against the measurement and fills in the defaults.
+    ///
+    /// # Errors
+    /// All that is wrong, each with its place in the request.
+    pub fn resolve(
+        self,
+        calibration: CalibrationId,
+        shape: SceneShape,
+    ) -> Result<JobSpec, Vec<InvalidField>> {
+        let mut errors = Vec::new();
+        if self.calibration.is_some_and(|given| given != calibration) {
+            let detail = format!("the measurement was taken with calibration {calibration}");
+            errors.push(InvalidField::new("/calibration", detail));
+        }
+        let snapshots = self.snapshots.within(shape.snapshots).unwrap_or_else(|error| {
+            errors.push(error);
+            SnapshotRange { first: 0, count: 1 }
+        });
+        let schedule = self.schedule.unwrap_or_else(|| self.algorithm.default_schedule());
+        match schedule.to_schedule() {
+            Err(wrong) => errors.extend(wrong.into_iter().map(|error| error.under("/schedule"))),
+            Ok(_) if self.algorithm == Algorithm::GapTv && schedule.needs_denoiser() => {
+                let detail = "gap-tv has no deep stages; ask for pnp-tv-fastdvdnet";
+                errors.push(InvalidField::new("/algorithm", detail));
+            }
+            Ok(_) => {}
+        }
+        let tile = self.tile.unwrap_or_default();
+        match TilePlan::new(shape.height, shape.width, tile.size, tile.overlap) {
+            Ok(plan) => errors.extend(too_many(plan.len(), snapshots)),
+            Err(error) => errors.push(InvalidField::new("/tile", error.to_string())),
+        }
+        if !(-100..=100).contains(&self.priority) {
+            let detail = format!("priority is {}; it must be from -100 to 100", self.priority);
+            errors.push(InvalidField::new("/priority", detail));
+        }
+        if !errors.is_empty() {
+            return Err(errors);
+        }
+        let (measurement, algorithm) = (self.measurement, self.algorithm);
+        let (priority, label) = (self.priority, self.label);
+        Ok(JobSpec {
+            calibration,
+            measurement,
+            shape,
+            snapshots,
+            algorithm,
+            schedule,
+            tile,
+            priority,
+            label,
+        })
+    }
+}
+
+fn too_many(tiles: usize, snapshots: SnapshotRange) -> Option<InvalidField> {
+    let tasks = (tiles as u64 + 1) * u64::from(snapshots.count) + 2;
+    (tasks > MAX_TASKS as u64).then(|| {
+        let detail = format!(
+            "{tiles} tiles in each of {} snapshots make {tasks} tasks; at most {MAX_TASKS} fit \
+             into one job: use larger tiles or fewer snapshots",
+            snapshots.count
+        );
+        InvalidField::new("/tile", detail)
+    })
+}
+
+impl SnapshotSelection {
+    /// The snapshots meant, of `available` in the measurement.
+    fn within(self, available: u32) -> Result<SnapshotRange, InvalidField> {
+        let (first, last) = match self {
+            Self::All => (0, available.saturating_sub(1)),
+            Self::One(index) => (index, index),
+            Self::Range(first, last) => (first, last),
+        };
+        let detail = if last < first {
+            format!("the range ends at {last} before it starts at {first}")
+        } else if last >= available {
+            format!("snapshot {last} is asked for, but the measurement has {available}, from 0")
+        } else {
+            return Ok(SnapshotRange { first, count: last - first + 1 });
+        };
+        Err(InvalidField::new("/snapshots", detail))
+    }
+}
+
+impl JobSpec {
+    /// The tile plan of every snapshot of the job; none only if the spec was changed by hand.
+    ///
+    /// # Errors
+    /// As [`TilePlan::new`].
+    pub fn tile_plan(&self) -> Result<TilePlan, crate::recon::ReconError> {
+        TilePlan::new(self.shape.height, self.shape.width, self.tile.size, self.tile.overlap)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{JobRequest, SceneShape, SnapshotRange};
+    use crate::job::{CalibrationId, MeasurementId};
+    use serde_json::{Value, json};
+
+    const SHAPE: SceneShape = SceneShape { frames: 8, height: 256, width: 300, snapshots: 6 };
+
+    fn request(mut fields: Value) -> Result<JobRequest, serde_json::Error> {
+        fields["measurement"] = json!(MeasurementId::new());
+        fields["algorithm"] = fields.get("algorithm").cloned().unwrap_or(json!("gap-tv"));
+        serde_json::from_value(fields)
+    }
+
+    fn pointers(fields: Value) -> Vec<String> {
+        let errors = request(fields).unwrap().resolve(CalibrationId::new(), SHAPE).unwrap_err();
+        errors.into_iter().map(|error| error.pointer).collect()
+    }
+
+    #[test]
+    fn defaults_are_filled_in() {
+        let calibration = CalibrationId::new();
+        let spec = request(json!({})).unwrap().resolve(calibration, SHAPE).unwrap();
+        assert_eq!(spec.snapshots, SnapshotRange { first: 0, count: 6 });
+        assert_eq!(spec.calibration, calibration);
+        assert_eq!(spec.tile_plan().unwrap().len(), 2);
+        assert!(!spec.schedule.needs_denoiser());
+    }
+
+    #[test]
+    fn selections_are_one_index_or_both_ends() {
+        for (json, first, count) in [(json!(2), 2, 1), (json!([1, 3]), 1, 3), (json!("all"), 0, 6)]
+        {
+            let request = request(json!({ "snapshots": json })).unwrap();
+            let spec = request.resolve(CalibrationId::new(), SHAPE).unwrap();
+            assert_eq!(spec.snapshots, SnapshotRange { first, count });
+        }
+        assert!(request(json!({"snapshots": "some"})).is_err());
+        assert!(request(json!({"snapshots": -1})).is_err());
+    }
+
+    #[test]
+    fn all_errors_are_told_at_once_with_their_places() {
+        let wrong = json!({
+            "snapshots": [4, 6],
+            "priority": 101,
+            "calibration": CalibrationId::new(),
+            "tile": {"size": 64, "overlap": 40},
+            "schedule": {"stages": [{"prior": "tv", "iterations": 0, "tv_weight": 0.1}]},
+        });
+        let places =
+            ["/calibration", "/snapshots", "/schedule/stages/0/iterations", "/tile", "/priority"];
+        assert_eq!(pointers(wrong), places);
+        assert_eq!(pointers(json!({"snapshots": [3, 2]})), ["/snapshots"]);
+        let deep = json!({"prior": "fastdvdnet", "iterations": 2, "sigma": [0.1, 0.1]});
+        assert_eq!(pointers(json!({"schedule": {"stages": [deep]}})), ["/algorithm"]);
+    }
+}

@@ -1,0 +1,301 @@
+//! The solver's schedule as data: what stands in a job, in `--schedule FILE` and in the manifest.
+//!
+//! `docs/schedule.schema.json` is the published schema of this JSON.
+
+use serde::{Deserialize, Serialize};
+
+use super::request::InvalidField;
+use crate::recon::ReconError;
+use crate::recon::schedule::{Prior, Schedule, Sigma, Stage};
+
+/// A schedule: the stages of the solver, one after the other.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScheduleSpec {
+    /// Use accelerated GAP; its residual accumulator lives through all stages.
+    #[serde(default = "yes")]
+    pub accelerated: bool,
+    /// Noise term added to the gram diagonal, at least 0. 0 forces y = Hx.
+    #[serde(default)]
+    pub gamma: f32,
+    /// The stages, at least one.
+    pub stages: Vec<StageSpec>,
+}
+
+/// One stage: a prior and the number of iterations with it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StageSpec {
+    /// The denoiser of this stage.
+    pub prior: PriorSpec,
+    /// The most iterations, at least 1.
+    pub iterations: usize,
+    /// Noise level on [0, 1] at the first and the last iteration, geometric between them.
+    /// Needed by the deep priors and refused for the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sigma: Option<[f32; 2]>,
+    /// Weight of the total variation; needed by `tv` and `tv+fastdvdnet`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tv_weight: Option<f32>,
+    /// Dual (Chambolle) updates for each TV step; 4 where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tv_updates: Option<usize>,
+    /// The stage ends early once ||v_k - v_(k-1)|| / ||v_k|| is below this; 0 never does.
+    #[serde(default)]
+    pub tolerance: f32,
+}
+
+/// The priors that a stage can have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum PriorSpec {
+    /// Isotropic total variation of each frame.
+    #[serde(rename = "tv")]
+    Tv,
+    /// FastDVDNet over the clip.
+    #[serde(rename = "fastdvdnet")]
+    FastDvdNet,
+    /// TV, then FastDVDNet, in each iteration.
+    #[serde(rename = "tv+fastdvdnet")]
+    TvFastDvdNet,
+}
+
+fn yes() -> bool {
+    true
+}
+
+/// Dual updates of a TV step where the schedule does not say.
+const DEFAULT_TV_UPDATES: usize = 4;
+/// The most stages of a schedule.
+const MAX_STAGES: usize = 32;
+/// The most iterations of a schedule; with more, a job would look hung.
+const MAX_ITERATIONS: usize = 10_000;
+
+/// Cost of one projection and one accelerated update, CPU-nanoseconds per voxel (measured).
+const PROJECTION_NS: f64 = 0.6;
+/// Cost of one dual update of TV, CPU-nanoseconds per voxel (measured).
+const TV_UPDATE_NS: f64 = 0.7;
+/// Cost of one pass of FastDVDNet with a shared first stage, CPU-nanoseconds per voxel (measured).
+const DEEP_PASS_NS: f64 = 9_300.0;
+
+impl PriorSpec {
+    fn to_prior(self) -> Prior {
+        match self {
+            Self::Tv => Prior::Tv,
+            Self::FastDvdNet => Prior::FastDvdNet,
+            Self::TvFastDvdNet => Prior::TvFastDvdNet,
+        }
+    }
+    /// True if the prior runs the deep denoiser.
+    #[must_use]
+    pub fn is_deep(self) -> bool {
+        matches!(self, Self::FastDvdNet | Self::TvFastDvdNet)
+    }
+
+    /// True if the prior runs total variation.
+    #[must_use]
+    pub fn has_tv(self) -> bool {
+        matches!(self, Self::Tv | Self::TvFastDvdNet)
+    }
+}
+
+impl StageSpec {
+    fn to_stage(&self) -> Result<Stage, ReconError> {
+        let sigma = match self.sigma {
+            Some([first, last]) => Some((Sigma::new(first)?, Sigma::new(last)?)),
+            None => None,
+        };
+        Ok(Stage {
+            prior: self.prior.to_prior(),
+            iterations: self.iterations,
+            sigma,
+            tv_weight: self.tv_weight.unwrap_or(0.0),
+            tv_updates: self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES),
+            tolerance: self.tolerance,
+        })
+    }
+
+    /// What the core does not refuse, because it is no error of numbers: a TV without a weight,
+    /// or a weight without a TV.
+    fn misfit(&self) -> Option<(&'static str, String)> {
+        match (self.prior.has_tv(), self.tv_weight) {
+            (true, None) => Some(("tv_weight", "a stage with TV needs its weight".into())),
+            (false, Some(_)) => Some(("tv_weight", "this stage has no TV; leave it out".into())),
+            _ => None,
+        }
+    }
+    /// The cost of one iteration in CPU-nanoseconds per voxel, as on the machine it was measured on.
+    fn iteration_ns(&self) -> f64 {
+        let dual_updates =
+            u32::try_from(self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES)).unwrap_or(u32::MAX);
+        let tv = if self.prior.has_tv() { TV_UPDATE_NS * f64::from(dual_updates) } else { 0.0 };
+        let deep = if self.prior.is_deep() { DEEP_PASS_NS } else { 0.0 };
+        PROJECTION_NS + tv + deep
+    }
+}
+
+impl ScheduleSpec {
+    /// The schedule as the core takes it.
+    ///
+    /// # Errors
+    /// One entry for each stage that is wrong, with a JSON pointer relative to the schedule.
+    pub fn to_schedule(&self) -> Result<Schedule, Vec<InvalidField>> {
+        let mut errors = Vec::new();
+        let mut whole =
+            Schedule { accelerated: self.accelerated, gamma: self.gamma, stages: Vec::new() };
+        if self.stages.len() > MAX_STAGES {
+            let message = format!("{} stages; at most {MAX_STAGES} are taken", self.stages.len());
+            return Err(vec![InvalidField::new("/stages", message)]);
+        }
+        for (index, spec) in self.stages.iter().enumerate() {
+            let stage = spec.to_stage().and_then(|stage| {
+                // Alone in a schedule, so that the error is known to be this stage's.
+                let alone = Schedule { accelerated: true, gamma: 0.0, stages: vec![stage.clone()] };
+                alone.validate().map(|()| stage)
+            });
+            match (stage, spec.misfit()) {
+                (Err(error), _) => errors.push(at(&format!("/stages/{index}"), &error)),
+                (Ok(_), Some((field, message))) => {
+                    errors.push(InvalidField::new(format!("/stages/{index}/{field}"), message));
+                }
+                (Ok(stage), None) => whole.stages.push(stage),
+            }
+        }
+        if self.planned_iterations() > MAX_ITERATIONS {
+            let planned = self.planned_iterations();
+            let message =
+                format!("{planned} iterations in all; at most {MAX_ITERATIONS} are taken");
+            errors.push(InvalidField::new("/stages", message));
+        }
+        if errors.is_empty() {
+            whole.validate().map_err(|error| vec![at("", &error)])?;
+            return Ok(whole);
+        }
+        Err(errors)
+    }
+    /// The most iterations that a run takes.
+    #[must_use]
+    pub fn planned_iterations(&self) -> usize {
+        self.stages.iter().fold(0, |sum, stage| sum.saturating_add(stage.iterations))
+    }
+
+    /// The most deep passes that a run takes.
+    #[must_use]
+    pub fn planned_passes(&self) -> usize {
+        self.stages.iter().filter(|s| s.prior.is_deep()).map(|s| s.iterations).sum()
+    }
+
+    /// True if a stage runs the deep denoiser.
+    #[must_use]
+    pub fn needs_denoiser(&self) -> bool {
+        self.stages.iter().any(|stage| stage.prior.is_deep())
+    }
+
+    /// The planned cost in CPU-nanoseconds per voxel.
+    #[must_use]
+    pub fn planned_ns_per_voxel(&self) -> f64 {
+        self.stages.iter().map(|stage| stage.iteration_ns() * count(stage.iterations)).sum()
+    }
+
+    /// The share of the planned cost, on [0, 1], that is behind a run which has done `iteration`
+    /// iterations of the stage with index `stage` and has left all stages before it.
+    #[must_use]
+    pub fn share_done(&self, stage: usize, iteration: usize) -> f64 {
+        let before: f64 =
+            self.stages.iter().take(stage).map(|s| s.iteration_ns() * count(s.iterations)).sum();
+        let here = self
+            .stages
+            .get(stage)
+            .map_or(0.0, |s| s.iteration_ns() * count(iteration.min(s.iterations)));
+        let planned = self.planned_ns_per_voxel();
+        if planned > 0.0 { ((before + here) / planned).clamp(0.0, 1.0) } else { 0.0 }
+    }
+}
+
+/// Where in the JSON a parameter that the core refuses stands.
+fn at(place: &str, error: &ReconError) -> InvalidField {
+    let pointer = match error {
+        ReconError::Parameter { name, .. } => format!("{place}/{name}"),
+        _ => place.to_owned(),
+    };
+    InvalidField::new(pointer, error.to_string())
+}
+
+impl From<&Schedule> for ScheduleSpec {
+    fn from(schedule: &Schedule) -> Self {
+        let stage = |stage: &Stage| {
+            let tv = stage.prior.uses_tv();
+            StageSpec {
+                prior: match stage.prior {
+                    Prior::Tv => PriorSpec::Tv,
+                    Prior::FastDvdNet => PriorSpec::FastDvdNet,
+                    Prior::TvFastDvdNet => PriorSpec::TvFastDvdNet,
+                },
+                iterations: stage.iterations,
+                sigma: stage.sigma.map(|(first, last)| [first.value(), last.value()]),
+                tv_weight: tv.then_some(stage.tv_weight),
+                tv_updates: tv.then_some(stage.tv_updates),
+                tolerance: stage.tolerance,
+            }
+        };
+        Self {
+            accelerated: schedule.accelerated,
+            gamma: schedule.gamma,
+            stages: schedule.stages.iter().map(stage).collect(),
+        }
+    }
+}
+
+fn count(n: usize) -> f64 {
+    f64::from(u32::try_from(n).unwrap_or(u32::MAX))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::ScheduleSpec;
+    use crate::recon::schedule::Schedule;
+    use serde_json::{Value, json};
+
+    fn pointers(schedule: Value) -> Vec<String> {
+        let spec: ScheduleSpec = serde_json::from_value(schedule).unwrap();
+        spec.to_schedule().unwrap_err().into_iter().map(|error| error.pointer).collect()
+    }
+
+    #[test]
+    fn the_default_schedules_survive_the_way_through_json() {
+        for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
+            let spec = ScheduleSpec::from(&schedule);
+            let text = serde_json::to_string(&spec).unwrap();
+            let read: ScheduleSpec = serde_json::from_str(&text).unwrap();
+            assert_eq!(read, spec);
+            assert_eq!(read.to_schedule().unwrap(), schedule);
+        }
+    }
+
+    #[test]
+    fn errors_point_at_their_place() {
+        let tv = json!({"prior": "tv", "iterations": 5, "tv_weight": 0.1});
+        let deep = json!({"prior": "fastdvdnet", "iterations": 5});
+        let zero = json!({"prior": "tv", "iterations": 0, "tv_weight": 0.1});
+        let bare = json!({"prior": "tv", "iterations": 3});
+        let stages = json!({"stages": [tv, deep, zero, bare]});
+        let expected = ["/stages/1/sigma", "/stages/2/iterations", "/stages/3/tv_weight"];
+        assert_eq!(pointers(stages), expected);
+        assert_eq!(pointers(json!({"stages": []})), ["/stages"]);
+        assert_eq!(pointers(json!({"gamma": -1.0, "stages": [tv]})), ["/gamma"]);
+    }
+
+    #[test]
+    fn unknown_fields_are_refused() {
+        let typo = json!({"stages": [{"prior": "tv", "iteration": 5}]});
+        assert!(serde_json::from_value::<ScheduleSpec>(typo).is_err());
+    }
+
+    #[test]
+    fn one_deep_pass_weighs_as_thousands_of_tv_iterations() {
+        let spec = ScheduleSpec::from(&Schedule::pnp_tv_fastdvdnet());
+        assert_eq!(spec.share_done(0, 0), 0.0);
+        assert!(spec.share_done(1, 0) < 0.01, "after all TV iterations");
+        assert!((spec.share_done(1, 12) - 0.5).abs() < 0.01, "half of the deep passes");
+        assert_eq!(spec.share_done(2, 0), 1.0);
+    }
+}

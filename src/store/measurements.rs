@@ -1,0 +1,196 @@
+//! Table `measurements`.
+
+use serde::Serialize;
+use sqlx::Row;
+use sqlx::sqlite::SqliteRow;
+
+use super::blobs::Origin;
+use super::calibrations::{gone_if_foreign_key, label};
+use super::error::StoreError;
+use super::rows::{integer, number, parsed, single};
+use super::{Page, StagedBlob, Store};
+use crate::job::{CalibrationId, Label, MeasurementId, Sha256, Timestamp};
+
+/// What is known of a measurement when it has been checked.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct NewMeasurement {
+    /// The user's name for it.
+    pub name: Option<Label>,
+    /// The calibration that it was taken with.
+    pub calibration: CalibrationId,
+    /// The upload with the snapshots.
+    pub data: Sha256,
+    /// Format of the upload, such as `tiff`.
+    pub format: String,
+    /// Sample type of the upload, such as `uint16`.
+    pub sample: String,
+    /// Snapshots (S).
+    pub snapshots: u32,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// The stored number that means 1, where the scene's sum of frames is up to B.
+    pub full_scale: f32,
+    /// Snapshots that the camera takes in a second.
+    pub camera_fps: Option<f64>,
+    /// Exposure of one snapshot in seconds.
+    pub exposure_s: Option<f64>,
+}
+
+/// A measurement on record.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Measurement {
+    /// Its identifier.
+    pub id: MeasurementId,
+    /// Hash of the prepared snapshots: a planar file of f32 [S, H, W], full scale divided out.
+    #[serde(skip)]
+    pub prepared: Sha256,
+    /// When it was made.
+    pub created_at: Timestamp,
+    /// What is known of it.
+    #[serde(flatten)]
+    pub facts: NewMeasurement,
+}
+
+/// Which measurements a list holds.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct MeasurementFilter {
+    /// Only those of this calibration.
+    pub calibration: Option<CalibrationId>,
+    /// Only those older than this one.
+    pub after: Option<MeasurementId>,
+}
+
+impl Store {
+    /// Records a measurement and puts its prepared snapshots in place.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] if the upload or the calibration is gone; or if the file or the
+    /// row can't be written.
+    pub async fn add_measurement(
+        &self,
+        facts: NewMeasurement,
+        prepared: StagedBlob,
+    ) -> Result<Measurement, StoreError> {
+        let measurement = Measurement {
+            id: MeasurementId::new(),
+            prepared: prepared.sha256(),
+            created_at: Timestamp::now(),
+            facts,
+        };
+        let facts = &measurement.facts;
+        let mut transaction = self.write().await?;
+        self.publish(&mut transaction, prepared, Origin::Prepared).await?;
+        sqlx::query(
+            "INSERT INTO measurements (id, name, calibration, data, prepared, format, sample,
+                 snapshots, height, width, full_scale, camera_fps, exposure_s, created_at)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        )
+        .bind(measurement.id.to_string())
+        .bind(facts.name.as_ref().map(Label::as_str))
+        .bind(facts.calibration.to_string())
+        .bind(facts.data.to_string())
+        .bind(measurement.prepared.to_string())
+        .bind(&facts.format)
+        .bind(&facts.sample)
+        .bind(i64::from(facts.snapshots))
+        .bind(integer(facts.height))
+        .bind(integer(facts.width))
+        .bind(f64::from(facts.full_scale))
+        .bind(facts.camera_fps)
+        .bind(facts.exposure_s)
+        .bind(measurement.created_at.0)
+        .execute(&mut *transaction)
+        .await
+        .map_err(|error| {
+            let id = format!("{} or blob {}", facts.calibration, facts.data);
+            gone_if_foreign_key(error, "calibration", id)
+        })?;
+        transaction.commit().await?;
+        Ok(measurement)
+    }
+
+    /// The measurement with this identifier.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`].
+    pub async fn measurement(&self, id: MeasurementId) -> Result<Measurement, StoreError> {
+        let row = sqlx::query("SELECT * FROM measurements WHERE id = ?")
+            .bind(id.to_string())
+            .fetch_optional(&self.readers)
+            .await?;
+        row.as_ref().map(measurement).transpose()?.ok_or_else(|| not_found(id))
+    }
+
+    /// A page of measurements, newest first.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn measurements(
+        &self,
+        filter: MeasurementFilter,
+        limit: u32,
+    ) -> Result<Page<Measurement>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT * FROM measurements
+             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR calibration = ?2)
+             ORDER BY id DESC LIMIT ?3",
+        )
+        .bind(filter.after.map(|id| id.to_string()))
+        .bind(filter.calibration.map(|id| id.to_string()))
+        .bind(i64::from(limit) + 1)
+        .fetch_all(&self.readers)
+        .await?;
+        Page::cut(&rows, limit, measurement)
+    }
+
+    /// Deletes a measurement that no job refers to.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`], [`StoreError::InUse`].
+    pub async fn delete_measurement(&self, id: MeasurementId) -> Result<(), StoreError> {
+        let mut transaction = self.write().await?;
+        let row = sqlx::query("SELECT count(*) AS users FROM jobs WHERE measurement = ?")
+            .bind(id.to_string())
+            .fetch_one(&mut *transaction)
+            .await?;
+        let users = number(&row, "users")?;
+        if users > 0 {
+            return Err(StoreError::InUse { what: "measurement", by: "jobs", users });
+        }
+        let row = sqlx::query("DELETE FROM measurements WHERE id = ? RETURNING prepared")
+            .bind(id.to_string())
+            .fetch_optional(&mut *transaction)
+            .await?
+            .ok_or_else(|| not_found(id))?;
+        self.release(&mut transaction, parsed(&row, "prepared")?).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+}
+
+fn measurement(row: &SqliteRow) -> Result<Measurement, StoreError> {
+    Ok(Measurement {
+        id: parsed(row, "id")?,
+        prepared: parsed(row, "prepared")?,
+        created_at: Timestamp(row.try_get("created_at")?),
+        facts: NewMeasurement {
+            name: label(row, "name")?,
+            calibration: parsed(row, "calibration")?,
+            data: parsed(row, "data")?,
+            format: row.try_get("format")?,
+            sample: row.try_get("sample")?,
+            snapshots: number(row, "snapshots")?,
+            height: number(row, "height")?,
+            width: number(row, "width")?,
+            full_scale: single(row, "full_scale")?,
+            camera_fps: row.try_get("camera_fps")?,
+            exposure_s: row.try_get("exposure_s")?,
+        },
+    })
+}
+
+fn not_found(id: MeasurementId) -> StoreError {
+    StoreError::NotFound { what: "measurement", id: id.to_string() }
+}

@@ -1,0 +1,139 @@
+//! All that lasts: SQLite for the records, content-addressed files for the arrays.
+//!
+//! The server and every worker process open the same folder. Files are put in place and removed
+//! while the writer's lock of the database is held, so that a file and its row can't part when two
+//! processes work on the same content: the database is the one mutex of the service. No transaction
+//! is open while anything is computed or uploaded.
+
+mod blobs;
+mod calibrations;
+mod dir;
+mod error;
+mod jobs;
+mod losses;
+mod measurements;
+mod progress;
+mod queue;
+mod results;
+mod rows;
+mod staging;
+mod tasks;
+#[cfg(test)]
+mod tests;
+mod workers;
+
+use std::path::Path;
+use std::time::Duration;
+
+use sqlx::SqlitePool;
+use sqlx::sqlite::{
+    Sqlite, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
+};
+
+pub use blobs::{Blob, Origin};
+pub use calibrations::{Calibration, NewCalibration};
+pub use dir::DataDir;
+pub use error::StoreError;
+pub use jobs::{Inserted, Job, JobFilter, NewJob};
+pub use losses::{MAX_FAILURES, MAX_LOSSES};
+pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
+pub use progress::{JobProgress, ProgressStage};
+pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
+pub use results::ResultFile;
+pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
+pub use tasks::{TaskRecord, TileResult};
+pub use workers::{WorkerEnd, WorkerRow};
+
+/// One page of a list, and the identifier to go on after.
+#[derive(Debug, Clone)]
+pub struct Page<T> {
+    /// The items, newest first.
+    pub items: Vec<T>,
+    /// True if there are more.
+    pub more: bool,
+}
+
+/// The store: a handle that is cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Store {
+    dir: DataDir,
+    /// One connection: within a process, writers wait for each other here and not in SQLite.
+    writer: SqlitePool,
+    readers: SqlitePool,
+}
+
+/// A transaction that holds the writer's lock from its start, so that it can't fail half-way
+/// because another process began to write.
+pub(crate) type WriteTransaction = sqlx::Transaction<'static, Sqlite>;
+
+impl Store {
+    /// Opens the store in `root`, makes what is missing, and brings the database up to date.
+    ///
+    /// # Errors
+    /// If the folder can't be written, the database can't be opened, or a newer version of this
+    /// program has changed it.
+    pub async fn open(root: &Path) -> Result<Self, StoreError> {
+        let dir = DataDir::create(root)?;
+        let options = SqliteConnectOptions::new()
+            .filename(dir.database())
+            .create_if_missing(true)
+            .foreign_keys(true)
+            .busy_timeout(Duration::from_secs(15))
+            .journal_mode(SqliteJournalMode::Wal)
+            // NORMAL survives a killed process, but a power cut could take back the last commits,
+            // and an answered request must not be lost. Commits are few (a heartbeat of each
+            // worker every two seconds), so a sync for each costs nothing that is felt.
+            .synchronous(SqliteSynchronous::Full);
+        let writer = SqlitePoolOptions::new()
+            .max_connections(1)
+            .idle_timeout(None)
+            .max_lifetime(None)
+            .connect_with(options.clone());
+        // Two processes that start together must not both make the tables.
+        let lock = dir.lock_blocking("migrate.lock").await?;
+        let writer = writer.await?;
+        sqlx::migrate!().run(&writer).await?;
+        drop(lock);
+        let readers = SqlitePoolOptions::new()
+            .max_connections(4)
+            .idle_timeout(None)
+            .max_lifetime(None)
+            .connect_with(options.read_only(true))
+            .await?;
+        Ok(Self { dir, writer, readers })
+    }
+
+    /// Where the files are.
+    #[must_use]
+    pub fn dir(&self) -> &DataDir {
+        &self.dir
+    }
+
+    /// Waits for running statements and closes all connections.
+    pub async fn close(&self) {
+        self.readers.close().await;
+        self.writer.close().await;
+    }
+
+    /// Asks the database for an answer.
+    ///
+    /// # Errors
+    /// If there is none.
+    pub async fn ping(&self) -> Result<(), StoreError> {
+        sqlx::query("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
+        Ok(())
+    }
+
+    pub(crate) async fn write(&self) -> Result<WriteTransaction, StoreError> {
+        Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
+    }
+}
+
+/// Runs work on files, which blocks, where it may block.
+pub(crate) async fn on_files<T, F>(work: F) -> Result<T, StoreError>
+where
+    T: Send + 'static,
+    F: FnOnce() -> Result<T, StoreError> + Send + 'static,
+{
+    tokio::task::spawn_blocking(work).await.map_err(|_| StoreError::Interrupted)?
+}

@@ -1,0 +1,354 @@
+//! The queue: how tasks get to workers and come back.
+//!
+//! A worker *claims* a task and holds it under a *lease* that its heartbeats renew. A lease that
+//! runs out makes the task ready again, so a dead worker costs one attempt. Each claim has a number,
+//! and what an earlier attempt says later is refused: that is the fence. Everything that changes a
+//! task also settles its job, in the same transaction.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde_json::Value;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use super::blobs::Origin;
+use super::error::StoreError;
+use super::rows::{json, number, parsed};
+use super::{
+    Calibration, Measurement, StagedBlob, StagedDir, Store, dir, jobs, losses, on_files, results,
+    tasks, workers,
+};
+use crate::job::{JobId, JobSpec, JobState, TaskId, TaskKind, TaskProgress, Timestamp, WorkerId};
+
+/// The right to work on a task, until it runs out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Lease {
+    /// The task.
+    pub task: TaskId,
+    /// The number of this attempt, from 1.
+    pub attempt: u32,
+    /// Who holds it.
+    pub worker: WorkerId,
+    /// For how long each heartbeat renews it.
+    pub length: Duration,
+}
+
+/// A task with all that a worker needs to do it.
+#[derive(Debug, Clone)]
+pub struct ClaimedTask {
+    /// The right to it, to be shown with every message about it.
+    pub lease: Lease,
+    /// What is to be done.
+    pub kind: TaskKind,
+    /// For which job.
+    pub job: JobId,
+    /// The job.
+    pub spec: JobSpec,
+    /// The calibration's record.
+    pub calibration: Calibration,
+    /// The prepared masks: planar f32 [B, H, W] on [0, 1].
+    pub masks: PathBuf,
+    /// The measurement's record.
+    pub measurement: Measurement,
+    /// The prepared snapshots: planar f32 [S, H, W], full scale divided out.
+    pub snapshots: PathBuf,
+    /// What the job's prepare task recorded; none for that task itself.
+    pub prepared: Option<Value>,
+}
+
+/// The answer to a heartbeat.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Heartbeat {
+    /// Go on; the lease is renewed.
+    Continue,
+    /// The job is not wanted any more: stop, and call [`Store::cancelled`].
+    Cancelled,
+    /// The lease ran out and the task is someone else's: stop, and drop everything.
+    Lost,
+}
+
+/// What a task has made.
+#[derive(Debug)]
+pub enum Product {
+    /// Nothing but its record (prepare).
+    Record,
+    /// The reconstructed tile.
+    Tile(StagedBlob),
+    /// The files of a snapshot (assemble) or of the job (manifest).
+    Files(StagedDir),
+}
+
+/// The end of a task.
+#[derive(Debug)]
+pub struct Completion {
+    /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
+    pub progress: TaskProgress,
+    /// What is to be remembered of it, for the manifest.
+    pub record: Value,
+    /// What it has made.
+    pub product: Product,
+}
+
+impl Store {
+    /// Hands out the next task, if there is one.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn claim(
+        &self,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>, StoreError> {
+        let now = Timestamp::now().0;
+        // 1. Look without the lock: most of the time there is nothing to do.
+        let work = sqlx::query(
+            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = 'ready' AND ready_at <= ?1)
+                OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running' AND lease_until < ?1)",
+        )
+        .bind(now)
+        .fetch_optional(&self.readers)
+        .await?;
+        if work.is_none() {
+            return Ok(None);
+        }
+        let mut transaction = self.write().await?;
+        // 2. Take back what silent workers hold.
+        losses::reap(&mut transaction, now).await?;
+        // 3. Claim: one statement finds the task, marks it and counts the attempt.
+        let claimed = sqlx::query(
+            "UPDATE tasks SET state = 'running', worker = ?1, lease_until = ?2, attempt = attempt + 1,
+                 stage = 'reading', iterations = 0, passes = 0, fraction = 0
+             WHERE id = (SELECT id FROM tasks WHERE state = 'ready' AND ready_at <= ?3
+                         ORDER BY priority DESC, job, ordinal LIMIT 1)
+             RETURNING id, job, kind, snapshot, tile, attempt",
+        )
+        .bind(worker.to_string())
+        .bind(now + millis(length))
+        .bind(now)
+        .fetch_optional(&mut *transaction)
+        .await?;
+        let Some(row) = claimed else {
+            transaction.commit().await?;
+            return Ok(None);
+        };
+        let lease =
+            Lease { task: parsed(&row, "id")?, attempt: number(&row, "attempt")?, worker, length };
+        let job = parsed(&row, "job")?;
+        // 4. Keep a record of the attempt, and move the job on.
+        sqlx::query("INSERT INTO attempts (task, attempt, worker, started_at) VALUES (?, ?, ?, ?)")
+            .bind(lease.task.to_string())
+            .bind(lease.attempt)
+            .bind(worker.to_string())
+            .bind(now)
+            .execute(&mut *transaction)
+            .await?;
+        if jobs::state(&mut transaction, job).await? == JobState::Queued {
+            jobs::set_state(&mut transaction, job, JobState::Running, None).await?;
+        }
+        workers::seen(&mut transaction, worker).await?;
+        transaction.commit().await?;
+        // 5. Fetch what the worker needs. If this fails, the lease runs out.
+        self.claimed_task(lease, job, &row).await.map(Some)
+    }
+
+    async fn claimed_task(
+        &self,
+        lease: Lease,
+        job: JobId,
+        row: &SqliteRow,
+    ) -> Result<ClaimedTask, StoreError> {
+        let found = sqlx::query(
+            "SELECT spec, (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared
+             FROM jobs WHERE id = ?",
+        )
+        .bind(job.to_string())
+        .fetch_one(&self.readers)
+        .await?;
+        let spec: JobSpec = json(&found, "spec")?;
+        let calibration = self.calibration(spec.calibration).await?;
+        let measurement = self.measurement(spec.measurement).await?;
+        let prepared: Option<String> = found.try_get("prepared")?;
+        Ok(ClaimedTask {
+            lease,
+            kind: tasks::kind(row)?,
+            job,
+            masks: self.dir().blob(&calibration.prepared),
+            snapshots: self.dir().blob(&measurement.prepared),
+            spec,
+            calibration,
+            measurement,
+            prepared: prepared.and_then(|text| serde_json::from_str(&text).ok()),
+        })
+    }
+
+    /// Renews a lease, notes the progress, and asks whether to go on.
+    ///
+    /// # Errors
+    /// If the database fails; the lease is not renewed then.
+    pub async fn heartbeat(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+    ) -> Result<Heartbeat, StoreError> {
+        let mut transaction = self.write().await?;
+        workers::seen(&mut transaction, lease.worker).await?;
+        let row = sqlx::query(
+            "UPDATE tasks SET lease_until = ?, stage = ?, iterations = ?, passes = ?, fraction = ?
+             WHERE id = ? AND attempt = ? AND state = 'running'
+             RETURNING (SELECT state FROM jobs WHERE id = tasks.job) AS job_state",
+        )
+        .bind(Timestamp::now().0 + millis(lease.length))
+        .bind(progress.stage.name())
+        .bind(progress.iterations)
+        .bind(progress.passes)
+        .bind(progress.fraction.clamp(0.0, 1.0))
+        .bind(lease.task.to_string())
+        .bind(lease.attempt)
+        .fetch_optional(&mut *transaction)
+        .await?;
+        transaction.commit().await?;
+        Ok(match row {
+            None => Heartbeat::Lost,
+            Some(row) => match parsed(&row, "job_state")? {
+                JobState::Queued | JobState::Running => Heartbeat::Continue,
+                _ => Heartbeat::Cancelled,
+            },
+        })
+    }
+
+    /// Stores what a task has made and moves its job on. Says [`Heartbeat::Lost`] if the lease has
+    /// run out and the task was claimed again; nothing is stored then.
+    ///
+    /// # Errors
+    /// If a file or the database can't be written; the task is still the worker's then.
+    pub async fn complete(
+        &self,
+        lease: &Lease,
+        completion: Completion,
+    ) -> Result<Heartbeat, StoreError> {
+        // Hashing and syncing files takes long, so it is done before the lock is taken.
+        let (files, product) = match completion.product {
+            Product::Files(staged) => on_files(move || Ok((staged.seal()?, staged)))
+                .await
+                .map(|(files, staged)| (files, Product::Files(staged)))?,
+            other => (Vec::new(), other),
+        };
+        let mut transaction = self.write().await?;
+        let Some((job, kind)) = held(&mut transaction, lease).await? else {
+            return Ok(Heartbeat::Lost);
+        };
+        let mut result = None;
+        match product {
+            Product::Record => {}
+            Product::Tile(staged) => {
+                result = Some(staged.sha256().to_string());
+                self.publish(&mut transaction, staged, Origin::Tile).await?;
+            }
+            Product::Files(staged) => {
+                results::record(&mut transaction, job, kind.snapshot(), &files).await?;
+                self.put_files(job, kind, staged, files).await?;
+            }
+        }
+        finish(&mut transaction, lease, &completion.progress, &completion.record, result).await?;
+        tasks::unblock(&mut transaction, job, kind).await?;
+        if kind == TaskKind::Manifest
+            && jobs::state(&mut transaction, job).await? == JobState::Running
+        {
+            jobs::set_state(&mut transaction, job, JobState::Succeeded, None).await?;
+            self.drop_tiles(&mut transaction, job).await?;
+        }
+        jobs::settle(&mut transaction, job).await?;
+        transaction.commit().await?;
+        Ok(Heartbeat::Continue)
+    }
+
+    /// Moves result files to their place, under the lock of the caller's transaction.
+    async fn put_files(
+        &self,
+        job: JobId,
+        kind: TaskKind,
+        staged: StagedDir,
+        files: Vec<super::ResultFile>,
+    ) -> Result<(), StoreError> {
+        let folder = self.dir().results(job);
+        let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));
+        on_files(move || {
+            dir::make_dir_durably(&folder)?;
+            match place {
+                Some(place) => staged.put(&place),
+                None => staged.put_files(&folder, &files),
+            }
+        })
+        .await
+    }
+
+    /// Removes the tiles of a job that needs them no more.
+    pub(super) async fn drop_tiles(
+        &self,
+        transaction: &mut SqliteConnection,
+        job: JobId,
+    ) -> Result<(), StoreError> {
+        let rows =
+            sqlx::query("SELECT DISTINCT result FROM tasks WHERE job = ? AND result IS NOT NULL")
+                .bind(job.to_string())
+                .fetch_all(&mut *transaction)
+                .await?;
+        sqlx::query("UPDATE tasks SET result = NULL WHERE job = ?")
+            .bind(job.to_string())
+            .execute(&mut *transaction)
+            .await?;
+        for row in &rows {
+            self.release(transaction, parsed(row, "result")?).await?;
+        }
+        Ok(())
+    }
+}
+
+fn millis(length: Duration) -> i64 {
+    i64::try_from(length.as_millis()).unwrap_or(i64::MAX / 2)
+}
+
+/// The job and kind of the task, if the lease is still good. A lease that ran out but was not
+/// claimed by anyone else is good: the work is done, so it may as well count.
+pub(super) async fn held(
+    connection: &mut SqliteConnection,
+    lease: &Lease,
+) -> Result<Option<(JobId, TaskKind)>, StoreError> {
+    let row = sqlx::query(
+        "SELECT job, kind, snapshot, tile FROM tasks WHERE id = ? AND attempt = ? AND state = 'running'",
+    )
+    .bind(lease.task.to_string())
+    .bind(lease.attempt)
+    .fetch_optional(connection)
+    .await?;
+    row.map(|row| Ok((parsed(&row, "job")?, tasks::kind(&row)?))).transpose()
+}
+
+/// Marks a task done.
+async fn finish(
+    connection: &mut SqliteConnection,
+    lease: &Lease,
+    progress: &TaskProgress,
+    record: &Value,
+    result: Option<String>,
+) -> Result<(), StoreError> {
+    let now = Timestamp::now().0;
+    sqlx::query(
+        "UPDATE tasks SET state = 'done', worker = NULL, lease_until = NULL, stage = NULL,
+             iterations = ?1, passes = ?2, fraction = ?3, record = ?4, result = ?5,
+             seconds = (?6 - (SELECT started_at FROM attempts WHERE task = id AND attempt = ?8)) / 1000.0
+         WHERE id = ?7",
+    )
+    .bind(progress.iterations)
+    .bind(progress.passes)
+    .bind(progress.fraction.clamp(0.0, 1.0))
+    .bind(record.to_string())
+    .bind(result)
+    .bind(now)
+    .bind(lease.task.to_string())
+    .bind(lease.attempt)
+    .execute(&mut *connection)
+    .await?;
+    losses::end_attempt(connection, lease.task, "done", None).await
+}

@@ -1,0 +1,255 @@
+//! Files on their way into the store: written under a temporary name, hashed, brought to the disk.
+//!
+//! Whoever writes holds a lock on the file, so that the sweep can tell it from what a dead process
+//! left. What is dropped before it is stored is removed.
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use sha2::Digest;
+use uuid::Uuid;
+
+use super::Store;
+use super::dir::{self, sync_dir};
+use super::error::StoreError;
+use super::results::ResultFile;
+use crate::job::Sha256;
+
+/// A temporary file or folder; its lock and its removal.
+#[derive(Debug)]
+struct Temporary {
+    path: PathBuf,
+    /// Open for the lock alone.
+    _lock: File,
+    /// Set when the content has found its place.
+    moved: bool,
+}
+
+impl Temporary {
+    fn new(path: PathBuf, lock: File) -> Result<Self, StoreError> {
+        lock.lock().map_err(StoreError::io("lock", &path))?;
+        Ok(Self { path, _lock: lock, moved: false })
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        if !self.moved {
+            // Nothing depends on it: what stays is swept at the next start.
+            let _ = dir::remove(&self.path);
+        }
+    }
+}
+
+impl Store {
+    fn temporary_path(&self) -> PathBuf {
+        self.dir().tmp().join(Uuid::now_v7().to_string())
+    }
+
+    /// A new file that is hashed while it is written. Blocks on the disk.
+    ///
+    /// # Errors
+    /// If the file can't be made.
+    pub fn blob_writer(&self) -> Result<BlobWriter, StoreError> {
+        let staged = self.staged_path()?;
+        let path = &staged.0.path;
+        let file = File::options().write(true).open(path);
+        let file = file.map_err(StoreError::io("open", path))?;
+        Ok(BlobWriter { file, temporary: staged.0, hasher: sha2::Sha256::new(), size: 0 })
+    }
+
+    /// A new empty file for a writer that wants a path. Blocks on the disk.
+    ///
+    /// # Errors
+    /// If the file can't be made.
+    pub fn staged_path(&self) -> Result<StagedPath, StoreError> {
+        let path = self.temporary_path();
+        let lock = File::create_new(&path).map_err(StoreError::io("make", &path))?;
+        Ok(StagedPath(Temporary::new(path, lock)?))
+    }
+
+    /// A new empty folder for the results of a task. Blocks on the disk.
+    ///
+    /// # Errors
+    /// If the folder can't be made.
+    pub fn staged_dir(&self) -> Result<StagedDir, StoreError> {
+        let path = self.temporary_path();
+        fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
+        let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
+        Ok(StagedDir(Temporary::new(path, lock)?))
+    }
+}
+
+/// A file that is hashed while it is written.
+#[derive(Debug)]
+pub struct BlobWriter {
+    temporary: Temporary,
+    file: File,
+    hasher: sha2::Sha256,
+    size: u64,
+}
+
+impl BlobWriter {
+    /// Appends bytes.
+    ///
+    /// # Errors
+    /// If the disk takes no more.
+    pub fn write(&mut self, bytes: &[u8]) -> Result<(), StoreError> {
+        self.hasher.update(bytes);
+        self.size += bytes.len() as u64;
+        self.file.write_all(bytes).map_err(StoreError::io("write", &self.temporary.path))
+    }
+
+    /// Bytes written so far.
+    #[must_use]
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Brings the file to the disk.
+    ///
+    /// # Errors
+    /// If that fails; the file is removed then.
+    pub fn finish(self) -> Result<StagedBlob, StoreError> {
+        self.file.sync_all().map_err(StoreError::io("write to the disk", &self.temporary.path))?;
+        let sha256 = Sha256::new(self.hasher.finalize().into());
+        Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
+    }
+}
+
+/// A temporary file that some other code writes.
+#[derive(Debug)]
+pub struct StagedPath(Temporary);
+
+impl StagedPath {
+    /// The path to write to. The file is there and empty; it must not be replaced by another one.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.0.path
+    }
+
+    /// Reads the file back to hash it, and brings it to the disk.
+    ///
+    /// # Errors
+    /// If that fails; the file is removed then.
+    pub fn finish(self) -> Result<StagedBlob, StoreError> {
+        let (sha256, size) = hash_and_sync(&self.0.path)?;
+        Ok(StagedBlob { temporary: self.0, sha256, size })
+    }
+}
+
+/// A file that is on the disk, but not yet in the store.
+#[derive(Debug)]
+pub struct StagedBlob {
+    temporary: Temporary,
+    sha256: Sha256,
+    size: u64,
+}
+
+impl StagedBlob {
+    /// The hash of its bytes.
+    #[must_use]
+    pub fn sha256(&self) -> Sha256 {
+        self.sha256
+    }
+
+    /// Its size in bytes.
+    #[must_use]
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Moves the file to its place. The writer's lock of the database must be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<(), StoreError> {
+        if let Some(folder) = place.parent() {
+            dir::make_dir_durably(folder)?;
+        }
+        // Also over a file that is there: it has the same bytes, or is damaged.
+        dir::rename_durably(&self.temporary.path, place)?;
+        self.temporary.moved = true;
+        Ok(())
+    }
+}
+
+/// A temporary folder in which a task writes its result files.
+#[derive(Debug)]
+pub struct StagedDir(Temporary);
+
+impl StagedDir {
+    /// The folder.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.0.path
+    }
+
+    /// Hashes all files and brings everything to the disk. The list is sorted by name.
+    pub(super) fn seal(&self) -> Result<Vec<ResultFile>, StoreError> {
+        let mut files = Vec::new();
+        seal_dir(&self.0.path, "", &mut files)?;
+        files.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(files)
+    }
+
+    /// Moves the folder to `place`; what was there goes. The writer's lock must be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<(), StoreError> {
+        if place.exists() {
+            let old = self.0.path.with_extension("old");
+            dir::rename_durably(place, &old)?;
+            dir::rename_durably(&self.0.path, place)?;
+            self.0.moved = true;
+            return dir::remove(&old);
+        }
+        dir::rename_durably(&self.0.path, place)?;
+        self.0.moved = true;
+        Ok(())
+    }
+
+    /// Moves the files, not the folder, into the folder `place`. The writer's lock must be held.
+    pub(super) fn put_files(self, place: &Path, files: &[ResultFile]) -> Result<(), StoreError> {
+        for file in files {
+            dir::rename_durably(&self.0.path.join(&file.name), &place.join(&file.name))?;
+        }
+        Ok(())
+    }
+}
+
+fn seal_dir(path: &Path, prefix: &str, files: &mut Vec<ResultFile>) -> Result<(), StoreError> {
+    for entry in fs::read_dir(path).map_err(StoreError::io("read the folder", path))? {
+        let entry = entry.map_err(StoreError::io("read the folder", path))?;
+        let name = format!("{prefix}{}", entry.file_name().to_string_lossy());
+        if entry.path().is_dir() {
+            seal_dir(&entry.path(), &format!("{name}/"), files)?;
+        } else {
+            let (sha256, size) = hash_and_sync(&entry.path())?;
+            files.push(ResultFile { name, size, sha256 });
+        }
+    }
+    sync_dir(path)
+}
+
+/// Hash and size of a file, which is then on the disk.
+fn hash_and_sync(path: &Path) -> Result<(Sha256, u64), StoreError> {
+    let mut file = File::open(path).map_err(StoreError::io("open", path))?;
+    let mut hasher = sha2::Sha256::new();
+    let mut buffer = vec![0; 256 * 1024];
+    let mut size = 0;
+    loop {
+        let count = file.read(&mut buffer).map_err(StoreError::io("read", path))?;
+        if count == 0 {
+            break;
+        }
+        hasher.update(&buffer[..count]);
+        size += count as u64;
+    }
+    file.sync_all().map_err(StoreError::io("write to the disk", path))?;
+    Ok((Sha256::new(hasher.finalize().into()), size))
+}
+
+/// The hash of the file's bytes, to compare it with the one on record.
+///
+/// # Errors
+/// If the file can't be read.
+pub fn hash_file(path: &Path) -> Result<Sha256, StoreError> {
+    hash_and_sync(path).map(|(sha256, _)| sha256)
+}

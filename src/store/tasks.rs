@@ -1,0 +1,182 @@
+//! Table `tasks`: cutting a job into tasks, and reading what they made.
+
+use std::path::PathBuf;
+
+use serde_json::{Value, json};
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use super::Store;
+use super::error::StoreError;
+use super::rows::{json as from_json, number, number_if, parsed};
+use crate::job::{JobId, JobSpec, Sha256, TaskId, TaskKind};
+
+/// The stored result of a tile.
+#[derive(Debug, Clone)]
+pub struct TileResult {
+    /// The tile's index in the plan.
+    pub tile: u32,
+    /// Where its file lies.
+    pub path: PathBuf,
+    /// The hash that the file should have.
+    pub sha256: Sha256,
+    /// What the worker told about it.
+    pub record: Value,
+}
+
+/// What is known of a task that is done.
+#[derive(Debug, Clone)]
+pub struct TaskRecord {
+    /// What it was.
+    pub kind: TaskKind,
+    /// What the worker told about it.
+    pub record: Value,
+    /// Seconds of the successful attempt.
+    pub seconds: f64,
+    /// The number of the successful attempt, from 1.
+    pub attempt: u32,
+}
+
+/// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
+const READ_S: f64 = 5e-9;
+const WRITE_S: f64 = 150e-9;
+
+/// Writes the tasks of a job.
+pub(super) async fn insert(
+    connection: &mut SqliteConnection,
+    job: JobId,
+    spec: &JobSpec,
+) -> Result<(), StoreError> {
+    // One statement for all: tens of thousands of single ones would hold the lock for seconds.
+    let rows: Vec<Value> = plan(spec)?
+        .into_iter()
+        .enumerate()
+        .map(|(ordinal, (kind, cost))| {
+            let id = TaskId::new().to_string();
+            json!([id, ordinal, kind.name(), kind.snapshot(), kind.tile(), cost])
+        })
+        .collect();
+    sqlx::query(
+        "INSERT INTO tasks (id, job, ordinal, kind, snapshot, tile, state, priority, cost)
+         SELECT value ->> 0, ?1, value ->> 1, value ->> 2, value ->> 3, value ->> 4,
+                CASE value ->> 2 WHEN 'prepare' THEN 'ready' ELSE 'blocked' END, ?2, value ->> 5
+         FROM json_each(?3)",
+    )
+    .bind(job.to_string())
+    .bind(spec.priority)
+    .bind(Value::from(rows).to_string())
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+/// The tasks of a job with their planned CPU-seconds, in the order in which they are handed out.
+#[allow(clippy::cast_precision_loss)] // counts far below 2^53
+fn plan(spec: &JobSpec) -> Result<Vec<(TaskKind, f64)>, StoreError> {
+    let tiles = spec
+        .tile_plan()
+        .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
+    let pixels = (spec.shape.height * spec.shape.width) as f64;
+    let frames = spec.shape.frames as f64;
+    let per_voxel = spec.schedule.planned_ns_per_voxel() * 1e-9;
+    let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
+    for snapshot in spec.snapshots.indices() {
+        for (tile, area) in (0..).zip(tiles.tiles()) {
+            let voxels = (area.height * area.width) as f64 * frames;
+            tasks.push((TaskKind::Tile { snapshot, tile }, voxels * per_voxel));
+        }
+        tasks.push((TaskKind::Assemble { snapshot }, pixels * frames * WRITE_S));
+    }
+    tasks.push((TaskKind::Manifest, 0.01));
+    Ok(tasks)
+}
+
+/// Makes ready the tasks of a job that waited for `done`, if that was the last one they waited for.
+pub(super) async fn unblock(
+    connection: &mut SqliteConnection,
+    job: JobId,
+    done: TaskKind,
+) -> Result<(), StoreError> {
+    let query = match done {
+        TaskKind::Prepare => sqlx::query(
+            "UPDATE tasks SET state = 'ready' WHERE job = ?1 AND kind = 'tile' AND state = 'blocked'",
+        ),
+        TaskKind::Tile { .. } => sqlx::query(
+            "UPDATE tasks SET state = 'ready'
+             WHERE job = ?1 AND kind = 'assemble' AND snapshot = ?2 AND state = 'blocked'
+               AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'tile'
+                                   AND snapshot = ?2 AND state <> 'done')",
+        ),
+        TaskKind::Assemble { .. } => sqlx::query(
+            "UPDATE tasks SET state = 'ready'
+             WHERE job = ?1 AND kind = 'manifest' AND state = 'blocked'
+               AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'assemble'
+                                   AND state <> 'done')",
+        ),
+        TaskKind::Manifest => return Ok(()),
+    };
+    query.bind(job.to_string()).bind(done.snapshot()).execute(connection).await?;
+    Ok(())
+}
+
+impl Store {
+    /// The stored tiles of a snapshot, in the order of the plan. The job's assembly has the right to
+    /// count on all of them being there.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn tile_results(
+        &self,
+        job: JobId,
+        snapshot: u32,
+    ) -> Result<Vec<TileResult>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT tile, result, record FROM tasks
+             WHERE job = ? AND kind = 'tile' AND snapshot = ? AND state = 'done' ORDER BY tile",
+        )
+        .bind(job.to_string())
+        .bind(snapshot)
+        .fetch_all(&self.readers)
+        .await?;
+        let read = |row: &SqliteRow| {
+            let sha256 = parsed(row, "result")?;
+            Ok(TileResult {
+                tile: number(row, "tile")?,
+                path: self.dir().blob(&sha256),
+                sha256,
+                record: from_json(row, "record")?,
+            })
+        };
+        rows.iter().map(read).collect()
+    }
+
+    /// What is known of all tasks of a job that are done, in order.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT kind, snapshot, tile, record, seconds, attempt FROM tasks
+             WHERE job = ? AND state = 'done' ORDER BY ordinal",
+        )
+        .bind(job.to_string())
+        .fetch_all(&self.readers)
+        .await?;
+        let read = |row: &SqliteRow| {
+            Ok(TaskRecord {
+                kind: kind(row)?,
+                record: from_json(row, "record")?,
+                seconds: row.try_get::<Option<f64>, _>("seconds")?.unwrap_or(0.0),
+                attempt: number(row, "attempt")?,
+            })
+        };
+        rows.iter().map(read).collect()
+    }
+}
+
+/// The kind of the task in this row.
+pub(super) fn kind(row: &SqliteRow) -> Result<TaskKind, StoreError> {
+    let name: String = row.try_get("kind")?;
+    TaskKind::from_parts(&name, number_if(row, "snapshot")?, number_if(row, "tile")?)
+        .ok_or(StoreError::Corrupt { column: "kind", value: name })
+}

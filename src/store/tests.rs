@@ -1,0 +1,421 @@
+//! The queue as workers see it: the whole life of a job, and every way in which it can be disturbed.
+
+use std::time::Duration;
+
+use serde_json::json;
+use tempfile::TempDir;
+
+use super::{
+    ClaimedTask, Completion, Heartbeat, Inserted, JobFilter, MAX_FAILURES, MAX_LOSSES,
+    NewCalibration, NewJob, NewMeasurement, Product, Store, StoreError, WorkerEnd,
+};
+use crate::job::{
+    Algorithm, JobId, JobRequest, JobState, MeasurementId, Sha256, SnapshotSelection, TaskKind,
+    TaskProgress, TileSpec, Timestamp, WorkerId,
+};
+
+const LEASE: Duration = Duration::from_secs(60);
+
+struct Lab {
+    store: Store,
+    measurement: MeasurementId,
+    worker: WorkerId,
+    _folder: TempDir,
+}
+
+impl Lab {
+    /// A store with a calibration of 64x96 pixels and a measurement of two snapshots.
+    async fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).await.unwrap();
+        let upload = |bytes: &[u8]| {
+            let mut writer = store.blob_writer().unwrap();
+            writer.write(bytes).unwrap();
+            writer.finish().unwrap()
+        };
+        let (masks, _) = store.store_upload(upload(b"masks")).await.unwrap();
+        let (data, _) = store.store_upload(upload(b"data")).await.unwrap();
+        let facts = NewCalibration {
+            name: None,
+            masks: masks.sha256,
+            format: "npy".into(),
+            sample: "float32".into(),
+            frames: 8,
+            height: 64,
+            width: 96,
+            full_scale: 1.0,
+            mask_mean: 0.5,
+            dead_pixels: 0,
+            clipped_negatives: 0,
+        };
+        let calibration = store.add_calibration(facts, upload(b"prepared masks")).await.unwrap();
+        let facts = NewMeasurement {
+            name: None,
+            calibration: calibration.id,
+            data: data.sha256,
+            format: "npy".into(),
+            sample: "float32".into(),
+            snapshots: 2,
+            height: 64,
+            width: 96,
+            full_scale: 1.0,
+            camera_fps: Some(30.0),
+            exposure_s: None,
+        };
+        let measurement = store.add_measurement(facts, upload(b"prepared data")).await.unwrap();
+        let worker = WorkerId::new();
+        store.worker_started(worker, 1).await.unwrap();
+        Self { store, measurement: measurement.id, worker, _folder: folder }
+    }
+
+    /// A job with two tiles in each of two snapshots.
+    async fn submit(&self, priority: i32) -> JobId {
+        match self.add(priority, None, b"request").await.unwrap() {
+            Inserted::New(id) | Inserted::Before(id) => id,
+        }
+    }
+
+    async fn add(
+        &self,
+        priority: i32,
+        key: Option<&str>,
+        request: &[u8],
+    ) -> Result<Inserted, StoreError> {
+        let measurement = self.store.measurement(self.measurement).await.unwrap().facts;
+        let shape = crate::job::SceneShape { frames: 8, height: 64, width: 96, snapshots: 2 };
+        let job = JobRequest {
+            measurement: self.measurement,
+            calibration: None,
+            snapshots: SnapshotSelection::All,
+            algorithm: Algorithm::GapTv,
+            schedule: None,
+            tile: Some(TileSpec { size: 64, overlap: 8 }),
+            priority,
+            label: None,
+        };
+        let spec = job.resolve(measurement.calibration, shape).unwrap();
+        let new =
+            NewJob { spec, request: Sha256::of(request), idempotency_key: key.map(Into::into) };
+        self.store.add_job(new).await
+    }
+
+    async fn claim(&self) -> Option<ClaimedTask> {
+        self.store.claim(self.worker, LEASE).await.unwrap()
+    }
+
+    /// Does the task as a worker would and says what the store answered.
+    async fn work(&self, task: &ClaimedTask) -> Heartbeat {
+        let product = match task.kind {
+            TaskKind::Prepare => Product::Record,
+            TaskKind::Tile { snapshot, tile } => {
+                let mut writer = self.store.blob_writer().unwrap();
+                writer.write(format!("{snapshot} {tile}").as_bytes()).unwrap();
+                Product::Tile(writer.finish().unwrap())
+            }
+            TaskKind::Assemble { .. } => {
+                let folder = self.store.staged_dir().unwrap();
+                std::fs::create_dir(folder.path().join("frames")).unwrap();
+                std::fs::write(folder.path().join("frames/frame_0001.exr"), "pixels").unwrap();
+                Product::Files(folder)
+            }
+            TaskKind::Manifest => {
+                let folder = self.store.staged_dir().unwrap();
+                std::fs::write(folder.path().join("manifest.json"), "{}").unwrap();
+                Product::Files(folder)
+            }
+        };
+        let record = json!({"kind": task.kind.name()});
+        let progress = TaskProgress { fraction: 0.5, ..TaskProgress::START };
+        self.store.complete(&task.lease, Completion { progress, record, product }).await.unwrap()
+    }
+
+    /// Works until there is nothing to do, and says what was done.
+    async fn work_off(&self) -> Vec<TaskKind> {
+        let mut done = Vec::new();
+        while let Some(task) = self.claim().await {
+            assert_eq!(self.work(&task).await, Heartbeat::Continue);
+            done.push(task.kind);
+        }
+        done
+    }
+
+    async fn state(&self, job: JobId) -> JobState {
+        self.store.job(job).await.unwrap().state
+    }
+}
+
+fn tile(snapshot: u32, tile: u32) -> TaskKind {
+    TaskKind::Tile { snapshot, tile }
+}
+
+#[tokio::test]
+async fn a_job_runs_in_order_and_leaves_its_results_and_no_tiles() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    assert_eq!(lab.state(job).await, JobState::Queued);
+    let order = [
+        TaskKind::Prepare,
+        tile(0, 0),
+        tile(0, 1),
+        TaskKind::Assemble { snapshot: 0 },
+        tile(1, 0),
+        tile(1, 1),
+        TaskKind::Assemble { snapshot: 1 },
+        TaskKind::Manifest,
+    ];
+    assert_eq!(lab.work_off().await, order);
+    let done = lab.store.job(job).await.unwrap();
+    assert_eq!(done.state, JobState::Succeeded);
+    assert!(done.finished_at >= done.started_at);
+    let (file, path) = lab.store.result_file(job, Some(1), "frames/frame_0001.exr").await.unwrap();
+    assert_eq!(Sha256::of(&std::fs::read(path).unwrap()), file.sha256);
+    assert!(lab.store.result_file(job, None, "manifest.json").await.unwrap().1.exists());
+    let progress = lab.store.progress(&done).await.unwrap();
+    assert_eq!((progress.percent, progress.tiles_done, progress.snapshots_done), (100.0, 4, 2));
+    // Two uploads and two prepared files are left.
+    assert_eq!(lab.store.blob_totals().await.unwrap().0, 4);
+    assert_eq!(std::fs::read_dir(lab.store.dir().tmp()).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn priority_comes_before_age() {
+    let lab = Lab::new().await;
+    let (old, urgent) = (lab.submit(0).await, lab.submit(5).await);
+    assert_eq!(lab.claim().await.unwrap().job, urgent);
+    assert_eq!(lab.claim().await.unwrap().job, old);
+    assert!(lab.claim().await.is_none(), "the tiles wait for the scale");
+}
+
+#[tokio::test]
+async fn no_task_goes_to_two_workers_at_once() {
+    let lab = Lab::new().await;
+    for _ in 0..20 {
+        lab.submit(0).await;
+    }
+    let claims = (0..8).map(|_| {
+        let store = lab.store.clone();
+        tokio::spawn(async move {
+            let mut tasks = Vec::new();
+            while let Some(task) = store.claim(WorkerId::new(), LEASE).await.unwrap() {
+                tasks.push(task.lease.task);
+            }
+            tasks
+        })
+    });
+    let mut tasks: Vec<_> =
+        futures_util::future::join_all(claims).await.into_iter().flat_map(Result::unwrap).collect();
+    tasks.sort();
+    tasks.dedup();
+    assert_eq!(tasks.len(), 20);
+}
+
+#[tokio::test]
+async fn a_silent_worker_loses_its_task_and_what_it_says_later_is_refused() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    let late = lab.store.claim(lab.worker, Duration::from_millis(1)).await.unwrap().unwrap();
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    let again = lab.claim().await.unwrap();
+    assert_eq!((again.lease.task, again.lease.attempt), (late.lease.task, 2));
+    let beat = lab.store.heartbeat(&late.lease, TaskProgress::START).await.unwrap();
+    assert_eq!(beat, Heartbeat::Lost);
+    assert_eq!(lab.work(&late).await, Heartbeat::Lost);
+    lab.store.fail(&late.lease, "too late", false).await.unwrap();
+    assert_eq!(lab.state(job).await, JobState::Running);
+    assert_eq!(lab.work(&again).await, Heartbeat::Continue);
+}
+
+#[tokio::test]
+async fn work_that_was_late_but_not_taken_over_counts() {
+    let lab = Lab::new().await;
+    lab.submit(0).await;
+    let late = lab.store.claim(lab.worker, Duration::from_millis(1)).await.unwrap().unwrap();
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    assert_eq!(lab.work(&late).await, Heartbeat::Continue);
+}
+
+#[tokio::test]
+async fn cancel_stops_running_tasks_at_their_heartbeat() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    let task = lab.claim().await.unwrap();
+    lab.store.cancel_job(job).await.unwrap();
+    assert_eq!(lab.state(job).await, JobState::Cancelling);
+    assert!(lab.store.delete_job(job).await.is_err());
+    let beat = lab.store.heartbeat(&task.lease, TaskProgress::START).await.unwrap();
+    assert_eq!(beat, Heartbeat::Cancelled);
+    lab.store.cancelled(&task.lease).await.unwrap();
+    assert_eq!(lab.state(job).await, JobState::Cancelled);
+    assert!(lab.claim().await.is_none());
+    lab.store.retry_job(job).await.unwrap();
+    assert_eq!(lab.work_off().await.len(), 8);
+    assert!(matches!(lab.store.cancel_job(job).await, Err(StoreError::State(_))));
+}
+
+#[tokio::test]
+async fn cancel_ends_a_job_whose_last_worker_finished_or_died() {
+    let lab = Lab::new().await;
+    for dies in [false, true] {
+        let job = lab.submit(0).await;
+        let task = lab.claim().await.unwrap();
+        lab.store.cancel_job(job).await.unwrap();
+        if dies {
+            lab.store.worker_ended(lab.worker, &WorkerEnd::Killed).await.unwrap();
+        } else {
+            assert_eq!(lab.work(&task).await, Heartbeat::Continue);
+        }
+        assert_eq!(lab.state(job).await, JobState::Cancelled);
+        assert!(lab.claim().await.is_none());
+    }
+}
+
+#[tokio::test]
+async fn a_waiting_job_is_cancelled_at_once_and_twice_is_no_error() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    lab.store.cancel_job(job).await.unwrap();
+    lab.store.cancel_job(job).await.unwrap();
+    assert_eq!(lab.state(job).await, JobState::Cancelled);
+    lab.store.delete_job(job).await.unwrap();
+    assert!(matches!(lab.store.job(job).await, Err(StoreError::NotFound { .. })));
+}
+
+#[tokio::test]
+async fn an_error_that_no_repetition_helps_fails_the_job_at_once() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    let prepare = lab.claim().await.unwrap();
+    lab.work(&prepare).await;
+    let (task, sibling) = (lab.claim().await.unwrap(), lab.claim().await.unwrap());
+    lab.store.fail(&task.lease, "the masks are gone", false).await.unwrap();
+    let failed = lab.store.job(job).await.unwrap();
+    assert_eq!(failed.state, JobState::Failed);
+    assert_eq!(failed.error.unwrap(), "tile 0 of snapshot 0: the masks are gone");
+    let beat = lab.store.heartbeat(&sibling.lease, TaskProgress::START).await.unwrap();
+    assert_eq!(beat, Heartbeat::Cancelled, "the others need not go on");
+    lab.store.cancelled(&sibling.lease).await.unwrap();
+    lab.store.retry_job(job).await.unwrap();
+    assert_eq!(lab.work_off().await.len(), 7, "all but the prepare task");
+    assert_eq!(lab.state(job).await, JobState::Succeeded);
+}
+
+#[tokio::test]
+async fn a_task_that_crashes_its_workers_is_given_up() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    for attempt in 1..=MAX_FAILURES {
+        lab.skip_pauses().await;
+        assert_eq!(lab.claim().await.unwrap().lease.attempt, attempt);
+        let end = WorkerEnd::Crashed("signal 11".into());
+        lab.store.worker_ended(lab.worker, &end).await.unwrap();
+    }
+    let error = lab.store.job(job).await.unwrap().error.unwrap();
+    assert_eq!(error, "preparing: the worker process died: signal 11 (3 attempts)");
+}
+
+#[tokio::test]
+async fn a_task_that_is_interrupted_is_not_given_up_for_a_long_time() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    for _ in 1..MAX_LOSSES {
+        lab.claim().await.unwrap();
+        lab.store.worker_ended(lab.worker, &WorkerEnd::Killed).await.unwrap();
+    }
+    for _ in 0..5 {
+        let task = lab.claim().await.unwrap();
+        lab.store.release_task(&task.lease).await.unwrap();
+    }
+    assert_eq!(lab.state(job).await, JobState::Running, "giving back is no loss");
+    lab.claim().await.unwrap();
+    lab.store.worker_ended(lab.worker, &WorkerEnd::Killed).await.unwrap();
+    assert_eq!(lab.state(job).await, JobState::Failed, "but there is an end");
+}
+
+#[tokio::test]
+async fn damaged_tiles_are_done_again() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    for _ in 0..3 {
+        let task = lab.claim().await.unwrap();
+        lab.work(&task).await;
+    }
+    let assemble = lab.claim().await.unwrap();
+    assert_eq!(assemble.kind, TaskKind::Assemble { snapshot: 0 });
+    assert_eq!(lab.store.tile_results(job, 0).await.unwrap().len(), 2);
+    lab.store.redo_tiles(&assemble.lease, &[1]).await.unwrap();
+    let done = lab.work_off().await;
+    assert_eq!(done[..2], [tile(0, 1), TaskKind::Assemble { snapshot: 0 }]);
+    assert_eq!(lab.state(job).await, JobState::Succeeded);
+}
+
+#[tokio::test]
+async fn a_key_makes_one_job() {
+    let lab = Lab::new().await;
+    let Inserted::New(first) = lab.add(0, Some("k"), b"a").await.unwrap() else { panic!() };
+    assert_eq!(lab.add(0, Some("k"), b"a").await.unwrap(), Inserted::Before(first));
+    let other = lab.add(0, Some("k"), b"b").await;
+    assert!(matches!(other, Err(StoreError::KeyReused { job, .. }) if job == first));
+    assert_eq!(lab.store.jobs(&JobFilter::default(), 10).await.unwrap().items.len(), 1);
+}
+
+#[tokio::test]
+async fn pages_join_without_gaps() {
+    let lab = Lab::new().await;
+    let mut ids = Vec::new();
+    for _ in 0..5 {
+        ids.push(lab.submit(0).await);
+    }
+    ids.reverse();
+    let mut filter = JobFilter::default();
+    let mut seen = Vec::new();
+    loop {
+        let page = lab.store.jobs(&filter, 2).await.unwrap();
+        seen.extend(page.items.iter().map(|job| job.id));
+        filter.after = seen.last().copied();
+        if !page.more {
+            break;
+        }
+    }
+    assert_eq!(seen, ids);
+}
+
+#[tokio::test]
+async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    let calibration = lab.store.job(job).await.unwrap().spec.calibration;
+    let in_use = |result| matches!(result, Err(StoreError::InUse { users: 1, .. }));
+    assert!(in_use(lab.store.delete_calibration(calibration).await));
+    assert!(in_use(lab.store.delete_measurement(lab.measurement).await));
+    let soon = Timestamp(Timestamp::now().0 + 1000);
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 0);
+    lab.store.cancel_job(job).await.unwrap();
+    lab.store.delete_job(job).await.unwrap();
+    lab.store.delete_measurement(lab.measurement).await.unwrap();
+    lab.store.delete_calibration(calibration).await.unwrap();
+    assert_eq!(lab.store.blob_totals().await.unwrap().0, 2, "uploads wait for their age");
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 2);
+    let left = walk(&lab.store.dir().blobs());
+    assert_eq!(left, Vec::<std::path::PathBuf>::new());
+}
+
+fn walk(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
+}
+
+#[tokio::test]
+async fn a_second_process_sees_the_same_store() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    let other = Store::open(lab.store.dir().root()).await.unwrap();
+    let task = other.claim(WorkerId::new(), LEASE).await.unwrap().unwrap();
+    assert_eq!((task.job, lab.state(job).await), (job, JobState::Running));
+}
+
+impl Lab {
+    /// Lets the pauses after failures pass.
+    async fn skip_pauses(&self) {
+        sqlx::query("UPDATE tasks SET ready_at = 0").execute(&self.store.writer).await.unwrap();
+    }
+}

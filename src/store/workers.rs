@@ -1,0 +1,141 @@
+//! Table `workers`: which worker processes live.
+
+use std::time::Duration;
+
+use sqlx::{Row, SqliteConnection};
+
+use super::Store;
+use super::error::StoreError;
+use super::losses::{self, Loss};
+use super::rows::{number, parsed};
+use crate::job::{Timestamp, WorkerId};
+
+/// A worker process on record.
+#[derive(Debug, Clone)]
+pub struct WorkerRow {
+    /// Its identifier.
+    pub id: WorkerId,
+    /// Its process.
+    pub pid: u32,
+    /// When it started.
+    pub started_at: Timestamp,
+    /// Its last sign of life.
+    pub seen_at: Timestamp,
+}
+
+/// How a worker came to its end, as far as the one who watched it can tell.
+#[derive(Debug, Clone)]
+pub enum WorkerEnd {
+    /// It ended by itself and gave its task back, if it had one.
+    Left,
+    /// It was killed from outside (or by the kernel, for memory): the task may be innocent.
+    Killed,
+    /// It died of a fault, such as SIGSEGV or a panic: the task is under suspicion.
+    Crashed(String),
+}
+
+impl Store {
+    /// Records that a worker has started.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<(), StoreError> {
+        let now = Timestamp::now().0;
+        sqlx::query(
+            "INSERT INTO workers (id, pid, version, started_at, seen_at) VALUES (?, ?, ?, ?, ?)
+             ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
+        )
+        .bind(id.to_string())
+        .bind(i64::from(pid))
+        .bind(env!("CARGO_PKG_VERSION"))
+        .bind(now)
+        .bind(now)
+        .execute(&self.writer)
+        .await?;
+        Ok(())
+    }
+
+    /// Records that a worker lives though it has no task; a heartbeat says the same of one that has.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn worker_seen(&self, id: WorkerId) -> Result<(), StoreError> {
+        seen(&mut *self.writer.acquire().await?, id).await
+    }
+
+    /// Records that a worker has ended, and frees its task at once instead of when its lease runs out.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn worker_ended(&self, id: WorkerId, end: &WorkerEnd) -> Result<(), StoreError> {
+        let loss = match end {
+            WorkerEnd::Left => Loss::Released,
+            WorkerEnd::Killed => Loss::Lost("the worker process was killed".into()),
+            WorkerEnd::Crashed(how) => Loss::Crashed(format!("the worker process died: {how}")),
+        };
+        let mut transaction = self.write().await?;
+        let tasks = sqlx::query("SELECT id FROM tasks WHERE worker = ? AND state = 'running'")
+            .bind(id.to_string())
+            .fetch_all(&mut *transaction)
+            .await?;
+        for row in &tasks {
+            losses::lose(&mut transaction, parsed(row, "id")?, &loss).await?;
+        }
+        sqlx::query("DELETE FROM workers WHERE id = ?")
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+
+    /// The workers that gave a sign of life within `age`.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>, StoreError> {
+        let rows = sqlx::query("SELECT * FROM workers WHERE seen_at >= ? ORDER BY id")
+            .bind(since(age))
+            .fetch_all(&self.readers)
+            .await?;
+        rows.iter().map(worker).collect()
+    }
+
+    /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn forget_workers(&self, age: Duration) -> Result<(), StoreError> {
+        sqlx::query("DELETE FROM workers WHERE seen_at < ?")
+            .bind(since(age))
+            .execute(&self.writer)
+            .await?;
+        Ok(())
+    }
+}
+
+/// Notes a sign of life.
+pub(super) async fn seen(
+    connection: &mut SqliteConnection,
+    id: WorkerId,
+) -> Result<(), StoreError> {
+    sqlx::query("UPDATE workers SET seen_at = ? WHERE id = ?")
+        .bind(Timestamp::now().0)
+        .bind(id.to_string())
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+fn since(age: Duration) -> i64 {
+    Timestamp::now().0 - i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2)
+}
+
+fn worker(row: &sqlx::sqlite::SqliteRow) -> Result<WorkerRow, StoreError> {
+    Ok(WorkerRow {
+        id: parsed(row, "id")?,
+        pid: number(row, "pid")?,
+        started_at: Timestamp(row.try_get("started_at")?),
+        seen_at: Timestamp(row.try_get("seen_at")?),
+    })
+}
