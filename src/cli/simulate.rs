@@ -137,7 +137,8 @@ fn make_masks(
         Pattern::RandomSquares => {
             let (masks, openings) = random_squares(frames, height, width, seed)?;
             let ApertureGrid { rows, columns } = ApertureGrid::for_frames(frames);
-            let ones = |row: &Vec<bool>| row.iter().map(|&open| if open { '1' } else { '0' }).collect();
+            let ones =
+                |row: &Vec<bool>| row.iter().map(|&open| if open { '1' } else { '0' }).collect();
             let open = openings.rows().iter().map(ones).collect();
             (masks, Some(Apertures { rows, columns, rank: openings.rank(), open }))
         }

@@ -105,7 +105,7 @@ mod tests {
     fn scene() -> (Array3<f32>, Array3<f32>) {
         let masks = iid_masks(4, 32, 32, 1).unwrap();
         let frames = Array3::from_shape_fn((4, 32, 32), |(k, i, j)| {
-            if (i + k) / 8 % 2 == j / 8 % 2 { 0.8 } else { 0.2 }
+            0.5 + 0.3 * ((i + k) as f32 * 0.2).sin() * (j as f32 * 0.1).cos()
         });
         (masks, frames)
     }
