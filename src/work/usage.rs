@@ -62,7 +62,7 @@ mod tests {
             sum += f64::from(number).sqrt();
         }
         assert!(sum > 0.0);
-        let big = vec![1u8; 64 << 20];
+        let big = std::hint::black_box(vec![1u8; 64 << 20]);
         assert!(peak_rss_bytes() > big.len() as u64);
     }
 
