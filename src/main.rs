@@ -1,3 +1,34 @@
 //! The `sci-recon` program.
 
-fn main() {}
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use sci_recon::cli;
+
+/// Reconstructs video from snapshot compressive measurements, over HTTP or right here.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Reconstruct(cli::reconstruct::Arguments),
+    Simulate(cli::simulate::Arguments),
+}
+
+fn main() -> ExitCode {
+    let outcome = match Arguments::parse().command {
+        Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
+        Command::Simulate(arguments) => cli::simulate::run(&arguments),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("sci-recon: {error}");
+            error.exit_code()
+        }
+    }
+}
