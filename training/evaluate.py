@@ -6,10 +6,12 @@ One JSON object a model: mean PSNR (dB) of the middle frame per sigma, and in th
 """
 import argparse
 import json
+import os
 
 import numpy as np
 import torch
 
+import export
 import model
 import solver
 from data import Footage
@@ -86,7 +88,7 @@ class LoopScenes:
 
 def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('weights', nargs='+')
+    p.add_argument('weights', nargs='+', help='checkpoints or folders with exported ONNX files')
     p.add_argument('--data', required=True)
     p.add_argument('--scene', help='a .mat scene as one more held-out clip')
     p.add_argument('--passes', type=int, default=16)
@@ -98,7 +100,7 @@ def main():
     scenes = LoopScenes(a.data, a.scene)
     print(json.dumps({'model': 'tv', 'loop': scenes.tv()}), flush=True)
     for path in a.weights:
-        net = model.load(path)
+        net = export.weights_of(path) if os.path.isdir(path) else model.load(path)
         row = {'model': path} if a.no_white else {'model': path, 'white': white(net, a.data)}
         if not isinstance(net, model.Block):
             row['loop'] = scenes.run(net, solver.geometric(a.first, a.last, a.passes), a.tv_weight)

@@ -71,7 +71,7 @@ def random_masks(r, b, size):
 
 # ---------------------------------------------------------------- solver
 def measure(x, masks):
-    return (x * masks).sum(1, keepdim=True)
+    return (x * masks).sum(1)[:, None]
 
 
 class Gap:
