@@ -36,7 +36,7 @@ def make_footage(folder):
     os.makedirs(raw)
     for split in ('train', 'val'):
         for i in range(2):
-            cv2.imwrite(f'{raw}/{split}{i}.png', texture(r, 220, 220))
+            cv2.imwrite(f'{raw}/{split}{i}.png', texture(r, 220, 220).astype(np.uint8))
         scene = texture(r, 140, 180).astype(np.uint8)
         video = cv2.VideoWriter(f'{raw}/{split}.avi', cv2.VideoWriter_fourcc(*'MJPG'), 25, (140, 120))
         for t in range(30):
