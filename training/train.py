@@ -50,8 +50,9 @@ def produce_snapshots(queue, root, seed, voxels, size):
 
 
 def random_levels(rng):
-    """A schedule of the kind that a job may name; long ones teach the network to stay put once it has arrived."""
-    return solver.geometric(rng.uniform(30, 100), math.exp(rng.uniform(math.log(4), math.log(12))), rng.choice([6, 8, 12, 12, 16, 16, 24, 32]))
+    """A schedule of the kind that a job may name. After TV the error is 10 to 40 (/255); a level far above it wipes out what is there."""
+    between = lambda low, high: math.exp(rng.uniform(math.log(low), math.log(high)))
+    return solver.geometric(between(12, 60), between(4, 10), rng.choice([4, 6, 8, 12, 12, 16, 16, 24, 32]))
 
 
 class Iterates:
@@ -214,7 +215,7 @@ def main():
         net = t.averaged()
         row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
         if scenes:
-            row['loop'] = scenes.run(net, solver.geometric(60, 6, 16))
+            row['loop'] = scenes.run(net, solver.geometric(30, 6, 12))
         print('evaluation', json.dumps(row), flush=True)
 
     evaluated, saved, sums = -1e9 if t.step == 0 else t.seconds, t.seconds, collections.defaultdict(float)
