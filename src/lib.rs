@@ -1,7 +1,9 @@
 //! Snapshot compressive imaging, from coded measurement to video, as an HTTP service.
 //!
-//! The modules follow the way of the data: bytes become arrays in [`formats`], arrays
-//! become video in [`recon`].
+//! The modules follow the way of the data: bytes become arrays in [`formats`], [`optics`] makes
+//! masks and measurements where no camera does, arrays become video in [`recon`], and [`work`]
+//! does so tile by tile and writes the results. A [`job`] says what is to be done, the [`store`]
+//! keeps what lasts, [`http`] is how lab machines reach all of it, and [`cli`] has the commands.
 
 pub mod cli;
 pub mod config;
@@ -9,5 +11,7 @@ pub mod formats;
 pub mod http;
 pub mod job;
 pub mod models;
+pub mod optics;
 pub mod recon;
 pub mod store;
+pub mod work;

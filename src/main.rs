@@ -16,17 +16,21 @@ struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Serve(config::ServeArguments),
+    Reconstruct(cli::reconstruct::Arguments),
+    Simulate(cli::simulate::Arguments),
 }
 
 fn main() -> ExitCode {
     let outcome = match Arguments::parse().command {
-        Command::Serve(arguments) => cli::serve::run(&arguments),
+        Command::Serve(arguments) => cli::serve::run(&arguments).map_err(Into::into),
+        Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
+        Command::Simulate(arguments) => cli::simulate::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("sci-recon: {error}");
-            ExitCode::FAILURE
+            error.exit_code()
         }
     }
 }

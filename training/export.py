@@ -126,6 +126,34 @@ def ffdnet_graph(net):
     return g, g.add('Add', y, 'frames')
 
 
+def weights_of(folder):
+    """The model whose graphs stand in a folder: exported files are also the starting point of further training."""
+    def layers(name):
+        graph = onnx.load(os.path.join(folder, name)).graph
+        constants = {c.name: numpy_helper.to_array(c).copy() for c in graph.initializer}
+        return [(constants[n.input[1]], constants[n.input[2]]) for n in graph.node if n.op_type == 'Conv']
+
+    def fill(module, pairs):
+        convs = [m for m in module.modules() if isinstance(m, torch.nn.Conv2d)]
+        pairs[-1] = tuple(-a for a in pairs[-1])   # the exporter moved the residual's sign into the last layer
+        for m, (weight, bias) in zip(convs, pairs, strict=True):
+            m.load_state_dict({'weight': torch.from_numpy(weight), 'bias': torch.from_numpy(bias)})
+
+    if os.path.exists(os.path.join(folder, 'model.onnx')):
+        net = model.FFDNet()
+        fill(net, layers('model.onnx'))
+        return net
+    net = model.FastDVDnet()
+    for block, name in ((net.t1, 'stage1.onnx'), (net.t2, 'stage2.onnx')):
+        pairs = layers(name)
+        (dense, bias), (second, second_bias) = pairs[:2]
+        dense = dense[:90].reshape(3, 30, 4, 3, 3)
+        grouped = np.stack([dense[k][:, [k, 3]] for k in range(3)]).reshape(90, 2, 3, 3)
+        pairs[:2] = [(grouped, bias[:90]), (np.ascontiguousarray(second[:, :90]), second_bias)]
+        fill(block, pairs)
+    return net.eval()
+
+
 def session(path, threads=1):
     import onnxruntime as ort
     o = ort.SessionOptions()

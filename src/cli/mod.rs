@@ -1,6 +1,14 @@
 //! The commands, one file each.
 
+mod arguments;
+mod error;
+mod input;
 mod logging;
+mod progress;
 mod supervisor;
 
+pub mod reconstruct;
 pub mod serve;
+pub mod simulate;
+
+pub use error::CliError;

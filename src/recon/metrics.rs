@@ -5,8 +5,8 @@ use ndarray::{ArrayView2, ArrayView3};
 
 use super::error::{ReconError, shape_text};
 
-/// Side of SSIM's uniform window.
-const WINDOW: usize = 7;
+/// Side of SSIM's uniform window: smaller frames have no SSIM.
+pub const WINDOW: usize = 7;
 
 /// Mean over the frames of `10 log10(1 / MSE)` in dB, of frames \[B,H,W\] on \[0,1\].
 /// Infinite if a frame equals its truth.

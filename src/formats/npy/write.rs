@@ -53,6 +53,20 @@ pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<(), FormatEr
     Ok(())
 }
 
+/// Writes (or overwrites) the file `path` with one image, axes (row, column).
+pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+    let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
+    let (height, width) = image.dim();
+    let mut writer = BufWriter::new(file);
+    writer
+        .write_all(&header(&format!("({height}, {width})")))
+        .map_err(FormatError::io("write the npy header"))?;
+    let mut sink = FrameSink::new(writer, 1, height, width);
+    sink.write_frame(image)?;
+    sink.finish()?;
+    Ok(())
+}
+
 /// A version 1.0 header, padded as NumPy does so that the data starts at a multiple of 64.
 fn header(shape: &str) -> Vec<u8> {
     let mut text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");

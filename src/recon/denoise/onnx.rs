@@ -85,6 +85,14 @@ impl Runtime {
         self.device
     }
 
+    /// Version of the library, for records: the branch that it was built from, such as
+    /// `rel-1.31.1`, or all that it tells.
+    pub fn version(&self) -> String {
+        let info = ort::info();
+        let branch = info.split_once("git-branch=").and_then(|(_, rest)| rest.split(',').next());
+        branch.filter(|branch| !branch.is_empty()).unwrap_or(info).to_owned()
+    }
+
     fn session(&self, name: &str, model: &[u8]) -> Result<Session, ReconError> {
         let failed = |error: String| {
             ReconError::Runtime(format!(

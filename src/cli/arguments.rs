@@ -1,0 +1,137 @@
+//! Arguments that several commands share.
+
+use std::fs;
+use std::path::PathBuf;
+
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+
+use super::CliError;
+use crate::job::{Algorithm, InvalidField, ScheduleSpec};
+use crate::recon::denoise::onnx::Device;
+use crate::recon::schedule::Schedule;
+use crate::work::NetworkSource;
+
+/// Which algorithm, and how long.
+#[derive(Debug, Args)]
+pub(super) struct ScheduleArguments {
+    /// The algorithm.
+    #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastDvdNet.name(),
+          value_parser = algorithms())]
+    pub(super) algorithm: Algorithm,
+    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
+    #[arg(long, value_name = "FILE")]
+    schedule: Option<PathBuf>,
+    /// Do exactly N iterations, without the test for convergence: the last stage is cut or made
+    /// longer.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    iterations: Option<u32>,
+}
+
+/// Where the denoiser runs.
+#[derive(Debug, Args)]
+pub(super) struct EngineArguments {
+    /// The libonnxruntime [default: the one beside the program].
+    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    onnxruntime: Option<PathBuf>,
+    /// Where the network runs: cpu, or cuda:0 for the first GPU.
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: String,
+}
+
+impl ScheduleArguments {
+    /// The schedule, checked.
+    pub(super) fn resolve(&self) -> Result<ScheduleSpec, CliError> {
+        let spec = match &self.schedule {
+            None => self.algorithm.default_schedule(),
+            Some(path) => {
+                let refused = |error: &dyn std::fmt::Display| {
+                    CliError::Input(format!("schedule {}: {error}", path.display()))
+                };
+                let text = fs::read_to_string(path).map_err(|error| refused(&error))?;
+                serde_json::from_str(&text).map_err(|error| refused(&error))?
+            }
+        };
+        let schedule = checked(&spec)?;
+        if self.algorithm == Algorithm::GapTv && schedule.needs_denoiser() {
+            return Err(CliError::Input(
+                "the schedule has stages with a learned denoiser, which gap-tv has not; use \
+                 --algorithm pnp-tv-fastdvdnet"
+                    .into(),
+            ));
+        }
+        Ok(match self.iterations {
+            Some(count) => ScheduleSpec::from(&schedule.with_iterations(count as usize)),
+            None => spec,
+        })
+    }
+}
+
+impl EngineArguments {
+    /// The source of denoisers.
+    pub(super) fn network(&self) -> Result<NetworkSource, CliError> {
+        // An empty variable is one that is not set.
+        let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
+        Ok(NetworkSource::new(library, Device::parse(&self.device)?))
+    }
+}
+
+/// The schedule as the solver takes it; all that is wrong with it in one message.
+pub(super) fn checked(spec: &ScheduleSpec) -> Result<Schedule, CliError> {
+    spec.to_schedule().map_err(|errors| {
+        let line = |error: &InvalidField| format!("{}: {}", error.pointer, error.detail);
+        let lines: Vec<String> = errors.iter().map(line).collect();
+        CliError::Input(format!("the schedule can't be used: {}", lines.join("; ")))
+    })
+}
+
+fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
+    PossibleValuesParser::new(Algorithm::ALL.map(Algorithm::name)).try_map(|name: String| {
+        let named = Algorithm::ALL.into_iter().find(|algorithm| algorithm.name() == name);
+        named.ok_or("no such algorithm")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::ScheduleArguments;
+    use crate::job::Algorithm;
+    use clap::Parser;
+    use std::fs;
+
+    #[derive(Debug, Parser)]
+    struct Command {
+        #[command(flatten)]
+        schedule: ScheduleArguments,
+    }
+
+    fn parse(arguments: &[&str]) -> ScheduleArguments {
+        Command::try_parse_from([&["test"], arguments].concat()).unwrap().schedule
+    }
+
+    #[test]
+    fn the_count_of_iterations_can_be_fixed() {
+        let spec = parse(&["--algorithm", "gap-tv", "--iterations", "7"]).resolve().unwrap();
+        assert_eq!(spec.planned_iterations(), 7);
+        assert!(spec.stages.iter().all(|stage| stage.tolerance == 0.0));
+        assert_eq!(parse(&[]).algorithm, Algorithm::PnpTvFastDvdNet);
+        assert!(Command::try_parse_from(["test", "--algorithm", "magic"]).is_err());
+        assert!(Command::try_parse_from(["test", "--iterations", "0"]).is_err());
+    }
+
+    #[test]
+    fn bad_schedules_are_named_with_their_file_and_place() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("schedule.json");
+        let message = |algorithm: &str, text: &str| {
+            fs::write(&file, text).unwrap();
+            let arguments = ["--algorithm", algorithm, "--schedule", file.to_str().unwrap()];
+            parse(&arguments).resolve().unwrap_err().to_string()
+        };
+        assert!(message("gap-tv", "{").contains("schedule.json"));
+        let sigma = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5}]}"#;
+        assert!(message("pnp-tv-fastdvdnet", sigma).contains("/stages/0/sigma"));
+        let deep = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5, "sigma": [0.2, 0.1]}]}"#;
+        assert!(message("gap-tv", deep).contains("--algorithm pnp-tv-fastdvdnet"));
+    }
+}

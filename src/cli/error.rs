@@ -1,0 +1,98 @@
+//! How a command ends when it does not end well.
+
+use std::fmt::Display;
+use std::path::Path;
+use std::process::ExitCode;
+
+use super::serve::ServeError;
+use crate::formats::FormatError;
+use crate::recon::ReconError;
+use crate::work::{NetworkError, ResultError, SolveError};
+
+/// Why a command failed, as a sentence for the user.
+#[derive(Debug, thiserror::Error)]
+pub enum CliError {
+    /// What the user gave can't be used; exit code 2, as for wrong arguments.
+    #[error("{0}")]
+    Input(String),
+    /// The machine or the program failed; exit code 1.
+    #[error("{0}")]
+    Failure(String),
+}
+
+impl CliError {
+    /// The process's exit code.
+    pub fn exit_code(&self) -> ExitCode {
+        match self {
+            Self::Input(_) => ExitCode::from(2),
+            Self::Failure(_) => ExitCode::FAILURE,
+        }
+    }
+
+    /// A file of the user that is not what it should be.
+    pub fn format(what: &str, path: &Path, error: &FormatError) -> Self {
+        let text = format!("{what} {}: {error}", path.display());
+        // A file that can't be opened is the user's to mend as well.
+        match error {
+            FormatError::Internal(_) => Self::Failure(text),
+            _ => Self::Input(text),
+        }
+    }
+
+    /// A file or folder that can't be read or written.
+    pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
+        Self::Failure(format!("cannot {action} {}: {error}", path.display()))
+    }
+}
+
+impl From<ReconError> for CliError {
+    fn from(error: ReconError) -> Self {
+        let text = error.to_string();
+        match error {
+            ReconError::Runtime(_) | ReconError::Diverged { .. } | ReconError::Cancelled => {
+                Self::Failure(text)
+            }
+            _ => Self::Input(text),
+        }
+    }
+}
+
+impl From<ServeError> for CliError {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Config(error) => Self::Input(error.to_string()),
+            other => Self::Failure(other.to_string()),
+        }
+    }
+}
+
+impl From<NetworkError> for CliError {
+    fn from(error: NetworkError) -> Self {
+        Self::Failure(error.to_string())
+    }
+}
+
+impl From<SolveError> for CliError {
+    fn from(error: SolveError) -> Self {
+        match error {
+            SolveError::Recon(error) => error.into(),
+            other => Self::Failure(other.to_string()),
+        }
+    }
+}
+
+impl From<ResultError> for CliError {
+    fn from(error: ResultError) -> Self {
+        match error {
+            ResultError::Foreign { .. } => Self::Input(error.to_string()),
+            other => Self::Failure(other.to_string()),
+        }
+    }
+}
+
+/// For results: files of the user are read through [`CliError::format`], which names them.
+impl From<FormatError> for CliError {
+    fn from(error: FormatError) -> Self {
+        Self::Failure(error.to_string())
+    }
+}

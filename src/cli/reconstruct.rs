@@ -1,0 +1,401 @@
+//! `sci-recon reconstruct`: one snapshot, without a server.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::Instant;
+
+use clap::Args;
+use ndarray::{Array2, Array3, s};
+use serde::Serialize;
+
+use super::CliError;
+use super::arguments::{EngineArguments, ScheduleArguments, checked};
+use super::input::{Scaled, Source};
+use super::progress::SnapshotBar;
+use crate::formats::mat::SceneArray;
+use crate::job::{Algorithm, ScheduleSpec, TileSpec, Timestamp};
+use crate::recon::metrics;
+use crate::recon::scale::ScaleEstimator;
+use crate::recon::tile::TilePlan;
+use crate::work::manifest::{
+    Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
+    frame_attributes,
+};
+use crate::work::{
+    NetworkSource, ResultSpec, SnapshotInput, TileOutcome, Usage, blended_frame, check_output,
+    peak_rss_bytes, replace_result, solve, write_result,
+};
+
+/// Reconstruct the frames of one snapshot from files, without a server.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Masks, one frame each: npy, TIFF, PNG, or a .mat scene's `mask`.
+    #[arg(long, value_name = "FILE", required_unless_present = "scene")]
+    masks: Option<PathBuf>,
+    /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a .mat scene's `meas`.
+    #[arg(long, value_name = "FILE", required_unless_present = "scene")]
+    measurement: Option<PathBuf>,
+    /// True frames, to be compared with: those of the snapshot, or of all snapshots.
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// A .mat scene (level 5) with `mask`, `meas` and perhaps `orig`, instead of the three files.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["masks", "measurement", "truth"])]
+    scene: Option<PathBuf>,
+    /// The snapshot, counted from 0.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    snapshot: usize,
+    /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
+    /// uint16, 1 for floats and .mat scenes].
+    #[arg(long, value_name = "VALUE")]
+    masks_full_scale: Option<f32>,
+    /// Value in the measurement's file that means 1 [default: 255 for uint8 and .mat scenes,
+    /// 65535 for uint16, 1 for floats].
+    #[arg(long, value_name = "VALUE")]
+    measurement_full_scale: Option<f32>,
+    /// Value in the truth's file that means 1 [default: as for the measurement].
+    #[arg(long, value_name = "VALUE")]
+    truth_full_scale: Option<f32>,
+    #[command(flatten)]
+    schedule: ScheduleArguments,
+    #[command(flatten)]
+    engine: EngineArguments,
+    /// Tiles solved at the same time [default: the number of cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    /// Largest side of a tile, in pixels.
+    #[arg(long, value_name = "PIXELS", default_value_t = TileSpec::default().size)]
+    tile: usize,
+    /// Least overlap of neighbouring tiles, in pixels.
+    #[arg(long, value_name = "PIXELS", default_value_t = TileSpec::default().overlap)]
+    overlap: usize,
+    /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json.
+    #[arg(long, value_name = "FOLDER")]
+    out: Option<PathBuf>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What `--json` prints.
+#[derive(Debug, Serialize)]
+struct Report {
+    algorithm: &'static str,
+    frames: usize,
+    height: usize,
+    width: usize,
+    psnr_db: Option<f64>,
+    ssim: Option<f64>,
+    seconds: f64,
+    denoiser_passes: usize,
+    tv_iterations: usize,
+    cpu_seconds: f64,
+    peak_rss_bytes: u64,
+    /// None for a schedule without a network.
+    provider: Option<&'static str>,
+    stop_reason: String,
+}
+
+/// What is to be done with the input.
+struct Setup {
+    algorithm: Algorithm,
+    schedule: ScheduleSpec,
+    plan: TilePlan,
+    network: NetworkSource,
+    threads: usize,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// Input that can't be used, or a failure on the way.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let schedule = arguments.schedule.resolve()?;
+    let network = arguments.engine.network()?;
+    let input = Input::read(arguments)?;
+    if let Some(out) = &arguments.out {
+        check_output(out)?;
+    }
+    let (_, height, width) = input.masks.array.dim();
+    let cores = thread::available_parallelism().map_or(1, usize::from);
+    let setup = Setup {
+        algorithm: arguments.schedule.algorithm,
+        schedule,
+        plan: TilePlan::new(height, width, arguments.tile, arguments.overlap)?,
+        network,
+        threads: arguments.threads.map_or(cores, usize::from),
+    };
+
+    let (started, before) = (Instant::now(), Usage::now());
+    let solution = input.solve(&setup)?;
+    let spent = Spent {
+        seconds: started.elapsed().as_secs_f64(),
+        cpu_seconds: (Usage::now() - before).cpu_seconds,
+    };
+
+    if let Some(out) = &arguments.out {
+        let manifest = solution.manifest(&input, &setup, arguments.snapshot, spent)?;
+        solution.write(out, &setup, manifest)?;
+    }
+    solution.report(&input, &setup, spent)?.print(arguments)
+}
+
+/// What the computing took.
+#[derive(Debug, Clone, Copy)]
+struct Spent {
+    seconds: f64,
+    cpu_seconds: f64,
+}
+
+struct Sources<'a> {
+    masks: Source<'a>,
+    measurement: Source<'a>,
+    truth: Option<Source<'a>>,
+}
+
+impl<'a> Sources<'a> {
+    fn new(arguments: &'a Arguments) -> Result<Self, CliError> {
+        let scene = arguments.scene.as_deref();
+        let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
+        let missing = || CliError::Input("name --masks and --measurement, or a --scene".into());
+        let source = |path, array, full_scale| Source { path, array, full_scale };
+        Ok(Self {
+            masks: source(
+                named(&arguments.masks).ok_or_else(missing)?,
+                SceneArray::Masks,
+                arguments.masks_full_scale,
+            ),
+            measurement: source(
+                named(&arguments.measurement).ok_or_else(missing)?,
+                SceneArray::Measurements,
+                arguments.measurement_full_scale,
+            ),
+            truth: named(&arguments.truth)
+                .map(|path| source(path, SceneArray::Truth, arguments.truth_full_scale)),
+        })
+    }
+}
+
+/// The files' content.
+struct Input<'a> {
+    sources: Sources<'a>,
+    masks: Scaled<Array3<f32>>,
+    measurement: Scaled<Array2<f32>>,
+    truth: Option<Array3<f32>>,
+}
+
+impl<'a> Input<'a> {
+    fn read(arguments: &'a Arguments) -> Result<Self, CliError> {
+        let sources = Sources::new(arguments)?;
+        let masks = sources.masks.masks()?;
+        let (measurement, snapshots) = sources.measurement.snapshot(arguments.snapshot)?;
+        let (frames, height, width) = masks.array.dim();
+        if measurement.array.dim() != (height, width) {
+            let (rows, columns) = measurement.array.dim();
+            return Err(CliError::Input(format!(
+                "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
+                 {height}x{width}; both must have the same height and width",
+                sources.measurement.path.display(),
+                sources.masks.path.display(),
+            )));
+        }
+        let truth = match &sources.truth {
+            Some(source) => read_truth(source, masks.array.dim(), arguments.snapshot, snapshots)?,
+            None => None,
+        };
+        Ok(Self { sources, masks, measurement, truth })
+    }
+
+    fn solve(&self, setup: &Setup) -> Result<Solution, CliError> {
+        let (height, width) = setup.plan.dim();
+        let mut estimator = ScaleEstimator::new(height, width);
+        self.masks.array.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
+        let white = estimator.white(self.measurement.array.view())?;
+        let input = SnapshotInput {
+            masks: self.masks.array.view(),
+            measurement: self.measurement.array.view(),
+            white,
+            schedule: &checked(&setup.schedule)?,
+            plan: &setup.plan,
+        };
+        let bar = SnapshotBar::new(&setup.schedule, setup.plan.len());
+        let tiles = solve(&input, &setup.network, setup.threads, &bar)?;
+        Ok(Solution { white, tiles })
+    }
+}
+
+/// The frames of the snapshot. A scene may go without; a file that was named may not.
+fn read_truth(
+    source: &Source<'_>,
+    (frames, height, width): (usize, usize, usize),
+    snapshot: usize,
+    snapshots: usize,
+) -> Result<Option<Array3<f32>>, CliError> {
+    let Some(truth) = source.frames_if_any()? else { return Ok(None) };
+    let truth = truth.array;
+    let (count, rows, columns) = truth.dim();
+    let first = match count {
+        _ if (rows, columns) != (height, width) => None,
+        _ if count == frames => Some(0),
+        _ if count == frames * snapshots => Some(snapshot * frames),
+        _ => None,
+    };
+    match first {
+        Some(first) => Ok(Some(truth.slice(s![first..first + frames, .., ..]).to_owned())),
+        None => Err(CliError::Input(format!(
+            "the true frames {} are {count}x{rows}x{columns}; {frames}x{height}x{width} (of the \
+             snapshot) or {}x{height}x{width} (of all snapshots) would fit",
+            source.path.display(),
+            frames * snapshots
+        ))),
+    }
+}
+
+struct Solution {
+    white: f32,
+    tiles: Vec<TileOutcome>,
+}
+
+impl Solution {
+    fn records(&self) -> Vec<TileRecord> {
+        self.tiles.iter().map(TileRecord::from).collect()
+    }
+
+    fn report(&self, input: &Input<'_>, setup: &Setup, spent: Spent) -> Result<Report, CliError> {
+        let (frames, height, width) = input.masks.array.dim();
+        let (psnr_db, ssim) = match &input.truth {
+            Some(truth) => self.compare(&setup.plan, truth)?,
+            None => (None, None),
+        };
+        let summary = Summary::of(&self.records());
+        Ok(Report {
+            algorithm: setup.algorithm.name(),
+            frames,
+            height,
+            width,
+            psnr_db,
+            ssim,
+            seconds: spent.seconds,
+            denoiser_passes: summary.denoiser_passes,
+            tv_iterations: summary.tv_iterations,
+            cpu_seconds: spent.cpu_seconds,
+            peak_rss_bytes: peak_rss_bytes(),
+            provider: setup.schedule.needs_denoiser().then(|| setup.network.provider()),
+            stop_reason: summary.stop_reason,
+        })
+    }
+
+    /// PSNR and SSIM, frame by frame, so that memory holds one blended frame. None for SSIM of
+    /// frames that are smaller than its window.
+    fn compare(
+        &self,
+        plan: &TilePlan,
+        truth: &Array3<f32>,
+    ) -> Result<(Option<f64>, Option<f64>), CliError> {
+        let (mut psnr, mut ssim) = (0.0, 0.0);
+        let (frames, height, width) = truth.dim();
+        let windows = height >= metrics::WINDOW && width >= metrics::WINDOW;
+        for k in 0..frames {
+            let frame = blended_frame(plan, &self.tiles, k);
+            let frame = frame.view().insert_axis(ndarray::Axis(0));
+            let truth = truth.slice(s![k..=k, .., ..]);
+            psnr += metrics::psnr(frame, truth)?;
+            if windows {
+                ssim += metrics::ssim(frame, truth)?;
+            }
+        }
+        let count = frames as f64;
+        Ok((Some(psnr / count), windows.then_some(ssim / count)))
+    }
+
+    fn manifest(
+        &self,
+        input: &Input<'_>,
+        setup: &Setup,
+        snapshot: usize,
+        spent: Spent,
+    ) -> Result<Manifest, CliError> {
+        let (frames, height, width) = input.masks.array.dim();
+        let deep = setup.schedule.needs_denoiser();
+        let tiles = self.records();
+        let content = Content {
+            program_version: env!("CARGO_PKG_VERSION").into(),
+            algorithm: setup.algorithm,
+            schedule: setup.schedule.clone(),
+            frames,
+            height,
+            width,
+            snapshot,
+            inputs: Inputs {
+                masks_sha256: input.sources.masks.sha256()?,
+                measurement_sha256: input.sources.measurement.sha256()?,
+            },
+            model: deep.then(|| ModelRecord::from(setup.network.model())),
+            scale: ScaleRecord {
+                masks_full_scale: input.masks.full_scale,
+                measurement_full_scale: input.measurement.full_scale,
+                white: self.white,
+            },
+            tile_plan: (&setup.plan).into(),
+            summary: Summary::of(&tiles),
+            tiles,
+            camera: None,
+            files: Vec::new(),
+        };
+        let run = RunRecord {
+            job: None,
+            provider: deep.then(|| setup.network.provider().into()),
+            onnxruntime: if deep { Some(setup.network.version()?) } else { None },
+            seconds: spent.seconds,
+            cpu_seconds: Some(spent.cpu_seconds),
+            finished_at: Timestamp::now().to_string(),
+        };
+        Ok(Manifest { schema: SCHEMA.into(), content, run })
+    }
+
+    fn write(&self, out: &Path, setup: &Setup, manifest: Manifest) -> Result<(), CliError> {
+        let failed = |error| CliError::file("write", out, &error);
+        fs::create_dir_all(out).map_err(failed)?;
+        // A failure on the way leaves an earlier result as it was.
+        let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
+        let Setup { plan, .. } = setup;
+        let (height, width) = plan.dim();
+        let attributes = frame_attributes(&manifest.content);
+        let spec = ResultSpec { height, width, attributes, white: self.white };
+        let frame = |k| Ok::<_, CliError>(blended_frame(plan, &self.tiles, k));
+        write_result(made.path(), &spec, frame, |files| manifest.with_files(files))?;
+        Ok(replace_result(made.path(), out)?)
+    }
+}
+
+impl Report {
+    fn print(&self, arguments: &Arguments) -> Result<(), CliError> {
+        if arguments.json {
+            let text = serde_json::to_string(self)
+                .map_err(|error| CliError::Failure(format!("the report: {error}")))?;
+            println!("{text}");
+            return Ok(());
+        }
+        println!(
+            "{}: {} frames of {}x{} in {:.1} s ({:.1} CPU-seconds), {} TV iterations, {} denoiser \
+             passes, {}",
+            self.algorithm,
+            self.frames,
+            self.height,
+            self.width,
+            self.seconds,
+            self.cpu_seconds,
+            self.tv_iterations,
+            self.denoiser_passes,
+            self.stop_reason
+        );
+        if let Some(psnr) = self.psnr_db {
+            let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
+            println!("PSNR {psnr:.2} dB{ssim}");
+        }
+        if let Some(out) = &arguments.out {
+            println!("frames are in {}", out.display());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,208 @@
+//! `sci-recon simulate`: masks and a measurement of a known scene.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use ndarray::{Array2, Array3, ArrayView3, s};
+use serde::Serialize;
+
+use super::CliError;
+use super::input::read_clip;
+use crate::formats::npy;
+use crate::optics::{ApertureGrid, OpticsError, iid_masks, measure, noisy, random_squares};
+
+/// Simulate a snapshot: make masks and measure known frames through them.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// The scene: npy, multi-page TIFF, a .mat scene's `orig`, or a folder of PNGs.
+    #[arg(long, value_name = "FILE")]
+    frames: PathBuf,
+    /// Value in the frames' file that means 1 [default: 255 for uint8 and .mat scenes, 65535 for
+    /// uint16, 1 for floats].
+    #[arg(long, value_name = "VALUE")]
+    full_scale: Option<f32>,
+    /// Frames in one snapshot.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    compression_ratio: u16,
+    /// Snapshots to be made, each of the next N frames of the scene.
+    #[arg(long, value_name = "N", default_value_t = 1,
+          value_parser = clap::value_parser!(u16).range(1..))]
+    snapshots: u16,
+    /// Kind of the masks.
+    #[arg(long)]
+    pattern: Pattern,
+    /// Seed of all that is random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Noise of the measurement on the scale of 255 grey values: S/255 is the standard deviation
+    /// added to y = sum C x, with x and C on [0,1].
+    #[arg(long, value_name = "S", default_value_t = 0.0)]
+    noise_sigma: f32,
+    /// Folder for masks.npy, measurement.npy, truth.npy and simulation.json.
+    #[arg(long, value_name = "FOLDER")]
+    out: PathBuf,
+}
+
+/// Kinds of masks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Pattern {
+    /// Independent binary pixels, half of them open, as in the public benchmark.
+    Iid,
+    /// The hybrid coded aperture: a lithography mask seen through random sub-apertures.
+    RandomSquares,
+}
+
+/// `simulation.json`.
+#[derive(Debug, Serialize)]
+struct Record {
+    program_version: &'static str,
+    pattern: &'static str,
+    seed: u64,
+    compression_ratio: usize,
+    snapshots: usize,
+    height: usize,
+    width: usize,
+    /// Frames of the scene that were left over.
+    unused_frames: usize,
+    /// Standard deviation that was added to the measurement, on its own scale.
+    noise_sigma: f32,
+    mask_mean: f32,
+    apertures: Option<Apertures>,
+}
+
+/// The sub-apertures of random squares.
+#[derive(Debug, Serialize)]
+struct Apertures {
+    rows: usize,
+    columns: usize,
+    rank: usize,
+    /// For each frame, `1` for each open sub-aperture and `0` for the others, row by row.
+    open: Vec<String>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// Input that can't be used, or files that can't be written.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let frames = read_clip(&arguments.frames, arguments.full_scale)?;
+    check_range(&arguments.frames, &frames)?;
+    let ratio = usize::from(arguments.compression_ratio);
+    let used = ratio * usize::from(arguments.snapshots);
+    let (count, height, width) = frames.dim();
+    if count < used {
+        return Err(CliError::Input(format!(
+            "{} holds {count} frames, but {} snapshots of {ratio} frames need {used}",
+            arguments.frames.display(),
+            arguments.snapshots
+        )));
+    }
+    let truth = frames.slice(s![..used, .., ..]);
+    let (masks, apertures) = make_masks(arguments.pattern, (ratio, height, width), arguments.seed)?;
+    let snapshots = measure_all(&masks, truth, arguments.noise_sigma / 255.0, arguments.seed)?;
+    let record = Record {
+        program_version: env!("CARGO_PKG_VERSION"),
+        pattern: arguments.pattern.name(),
+        seed: arguments.seed,
+        compression_ratio: ratio,
+        snapshots: snapshots.len(),
+        height,
+        width,
+        unused_frames: count - used,
+        noise_sigma: arguments.noise_sigma / 255.0,
+        mask_mean: masks.mean().unwrap_or(0.0),
+        apertures,
+    };
+    write(&arguments.out, &masks, &snapshots, truth, &record)
+}
+
+impl Pattern {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Iid => "iid",
+            Self::RandomSquares => "random-squares",
+        }
+    }
+}
+
+/// The masks \[B,H,W\], and the sub-apertures behind them if there are any.
+fn make_masks(
+    pattern: Pattern,
+    (frames, height, width): (usize, usize, usize),
+    seed: u64,
+) -> Result<(Array3<f32>, Option<Apertures>), CliError> {
+    Ok(match pattern {
+        Pattern::Iid => (iid_masks(frames, height, width, seed)?, None),
+        Pattern::RandomSquares => {
+            let (masks, openings) = random_squares(frames, height, width, seed)?;
+            let ApertureGrid { rows, columns } = ApertureGrid::for_frames(frames);
+            let ones =
+                |row: &Vec<bool>| row.iter().map(|&open| if open { '1' } else { '0' }).collect();
+            let open = openings.rows().iter().map(ones).collect();
+            (masks, Some(Apertures { rows, columns, rank: openings.rank(), open }))
+        }
+    })
+}
+
+/// One measurement for each `B` frames of the truth.
+fn measure_all(
+    masks: &Array3<f32>,
+    truth: ArrayView3<'_, f32>,
+    sigma: f32,
+    seed: u64,
+) -> Result<Vec<Array2<f32>>, CliError> {
+    let clips = truth.axis_chunks_iter(ndarray::Axis(0), masks.dim().0);
+    let mut snapshots = Vec::with_capacity(clips.len());
+    for (index, clip) in clips.enumerate() {
+        let y = measure(masks.view(), clip)?;
+        // Each snapshot has noise of its own.
+        snapshots.push(noisy(y, sigma, seed.wrapping_add(index as u64))?);
+    }
+    Ok(snapshots)
+}
+
+fn write(
+    out: &Path,
+    masks: &Array3<f32>,
+    snapshots: &[Array2<f32>],
+    truth: ArrayView3<'_, f32>,
+    record: &Record,
+) -> Result<(), CliError> {
+    let failed = |error| CliError::file("write", out, &error);
+    fs::create_dir_all(out).map_err(failed)?;
+    npy::write_f32(&out.join("masks.npy"), masks.view())?;
+    npy::write_f32(&out.join("truth.npy"), truth)?;
+    let measurement = out.join("measurement.npy");
+    match snapshots {
+        [only] => npy::write_image_f32(&measurement, only.view())?,
+        several => {
+            let views: Vec<_> = several.iter().map(|y| y.view()).collect();
+            let stack = ndarray::stack(ndarray::Axis(0), &views)
+                .map_err(|error| CliError::Failure(error.to_string()))?;
+            npy::write_f32(&measurement, stack.view())?;
+        }
+    }
+    let text = serde_json::to_string_pretty(record)
+        .map_err(|error| CliError::Failure(format!("simulation.json: {error}")))?;
+    fs::write(out.join("simulation.json"), text + "\n").map_err(failed)
+}
+
+/// A scene that is not on \[0,1\] has a full scale that somebody must state.
+fn check_range(path: &Path, frames: &Array3<f32>) -> Result<(), CliError> {
+    let outside = |value: f32| !(-1e-6..=1.0 + 1e-6).contains(&value);
+    let Some(((k, i, j), value)) = frames.indexed_iter().find(|(_, v)| outside(**v)) else {
+        return Ok(());
+    };
+    Err(CliError::Input(format!(
+        "frames {}: {value} times the full scale at frame {k}, row {i}, column {j} (counted from \
+         0); a scene must lie between 0 and its full scale: state --full-scale",
+        path.display()
+    )))
+}
+
+impl From<OpticsError> for CliError {
+    fn from(error: OpticsError) -> Self {
+        Self::Input(error.to_string())
+    }
+}

@@ -1,0 +1,75 @@
+//! The optics: aperture patterns, the masks that they project, and simulated measurements.
+//!
+//! Knows arrays only. Everything random comes from a ChaCha generator with a stated seed, so
+//! that a simulation can be repeated bit for bit.
+
+mod iid;
+mod multiplex;
+mod simulate;
+mod squares;
+
+pub use iid::iid_masks;
+pub use multiplex::Multiplexing;
+pub use simulate::{measure, noisy};
+pub use squares::{ApertureGrid, random_squares};
+
+use thiserror::Error;
+
+/// What can't be built or simulated.
+#[derive(Debug, Error, PartialEq)]
+pub enum OpticsError {
+    /// A number that is out of its range.
+    #[error("{name} is {value}; it must be {range}")]
+    Parameter {
+        /// Name of the number.
+        name: &'static str,
+        /// Its value.
+        value: String,
+        /// The values that are right.
+        range: &'static str,
+    },
+    /// Random patterns kept a rank below the largest possible one.
+    #[error(
+        "{tries} random draws of {frames} patterns with {open} of {apertures} sub-apertures open \
+         reached rank {reached} at most; rank {wanted} is possible: use another seed or open \
+         about half of the sub-apertures"
+    )]
+    Rank {
+        /// Number of draws.
+        tries: usize,
+        /// Patterns in a draw.
+        frames: usize,
+        /// Open sub-apertures of a pattern.
+        open: usize,
+        /// All sub-apertures.
+        apertures: usize,
+        /// Best rank seen.
+        reached: usize,
+        /// Rank that is possible.
+        wanted: usize,
+    },
+    /// Masks and frames that do not belong together.
+    #[error("the frames are {frames}, the masks {masks}; both must have the same size")]
+    Sizes {
+        /// Size of the frames, as frames x rows x columns.
+        frames: String,
+        /// Size of the masks.
+        masks: String,
+    },
+}
+
+/// The generator of everything random here: the same on every machine.
+fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
+    rand::SeedableRng::seed_from_u64(seed)
+}
+
+/// Refuses an empty stack.
+fn check_size(frames: usize, height: usize, width: usize) -> Result<(), OpticsError> {
+    for (name, value) in [("compression ratio", frames), ("height", height), ("width", width)] {
+        if value == 0 {
+            let range = "at least 1";
+            return Err(OpticsError::Parameter { name, value: value.to_string(), range });
+        }
+    }
+    Ok(())
+}

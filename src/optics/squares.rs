@@ -1,0 +1,146 @@
+//! "Random squares": the masks of the hybrid coded aperture in the paper's simulation.
+
+use ndarray::{Array2, Array3, ArrayView2, s};
+use rand::Rng;
+
+use super::{Multiplexing, OpticsError, check_size, generator};
+
+/// A grid of square sub-apertures. Opening one shifts the projected lithography mask by whole
+/// mask pixels, neighbours by one pixel more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ApertureGrid {
+    /// Rows of sub-apertures.
+    pub rows: usize,
+    /// Columns of sub-apertures.
+    pub columns: usize,
+}
+
+impl ApertureGrid {
+    /// The grid for `frames` frames in a snapshot: 3x4 up to 12 frames and 4x5 up to 20, as in
+    /// the paper and its code, and for more the smallest grid of r x (r+1) with at least as many
+    /// sub-apertures as frames (5x6 up to 30), because fewer can't tell the frames apart.
+    pub fn for_frames(frames: usize) -> Self {
+        let mut rows = 3;
+        while rows * (rows + 1) < frames {
+            rows += 1;
+        }
+        Self { rows, columns: rows + 1 }
+    }
+
+    /// Number of sub-apertures.
+    pub fn count(self) -> usize {
+        self.rows * self.columns
+    }
+}
+
+/// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them.
+///
+/// A random binary lithography mask (half of it open) is seen through the sub-apertures of
+/// [`ApertureGrid::for_frames`], half of them open in each frame: the mask of a frame is the sum
+/// of the shifted lithography masks of its open sub-apertures (Eq. 1 of the paper), divided by
+/// the largest value of all frames.
+///
+/// # Errors
+/// A size of 0, or no multiplexing matrix of full rank within bounded tries.
+pub fn random_squares(
+    frames: usize,
+    height: usize,
+    width: usize,
+    seed: u64,
+) -> Result<(Array3<f32>, Multiplexing), OpticsError> {
+    check_size(frames, height, width)?;
+    let grid = ApertureGrid::for_frames(frames);
+    let mut rng = generator(seed);
+    let openings = Multiplexing::random(frames, grid.count(), grid.count() / 2, &mut rng)?;
+    let lithography =
+        Array2::from_shape_simple_fn((height + grid.rows - 1, width + grid.columns - 1), || {
+            f32::from(u8::from(rng.random::<bool>()))
+        });
+    let mut masks = Array3::zeros((frames, height, width));
+    for (mut mask, open) in masks.outer_iter_mut().zip(openings.rows()) {
+        for (aperture, _) in open.iter().enumerate().filter(|(_, open)| **open) {
+            mask += &shifted(&lithography, grid, aperture, height, width);
+        }
+    }
+    let largest = masks.fold(0.0f32, |largest, &value| largest.max(value));
+    if largest > 0.0 {
+        masks /= largest;
+    }
+    Ok((masks, openings))
+}
+
+/// The lithography mask as seen through one sub-aperture.
+fn shifted(
+    lithography: &Array2<f32>,
+    grid: ApertureGrid,
+    aperture: usize,
+    height: usize,
+    width: usize,
+) -> ArrayView2<'_, f32> {
+    let (row, column) = (aperture / grid.columns, aperture % grid.columns);
+    lithography.slice(s![row..row + height, column..column + width])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ApertureGrid, random_squares};
+    use ndarray::{Array2, Axis};
+
+    #[test]
+    fn grids_follow_the_stated_rule() {
+        for (frames, rows, columns) in
+            [(1, 3, 4), (10, 3, 4), (12, 3, 4), (13, 4, 5), (20, 4, 5), (21, 5, 6), (30, 5, 6)]
+        {
+            assert_eq!(ApertureGrid::for_frames(frames), ApertureGrid { rows, columns });
+        }
+        assert!(ApertureGrid::for_frames(31).count() >= 31);
+    }
+
+    /// Mean, mean over the pixels of the deviation over the frames, mean and largest correlation
+    /// between two frames.
+    fn statistics(seed: u64) -> (f32, f32, f32, f32) {
+        let (masks, openings) = random_squares(10, 128, 128, seed).unwrap();
+        assert_eq!(openings.rank(), 10);
+        let deviation = masks.std_axis(Axis(0), 0.0).mean().unwrap();
+        let centred: Vec<Array2<f32>> =
+            masks.outer_iter().map(|m| &m - m.mean().unwrap()).collect();
+        let mut correlations = Vec::new();
+        for (k, a) in centred.iter().enumerate() {
+            for b in &centred[..k] {
+                let norm = ((a * a).sum() * (b * b).sum()).sqrt();
+                correlations.push((a * b).sum() / norm);
+            }
+        }
+        let mean = correlations.iter().sum::<f32>() / correlations.len() as f32;
+        let largest = correlations.iter().fold(0.0f32, |a, &b| a.max(b));
+        (masks.mean().unwrap(), deviation, mean, largest)
+    }
+
+    #[test]
+    fn statistics_are_those_of_the_paper() {
+        for seed in 0..8 {
+            let (mean, deviation, correlation, largest) = statistics(seed);
+            assert!((0.45..=0.55).contains(&mean), "seed {seed}: mean {mean}");
+            assert!((0.117..=0.143).contains(&deviation), "seed {seed}: deviation {deviation}");
+            assert!((0.45..=0.58).contains(&correlation), "seed {seed}: {correlation}");
+            assert!(largest <= 0.86, "seed {seed}: largest correlation {largest}");
+        }
+    }
+
+    #[test]
+    fn masks_reach_one_and_repeat_with_their_seed() {
+        let (masks, openings) = random_squares(8, 40, 30, 1).unwrap();
+        assert_eq!(masks.fold(0.0f32, |a, &b| a.max(b)), 1.0);
+        assert!(masks.iter().all(|&v| v >= 0.0));
+        let (again, same) = random_squares(8, 40, 30, 1).unwrap();
+        assert_eq!((masks, openings), (again, same));
+    }
+
+    #[test]
+    fn a_mask_is_the_sum_of_its_open_sub_apertures() {
+        // Two frames that differ in their openings differ by shifts of one lithography mask:
+        // the values are sixths.
+        let (masks, _) = random_squares(10, 64, 64, 4).unwrap();
+        assert!(masks.iter().all(|v| (v * 6.0 - (v * 6.0).round()).abs() < 1e-5));
+    }
+}

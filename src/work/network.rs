@@ -1,0 +1,102 @@
+//! Where the denoiser comes from: libonnxruntime and the network that the program carries.
+
+use std::path::{Path, PathBuf};
+
+use crate::models::{FASTDVDNET_GRAY, TwoStageModel};
+use crate::recon::ReconError;
+use crate::recon::denoise::fastdvdnet::FastDvdNet;
+use crate::recon::denoise::onnx::{Device, Runtime};
+
+/// The library's name beside the executable.
+const LIBRARY: &str = "libonnxruntime.so";
+
+/// Why there is no denoiser.
+#[derive(Debug, thiserror::Error)]
+pub enum NetworkError {
+    /// No libonnxruntime was found.
+    #[error(
+        "no libonnxruntime: {0}; name it with --onnxruntime or ORT_DYLIB_PATH, or fetch it with \
+         scripts/fetch-onnxruntime.sh"
+    )]
+    Missing(String),
+    /// It was found, but the network does not run on it.
+    #[error(transparent)]
+    Runtime(#[from] ReconError),
+}
+
+/// Loads denoisers. Nothing is opened before the first one is asked for: TV needs no library.
+#[derive(Debug, Clone)]
+pub struct NetworkSource {
+    library: Option<PathBuf>,
+    device: Device,
+}
+
+impl NetworkSource {
+    /// `library` is a libonnxruntime, or none for the one beside the executable.
+    pub fn new(library: Option<PathBuf>, device: Device) -> Self {
+        Self { library, device }
+    }
+
+    /// Name of the execution provider, for records.
+    pub fn provider(&self) -> &'static str {
+        self.device.provider()
+    }
+
+    /// The network that is loaded.
+    pub fn model(&self) -> &'static TwoStageModel {
+        &FASTDVDNET_GRAY
+    }
+
+    /// What the library says about itself; loads it.
+    ///
+    /// # Errors
+    /// As [`NetworkSource::load`].
+    pub fn version(&self) -> Result<String, NetworkError> {
+        Ok(self.runtime()?.version())
+    }
+
+    /// A denoiser with sessions of its own, for one thread.
+    ///
+    /// # Errors
+    /// No library, or one that can't run the network on the device that was asked for.
+    pub fn load(&self) -> Result<FastDvdNet, NetworkError> {
+        let (runtime, model) = (self.runtime()?, self.model());
+        Ok(FastDvdNet::load(&runtime, model.stage1, model.stage2)?)
+    }
+
+    fn runtime(&self) -> Result<Runtime, NetworkError> {
+        Ok(Runtime::open(&self.path()?, self.device)?)
+    }
+
+    fn path(&self) -> Result<PathBuf, NetworkError> {
+        if let Some(library) = &self.library {
+            return existing(library).ok_or_else(|| {
+                NetworkError::Missing(format!("there is no file {}", library.display()))
+            });
+        }
+        let executable = std::env::current_exe()
+            .map_err(|error| NetworkError::Missing(format!("the program's own path: {error}")))?;
+        let beside = executable.with_file_name(LIBRARY);
+        existing(&beside).ok_or_else(|| {
+            NetworkError::Missing("none is named and none is beside the program".into())
+        })
+    }
+}
+
+fn existing(path: &Path) -> Option<PathBuf> {
+    path.is_file().then(|| path.to_path_buf())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::NetworkSource;
+    use crate::recon::denoise::onnx::Device;
+
+    #[test]
+    fn a_missing_library_is_named() {
+        let source = NetworkSource::new(Some("/nowhere/libonnxruntime.so".into()), Device::Cpu);
+        let error = source.load().err().unwrap().to_string();
+        assert!(error.contains("/nowhere/libonnxruntime.so"), "{error}");
+        assert!(error.contains("--onnxruntime"), "{error}");
+    }
+}

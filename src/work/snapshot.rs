@@ -1,0 +1,220 @@
+//! A whole snapshot in memory, its tiles on several threads.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
+
+use super::network::{NetworkError, NetworkSource};
+use super::tile::{TileInput, TileOutcome, reconstruct_tile};
+use crate::recon::ReconError;
+use crate::recon::denoise::Denoiser;
+use crate::recon::gap::{Control, Observer, Progress};
+use crate::recon::schedule::Schedule;
+use crate::recon::tile::{Tile, TilePlan};
+
+/// What is to be solved.
+#[derive(Debug, Clone, Copy)]
+pub struct SnapshotInput<'a> {
+    /// Masks \[B,H,W\] on \[0,1\].
+    pub masks: ArrayView3<'a, f32>,
+    /// Measurement \[H,W\].
+    pub measurement: ArrayView2<'a, f32>,
+    /// White level of the scene.
+    pub white: f32,
+    /// The schedule.
+    pub schedule: &'a Schedule,
+    /// The cut; it has the size of the masks.
+    pub plan: &'a TilePlan,
+}
+
+/// Why a snapshot was not solved.
+#[derive(Debug, thiserror::Error)]
+pub enum SolveError {
+    /// No denoiser.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// The solver refused or failed.
+    #[error(transparent)]
+    Recon(#[from] ReconError),
+    /// A thread died.
+    #[error("a computing thread ended unexpectedly")]
+    Thread,
+}
+
+/// Is told how far the tiles are; called from all threads.
+pub trait TileProgress: Sync {
+    /// A tile has done an iteration.
+    fn iteration(&self, tile: &Tile, progress: &Progress);
+    /// A tile is ready.
+    fn finished(&self, tile: &Tile);
+}
+
+/// Listens to nothing.
+impl TileProgress for () {
+    fn iteration(&self, _: &Tile, _: &Progress) {}
+    fn finished(&self, _: &Tile) {}
+}
+
+/// Solves all tiles of a snapshot on up to `threads` threads, one denoiser a thread, and gives
+/// them in the plan's order. The result does not depend on the number of threads.
+///
+/// # Errors
+/// The first failure of any tile; the others stop at their next iteration.
+pub fn solve(
+    input: &SnapshotInput<'_>,
+    network: &NetworkSource,
+    threads: usize,
+    progress: &dyn TileProgress,
+) -> Result<Vec<TileOutcome>, SolveError> {
+    let run = Run {
+        input,
+        network,
+        progress,
+        next: AtomicUsize::new(0),
+        stop: AtomicBool::new(false),
+        done: Mutex::new((0..input.plan.len()).map(|_| None).collect()),
+    };
+    let threads = threads.clamp(1, input.plan.len());
+    let outcomes: Vec<Result<(), SolveError>> = thread::scope(|scope| {
+        let handles: Vec<_> = (0..threads).map(|_| scope.spawn(|| run.thread())).collect();
+        handles.into_iter().map(|h| h.join().unwrap_or(Err(SolveError::Thread))).collect()
+    });
+    // Threads that were stopped report a cancellation; the cause is the other error.
+    let cancelled = |e: &SolveError| matches!(e, SolveError::Recon(ReconError::Cancelled));
+    let mut errors: Vec<SolveError> = outcomes.into_iter().filter_map(Result::err).collect();
+    errors.sort_by_key(cancelled);
+    if let Some(error) = errors.into_iter().next() {
+        return Err(error);
+    }
+    let done = run.done.into_inner().map_err(|_| SolveError::Thread)?;
+    done.into_iter().collect::<Option<_>>().ok_or(SolveError::Thread)
+}
+
+struct Run<'a, 'b> {
+    input: &'a SnapshotInput<'b>,
+    network: &'a NetworkSource,
+    progress: &'a dyn TileProgress,
+    next: AtomicUsize,
+    stop: AtomicBool,
+    done: Mutex<Vec<Option<TileOutcome>>>,
+}
+
+impl Run<'_, '_> {
+    fn thread(&self) -> Result<(), SolveError> {
+        let outcome = self.tiles();
+        if outcome.is_err() {
+            self.stop.store(true, Ordering::Relaxed);
+        }
+        outcome
+    }
+
+    fn tiles(&self) -> Result<(), SolveError> {
+        let schedule = self.input.schedule;
+        let mut network = match schedule.needs_denoiser() {
+            true => Some(self.network.load()?),
+            false => None,
+        };
+        loop {
+            let index = self.next.fetch_add(1, Ordering::Relaxed);
+            let Some(tile) = self.input.plan.tile(index) else { return Ok(()) };
+            let (rows, columns) =
+                (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
+            let window = TileInput {
+                masks: self.input.masks.slice(s![.., rows.clone(), columns.clone()]).to_owned(),
+                measurement: self.input.measurement.slice(s![rows, columns]).to_owned(),
+                white: self.input.white,
+            };
+            let denoiser = network.as_mut().map(|network| network as &mut dyn Denoiser);
+            let mut observer = TileObserver { progress: self.progress, stop: &self.stop, tile };
+            let outcome = reconstruct_tile(window, schedule, denoiser, &mut observer)?;
+            self.progress.finished(&tile);
+            self.done.lock().map_err(|_| SolveError::Thread)?[index] = Some(outcome);
+        }
+    }
+}
+
+struct TileObserver<'a> {
+    progress: &'a dyn TileProgress,
+    stop: &'a AtomicBool,
+    tile: Tile,
+}
+
+impl Observer for TileObserver<'_> {
+    fn iteration(&mut self, progress: &Progress) -> Control {
+        self.progress.iteration(&self.tile, progress);
+        match self.stop.load(Ordering::Relaxed) {
+            true => Control::Cancel,
+            false => Control::Continue,
+        }
+    }
+}
+
+/// Frame `k` \[H,W\] of the whole picture, blended from its tiles in the plan's order.
+pub fn blended_frame(plan: &TilePlan, tiles: &[TileOutcome], k: usize) -> Array2<f32> {
+    let mut whole = Array2::zeros(plan.dim());
+    for (tile, outcome) in plan.tiles().zip(tiles) {
+        plan.blend(&tile, outcome.frames.index_axis(Axis(0), k), whole.view_mut());
+    }
+    whole
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{SnapshotInput, SolveError, blended_frame, solve};
+    use crate::optics::{iid_masks, measure};
+    use crate::recon::ReconError;
+    use crate::recon::denoise::onnx::Device;
+    use crate::recon::schedule::Schedule;
+    use crate::recon::tile::TilePlan;
+    use crate::work::NetworkSource;
+    use ndarray::Array3;
+
+    fn scene(side: usize) -> (Array3<f32>, Array3<f32>) {
+        let masks = iid_masks(4, side, side, 2).unwrap();
+        let frames = Array3::from_shape_fn((4, side, side), |(k, i, j)| {
+            0.5 + 0.4 * ((i + 3 * k) as f32 * 0.13).sin() * (j as f32 * 0.09).cos()
+        });
+        (masks, frames)
+    }
+
+    fn network() -> NetworkSource {
+        NetworkSource::new(None, Device::Cpu)
+    }
+
+    #[test]
+    fn the_number_of_threads_changes_nothing_and_seams_are_small() {
+        let (masks, truth) = scene(96);
+        let y = measure(masks.view(), truth.view()).unwrap();
+        let schedule = Schedule::gap_tv();
+        let frames = |plan: &TilePlan, threads| {
+            let (masks, measurement) = (masks.view(), y.view());
+            let input = SnapshotInput { masks, measurement, white: 1.0, schedule: &schedule, plan };
+            let tiles = solve(&input, &network(), threads, &()).unwrap();
+            blended_frame(plan, &tiles, 1)
+        };
+        let cut = TilePlan::new(96, 96, 48, 16).unwrap();
+        let one = frames(&cut, 1);
+        assert_eq!(one, frames(&cut, 3));
+        let whole = frames(&TilePlan::new(96, 96, 96, 0).unwrap(), 1);
+        let error = |frame: &ndarray::Array2<f32>| {
+            (frame - &truth.index_axis(ndarray::Axis(0), 1)).mapv(|d| d * d).mean().unwrap()
+        };
+        let decibels = 10.0 * (error(&one) / error(&whole)).log10();
+        assert!(decibels.abs() < 0.3, "{decibels} dB between tiled and whole");
+    }
+
+    #[test]
+    fn the_cause_of_a_failure_is_told_not_its_consequence() {
+        let (masks, truth) = scene(96);
+        let mut y = measure(masks.view(), truth.view()).unwrap();
+        y[[90, 90]] = f32::NAN;
+        let (schedule, plan) = (Schedule::gap_tv(), TilePlan::new(96, 96, 48, 16).unwrap());
+        let (masks, measurement) = (masks.view(), y.view());
+        let input =
+            SnapshotInput { masks, measurement, white: 1.0, schedule: &schedule, plan: &plan };
+        let error = solve(&input, &network(), 2, &()).unwrap_err();
+        assert!(matches!(error, SolveError::Recon(ReconError::Diverged { .. })), "{error}");
+    }
+}

@@ -1,0 +1,100 @@
+"""The whole pipeline on tiny settings and footage made here: pack, train every stage, resume, export, read back, evaluate.
+
+    python test_pipeline.py      (or through pytest; about a minute on one core)
+"""
+import json
+import os
+import subprocess
+import sys
+import tempfile
+
+import cv2
+import numpy as np
+import torch
+
+import export
+import model
+import solver
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+
+
+def run(script, *arguments):
+    done = subprocess.run([sys.executable, os.path.join(HERE, script), *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def texture(r, height, width):
+    """Noise of several scales: something with edges and fine detail."""
+    return sum(cv2.resize(r.random((height // s + 1, width // s + 1)), (width, height)) for s in (2, 8, 32)) * 85
+
+
+def make_footage(folder):
+    """Two photographs and a drifting video per split, packed by pack.py."""
+    r, raw = np.random.default_rng(0), os.path.join(folder, 'raw')
+    os.makedirs(raw)
+    for split in ('train', 'val'):
+        for i in range(2):
+            cv2.imwrite(f'{raw}/{split}{i}.png', texture(r, 220, 220).astype(np.uint8))
+        scene = texture(r, 140, 180).astype(np.uint8)
+        video = cv2.VideoWriter(f'{raw}/{split}.avi', cv2.VideoWriter_fourcc(*'MJPG'), 25, (140, 120))
+        for t in range(30):
+            video.write(cv2.cvtColor(scene[:120, t:t + 140], cv2.COLOR_GRAY2BGR))
+        video.release()
+        data = os.path.join(folder, 'data')
+        run('pack.py', '--out', data, '--source', 'synthetic', '--licence', 'none', '--split', split,
+            f'{raw}/{split}0.png', f'{raw}/{split}1.png', f'{raw}/{split}.avi')
+    return data
+
+
+def test_shared_first_stage():
+    net = model.FastDVDnet().eval()
+    for p in net.parameters():
+        torch.nn.init.normal_(p, 0, .02)
+    x, sigma = torch.rand(2, 7, 16, 16), torch.tensor([.1, .3]).view(2, 1, 1, 1)
+    with torch.no_grad():
+        whole = net.clips(x, sigma)
+        for k in range(2, 5):
+            assert (whole[:, k:k + 1] - net(x[:, k - 2:k + 3], sigma)).abs().max() < 1e-6
+
+
+def test_projection_explains_the_measurement():
+    r = np.random.default_rng(1)
+    for kind in ('iid', 'squares', 'circle', 'grey'):
+        masks = torch.from_numpy(solver.draw_masks(r, kind, 8, 24)[None])
+        assert 0 <= masks.min() and masks.max() == 1
+        masks[..., 3, 5] = 0   # a dead pixel
+        x = torch.rand(1, 8, 24, 24)
+        y = solver.measure(x, masks)
+        v = solver.Gap(y, masks).project(torch.zeros_like(x))
+        assert torch.isfinite(v).all() and (solver.measure(v, masks) - y).abs().max() < 1e-4
+        gap, v = solver.start(y, masks, 5)
+        assert torch.isfinite(v).all()
+
+
+def test_pipeline():
+    with tempfile.TemporaryDirectory() as folder:
+        data = make_footage(folder)
+        out = lambda name: os.path.join(folder, name)
+        common = ('--data', data, '--crop', 32, '--frames', 8, '--steps', 3)
+        run('train.py', *common, '--stage', 'block', '--out', out('block.pt'))
+        run('train.py', *common, '--stage', 'full', '--init', out('block.pt'), '--out', out('full.pt'))
+        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2)
+        run('train.py', *common, '--stage', 'ffdnet', '--out', out('ffdnet.pt'))
+        run('train.py', *common, '--stage', 'loop', '--out', out('loop.pt'), '--runs', 2)
+        assert torch.load(out('loop.pt'), weights_only=True)['step'] == 6, 'the second run continues the first'
+        for name in ('loop', 'ffdnet'):
+            run('export.py', out(f'{name}.pt'), out(name))
+            for k, v in model.load(out(f'{name}.pt')).state_dict().items():
+                assert torch.equal(v, export.weights_of(out(name)).state_dict()[k]), k
+        rows = [json.loads(line) for line in run('evaluate.py', '--data', data, out('loop'), out('ffdnet'), '--passes', 2).splitlines()]
+        assert [os.path.basename(r['model']) for r in rows] == ['tv', 'loop', 'ffdnet']
+        assert all(np.isfinite(list(r['loop'].values())).all() for r in rows)
+
+
+if __name__ == '__main__':
+    for name, test in list(globals().items()):
+        if name.startswith('test_'):
+            test()
+            print(name, 'ok')

@@ -1,0 +1,252 @@
+"""Train a denoiser on a CPU or one CUDA GPU.
+
+    python train.py --data DATA --out run/block.pt --stage block  --minutes 45                          # one block as a 3-frame denoiser
+    python train.py --data DATA --out run/full.pt  --stage full   --minutes 45 --init run/block.pt      # both blocks jointly
+    python train.py --data DATA --out run/loop.pt  --stage loop   --minutes 90 --init run/full.pt       # half white noise, half solver iterates
+    python train.py --data DATA --out run/ffdnet.pt --stage ffdnet --minutes 45
+
+The checkpoint at --out holds everything: the same command again continues where it stood. --minutes counts training time over all runs.
+"""
+import argparse
+import collections
+import json
+import math
+import multiprocessing as mp
+import os
+import random
+import time
+
+import numpy as np
+import torch
+
+import evaluate
+import export
+import model
+import solver
+from data import Footage
+
+FRAMES = {'block': 3, 'full': 5, 'loop': 5, 'ffdnet': 1}
+
+
+# ---------------------------------------------------------------- producers
+def produce_clips(queue, root, seed, clips, frames, size):
+    footage = Footage(root, 'train', seed)
+    while True:
+        queue.put(footage.batch(clips, frames, size))
+
+
+def produce_snapshots(queue, root, seed, voxels, size):
+    """Simulated snapshots: truth and masks [N,B,size,size], measurement [N,1,size,size]."""
+    footage, r = Footage(root, 'train', seed), np.random.default_rng(seed)
+    while True:
+        b = int(r.choice([6, 8, 8, 10, 10, 12, 16]))
+        n = max(1, round(voxels / (b * size * size)))
+        x = footage.batch(n, b, size)
+        masks = np.stack([solver.random_masks(r, b, size) for _ in range(n)])
+        y = solver.measure(x, masks)
+        if r.random() < .35:
+            y = y + r.normal(0, r.uniform(0, 6 / 255), y.shape)
+        queue.put((x, masks, y.astype(np.float32)))
+
+
+def random_levels(rng):
+    """A schedule of the kind that a job may name. After TV the error is 10 to 40 (/255); a level far above it wipes out what is there."""
+    between = lambda low, high: math.exp(rng.uniform(math.log(low), math.log(high)))
+    return solver.geometric(between(12, 60), between(4, 10), rng.choice([4, 6, 8, 12, 12, 16, 16, 24, 32]))
+
+
+class Iterates:
+    """What the solver hands to the network. Several runs stand open; each step advances one of them by one pass.
+
+    The forward pass that trains is the pass that moves the run on, so iterates cost nothing but the projection.
+    """
+
+    def __init__(self, queue, device, runs):
+        self.queue, self.device = queue, device
+        self.rng = random.Random(0)
+        self.runs = [self.fresh() for _ in range(runs)]
+
+    def fresh(self):
+        x, masks, y = (torch.from_numpy(a).to(self.device) for a in self.queue.get())
+        gap, v = solver.start(y, masks, self.rng.randint(20, 50), self.rng.uniform(.07, .15))
+        return {'truth': x, 'gap': gap, 'v': v, 'levels': random_levels(self.rng), 'tv': self.rng.choice([0, 0, 0, .02])}
+
+    @torch.no_grad()
+    def next(self):
+        """(input, sigma, truth, done): call done(output) with what the network made of the input."""
+        i = self.rng.randrange(len(self.runs))
+        run = self.runs[i]
+        x = run['gap'].project(run['v'])
+        if run['tv']:
+            x = solver.tv(x, run['tv'])
+        sigma = torch.full((len(x), 1, 1, 1), run['levels'].pop(0), device=self.device)
+
+        def done(output):
+            run['v'] = output
+            if not run['levels'] or not torch.isfinite(output).all() or output.abs().max() > 4:
+                self.runs[i] = self.fresh()
+        return x, sigma, run['truth'], done
+
+
+# ---------------------------------------------------------------- training
+def rms_error(output, truth):
+    """The root mean square error per clip, averaged. Between the squared error, where the noisiest clips decide alone, and its
+    logarithm, where clips that are clean already do (tried: it lost 3 dB on white noise)."""
+    return (((output.float() - truth) ** 2).mean((1, 2, 3)) + 1e-6).sqrt().mean()
+
+
+def predict(net, stage, x, sigma):
+    """The output and the frames of x that it stands for."""
+    if stage == 'loop' or stage == 'ffdnet':
+        return net.clips(x, sigma), slice(None)
+    return evaluate.denoise(net, x, sigma), slice(x.shape[1] // 2, x.shape[1] // 2 + 1)
+
+
+class Training:
+    def __init__(self, a, device):
+        self.a, self.device = a, device
+        self.net = model.KINDS[{'full': 'fastdvdnet', 'loop': 'fastdvdnet'}.get(a.stage, a.stage)]()
+        self.step, self.seconds = 0, 0.
+        state = torch.load(a.out, map_location='cpu', weights_only=True) if os.path.exists(a.out) else None
+        if state:
+            self.net.load_state_dict(state['net'])
+        elif a.init:
+            self.net.load_state_dict(self.initial(a.init))
+        self.net = self.net.to(device, memory_format=torch.channels_last)
+        self.average = {k: v.clone() for k, v in self.net.state_dict().items()}
+        self.optimizer = torch.optim.AdamW(self.net.parameters(), a.lr, betas=(.9, .99), weight_decay=1e-5, fused=device == 'cuda')
+        if state:
+            self.average = {k: v.to(device) for k, v in state['average'].items()}
+            self.optimizer.load_state_dict(state['optimizer'])
+            self.step, self.seconds = state['step'], state['seconds']
+
+    def initial(self, path):
+        weights = (export.weights_of(path) if os.path.isdir(path) else model.load(path)).state_dict()
+        if isinstance(self.net, model.FastDVDnet) and 't1.inc.0.weight' not in weights:
+            return {f'{t}.{k}': v for t in ('t1', 't2') for k, v in weights.items()}   # both stages start from the 3-frame denoiser
+        return weights
+
+    def save(self):
+        state = {'net': self.net.state_dict(), 'average': self.average, 'optimizer': self.optimizer.state_dict(),
+                 'step': self.step, 'seconds': self.seconds}
+        torch.save(state, self.a.out + '.part')
+        os.replace(self.a.out + '.part', self.a.out)   # an interrupted save leaves the old checkpoint whole
+
+    def averaged(self):
+        net = type(self.net)()
+        net.load_state_dict(self.average)
+        return net.to(self.device, memory_format=torch.channels_last).eval()
+
+    def learn(self, x, sigma, truth):
+        """Add the gradient of one batch; returns the loss and the output."""
+        # On a GPU in bf16; on the CPUs tried, bf16 was slower than float32.
+        with torch.autocast(self.device, torch.bfloat16, enabled=self.device == 'cuda'):
+            y, frames = predict(self.net, self.a.stage, x, sigma)
+        loss = rms_error(y, truth[:, frames])
+        loss.backward()
+        return loss.detach(), y.detach().float()
+
+    def update(self):
+        """One step of the optimizer with the gradients added so far."""
+        progress = min(1., self.seconds / (60 * self.a.minutes))
+        lr = self.a.lr * min(1, (self.step + 1) / 100) * (.5 * (1 + math.cos(math.pi * progress)) * .98 + .02)
+        for group in self.optimizer.param_groups:
+            group['lr'] = lr
+        norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), .3)   # twice the usual norm
+        if torch.isfinite(norm):
+            self.optimizer.step()
+            self.step += 1
+            keep = min(.999 if self.device == 'cuda' else .998, self.step / (self.step + 10))
+            with torch.no_grad():
+                torch._foreach_lerp_(list(self.average.values()), list(self.net.state_dict().values()), 1 - keep)
+        self.optimizer.zero_grad(set_to_none=True)
+        return norm
+
+    def white_noise(self, x):
+        """The same clips with noise of a level drawn per clip, sigma 3 to 100 (/255), log-uniform."""
+        sigma = torch.empty(len(x), 1, 1, 1, device=self.device).uniform_(math.log(3), math.log(100)).exp() / 255
+        return x + torch.randn_like(x) * sigma, sigma
+
+
+def start_producers(target, count, *arguments):
+    queue = mp.Queue(8)
+    seed = time.time_ns() % 2 ** 31
+    for i in range(count):
+        mp.Process(target=target, args=(queue, arguments[0], seed + i, *arguments[1:]), daemon=True).start()
+    return queue
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('--data', required=True)
+    p.add_argument('--out', required=True)
+    p.add_argument('--stage', choices=FRAMES, required=True)
+    p.add_argument('--init', help='weights to start from: a checkpoint, or a folder with exported ONNX files')
+    p.add_argument('--minutes', type=float, default=45, help='training time over all runs; the learning rate falls to its end')
+    p.add_argument('--run-minutes', type=float, default=math.inf, help='stop this run after so many minutes')
+    p.add_argument('--steps', type=int, help='stop this run after so many steps')
+    p.add_argument('--frames', type=int, default=0, help='frames a batch (default: 16 on a CPU, 384 on a GPU)')
+    p.add_argument('--crop', type=int, default=64)
+    p.add_argument('--lr', type=float, default=2e-4)
+    p.add_argument('--runs', type=int, default=12, help='solver runs that stand open in stage loop')
+    p.add_argument('--workers', type=int, default=1, help='producer processes of each kind')
+    p.add_argument('--threads', type=int, default=1)
+    p.add_argument('--scene', help='a .mat scene that evaluation also runs')
+    p.add_argument('--every', type=float, default=15, help='minutes between evaluations')
+    a = p.parse_args()
+    device = 'cuda' if torch.cuda.is_available() else 'cpu'
+    torch.set_num_threads(a.threads)
+    os.makedirs(os.path.dirname(os.path.abspath(a.out)), exist_ok=True)
+
+    t = Training(a, device)
+    count = a.frames or (384 if device == 'cuda' else 16)
+    frames = FRAMES[a.stage]
+    clips = start_producers(produce_clips, a.workers, a.data, max(1, count // frames), frames, a.crop)
+    loop, scenes = None, None
+    if a.stage == 'loop':
+        snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop)
+        loop = Iterates(snapshots, device, a.runs)
+    if a.stage in ('loop', 'full', 'ffdnet'):
+        scenes = evaluate.LoopScenes(a.data, a.scene, device=device)
+        print('TV', json.dumps(scenes.tv()), flush=True)
+
+    def report():
+        t.save()
+        net = t.averaged()
+        row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
+        if scenes:
+            row['loop'] = scenes.run(net, solver.geometric(30, 6, 12))
+        print('evaluation', json.dumps(row), flush=True)
+
+    evaluated, saved, sums = -1e9 if t.step == 0 else t.seconds, t.seconds, collections.defaultdict(float)
+    n = 0
+    last = t.step + a.steps if a.steps else math.inf
+    end = min(60 * a.minutes, t.seconds + 60 * a.run_minutes)
+    while t.seconds < end and t.step < last:
+        if t.seconds - evaluated > 60 * a.every:
+            evaluated = t.seconds
+            report()
+        began = time.monotonic()
+        truth = torch.from_numpy(clips.get()).to(device, non_blocking=True)
+        white, _ = t.learn(*t.white_noise(truth), truth)
+        sums['white'] += white
+        if loop:   # every step sees both kinds
+            x, sigma, truth, done = loop.next()
+            looped, y = t.learn(x, sigma, truth)
+            done(y)
+            sums['loop'] += looped
+        sums['gradient norm'] += t.update()
+        n += 1
+        t.seconds += time.monotonic() - began
+        if n == 50:
+            print(f'{t.seconds / 60:.1f} min, step {t.step}, rms error and norm', {k: round(float(s) / n, 5) for k, s in sums.items()}, flush=True)
+            n = 0
+            sums.clear()
+        if t.seconds - saved > 120:
+            saved = t.seconds
+            t.save()
+    report()
+
+
+if __name__ == '__main__':
+    main()
