@@ -1,4 +1,4 @@
-//! The HTTP interface. `openapi.yaml` is its contract, [`router`] its table of contents.
+//! The HTTP interface. `openapi.yaml` is its contract, [`router()`] its table of contents.
 //!
 //! Handlers are thin: take the request apart, make one or two calls, answer. Errors are
 //! problem+json (RFC 9457); [`error`] has the only table of status codes.
