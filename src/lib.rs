@@ -3,10 +3,12 @@
 //! The modules follow the way of the data: bytes become arrays in [`formats`], [`optics`] makes
 //! masks and measurements where no camera does, arrays become video in [`recon`], and [`work`]
 //! does so tile by tile and writes the results. A [`job`] says what is to be done, the [`store`]
-//! keeps what lasts, and [`cli`] has the commands.
+//! keeps what lasts, [`http`] is how lab machines reach all of it, and [`cli`] has the commands.
 
 pub mod cli;
+pub mod config;
 pub mod formats;
+pub mod http;
 pub mod job;
 pub mod models;
 pub mod optics;

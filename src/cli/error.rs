@@ -4,6 +4,7 @@ use std::fmt::Display;
 use std::path::Path;
 use std::process::ExitCode;
 
+use super::serve::ServeError;
 use crate::formats::FormatError;
 use crate::recon::ReconError;
 use crate::work::{NetworkError, ResultError, SolveError};
@@ -41,6 +42,15 @@ impl CliError {
     /// A file or folder that can't be read or written.
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
+    }
+}
+
+impl From<ServeError> for CliError {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Config(_) => Self::Input(error.to_string()),
+            other => Self::Failure(other.to_string()),
+        }
     }
 }
 

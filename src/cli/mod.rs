@@ -3,9 +3,13 @@
 mod arguments;
 mod error;
 mod input;
+mod logging;
 mod progress;
+mod supervisor;
 
 pub mod reconstruct;
+pub mod serve;
 pub mod simulate;
+pub mod worker;
 
 pub use error::CliError;

@@ -37,7 +37,7 @@ pub use error::StoreError;
 pub use jobs::{Inserted, Job, JobFilter, NewJob};
 pub use losses::{MAX_FAILURES, MAX_LOSSES};
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
-pub use progress::{JobProgress, ProgressStage};
+pub use progress::{JobProgress, ProgressStage, TaskCounts};
 pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};

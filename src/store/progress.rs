@@ -4,6 +4,7 @@
 //! workers need at most `work / m + (1 - 1/m) * longest task`, with all stages at their most
 //! iterations; it shrinks when the solver converges early.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -55,6 +56,9 @@ pub struct JobProgress {
     /// Deep passes done, over all tiles.
     pub passes_done: u64,
 }
+
+/// Numbers of tasks by kind and state.
+pub type TaskCounts = BTreeMap<(String, String), u64>;
 
 /// Workers that were silent for longer do not count.
 const WORKER_AGE: Duration = Duration::from_secs(15);
@@ -152,17 +156,24 @@ impl Store {
         })
     }
 
-    /// The number of tasks in each state, for each kind.
+    /// The number of tasks by kind and state, with zeros for what there is none of.
     ///
     /// # Errors
     /// If the database fails.
-    pub async fn task_counts(&self) -> Result<Vec<(String, String, u64)>, StoreError> {
+    pub async fn task_counts(&self) -> Result<TaskCounts, StoreError> {
         let rows = sqlx::query("SELECT kind, state, count(*) AS n FROM tasks GROUP BY kind, state")
             .fetch_all(&self.readers)
             .await?;
-        rows.iter()
-            .map(|row| Ok((row.try_get("kind")?, row.try_get("state")?, number(row, "n")?)))
-            .collect()
+        let mut counts = TaskCounts::new();
+        for kind in ["prepare", "tile", "assemble", "manifest"] {
+            for state in ["blocked", "ready", "running", "done", "failed", "cancelled"] {
+                counts.insert((kind.to_owned(), state.to_owned()), 0);
+            }
+        }
+        for row in &rows {
+            counts.insert((row.try_get("kind")?, row.try_get("state")?), number(row, "n")?);
+        }
+        Ok(counts)
     }
 }
 

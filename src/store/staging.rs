@@ -4,7 +4,7 @@
 //! left. What is dropped before it is stored is removed.
 
 use std::fs::{self, File};
-use std::io::{Read, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::Digest;
@@ -81,7 +81,7 @@ impl Store {
     }
 }
 
-/// A file that is hashed while it is written.
+/// A file that is hashed while it is written. It does not buffer.
 #[derive(Debug)]
 pub struct BlobWriter {
     temporary: Temporary,
@@ -91,16 +91,6 @@ pub struct BlobWriter {
 }
 
 impl BlobWriter {
-    /// Appends bytes.
-    ///
-    /// # Errors
-    /// If the disk takes no more.
-    pub fn write(&mut self, bytes: &[u8]) -> Result<(), StoreError> {
-        self.hasher.update(bytes);
-        self.size += bytes.len() as u64;
-        self.file.write_all(bytes).map_err(StoreError::io("write", &self.temporary.path))
-    }
-
     /// Bytes written so far.
     #[must_use]
     pub fn size(&self) -> u64 {
@@ -115,6 +105,19 @@ impl BlobWriter {
         self.file.sync_all().map_err(StoreError::io("write to the disk", &self.temporary.path))?;
         let sha256 = Sha256::new(self.hasher.finalize().into());
         Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
+    }
+}
+
+impl Write for BlobWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let count = self.file.write(bytes)?;
+        self.hasher.update(&bytes[..count]);
+        self.size += count as u64;
+        Ok(count)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
     }
 }
 

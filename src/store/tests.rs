@@ -1,5 +1,6 @@
 //! The queue as workers see it: the whole life of a job, and every way in which it can be disturbed.
 
+use std::io::Write;
 use std::time::Duration;
 
 use serde_json::json;
@@ -30,7 +31,7 @@ impl Lab {
         let store = Store::open(folder.path()).await.unwrap();
         let upload = |bytes: &[u8]| {
             let mut writer = store.blob_writer().unwrap();
-            writer.write(bytes).unwrap();
+            writer.write_all(bytes).unwrap();
             writer.finish().unwrap()
         };
         let (masks, _) = store.store_upload(upload(b"masks")).await.unwrap();
@@ -109,7 +110,7 @@ impl Lab {
             TaskKind::Prepare => Product::Record,
             TaskKind::Tile { snapshot, tile } => {
                 let mut writer = self.store.blob_writer().unwrap();
-                writer.write(format!("{snapshot} {tile}").as_bytes()).unwrap();
+                writer.write_all(format!("{snapshot} {tile}").as_bytes()).unwrap();
                 Product::Tile(writer.finish().unwrap())
             }
             TaskKind::Assemble { .. } => {

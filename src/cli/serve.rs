@@ -1,0 +1,178 @@
+//! `sci-recon serve`: the API and its workers, until it is told to stop.
+
+use std::io::Write;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::watch;
+
+use super::logging;
+use super::supervisor::Supervisor;
+use crate::config::{ConfigError, ServeArguments, WorkerArguments};
+use crate::http::{App, Metrics, router};
+use crate::job::Timestamp;
+use crate::store::{Store, StoreError};
+
+/// How long open requests may take to end at a shutdown.
+const DRAIN: Duration = Duration::from_secs(20);
+/// The file in the data folder that says where the service listens.
+const ADDRESS_FILE: &str = "server.json";
+
+/// Why the service could not start or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// A setting is wrong.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The store can't be opened.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// Another server has the folder.
+    #[error("another server uses {0}; stop it first, or give this one its own --data")]
+    Taken(String),
+    /// The address can't be had.
+    #[error("can't listen at {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The operating system refused something else.
+    #[error("can't {action}: {source}")]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// The figures can't be counted.
+    #[error("can't count figures: {0}")]
+    Metrics(#[from] metrics_exporter_prometheus::BuildError),
+}
+
+fn io(action: &'static str) -> impl FnOnce(std::io::Error) -> ServeError {
+    move |source| ServeError::Io { action, source }
+}
+
+/// Serves until SIGTERM or Ctrl-C.
+///
+/// # Errors
+/// If it can't start.
+pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
+    settings.check()?;
+    logging::start(settings.log_format);
+    tokio::runtime::Runtime::new().map_err(io("start the runtime"))?.block_on(serve(settings))
+}
+
+async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
+    // 1. The store, for this server alone.
+    let store = Store::open(&settings.data).await?;
+    let taken = || ServeError::Taken(store.dir().root().display().to_string());
+    let _lock = store.dir().try_lock_server()?.ok_or_else(taken)?;
+    // 2. What an earlier server left.
+    let swept = store.dir().sweep_tmp()?;
+    store.forget_workers(Duration::from_secs(60)).await?;
+    // 3. The address, for those who wait for it.
+    let listener = TcpListener::bind(settings.listen)
+        .await
+        .map_err(|source| ServeError::Listen { address: settings.listen, source })?;
+    let address = listener.local_addr().map_err(io("learn the address"))?;
+    tracing::info!(%address, data = %store.dir().root().display(), swept, "listening");
+    announce(store.dir().root(), address)?;
+    // 4. Workers and housekeeping, until the signal.
+    let (stopper, stop) = watch::channel(false);
+    let metrics = Metrics::install()?;
+    let program = std::env::current_exe().map_err(io("find this program"))?;
+    let workers = worker_arguments(settings, store.dir().root());
+    let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
+    tokio::spawn(keep_house(store.clone(), metrics.clone(), settings.upload_hours));
+    tokio::spawn(async move {
+        stop_signal().await;
+        // Fails only if nobody listens any more.
+        let _ = stopper.send(true);
+    });
+    // 5. The API.
+    let service = router(App::new(store.clone(), settings, metrics));
+    let server = axum::serve(listener, service).with_graceful_shutdown(stopped(stop.clone()));
+    tokio::select! {
+        served = server => served.map_err(io("serve"))?,
+        () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
+    }
+    // 6. The end: workers give their tasks back.
+    supervisor.ended().await;
+    // It only tells where the service was.
+    let _ = std::fs::remove_file(store.dir().root().join(ADDRESS_FILE));
+    store.close().await;
+    tracing::info!("stopped");
+    Ok(())
+}
+
+/// Says where the service listens: one JSON line on standard output, and the same in a file.
+fn announce(root: &Path, address: SocketAddr) -> Result<(), ServeError> {
+    let text = serde_json::json!({
+        "address": address.to_string(),
+        "url": format!("http://{address}"),
+        "pid": std::process::id(),
+    })
+    .to_string();
+    let (path, draft) = (root.join(ADDRESS_FILE), root.join("server.json.new"));
+    std::fs::write(&draft, &text).map_err(io("write server.json"))?;
+    std::fs::rename(draft, path).map_err(io("write server.json"))?;
+    let mut stdout = std::io::stdout();
+    writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(io("print the address"))
+}
+
+fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
+    WorkerArguments {
+        data: root.to_owned(),
+        engine: settings.engine.clone(),
+        log_format: settings.log_format,
+        id: None,
+        supervised: true,
+    }
+}
+
+/// Every few seconds: figures; every hour: uploads that nobody came back for.
+async fn keep_house(store: Store, metrics: Metrics, upload_hours: u64) {
+    let mut tick = tokio::time::interval(Duration::from_secs(5));
+    for count in 0u64.. {
+        tick.tick().await;
+        metrics.upkeep();
+        if count % 720 != 0 {
+            continue;
+        }
+        let age = i64::try_from(upload_hours.saturating_mul(3_600_000)).unwrap_or(i64::MAX);
+        match store.collect(Timestamp(Timestamp::now().0.saturating_sub(age))).await {
+            Ok(0) => {}
+            Ok(files) => tracing::info!(files, "removed uploads that nothing refers to"),
+            Err(error) => tracing::error!(%error, "old uploads can't be removed"),
+        }
+    }
+}
+
+async fn stop_signal() {
+    let terminate = async {
+        match signal(SignalKind::terminate()) {
+            Ok(mut signal) => signal.recv().await,
+            Err(_) => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        _ = terminate => tracing::info!("stopping on SIGTERM"),
+        _ = tokio::signal::ctrl_c() => tracing::info!("stopping on Ctrl-C"),
+    }
+}
+
+async fn stopped(mut stop: watch::Receiver<bool>) {
+    // An error means that the sender is gone, which is a stop as well.
+    let _ = stop.wait_for(|stop| *stop).await;
+}
+
+async fn too_late(stop: watch::Receiver<bool>) {
+    stopped(stop).await;
+    tokio::time::sleep(DRAIN).await;
+}

@@ -1,0 +1,178 @@
+//! Keeps worker processes running: starts them, watches their end, starts others.
+//!
+//! A worker's standard input is a pipe from here that nothing is written to. When it closes, be it
+//! because the server wants the worker to end or because the server was killed, the worker gives its
+//! task back and ends: no worker outlives its server.
+
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use tokio::process::{Child, Command};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use crate::config::WorkerArguments;
+use crate::job::WorkerId;
+use crate::store::{Store, WorkerEnd};
+
+/// How long a worker may take to give its task back.
+const GRACE: Duration = Duration::from_secs(8);
+/// The shortest and the longest pause before a worker is started again.
+const PAUSES: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(15));
+/// A worker that lived for so long did not die of its start.
+const HEALTHY: Duration = Duration::from_secs(20);
+
+/// The worker processes of a server.
+pub(super) struct Supervisor {
+    slots: JoinSet<()>,
+}
+
+impl Supervisor {
+    /// Starts `count` workers, to end when `stop` becomes true.
+    pub(super) fn start(
+        store: &Store,
+        program: &PathBuf,
+        arguments: &WorkerArguments,
+        count: usize,
+        stop: &watch::Receiver<bool>,
+    ) -> Self {
+        let mut slots = JoinSet::new();
+        for _ in 0..count {
+            let slot = Slot {
+                store: store.clone(),
+                program: program.clone(),
+                arguments: arguments.clone(),
+                stop: stop.clone(),
+            };
+            slots.spawn(slot.keep_running());
+        }
+        Self { slots }
+    }
+
+    /// Waits until all workers have ended.
+    pub(super) async fn ended(mut self) {
+        while self.slots.join_next().await.is_some() {}
+    }
+}
+
+/// The place of one worker.
+struct Slot {
+    store: Store,
+    program: PathBuf,
+    arguments: WorkerArguments,
+    stop: watch::Receiver<bool>,
+}
+
+impl Slot {
+    async fn keep_running(mut self) {
+        let mut pause = PAUSES.0;
+        while !*self.stop.borrow() {
+            let id = WorkerId::new();
+            let start = Instant::now();
+            match self.spawn(id) {
+                Ok(child) => self.watch(id, child).await,
+                Err(error) => tracing::error!(%error, "a worker can't be started"),
+            }
+            pause = if start.elapsed() > HEALTHY { PAUSES.0 } else { (pause * 2).min(PAUSES.1) };
+            tokio::select! {
+                () = tokio::time::sleep(pause) => {}
+                () = stopped(&mut self.stop) => {}
+            }
+        }
+    }
+
+    fn spawn(&self, id: WorkerId) -> std::io::Result<Child> {
+        let arguments =
+            WorkerArguments { id: Some(id), supervised: true, ..self.arguments.clone() };
+        Command::new(&self.program)
+            .args(arguments.command_line())
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            // Away from the terminal: Ctrl-C is for the server, which then tells the workers.
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()
+    }
+
+    async fn watch(&mut self, id: WorkerId, mut child: Child) {
+        let stdin = child.stdin.take();
+        let ended = tokio::select! {
+            status = child.wait() => Some(status),
+            () = stopped(&mut self.stop) => None,
+        };
+        let status = match ended {
+            Some(status) => status,
+            None => {
+                drop(stdin);
+                end(id, child).await
+            }
+        };
+        let end = match status {
+            Ok(status) => judge(status),
+            Err(error) => WorkerEnd::Crashed(error.to_string()),
+        };
+        self.report(id, &end).await;
+    }
+
+    async fn report(&self, id: WorkerId, end: &WorkerEnd) {
+        let reason = match end {
+            WorkerEnd::Left => "left",
+            WorkerEnd::Killed => "killed",
+            WorkerEnd::Crashed(_) => "crashed",
+        };
+        metrics::counter!("sci_recon_worker_exits_total", "reason" => reason).increment(1);
+        match end {
+            WorkerEnd::Left => tracing::info!(worker = %id, "a worker has ended"),
+            WorkerEnd::Killed => tracing::warn!(worker = %id, "a worker was killed"),
+            WorkerEnd::Crashed(how) => tracing::error!(worker = %id, how, "a worker has died"),
+        }
+        if let Err(error) = self.store.worker_ended(id, end).await {
+            // Its lease runs out instead.
+            tracing::error!(worker = %id, %error, "the task of a worker can't be freed");
+        }
+    }
+}
+
+async fn stopped(stop: &mut watch::Receiver<bool>) {
+    // An error means that the sender is gone, which is a stop as well.
+    let _ = stop.wait_for(|stop| *stop).await;
+}
+
+/// Waits for a worker that was told to end, and kills it if it does not.
+async fn end(id: WorkerId, mut child: Child) -> std::io::Result<ExitStatus> {
+    if let Ok(status) = tokio::time::timeout(GRACE, child.wait()).await {
+        return status;
+    }
+    tracing::warn!(worker = %id, "a worker did not end in time and is killed");
+    child.start_kill()?;
+    child.wait().await
+}
+
+/// Why a worker ended: by itself, from outside, or of a fault that its task may have caused.
+fn judge(status: ExitStatus) -> WorkerEnd {
+    const SIGINT: i32 = 2;
+    const SIGKILL: i32 = 9;
+    const SIGTERM: i32 = 15;
+    match (status.code(), status.signal()) {
+        (Some(0), _) => WorkerEnd::Left,
+        (_, Some(SIGINT | SIGKILL | SIGTERM)) => WorkerEnd::Killed,
+        _ => WorkerEnd::Crashed(status.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ExitStatus, ExitStatusExt, WorkerEnd, judge};
+
+    #[test]
+    fn a_kill_is_not_held_against_the_task_and_a_fault_is() {
+        assert!(matches!(judge(ExitStatus::from_raw(0)), WorkerEnd::Left));
+        assert!(matches!(judge(ExitStatus::from_raw(9)), WorkerEnd::Killed));
+        for fault in [11, 6, 4, 101 << 8] {
+            let end = judge(ExitStatus::from_raw(fault));
+            assert!(matches!(end, WorkerEnd::Crashed(_)), "{fault}: {end:?}");
+        }
+    }
+}

@@ -1,0 +1,237 @@
+//! All settings of the service. The comments here are the help on the command line; each setting
+//! can also be given as the environment variable that the help names.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+
+use crate::job::WorkerId;
+
+/// Serves the HTTP API and runs workers.
+#[derive(Debug, Clone, Args)]
+pub struct ServeArguments {
+    /// Folder for the database, uploads and results; it is made if it is missing.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    pub data: PathBuf,
+
+    /// Address to listen at; port 0 takes a free one.
+    #[arg(
+        long,
+        env = "SCI_RECON_LISTEN",
+        value_name = "ADDRESS",
+        default_value = "127.0.0.1:8080"
+    )]
+    pub listen: SocketAddr,
+
+    /// Listen at an address that other machines reach, though there is no access control yet.
+    #[arg(long, env = "SCI_RECON_ALLOW_REMOTE")]
+    pub allow_remote: bool,
+
+    /// Worker processes to run; 0 runs none, for workers that are started by hand [default: one
+    /// for each core].
+    #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
+    pub workers: Option<usize>,
+
+    /// Settings that the workers get.
+    #[command(flatten)]
+    pub engine: EngineArguments,
+
+    /// Largest upload in bytes.
+    #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", default_value_t = 8 << 30)]
+    pub max_upload_bytes: u64,
+
+    /// Uploads that are received at the same time; more are told to come back later.
+    #[arg(long, env = "SCI_RECON_MAX_UPLOADS", value_name = "N", default_value_t = 32)]
+    pub max_uploads: usize,
+
+    /// Bytes of the disk that uploads leave free.
+    #[arg(long, env = "SCI_RECON_MIN_FREE_BYTES", value_name = "BYTES", default_value_t = 1 << 30)]
+    pub min_free_bytes: u64,
+
+    /// Seconds without a byte after which an upload is given up.
+    #[arg(
+        long,
+        env = "SCI_RECON_UPLOAD_IDLE_SECONDS",
+        value_name = "SECONDS",
+        default_value_t = 60
+    )]
+    pub upload_idle_seconds: u64,
+
+    /// Seconds that an answer may take (other than uploads, checks of uploads, and downloads).
+    #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
+    pub request_seconds: u64,
+
+    /// Hours for which an upload that nothing refers to is kept.
+    #[arg(long, env = "SCI_RECON_UPLOAD_HOURS", value_name = "HOURS", default_value_t = 72)]
+    pub upload_hours: u64,
+
+    /// How log lines look.
+    #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
+    pub log_format: LogFormat,
+}
+
+/// Takes tasks from a data folder and does them, until it is told to stop.
+#[derive(Debug, Clone, Args)]
+pub struct WorkerArguments {
+    /// Folder with the database, uploads and results.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    pub data: PathBuf,
+
+    /// Where and how it computes.
+    #[command(flatten)]
+    pub engine: EngineArguments,
+
+    /// How log lines look.
+    #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
+    pub log_format: LogFormat,
+
+    /// Identifier under which it is on record [default: a new one].
+    #[arg(long, value_name = "ID", hide = true)]
+    pub id: Option<WorkerId>,
+
+    /// Ends when its standard input does: the server that started it is gone then.
+    #[arg(long, hide = true)]
+    pub supervised: bool,
+}
+
+/// Where and how workers compute.
+#[derive(Debug, Clone, Args)]
+pub struct EngineArguments {
+    /// The libonnxruntime [default: the one beside the program].
+    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    pub onnxruntime: Option<PathBuf>,
+
+    /// Where the network runs: cpu, or cuda:0 for the first GPU.
+    #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
+    pub device: String,
+
+    /// Threads of one worker.
+    #[arg(long, env = "SCI_RECON_WORKER_THREADS", value_name = "N", default_value_t = 1)]
+    pub threads: usize,
+
+    /// How much workers stand back for others (0 to 19), so that the API answers at full load.
+    #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
+          value_parser = clap::value_parser!(i32).range(0..=19))]
+    pub nice: i32,
+}
+
+/// How log lines look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum LogFormat {
+    /// For people.
+    #[default]
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+/// A setting that can't be.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The service would be open to everyone.
+    #[error(
+        "{0} can be reached from other machines, and there is no access control yet: listen at \
+         127.0.0.1, or say --allow-remote if the network is trusted"
+    )]
+    Remote(SocketAddr),
+}
+
+impl ServeArguments {
+    /// Checks what can't be checked field by field.
+    ///
+    /// # Errors
+    /// See [`ConfigError`].
+    pub fn check(&self) -> Result<(), ConfigError> {
+        if !self.listen.ip().is_loopback() && !self.allow_remote {
+            return Err(ConfigError::Remote(self.listen));
+        }
+        Ok(())
+    }
+
+    /// Worker processes to run.
+    #[must_use]
+    pub fn worker_count(&self) -> usize {
+        let cores = || std::thread::available_parallelism().map_or(1, usize::from);
+        self.workers.unwrap_or_else(cores)
+    }
+
+    /// The longest pause in an upload.
+    #[must_use]
+    pub fn upload_idle(&self) -> Duration {
+        Duration::from_secs(self.upload_idle_seconds)
+    }
+
+    /// The longest time for an answer.
+    #[must_use]
+    pub fn request_time(&self) -> Duration {
+        Duration::from_secs(self.request_seconds)
+    }
+}
+
+impl WorkerArguments {
+    /// The command line that makes these arguments again, for a worker process.
+    #[must_use]
+    pub fn command_line(&self) -> Vec<std::ffi::OsString> {
+        let mut line: Vec<std::ffi::OsString> = vec!["worker".into()];
+        let mut option = |name: &str, value: std::ffi::OsString| line.extend([name.into(), value]);
+        option("--data", self.data.clone().into());
+        option("--device", self.engine.device.clone().into());
+        option("--threads", self.engine.threads.to_string().into());
+        option("--nice", self.engine.nice.to_string().into());
+        let format = if self.log_format == LogFormat::Json { "json" } else { "text" };
+        option("--log-format", format.into());
+        if let Some(library) = &self.engine.onnxruntime {
+            option("--onnxruntime", library.clone().into());
+        }
+        if let Some(id) = self.id {
+            option("--id", id.to_string().into());
+        }
+        if self.supervised {
+            line.push("--supervised".into());
+        }
+        line
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ServeArguments, WorkerArguments};
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Serve {
+        #[command(flatten)]
+        arguments: ServeArguments,
+    }
+
+    #[derive(Debug, Parser)]
+    #[command(no_binary_name = true)]
+    struct Worker {
+        #[command(flatten)]
+        arguments: WorkerArguments,
+    }
+
+    #[test]
+    fn only_this_machine_is_served_unless_told_so() {
+        let serve = |listen: &[&str]| {
+            let line = [&["serve", "--data", "d"], listen].concat();
+            Serve::try_parse_from(line).unwrap().arguments.check()
+        };
+        assert!(serve(&[]).is_ok());
+        assert!(serve(&["--listen", "[::1]:0"]).is_ok());
+        let error = serve(&["--listen", "0.0.0.0:80"]).unwrap_err().to_string();
+        assert!(error.contains("--allow-remote"), "{error}");
+        assert!(serve(&["--listen", "0.0.0.0:80", "--allow-remote"]).is_ok());
+    }
+
+    #[test]
+    fn a_worker_gets_the_arguments_that_were_meant_for_it() {
+        let line = ["--data", "some dir", "--device", "cuda:0", "--threads", "3", "--nice", "5"];
+        let more = ["--onnxruntime", "lib.so", "--supervised", "--log-format", "json"];
+        let first = Worker::try_parse_from(line.iter().chain(&more)).unwrap().arguments;
+        let again = Worker::try_parse_from(&first.command_line()[1..]).unwrap().arguments;
+        assert_eq!(format!("{first:?}"), format!("{again:?}"));
+    }
+}

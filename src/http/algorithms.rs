@@ -1,0 +1,37 @@
+//! `/v1/algorithms`: what can be asked for, with the defaults.
+
+use axum::Json;
+use serde::Serialize;
+
+use crate::job::{Algorithm, ScheduleSpec, TileSpec};
+
+/// An algorithm as it is shown.
+#[derive(Debug, Serialize)]
+pub(super) struct AlgorithmBody {
+    name: Algorithm,
+    schedule: ScheduleSpec,
+    planned_iterations: usize,
+    planned_passes: usize,
+    tile: TileSpec,
+}
+
+/// The list as it is shown.
+#[derive(Debug, Serialize)]
+pub(super) struct ListBody {
+    items: Vec<AlgorithmBody>,
+}
+
+/// `GET /v1/algorithms`
+pub(super) async fn list() -> Json<ListBody> {
+    let show = |name: Algorithm| {
+        let schedule = name.default_schedule();
+        AlgorithmBody {
+            name,
+            planned_iterations: schedule.planned_iterations(),
+            planned_passes: schedule.planned_passes(),
+            schedule,
+            tile: TileSpec::default(),
+        }
+    };
+    Json(ListBody { items: Algorithm::ALL.map(show).into() })
+}

@@ -1,0 +1,57 @@
+//! What all handlers share.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Semaphore;
+
+use super::metrics::Metrics;
+use crate::config::ServeArguments;
+use crate::formats::Limits;
+use crate::store::Store;
+
+/// What all handlers share; cheap to clone.
+#[derive(Debug, Clone)]
+pub struct App(Arc<Shared>);
+
+/// The content of [`App`].
+#[derive(Debug)]
+pub struct Shared {
+    pub(super) store: Store,
+    pub(super) limits: Limits,
+    pub(super) max_upload_bytes: u64,
+    pub(super) min_free_bytes: u64,
+    pub(super) upload_idle: Duration,
+    pub(super) request_time: Duration,
+    pub(super) uploads: Arc<Semaphore>,
+    /// One file is checked at a time: each takes a core and a frame of memory.
+    pub(super) intake: Arc<Semaphore>,
+    pub(super) metrics: Metrics,
+}
+
+impl App {
+    /// The app on a store, with these settings.
+    #[must_use]
+    pub fn new(store: Store, settings: &ServeArguments, metrics: Metrics) -> Self {
+        let limits = Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() };
+        Self(Arc::new(Shared {
+            store,
+            limits,
+            max_upload_bytes: settings.max_upload_bytes,
+            min_free_bytes: settings.min_free_bytes,
+            upload_idle: settings.upload_idle(),
+            request_time: settings.request_time(),
+            uploads: Arc::new(Semaphore::new(settings.max_uploads)),
+            intake: Arc::new(Semaphore::new(1)),
+            metrics,
+        }))
+    }
+}
+
+impl std::ops::Deref for App {
+    type Target = Shared;
+
+    fn deref(&self) -> &Shared {
+        &self.0
+    }
+}

@@ -1,0 +1,87 @@
+//! `/v1/blobs`: files by the SHA-256 of their bytes.
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{FromRequest, Multipart, Request, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::app::App;
+use super::error::{ApiError, Code};
+use super::extract::Params;
+use super::upload;
+use crate::job::Sha256;
+use crate::store::{Blob, StagedBlob};
+
+/// `POST /v1/blobs`: the file as the raw body, or as the field `file` of a form.
+pub(super) async fn create(
+    State(app): State<App>,
+    headers: HeaderMap,
+    request: Request,
+) -> Result<Response, ApiError> {
+    let _permit = begin(&app, &headers)?;
+    let staged = if is_form(&headers) {
+        receive_form(&app, request).await?
+    } else {
+        upload::receive(&app, request.into_body().into_data_stream()).await?
+    };
+    store(&app, staged).await
+}
+
+/// `PUT /v1/blobs/{sha256}`: the raw body, which must have this hash.
+pub(super) async fn put(
+    State(app): State<App>,
+    Params(sha256): Params<Sha256>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    let _permit = begin(&app, &headers)?;
+    let staged = upload::receive(&app, body.into_data_stream()).await?;
+    if staged.sha256() != sha256 {
+        let detail = format!("the address says {sha256}, the bytes have {}", staged.sha256());
+        return Err(ApiError::new(Code::HashMismatch, detail));
+    }
+    store(&app, staged).await
+}
+
+/// `GET /v1/blobs/{sha256}`: whether the file is there, and its size.
+pub(super) async fn show(
+    State(app): State<App>,
+    Params(sha256): Params<Sha256>,
+) -> Result<Json<Blob>, ApiError> {
+    Ok(Json(app.store.upload(sha256).await?))
+}
+
+/// Takes one of the places for uploads and refuses what is too large.
+fn begin(app: &App, headers: &HeaderMap) -> Result<OwnedSemaphorePermit, ApiError> {
+    upload::admit(app, headers)?;
+    app.uploads.clone().try_acquire_owned().map_err(|_| {
+        ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
+    })
+}
+
+fn is_form(headers: &HeaderMap) -> bool {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    kind.is_some_and(|kind| kind.trim_start().to_ascii_lowercase().starts_with("multipart/"))
+}
+
+async fn receive_form(app: &App, request: Request) -> Result<StagedBlob, ApiError> {
+    let malformed = |text: String| ApiError::new(Code::MalformedRequest, text);
+    let mut form = Multipart::from_request(request, app)
+        .await
+        .map_err(|error| malformed(error.body_text()))?;
+    while let Some(field) = form.next_field().await.map_err(|error| malformed(error.body_text()))? {
+        if field.name() == Some("file") {
+            return upload::receive(app, field).await;
+        }
+    }
+    Err(malformed("the form has no field named file".into()))
+}
+
+async fn store(app: &App, staged: StagedBlob) -> Result<Response, ApiError> {
+    let (blob, new) = app.store.store_upload(staged).await?;
+    let status = if new { StatusCode::CREATED } else { StatusCode::OK };
+    let location = [(header::LOCATION, format!("/v1/blobs/{}", blob.sha256))];
+    Ok((status, location, Json(blob)).into_response())
+}

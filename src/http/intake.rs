@@ -1,0 +1,119 @@
+//! From an upload to a calibration or measurement: the content is checked frame by frame and
+//! written as a prepared array. Blocks; one at a time runs, where blocking is allowed.
+
+use std::io::BufWriter;
+use std::path::Path;
+
+use super::app::App;
+use super::error::{ApiError, Code};
+use crate::formats::mat::{self, SceneArray};
+use crate::formats::validate::{
+    MaskCheck, MaskStatistics, MeasurementCheck, MeasurementStatistics,
+};
+use crate::formats::{self, FormatError, FrameReader, FullScale, Limits, StackInfo, planar};
+use crate::job::Sha256;
+use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
+
+/// What an upload turned out to be.
+pub(super) struct Prepared<T> {
+    pub(super) info: StackInfo,
+    pub(super) statistics: T,
+    pub(super) file: StagedBlob,
+}
+
+/// Runs a check where it may block, after those that came before it.
+pub(super) async fn run<T, F>(app: &App, check: F) -> Result<T, ApiError>
+where
+    T: Send + 'static,
+    F: FnOnce(&Store, &Limits) -> Result<T, ApiError> + Send + 'static,
+{
+    let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
+    let permit = app.intake.clone().acquire_owned().await.map_err(stopped)?;
+    let (store, limits) = (app.store.clone(), app.limits);
+    let checked = tokio::task::spawn_blocking(move || {
+        // Held until the check ends, also if the user does not wait for it.
+        let _permit = permit;
+        check(&store, &limits)
+    });
+    checked.await.map_err(|error| ApiError::internal(&error))?
+}
+
+/// Checks masks and writes them on [0, 1].
+pub(super) fn masks(
+    store: &Store,
+    limits: &Limits,
+    upload: &Sha256,
+    full_scale: Option<f32>,
+) -> Result<Prepared<MaskStatistics>, ApiError> {
+    let path = store.dir().blob(upload);
+    let (mut reader, scale) = open(&path, limits, SceneArray::Masks, full_scale)?;
+    let info = *reader.info();
+    let mut writer = writer(store, &info)?;
+    let statistics =
+        MaskCheck::run(&mut *reader, scale, |mask| writer.write_frame(mask)).map_err(refused)?;
+    Ok(Prepared { info, statistics, file: finish(writer)? })
+}
+
+/// Checks a measurement against its calibration and writes it with its full scale divided out.
+pub(super) fn measurement(
+    store: &Store,
+    limits: &Limits,
+    upload: &Sha256,
+    full_scale: Option<f32>,
+    calibration: &Calibration,
+) -> Result<Prepared<MeasurementStatistics>, ApiError> {
+    let path = store.dir().blob(upload);
+    let (mut reader, scale) = open(&path, limits, SceneArray::Measurements, full_scale)?;
+    let info = *reader.info();
+    let masks = &calibration.facts;
+    if (info.height, info.width) != (masks.height, masks.width) {
+        let detail = format!(
+            "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}",
+            info.height, info.width, calibration.id, masks.height, masks.width
+        );
+        return Err(ApiError::new(Code::SizeMismatch, detail).at("/data"));
+    }
+    let mut writer = writer(store, &info)?;
+    let statistics =
+        MeasurementCheck::run(&mut *reader, scale, |snapshot| writer.write_frame(snapshot))
+            .map_err(refused)?;
+    Ok(Prepared { info, statistics, file: finish(writer)? })
+}
+
+fn open(
+    path: &Path,
+    limits: &Limits,
+    array: SceneArray,
+    full_scale: Option<f32>,
+) -> Result<(Box<dyn FrameReader + Send>, FullScale), ApiError> {
+    let reader = match mat::is_mat(path)? {
+        true => mat::open_array(path, array, limits),
+        false => formats::open_stack(path, limits),
+    };
+    let reader = reader?;
+    let scale = match full_scale {
+        Some(value) => {
+            FullScale::new(value).map_err(|error| ApiError::from(error).at("/full_scale"))?
+        }
+        None => reader.info().default_full_scale,
+    };
+    Ok((reader, scale))
+}
+
+type Writer = planar::Writer<BufWriter<BlobWriter>>;
+
+fn writer(store: &Store, info: &StackInfo) -> Result<Writer, ApiError> {
+    let buffered = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
+    Ok(planar::Writer::new(buffered, info.frames, info.height, info.width)?)
+}
+
+fn finish(writer: Writer) -> Result<StagedBlob, ApiError> {
+    let buffered = writer.finish()?;
+    // `finish` has flushed, so this only unwraps.
+    let inner = buffered.into_inner().map_err(|error| ApiError::internal(error.error()))?;
+    Ok(inner.finish()?)
+}
+
+fn refused(error: FormatError) -> ApiError {
+    error.into()
+}

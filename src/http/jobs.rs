@@ -1,0 +1,211 @@
+//! `/v1/jobs`: asking for a reconstruction and watching it.
+
+use axum::Json;
+use axum::extract::State;
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+
+use super::app::App;
+use super::calibrations::missing;
+use super::conditional;
+use super::error::{ApiError, Code};
+use super::extract::{Body, Params, QueryOf, idempotency_key};
+use super::page::{Limit, PageBody};
+use crate::job::{
+    Algorithm, CalibrationId, JobId, JobRequest, JobSpec, JobState, Label, MeasurementId,
+    SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
+};
+use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, StoreError};
+
+/// A job as it is shown.
+#[derive(Debug, Serialize)]
+pub(super) struct JobBody {
+    id: JobId,
+    state: JobState,
+    label: Option<Label>,
+    calibration: CalibrationId,
+    measurement: MeasurementId,
+    shape: SceneShape,
+    snapshots: SnapshotRange,
+    algorithm: Algorithm,
+    schedule: ScheduleSpec,
+    tile: TileSpec,
+    priority: i32,
+    error: Option<String>,
+    created_at: Timestamp,
+    started_at: Option<Timestamp>,
+    finished_at: Option<Timestamp>,
+    progress: JobProgress,
+}
+
+impl JobBody {
+    fn new(job: Job, progress: JobProgress) -> Self {
+        let JobSpec {
+            calibration,
+            measurement,
+            shape,
+            snapshots,
+            algorithm,
+            schedule,
+            tile,
+            priority,
+            label,
+        } = job.spec;
+        let Job { id, state, error, created_at, started_at, finished_at, .. } = job;
+        Self {
+            id,
+            state,
+            label,
+            calibration,
+            measurement,
+            shape,
+            snapshots,
+            algorithm,
+            schedule,
+            tile,
+            priority,
+            error,
+            created_at,
+            started_at,
+            finished_at,
+            progress,
+        }
+    }
+}
+
+/// The query of the list.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    #[serde(default)]
+    limit: Limit,
+    cursor: Option<JobId>,
+    state: Option<JobState>,
+    calibration: Option<CalibrationId>,
+    measurement: Option<MeasurementId>,
+    label: Option<Label>,
+}
+
+/// `POST /v1/jobs`
+pub(super) async fn create(
+    State(app): State<App>,
+    headers: HeaderMap,
+    Body(request): Body<JobRequest>,
+) -> Result<Response, ApiError> {
+    let idempotency_key = idempotency_key(&headers)?;
+    // Hashed as it was understood, so that white space and the order of fields do not matter.
+    let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
+    let spec = resolve(&app, request).await?;
+    let new = NewJob { spec, request: Sha256::of(&text), idempotency_key };
+    let (id, status) = match app.store.add_job(new).await? {
+        Inserted::New(id) => (id, StatusCode::CREATED),
+        Inserted::Before(id) => (id, StatusCode::OK),
+    };
+    let location = [(header::LOCATION, format!("/v1/jobs/{id}"))];
+    Ok((status, location, Json(body(&app, id).await?)).into_response())
+}
+
+/// Checks a request against the measurement that it names.
+async fn resolve(app: &App, request: JobRequest) -> Result<JobSpec, ApiError> {
+    let measurement = app.store.measurement(request.measurement).await;
+    let measurement = measurement.map_err(|error| missing("/measurement", error))?.facts;
+    let calibration = app.store.calibration(measurement.calibration).await;
+    let calibration = calibration.map_err(|error| missing("/measurement", error))?;
+    let shape = SceneShape {
+        frames: calibration.facts.frames,
+        height: measurement.height,
+        width: measurement.width,
+        snapshots: measurement.snapshots,
+    };
+    let resolved = request.resolve(calibration.id, shape);
+    resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))
+}
+
+async fn body(app: &App, id: JobId) -> Result<JobBody, ApiError> {
+    let job = app.store.job(id).await?;
+    let progress = app.store.progress(&job).await?;
+    Ok(JobBody::new(job, progress))
+}
+
+/// `GET /v1/jobs`
+pub(super) async fn list(
+    State(app): State<App>,
+    QueryOf(query): QueryOf<ListQuery>,
+) -> Result<Json<PageBody<JobBody>>, ApiError> {
+    let filter = JobFilter {
+        state: query.state,
+        calibration: query.calibration,
+        measurement: query.measurement,
+        label: query.label,
+        after: query.cursor,
+    };
+    let page = app.store.jobs(&filter, query.limit.get()).await?;
+    let (mut items, more) = (Vec::new(), page.more);
+    for job in page.items {
+        let progress = app.store.progress(&job).await?;
+        items.push(JobBody::new(job, progress));
+    }
+    let page = crate::store::Page { items, more };
+    Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
+}
+
+/// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
+pub(super) async fn show(
+    State(app): State<App>,
+    Params(id): Params<JobId>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let body = body(&app, id).await?;
+    let text = serde_json::to_vec(&body).map_err(|error| ApiError::internal(&error))?;
+    let etag = conditional::etag(&Sha256::of(&text));
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
+    if conditional::is_known(&headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
+    }
+    let kind = [(header::CONTENT_TYPE, "application/json")];
+    Ok((tags, kind, text).into_response())
+}
+
+/// `POST /v1/jobs/{job}/cancel`
+pub(super) async fn cancel(
+    State(app): State<App>,
+    Params(id): Params<JobId>,
+) -> Result<Response, ApiError> {
+    app.store.cancel_job(id).await?;
+    accepted(&app, id).await
+}
+
+/// `POST /v1/jobs/{job}/retry`
+pub(super) async fn retry(
+    State(app): State<App>,
+    Params(id): Params<JobId>,
+) -> Result<Response, ApiError> {
+    app.store.retry_job(id).await?;
+    accepted(&app, id).await
+}
+
+async fn accepted(app: &App, id: JobId) -> Result<Response, ApiError> {
+    let retry_after: (HeaderName, &str) = (header::RETRY_AFTER, "1");
+    Ok((StatusCode::ACCEPTED, [retry_after], Json(body(app, id).await?)).into_response())
+}
+
+/// `DELETE /v1/jobs/{job}`
+pub(super) async fn delete(
+    State(app): State<App>,
+    Params(id): Params<JobId>,
+) -> Result<StatusCode, ApiError> {
+    app.store.delete_job(id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// The job, if it has this snapshot; else there is no such thing.
+pub(super) async fn with_snapshot(app: &App, id: JobId, snapshot: u32) -> Result<Job, ApiError> {
+    let job = app.store.job(id).await?;
+    if job.spec.snapshots.contains(snapshot) {
+        return Ok(job);
+    }
+    let not_found =
+        StoreError::NotFound { what: "snapshot in this job:", id: snapshot.to_string() };
+    Err(not_found.into())
+}

@@ -1,0 +1,111 @@
+//! What happens to every request around its handler.
+
+use std::any::Any;
+use std::time::Instant;
+
+use axum::extract::{MatchedPath, Request, State};
+use axum::http::{HeaderName, HeaderValue, Method};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use tracing::Instrument;
+use uuid::Uuid;
+
+use super::app::App;
+use super::error::{ApiError, Code};
+use super::metrics;
+
+const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+/// Gives the request an identifier, or keeps the client's; logs and counts it when it is answered.
+pub(super) async fn observe(mut request: Request, next: Next) -> Response {
+    let id = request.headers().get(&REQUEST_ID).filter(|id| is_plain(id)).cloned();
+    let id = id.unwrap_or_else(new_id);
+    request.headers_mut().insert(REQUEST_ID, id.clone());
+    let (method, path) = (request.method().clone(), request.uri().path().to_owned());
+    let route = request.extensions().get::<MatchedPath>().map(|route| route.as_str().to_owned());
+    let span =
+        tracing::info_span!("request", id = id.to_str().unwrap_or(""), %method, path = %path);
+    let start = Instant::now();
+    let mut response = next.run(request).instrument(span.clone()).await;
+    let (status, took) = (response.status().as_u16(), start.elapsed());
+    // A status that everyone polls for is not worth a line each.
+    let _entered = span.enter();
+    if is_quiet(&method, &path) {
+        tracing::debug!(status, ms = took.as_millis(), "answered");
+    } else {
+        tracing::info!(status, ms = took.as_millis(), "answered");
+    }
+    metrics::observe(known(&method), route.as_deref().unwrap_or("none"), status, took);
+    response.headers_mut().insert(REQUEST_ID, id);
+    response
+}
+
+fn is_quiet(method: &Method, path: &str) -> bool {
+    method == Method::GET && (!path.starts_with("/v1/") || path.starts_with("/v1/jobs"))
+}
+
+/// Methods are a label of the metrics, and clients can make up new ones without end.
+fn known(method: &Method) -> &'static str {
+    match *method {
+        Method::GET => "GET",
+        Method::HEAD => "HEAD",
+        Method::POST => "POST",
+        Method::PUT => "PUT",
+        Method::DELETE => "DELETE",
+        _ => "other",
+    }
+}
+
+/// True for an identifier that can stand in a log as it is.
+fn is_plain(id: &HeaderValue) -> bool {
+    let bytes = id.as_bytes();
+    (1..=100).contains(&bytes.len())
+        && bytes.iter().all(|byte| byte.is_ascii_alphanumeric() || b"-_.:/+=".contains(byte))
+}
+
+fn new_id() -> HeaderValue {
+    let text = Uuid::now_v7().to_string();
+    HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static("unknown"))
+}
+
+/// Gives up on an answer that takes too long.
+pub(super) async fn timeout(State(app): State<App>, request: Request, next: Next) -> Response {
+    match tokio::time::timeout(app.request_time, next.run(request)).await {
+        Ok(response) => response,
+        Err(_) => {
+            let seconds = app.request_time.as_secs();
+            tracing::warn!(seconds, "an answer took too long");
+            let detail = format!("there was no answer within {seconds} seconds");
+            ApiError::new(Code::TimedOut, detail).into_response()
+        }
+    }
+}
+
+/// The answer to a request whose handler panicked.
+pub(super) fn panicked(cause: Box<dyn Any + Send>) -> Response {
+    let text = cause
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| cause.downcast_ref::<&str>().copied())
+        .unwrap_or("no message");
+    tracing::error!(panic = text, "a handler panicked");
+    ApiError::new(Code::Internal, "an error of the service; its log says more").into_response()
+}
+
+/// The answer to a path that leads nowhere.
+pub(super) async fn not_found(request: Request) -> ApiError {
+    let detail = format!("no route leads to {:?}", shortened(request.uri().path()));
+    ApiError::new(Code::NotFound, detail)
+}
+
+/// The answer to a method that the path does not have; the router adds the header `Allow`.
+pub(super) async fn method_not_allowed(request: Request) -> ApiError {
+    let path = shortened(request.uri().path());
+    let method = shortened(request.method().as_str());
+    let detail = format!("{path:?} does not take {method}; the header Allow says what it takes");
+    ApiError::new(Code::MethodNotAllowed, detail)
+}
+
+fn shortened(text: &str) -> String {
+    text.chars().take(120).collect()
+}

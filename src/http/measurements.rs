@@ -1,0 +1,126 @@
+//! `/v1/measurements`: coded snapshots.
+
+use axum::Json;
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+
+use super::app::App;
+use super::calibrations::missing;
+use super::error::{ApiError, Code};
+use super::extract::{Body, Params, QueryOf};
+use super::intake::{self, Prepared};
+use super::page::{Limit, PageBody};
+use crate::formats::StackInfo;
+use crate::job::{CalibrationId, InvalidField, Label, MeasurementId, Sha256};
+use crate::store::{Measurement, MeasurementFilter, NewMeasurement};
+
+/// The body of `POST /v1/measurements`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct MeasurementRequest {
+    name: Option<Label>,
+    /// The calibration that it was taken with.
+    calibration: CalibrationId,
+    /// The upload with the snapshots.
+    data: Sha256,
+    /// The stored number that means 1.
+    full_scale: Option<f32>,
+    /// Snapshots in a second.
+    camera_fps: Option<f64>,
+    /// Seconds of one snapshot.
+    exposure_s: Option<f64>,
+}
+
+/// The query of the list.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    #[serde(default)]
+    limit: Limit,
+    cursor: Option<MeasurementId>,
+    calibration: Option<CalibrationId>,
+}
+
+/// `POST /v1/measurements`
+pub(super) async fn create(
+    State(app): State<App>,
+    Body(request): Body<MeasurementRequest>,
+) -> Result<Response, ApiError> {
+    check_times(&request)?;
+    let (data, full_scale) = (request.data, request.full_scale);
+    let calibration = app.store.calibration(request.calibration).await;
+    let calibration = calibration.map_err(|error| missing("/calibration", error))?;
+    app.store.upload(data).await.map_err(|error| missing("/data", error))?;
+    let prepared = intake::run(&app, move |store, limits| {
+        intake::measurement(store, limits, &data, full_scale, &calibration)
+    });
+    let Prepared { info, statistics, file } = prepared.await?;
+    let facts = facts(request, &info, statistics.full_scale.value());
+    let measurement = app.store.add_measurement(facts, file).await?;
+    let location = [(header::LOCATION, format!("/v1/measurements/{}", measurement.id))];
+    Ok((StatusCode::CREATED, location, Json(measurement)).into_response())
+}
+
+/// Refuses times that can't be: they become the times of frames.
+fn check_times(request: &MeasurementRequest) -> Result<(), ApiError> {
+    let checks = [
+        ("/camera_fps", request.camera_fps, 1e9, "snapshots in a second"),
+        ("/exposure_s", request.exposure_s, 1e5, "seconds"),
+    ];
+    let mut errors = Vec::new();
+    for (pointer, value, most, unit) in checks {
+        if let Some(value) = value
+            && !(value > 0.0 && value <= most)
+        {
+            let detail = format!("{value} {unit} can't be; it must be above 0 and at most {most}");
+            errors.push(InvalidField::new(pointer, detail));
+        }
+    }
+    if errors.is_empty() { Ok(()) } else { Err(ApiError::fields(Code::InvalidRequest, errors)) }
+}
+
+fn facts(request: MeasurementRequest, info: &StackInfo, full_scale: f32) -> NewMeasurement {
+    NewMeasurement {
+        name: request.name,
+        calibration: request.calibration,
+        data: request.data,
+        format: info.format.name().to_owned(),
+        sample: info.sample.name().to_owned(),
+        // The limits on uploads keep the count far below this.
+        snapshots: u32::try_from(info.frames).unwrap_or(u32::MAX),
+        height: info.height,
+        width: info.width,
+        full_scale,
+        camera_fps: request.camera_fps,
+        exposure_s: request.exposure_s,
+    }
+}
+
+/// `GET /v1/measurements`
+pub(super) async fn list(
+    State(app): State<App>,
+    QueryOf(query): QueryOf<ListQuery>,
+) -> Result<Json<PageBody<Measurement>>, ApiError> {
+    let filter = MeasurementFilter { calibration: query.calibration, after: query.cursor };
+    let page = app.store.measurements(filter, query.limit.get()).await?;
+    Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
+}
+
+/// `GET /v1/measurements/{measurement}`
+pub(super) async fn show(
+    State(app): State<App>,
+    Params(id): Params<MeasurementId>,
+) -> Result<Json<Measurement>, ApiError> {
+    Ok(Json(app.store.measurement(id).await?))
+}
+
+/// `DELETE /v1/measurements/{measurement}`
+pub(super) async fn delete(
+    State(app): State<App>,
+    Params(id): Params<MeasurementId>,
+) -> Result<StatusCode, ApiError> {
+    app.store.delete_measurement(id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

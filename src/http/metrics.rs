@@ -1,0 +1,93 @@
+//! `/metrics`: what Prometheus reads. Requests are counted as they go by; what stands in the store
+//! is read when it is asked for.
+
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use metrics::{
+    Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge, histogram,
+};
+use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
+
+use super::app::App;
+use super::error::ApiError;
+use crate::job::JobState;
+
+const REQUEST_SECONDS: &str = "sci_recon_http_request_duration_seconds";
+const BUCKETS: [f64; 10] = [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0, 30.0];
+
+/// The figures of this process.
+#[derive(Debug, Clone)]
+pub struct Metrics(PrometheusHandle);
+
+impl Metrics {
+    /// Begins to count, for the whole process; a second call gives the same figures.
+    ///
+    /// # Errors
+    /// If another recorder counts already.
+    pub fn install() -> Result<Self, BuildError> {
+        static HANDLE: OnceLock<PrometheusHandle> = OnceLock::new();
+        if let Some(handle) = HANDLE.get() {
+            return Ok(Self(handle.clone()));
+        }
+        let handle = PrometheusBuilder::new()
+            .set_buckets_for_metric(Matcher::Full(REQUEST_SECONDS.into()), &BUCKETS)?
+            .install_recorder()?;
+        describe();
+        Ok(Self(HANDLE.get_or_init(|| handle).clone()))
+    }
+
+    /// Folds what was observed into the histograms; to be called every few seconds.
+    pub fn upkeep(&self) {
+        self.0.run_upkeep();
+    }
+}
+
+fn describe() {
+    describe_counter!("sci_recon_http_requests_total", "Requests answered.");
+    describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "Time from a request to its answer.");
+    describe_counter!("sci_recon_upload_bytes_total", Unit::Bytes, "Bytes of uploads received.");
+    describe_counter!("sci_recon_worker_exits_total", "Worker processes that ended, by reason.");
+    describe_gauge!("sci_recon_jobs", "Jobs on record, by state.");
+    describe_gauge!("sci_recon_tasks", "Tasks on record, by kind and state.");
+    describe_gauge!("sci_recon_workers", "Worker processes alive.");
+    describe_gauge!("sci_recon_blobs", "Files in the content-addressed store.");
+    describe_gauge!("sci_recon_blob_bytes", Unit::Bytes, "Bytes of files in that store.");
+    describe_gauge!("sci_recon_disk_free_bytes", Unit::Bytes, "Bytes free on the disk.");
+    describe_gauge!("sci_recon_disk_size_bytes", Unit::Bytes, "Bytes of the disk.");
+}
+
+/// Counts a request. `route` is the pattern and not the path: there are few patterns.
+pub(super) fn observe(method: &str, route: &str, status: u16, took: Duration) {
+    let (method, route) = (method.to_owned(), route.to_owned());
+    counter!("sci_recon_http_requests_total", "method" => method.clone(), "route" => route.clone(),
+        "status" => status.to_string())
+    .increment(1);
+    histogram!(REQUEST_SECONDS, "method" => method, "route" => route).record(took.as_secs_f64());
+}
+
+/// `GET /metrics`
+#[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
+pub(super) async fn show(State(app): State<App>) -> Result<Response, ApiError> {
+    let counted = app.store.job_counts().await?;
+    for state in JobState::ALL {
+        let jobs = counted.iter().find(|(found, _)| *found == state).map_or(0, |(_, jobs)| *jobs);
+        gauge!("sci_recon_jobs", "state" => state.name()).set(jobs as f64);
+    }
+    for ((kind, state), count) in app.store.task_counts().await? {
+        gauge!("sci_recon_tasks", "kind" => kind, "state" => state).set(count as f64);
+    }
+    let workers = app.store.live_workers(Duration::from_secs(15)).await?.len();
+    gauge!("sci_recon_workers").set(workers as f64);
+    let (files, bytes) = app.store.blob_totals().await?;
+    gauge!("sci_recon_blobs").set(files as f64);
+    gauge!("sci_recon_blob_bytes").set(bytes as f64);
+    let (free, size) = app.store.dir().disk()?;
+    gauge!("sci_recon_disk_free_bytes").set(free as f64);
+    gauge!("sci_recon_disk_size_bytes").set(size as f64);
+    let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
+    Ok((kind, app.metrics.0.render()).into_response())
+}

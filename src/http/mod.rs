@@ -1,0 +1,26 @@
+//! The HTTP interface. `openapi.yaml` is its contract, [`router`] its table of contents.
+//!
+//! Handlers are thin: take the request apart, make one or two calls, answer. Errors are
+//! problem+json (RFC 9457); [`error`] has the only table of status codes.
+
+mod algorithms;
+mod app;
+mod blobs;
+mod calibrations;
+mod conditional;
+pub mod error;
+mod extract;
+mod health;
+mod intake;
+mod jobs;
+mod layers;
+mod measurements;
+mod metrics;
+mod page;
+mod results;
+mod router;
+mod upload;
+
+pub use app::App;
+pub use metrics::Metrics;
+pub use router::{Route, router, routes};

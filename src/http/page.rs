@@ -1,0 +1,54 @@
+//! Pages of lists.
+
+use serde::{Deserialize, Serialize};
+
+use crate::store::Page;
+
+/// How many items a page has where nobody says.
+const DEFAULT: u32 = 50;
+/// How many items a page has at most.
+const MAX: u32 = 200;
+
+/// The `limit` of a list, on 1 to 200.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(try_from = "u32")]
+pub(super) struct Limit(u32);
+
+impl Default for Limit {
+    fn default() -> Self {
+        Self(DEFAULT)
+    }
+}
+
+impl TryFrom<u32> for Limit {
+    type Error = String;
+
+    fn try_from(limit: u32) -> Result<Self, String> {
+        if (1..=MAX).contains(&limit) {
+            return Ok(Self(limit));
+        }
+        Err(format!("limit is {limit}; it must be from 1 to {MAX}"))
+    }
+}
+
+impl Limit {
+    pub(super) fn get(self) -> u32 {
+        self.0
+    }
+}
+
+/// A page as JSON.
+#[derive(Debug, Serialize)]
+pub(super) struct PageBody<T> {
+    items: Vec<T>,
+    /// What to send as `cursor` for the next page; null on the last one.
+    next_cursor: Option<String>,
+}
+
+impl<T> PageBody<T> {
+    /// The page with its items as they are shown; `id` gives the cursor after an item.
+    pub(super) fn new<R>(page: Page<R>, id: impl Fn(&R) -> String, show: impl Fn(R) -> T) -> Self {
+        let next_cursor = if page.more { page.items.last().map(id) } else { None };
+        Self { items: page.items.into_iter().map(show).collect(), next_cursor }
+    }
+}

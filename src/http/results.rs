@@ -1,0 +1,240 @@
+//! Results: frames, stacks and manifests of a job, with ETag and Range.
+
+use std::path::Path;
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use tokio::fs::File;
+use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
+use tokio_util::io::ReaderStream;
+
+use super::app::App;
+use super::conditional::{self, Wanted};
+use super::error::{ApiError, Code};
+use super::extract::Params;
+use super::jobs::with_snapshot;
+use crate::job::JobId;
+use crate::store::{ResultFile, StoreError};
+
+/// The files of a snapshot.
+#[derive(Debug, Serialize)]
+pub(super) struct SnapshotBody {
+    snapshot: u32,
+    /// True once the files are there.
+    ready: bool,
+    files: Vec<FileBody>,
+}
+
+/// A file as it is shown.
+#[derive(Debug, Serialize)]
+struct FileBody {
+    #[serde(flatten)]
+    file: ResultFile,
+    /// Where it is downloaded from, if it is.
+    href: Option<String>,
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}`
+pub(super) async fn snapshot(
+    State(app): State<App>,
+    Params((job, snapshot)): Params<(JobId, u32)>,
+) -> Result<Json<SnapshotBody>, ApiError> {
+    with_snapshot(&app, job, snapshot).await?;
+    let files = app.store.result_files(job, Some(snapshot)).await?;
+    let show = |file: ResultFile| FileBody { href: href(job, snapshot, &file.name), file };
+    let ready = !files.is_empty();
+    Ok(Json(SnapshotBody { snapshot, ready, files: files.into_iter().map(show).collect() }))
+}
+
+/// The address of a result file: the inverse of [`frame_file`] and of the routes.
+fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
+    let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
+    if let "stack.exr" | "frames.npy" | "manifest.json" = name {
+        return Some(format!("{base}/{name}"));
+    }
+    let (stem, kind) = name.rsplit_once('/')?.1.rsplit_once('.')?;
+    let number: u32 = stem.strip_prefix("frame_")?.parse().ok()?;
+    Some(format!("{base}/frames/{number}.{kind}"))
+}
+
+/// `GET /v1/jobs/{job}/manifest.json`
+pub(super) async fn job_manifest(
+    State(app): State<App>,
+    Params(job): Params<JobId>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    app.store.job(job).await?;
+    send(&app, job, None, "manifest.json", &headers).await
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/manifest.json`
+pub(super) async fn manifest(
+    State(app): State<App>,
+    Params((job, snapshot)): Params<(JobId, u32)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    with_snapshot(&app, job, snapshot).await?;
+    send(&app, job, Some(snapshot), "manifest.json", &headers).await
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/stack.exr`
+pub(super) async fn stack(
+    State(app): State<App>,
+    Params((job, snapshot)): Params<(JobId, u32)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    with_snapshot(&app, job, snapshot).await?;
+    send(&app, job, Some(snapshot), "stack.exr", &headers).await
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames.npy`
+pub(super) async fn array(
+    State(app): State<App>,
+    Params((job, snapshot)): Params<(JobId, u32)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    with_snapshot(&app, job, snapshot).await?;
+    send(&app, job, Some(snapshot), "frames.npy", &headers).await
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}`, where the frame is `1.exr` or `1.png`.
+pub(super) async fn frame(
+    State(app): State<App>,
+    Params((job, snapshot, frame)): Params<(JobId, u32, String)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let frames = with_snapshot(&app, job, snapshot).await?.spec.shape.frames;
+    let name = frame_file(&frame, frames).ok_or_else(|| {
+        let detail = format!("frames are 1.exr to {frames}.exr, and the same with .png");
+        ApiError::new(Code::NotFound, detail)
+    })?;
+    send(&app, job, Some(snapshot), &name, &headers).await
+}
+
+/// The result file that `1.exr` or `1.png` means, counted from 1 to `frames`.
+fn frame_file(frame: &str, frames: usize) -> Option<String> {
+    let (number, kind) = frame.split_once('.')?;
+    let folder = match kind {
+        "exr" => "frames",
+        "png" => "png",
+        _ => return None,
+    };
+    let number: usize = number.parse().ok().filter(|n: &usize| n.to_string() == number)?;
+    (1..=frames).contains(&number).then(|| format!("{folder}/frame_{number:04}.{kind}"))
+}
+
+/// Answers with a result file, or the part of it that is asked for.
+async fn send(
+    app: &App,
+    job: JobId,
+    snapshot: Option<u32>,
+    name: &str,
+    headers: &HeaderMap,
+) -> Result<Response, ApiError> {
+    let (file, path) = match app.store.result_file(job, snapshot, name).await {
+        Err(StoreError::NotFound { .. }) => {
+            let detail = format!("{name} is not there yet; the job's state says how far it is");
+            return Err(ApiError::new(Code::NotReady, detail));
+        }
+        other => other?,
+    };
+    let etag = conditional::etag(&file.sha256);
+    if conditional::is_known(headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
+    }
+    let (status, start, length) = match conditional::wanted(headers, &etag, file.size) {
+        Wanted::Whole => (StatusCode::OK, 0, file.size),
+        Wanted::Part { start, length } => (StatusCode::PARTIAL_CONTENT, start, length),
+        Wanted::Outside => return Err(outside(file.size)),
+    };
+    let mut response = (status, part(&path, start, length).await?).into_response();
+    let fields = response.headers_mut();
+    fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
+    fields.insert(header::CONTENT_LENGTH, length.into());
+    fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
+    fields.insert(header::ETAG, value(etag));
+    fields.insert(header::CONTENT_DISPOSITION, value(disposition(job, snapshot, name)));
+    if status == StatusCode::PARTIAL_CONTENT {
+        let range = format!("bytes {start}-{}/{}", start + length - 1, file.size);
+        fields.insert(header::CONTENT_RANGE, value(range));
+    }
+    Ok(response)
+}
+
+fn outside(size: u64) -> ApiError {
+    let detail = format!("the file has {size} bytes, counted from 0");
+    ApiError::new(Code::RangeNotSatisfiable, detail)
+        .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
+}
+
+async fn part(path: &Path, start: u64, length: u64) -> Result<Body, ApiError> {
+    let mut file = File::open(path).await.map_err(|error| ApiError::internal(&error))?;
+    if start > 0 {
+        file.seek(SeekFrom::Start(start)).await.map_err(|error| ApiError::internal(&error))?;
+    }
+    Ok(Body::from_stream(ReaderStream::with_capacity(file.take(length), 64 * 1024)))
+}
+
+fn media_type(name: &str) -> &'static str {
+    match name.rsplit_once('.').map(|(_, kind)| kind) {
+        Some("exr") => "image/x-exr",
+        Some("png") => "image/png",
+        Some("json") => "application/json",
+        _ => "application/octet-stream",
+    }
+}
+
+/// The name under which a browser saves the file: one that tells jobs and snapshots apart.
+fn disposition(job: JobId, snapshot: Option<u32>, name: &str) -> String {
+    let file = name.rsplit('/').next().unwrap_or(name);
+    let short: String =
+        job.to_string().chars().rev().take(8).collect::<Vec<_>>().into_iter().rev().collect();
+    match snapshot {
+        Some(snapshot) => format!("inline; filename=\"{short}_{snapshot:04}_{file}\""),
+        None => format!("inline; filename=\"{short}_{file}\""),
+    }
+}
+
+/// A header value made of characters that we chose.
+fn value(text: String) -> HeaderValue {
+    HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{frame_file, href};
+    use crate::job::JobId;
+
+    #[test]
+    fn frames_are_named_by_number_and_kind() {
+        assert_eq!(frame_file("1.exr", 8).unwrap(), "frames/frame_0001.exr");
+        assert_eq!(frame_file("8.png", 8).unwrap(), "png/frame_0008.png");
+        for bad in ["0.exr", "9.exr", "1.tiff", "01.exr", "+1.exr", "../1.exr", "1", "1.exr.png"] {
+            assert_eq!(frame_file(bad, 8), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn every_file_is_shown_with_its_address() {
+        let job = JobId::new();
+        let address = |name| href(job, 3, name).map(|text| text.split_off_after("snapshots/"));
+        assert_eq!(address("frames/frame_0012.exr").unwrap(), "3/frames/12.exr");
+        assert_eq!(address("png/frame_0012.png").unwrap(), "3/frames/12.png");
+        assert_eq!(address("stack.exr").unwrap(), "3/stack.exr");
+        assert_eq!(address("notes.txt"), None);
+    }
+
+    trait SplitOffAfter {
+        fn split_off_after(self, mark: &str) -> String;
+    }
+
+    impl SplitOffAfter for String {
+        fn split_off_after(self, mark: &str) -> String {
+            self.split_once(mark).unwrap().1.to_owned()
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! The routes: the table of contents of the API. `openapi.yaml` has the same ones; a test sees to it.
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::handler::Handler;
+use axum::middleware::{from_fn, from_fn_with_state};
+use axum::routing::{MethodFilter, MethodRouter, on};
+use tower_http::catch_panic::CatchPanicLayer;
+
+use super::app::App;
+use super::{
+    algorithms, blobs, calibrations, health, jobs, layers, measurements, metrics, results,
+};
+
+/// The largest JSON body.
+const JSON_BYTES: usize = 256 * 1024;
+
+/// All routes.
+#[must_use]
+#[rustfmt::skip]
+pub fn routes() -> Vec<Route> {
+    use Route as R;
+    vec![
+        R::at("/v1/blobs").post(blobs::create).uploads(),
+        R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).uploads(),
+        R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
+        R::at("/v1/calibrations/{calibration}").get(calibrations::show).delete(calibrations::delete),
+        R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
+        R::at("/v1/measurements/{measurement}").get(measurements::show).delete(measurements::delete),
+        R::at("/v1/algorithms").get(algorithms::list),
+        R::at("/v1/jobs").get(jobs::list).post(jobs::create),
+        R::at("/v1/jobs/{job}").get(jobs::show).delete(jobs::delete),
+        R::at("/v1/jobs/{job}/cancel").post(jobs::cancel),
+        R::at("/v1/jobs/{job}/retry").post(jobs::retry),
+        R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}").get(results::snapshot),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::manifest),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::stack),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::array),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
+        R::at("/livez").get(health::live),
+        R::at("/readyz").get(health::ready),
+        R::at("/metrics").get(metrics::show),
+        R::at("/openapi.yaml").get(health::contract),
+    ]
+}
+
+/// The router with all routes and layers.
+pub fn router(app: App) -> Router {
+    let timeout = from_fn_with_state(app.clone(), layers::timeout);
+    let mut router = Router::new();
+    for route in routes() {
+        let handlers =
+            if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
+        router = router.route(route.path, handlers);
+    }
+    router
+        .fallback(layers::not_found)
+        .method_not_allowed_fallback(layers::method_not_allowed)
+        .layer(DefaultBodyLimit::max(JSON_BYTES))
+        .layer(CatchPanicLayer::custom(layers::panicked))
+        .layer(from_fn(layers::observe))
+        .with_state(app)
+}
+
+/// A path with its methods and handlers.
+#[derive(Debug)]
+pub struct Route {
+    /// The path, with parameters in braces.
+    pub path: &'static str,
+    /// The methods as they stand in the contract, in lower case.
+    pub methods: Vec<&'static str>,
+    handlers: MethodRouter<App>,
+    slow: bool,
+}
+
+impl Route {
+    fn at(path: &'static str) -> Self {
+        Self { path, methods: Vec::new(), handlers: MethodRouter::new(), slow: false }
+    }
+
+    fn method<H, T>(mut self, name: &'static str, filter: MethodFilter, handler: H) -> Self
+    where
+        H: Handler<T, App>,
+        T: 'static,
+    {
+        self.methods.push(name);
+        self.handlers = self.handlers.merge(on(filter, handler));
+        self
+    }
+
+    /// GET, and HEAD with it.
+    fn get<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("get", MethodFilter::GET, handler)
+    }
+
+    fn post<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("post", MethodFilter::POST, handler)
+    }
+
+    fn put<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("put", MethodFilter::PUT, handler)
+    }
+
+    fn delete<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("delete", MethodFilter::DELETE, handler)
+    }
+
+    /// Without a limit on the time of the answer: the check of a large file takes minutes.
+    fn slow(mut self) -> Self {
+        self.slow = true;
+        self
+    }
+
+    /// As [`Self::slow`], and with uploads' own limits instead of that of JSON bodies.
+    fn uploads(mut self) -> Self {
+        self.handlers = self.handlers.layer(DefaultBodyLimit::disable());
+        self.slow()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::routes;
+
+    #[test]
+    fn the_contract_has_all_routes_and_no_others() {
+        let contract: serde_yaml_ng::Value =
+            serde_yaml_ng::from_str(include_str!("../../openapi.yaml")).unwrap();
+        let mut documented = BTreeSet::new();
+        for (path, item) in contract["paths"].as_mapping().unwrap() {
+            for (key, _) in item.as_mapping().unwrap() {
+                let (path, key) = (path.as_str().unwrap(), key.as_str().unwrap());
+                // A route for GET also answers HEAD.
+                if key != "parameters" && key != "summary" && key != "head" {
+                    documented.insert(format!("{key} {path}"));
+                }
+            }
+        }
+        let routes = routes();
+        let served = routes.iter().flat_map(|route| {
+            route.methods.iter().map(|method| format!("{method} {}", route.path))
+        });
+        assert_eq!(served.collect::<BTreeSet<_>>(), documented);
+    }
+}

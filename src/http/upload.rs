@@ -1,0 +1,99 @@
+//! Receiving a file: from the network to the disk, hashed on the way, a few chunks in memory.
+
+use std::io::Write;
+
+use axum::body::Bytes;
+use axum::http::{HeaderMap, header};
+use futures_util::{Stream, StreamExt};
+use tokio::sync::mpsc;
+
+use super::app::App;
+use super::error::{ApiError, Code};
+use crate::store::{StagedBlob, Store, StoreError};
+
+/// Chunks between the network and the disk.
+const CHUNKS: usize = 4;
+
+/// Receives a stream into a file that is not yet in the store. What is broken off leaves nothing.
+pub(super) async fn receive<S, E>(app: &App, mut stream: S) -> Result<StagedBlob, ApiError>
+where
+    S: Stream<Item = Result<Bytes, E>> + Unpin,
+    E: std::fmt::Display,
+{
+    let (sender, receiver) = mpsc::channel(CHUNKS);
+    let store = app.store.clone();
+    let writer = tokio::task::spawn_blocking(move || write(&store, receiver));
+    let mut size = 0;
+    while let Some(chunk) = next(app, &mut stream).await? {
+        size += chunk.len() as u64;
+        if size > app.max_upload_bytes {
+            return Err(too_large(app));
+        }
+        // A writer that takes no more has failed, and says why below.
+        if sender.send(chunk).await.is_err() {
+            break;
+        }
+    }
+    drop(sender);
+    let staged = writer.await.map_err(|_| StoreError::Interrupted)??;
+    if staged.size() == 0 {
+        return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
+    }
+    metrics::counter!("sci_recon_upload_bytes_total").increment(staged.size());
+    Ok(staged)
+}
+
+async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>, ApiError>
+where
+    S: Stream<Item = Result<Bytes, E>> + Unpin,
+    E: std::fmt::Display,
+{
+    match tokio::time::timeout(app.upload_idle, stream.next()).await {
+        Ok(Some(Ok(chunk))) => Ok(Some(chunk)),
+        Ok(None) => Ok(None),
+        Ok(Some(Err(error))) => {
+            let detail = format!("the upload was broken off: {error}");
+            Err(ApiError::new(Code::MalformedRequest, detail))
+        }
+        Err(_) => {
+            let seconds = app.upload_idle.as_secs();
+            let detail = format!("no byte came for {seconds} seconds; send the file again");
+            Err(ApiError::new(Code::UploadStalled, detail))
+        }
+    }
+}
+
+fn write(store: &Store, mut chunks: mpsc::Receiver<Bytes>) -> Result<StagedBlob, StoreError> {
+    let mut writer = store.blob_writer()?;
+    while let Some(chunk) = chunks.blocking_recv() {
+        writer.write_all(&chunk).map_err(|source| StoreError::Io {
+            action: "write",
+            path: store.dir().root().to_owned(),
+            source,
+        })?;
+    }
+    writer.finish()
+}
+
+/// Refuses an upload that says by its length that it can't be taken, before its first byte.
+pub(super) fn admit(app: &App, headers: &HeaderMap) -> Result<(), ApiError> {
+    let length = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok());
+    let length: u64 = length.and_then(|text| text.parse().ok()).unwrap_or(0);
+    if length > app.max_upload_bytes {
+        return Err(too_large(app));
+    }
+    let (free, _) = app.store.dir().disk()?;
+    if free < length.saturating_add(app.min_free_bytes) {
+        let detail = format!(
+            "the upload has {length} bytes, but of the {free} bytes free {} are kept in reserve",
+            app.min_free_bytes
+        );
+        return Err(ApiError::new(Code::InsufficientStorage, detail));
+    }
+    Ok(())
+}
+
+fn too_large(app: &App) -> ApiError {
+    let detail = format!("an upload has at most {} bytes", app.max_upload_bytes);
+    ApiError::new(Code::TooLarge, detail)
+}
