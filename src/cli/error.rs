@@ -45,15 +45,6 @@ impl CliError {
     }
 }
 
-impl From<ServeError> for CliError {
-    fn from(error: ServeError) -> Self {
-        match error {
-            ServeError::Config(_) => Self::Input(error.to_string()),
-            other => Self::Failure(other.to_string()),
-        }
-    }
-}
-
 impl From<ReconError> for CliError {
     fn from(error: ReconError) -> Self {
         let text = error.to_string();
@@ -62,6 +53,15 @@ impl From<ReconError> for CliError {
                 Self::Failure(text)
             }
             _ => Self::Input(text),
+        }
+    }
+}
+
+impl From<ServeError> for CliError {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Config(error) => Self::Input(error.to_string()),
+            other => Self::Failure(other.to_string()),
         }
     }
 }

@@ -5,7 +5,7 @@
 //! task back and ends: no worker outlives its server.
 
 use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
@@ -33,7 +33,7 @@ impl Supervisor {
     /// Starts `count` workers, to end when `stop` becomes true.
     pub(super) fn start(
         store: &Store,
-        program: &PathBuf,
+        program: &Path,
         arguments: &WorkerArguments,
         count: usize,
         stop: &watch::Receiver<bool>,
@@ -42,7 +42,7 @@ impl Supervisor {
         for _ in 0..count {
             let slot = Slot {
                 store: store.clone(),
-                program: program.clone(),
+                program: program.to_owned(),
                 arguments: arguments.clone(),
                 stop: stop.clone(),
             };

@@ -142,12 +142,7 @@ fn manifest(
         tile_plan: plan.into(),
         summary: Summary::of(&tiles),
         tiles,
-        camera: CameraRecord::new(
-            measurement.camera_fps,
-            measurement.exposure_s,
-            snapshot,
-            frames,
-        ),
+        camera: CameraRecord::new(measurement.camera_fps, measurement.exposure_s, snapshot, frames),
         files: Vec::new(),
     };
     let cpu_seconds = records.iter().map(|record| record.cpu_seconds).sum();

@@ -10,7 +10,9 @@ use super::manifest::{Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, Tile
 use super::prepare::{Prepared, to_record};
 use super::result::ResultFile;
 use super::task::{Engine, TaskError};
-use crate::job::{Algorithm, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp};
+use crate::job::{
+    Algorithm, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp,
+};
 use crate::store::{ClaimedTask, Completion, Product, Store, TaskRecord};
 
 /// Name and version of this form of record.
@@ -77,12 +79,9 @@ pub(super) fn run(
     let text = serde_json::to_string_pretty(&manifest)
         .map_err(|error| TaskError::Record { what: "job", problem: error.to_string() })?;
     let path = staged.path().join("manifest.json");
-    fs::write(&path, text + "\n").map_err(|source| super::ResultError::File {
-        name: "manifest.json".into(),
-        source,
-    })?;
-    let progress =
-        TaskProgress { stage: TaskStage::Writing, fraction: 1.0, ..TaskProgress::START };
+    fs::write(&path, text + "\n")
+        .map_err(|source| super::ResultError::File { name: "manifest.json".into(), source })?;
+    let progress = TaskProgress { stage: TaskStage::Writing, fraction: 1.0, ..TaskProgress::START };
     Ok(Completion { progress, record: to_record(&Value::Null)?, product: Product::Files(staged) })
 }
 

@@ -60,9 +60,7 @@ fn plane(reader: &Reader, frame: usize) -> Result<ndarray::Array2<f32>, FormatEr
 
 /// What is to be remembered of a task.
 pub(super) fn to_record(value: &impl Serialize) -> Result<serde_json::Value, TaskError> {
-    let record = |error: serde_json::Error| TaskError::Record {
-        what: "task",
-        problem: error.to_string(),
-    };
+    let record =
+        |error: serde_json::Error| TaskError::Record { what: "task", problem: error.to_string() };
     serde_json::to_value(value).map_err(record)
 }
