@@ -321,7 +321,7 @@ impl Solution {
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
             algorithm: setup.algorithm,
-            schedule: setup.schedule.clone(),
+            schedule: ScheduleSpec::from(&checked(&setup.schedule)?),
             frames,
             height,
             width,

@@ -15,7 +15,7 @@ use super::task::{Engine, Shared, TaskError};
 use super::tile::TileTaskRecord;
 use crate::formats::Limits;
 use crate::formats::planar::Reader;
-use crate::job::{TaskProgress, TaskStage, Timestamp};
+use crate::job::{ScheduleSpec, TaskProgress, TaskStage, Timestamp};
 use crate::recon::tile::TilePlan;
 use crate::store::{ClaimedTask, Completion, Product, Store, TileResult, hash_file};
 
@@ -124,7 +124,7 @@ fn manifest(
     let content = Content {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: spec.schedule.clone(),
+        schedule: ScheduleSpec::from(&spec.schedule.to_schedule()?),
         frames,
         height: spec.shape.height,
         width: spec.shape.width,

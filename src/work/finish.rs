@@ -108,7 +108,7 @@ fn content(
     Ok(JobContent {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: spec.schedule.clone(),
+        schedule: ScheduleSpec::from(&spec.schedule.to_schedule()?),
         shape: spec.shape,
         inputs: Inputs {
             masks_sha256: calibration.masks.to_string(),

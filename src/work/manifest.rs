@@ -17,6 +17,9 @@ use crate::recon::tile::TilePlan;
 /// Name and version of this form of record.
 pub const SCHEMA: &str = "sci-recon/snapshot/1";
 
+/// What the names of all our records begin with.
+pub(super) const SCHEMA_FAMILY: &str = "sci-recon/";
+
 /// Everything that is known about the reconstruction of one snapshot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {

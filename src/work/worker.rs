@@ -1,13 +1,16 @@
 //! The loop of a worker process.
 //!
-//! 1. Claim a task. 2. Do it on a thread of its own, while 3. heartbeats renew the lease, tell
-//! the progress and listen for a cancel. 4. Store what it made, or why it failed.
+//! 1. Claim a task.
+//! 2. Do it on a thread of its own.
+//! 3. Meanwhile, renew the lease, tell the progress and listen for a cancel.
+//! 4. Store what it made, or why it failed.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
+use tracing::Instrument;
 
 use super::network::NetworkSource;
 use super::task::{Engine, Material, Shared, TaskError, perform};
@@ -119,34 +122,46 @@ impl Worker {
         let span = tracing::info_span!("task", job = %task.job, kind = name, task = %lease.task);
         let material = match Material::of(&self.store, &task).await {
             Ok(material) => material,
-            Err(error) => return Ok(self.failed(&lease, &error.into()).await),
+            Err(error) => {
+                self.failed(&lease, &error.into()).instrument(span).await;
+                return Ok(());
+            }
         };
         let shared = Arc::new(Shared::new());
         let computing = self.start(task, material, &shared, span.clone());
-        let (computed, reason) = self.watch(computing, &lease, &shared).await?;
-        let (engine, outcome) = computed;
+        let watching = self.watch(computing, &lease, &shared).instrument(span.clone());
+        let ((engine, outcome), reason) = watching.await?;
         self.engine = Some(engine);
-        let _entered = span.enter();
+        self.end(&lease, outcome, reason).instrument(span).await;
+        Ok(())
+    }
+
+    /// Tells the store how a task ended.
+    async fn end(
+        &self,
+        lease: &Lease,
+        outcome: Result<Completion, TaskError>,
+        reason: Option<Reason>,
+    ) {
         match (outcome, reason) {
-            (Ok(completion), _) => self.complete(&lease, completion).await,
+            (Ok(completion), _) => self.complete(lease, completion).await,
             (Err(TaskError::Stopped), Some(Reason::Cancelled)) => {
                 tracing::info!("cancelled");
-                said(self.store.cancelled(&lease).await);
+                said(self.store.cancelled(lease).await);
             }
             (Err(TaskError::Stopped), Some(Reason::Shutdown) | None) => {
                 tracing::info!("given back");
-                said(self.store.release_task(&lease).await);
+                said(self.store.release_task(lease).await);
             }
             (Err(TaskError::Stopped), Some(Reason::Lost)) => {
                 tracing::warn!("the lease ran out and the task is another worker's now");
             }
             (Err(TaskError::Damaged(tiles)), _) => {
                 tracing::error!(?tiles, "stored tiles are damaged and will be done again");
-                said(self.store.redo_tiles(&lease, &tiles).await);
+                said(self.store.redo_tiles(lease, &tiles).await);
             }
-            (Err(error), _) => self.failed(&lease, &error).await,
+            (Err(error), _) => self.failed(lease, &error).await,
         }
-        Ok(())
     }
 
     fn start(
