@@ -76,7 +76,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     // 2. What an earlier server left.
     let swept = store.dir().sweep_tmp()?;
     store.forget_workers(Duration::from_secs(60)).await?;
-    // 3. The address, for those who wait for it.
+    // 3. The address, for those who wait for it; who has it may send a signal.
+    let signal = stop_signal().map_err(io("listen for signals"))?;
     let listener = TcpListener::bind(settings.listen)
         .await
         .map_err(|source| ServeError::Listen { address: settings.listen, source })?;
@@ -91,7 +92,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
     tokio::spawn(keep_house(store.clone(), metrics.clone(), settings.upload_hours));
     tokio::spawn(async move {
-        stop_signal().await;
+        signal.await;
         // Fails only if nobody listens any more.
         let _ = stopper.send(true);
     });
@@ -154,17 +155,16 @@ async fn keep_house(store: Store, metrics: Metrics, upload_hours: u64) {
     }
 }
 
-async fn stop_signal() {
-    let terminate = async {
-        match signal(SignalKind::terminate()) {
-            Ok(mut signal) => signal.recv().await,
-            Err(_) => std::future::pending().await,
+/// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.
+fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    Ok(async move {
+        tokio::select! {
+            _ = terminate.recv() => tracing::info!("stopping on SIGTERM"),
+            _ = interrupt.recv() => tracing::info!("stopping on Ctrl-C"),
         }
-    };
-    tokio::select! {
-        _ = terminate => tracing::info!("stopping on SIGTERM"),
-        _ = tokio::signal::ctrl_c() => tracing::info!("stopping on Ctrl-C"),
-    }
+    })
 }
 
 async fn stopped(mut stop: watch::Receiver<bool>) {

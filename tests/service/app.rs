@@ -1,0 +1,197 @@
+//! The service under test.
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::samples;
+
+/// A running service; it is killed when this is dropped.
+pub struct TestApp {
+    folder: TempDir,
+    process: Child,
+    url: String,
+    client: Client,
+    arguments: Vec<String>,
+}
+
+/// An answer whose body has been read.
+#[derive(Debug)]
+pub struct Answer {
+    pub status: StatusCode,
+    pub headers: reqwest::header::HeaderMap,
+    pub bytes: Vec<u8>,
+}
+
+impl Answer {
+    pub async fn read(response: Response) -> Self {
+        let (status, headers) = (response.status(), response.headers().clone());
+        Self { status, headers, bytes: response.bytes().await.unwrap().to_vec() }
+    }
+
+    pub fn json(&self) -> Value {
+        serde_json::from_slice(&self.bytes)
+            .unwrap_or_else(|_| panic!("no JSON: {}", String::from_utf8_lossy(&self.bytes)))
+    }
+
+    pub fn header(&self, name: &str) -> &str {
+        self.headers.get(name).map_or("", |value| value.to_str().unwrap())
+    }
+
+    /// Checks that this is a whole problem with this status and code, and gives its detail.
+    #[track_caller]
+    pub fn problem(&self, status: u16, code: &str) -> String {
+        let text = String::from_utf8_lossy(&self.bytes).into_owned();
+        assert_eq!(self.status.as_u16(), status, "{text}");
+        assert_eq!(self.header("content-type"), "application/problem+json", "{text}");
+        assert!(!self.header("x-request-id").is_empty());
+        let problem = self.json();
+        assert_eq!(problem["code"], code, "{text}");
+        assert_eq!(problem["status"], status);
+        assert_eq!(problem["type"], format!("urn:sci-recon:problem:{code}"));
+        assert!(problem["title"].is_string() && problem["retryable"].is_boolean());
+        problem["detail"].as_str().unwrap().to_owned()
+    }
+
+    #[track_caller]
+    pub fn expect(self, status: u16) -> Self {
+        let text = String::from_utf8_lossy(&self.bytes);
+        assert_eq!(self.status.as_u16(), status, "{text}");
+        self
+    }
+}
+
+impl TestApp {
+    /// A service without workers: what is submitted stays in the queue.
+    pub async fn start() -> Self {
+        Self::with(&["--workers", "0"]).await
+    }
+
+    pub async fn with(arguments: &[&str]) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let arguments: Vec<String> = arguments.iter().map(|&text| text.to_owned()).collect();
+        let (process, url) = spawn(folder.path(), &arguments);
+        Self { folder, process, url, client: Client::new(), arguments }
+    }
+
+    /// Kills the server as a power cut would, and starts another one on the same folder.
+    pub fn restart(&mut self) {
+        self.kill();
+        (self.process, self.url) = spawn(self.folder.path(), &self.arguments);
+    }
+
+    /// SIGKILL.
+    pub fn kill(&mut self) {
+        self.process.kill().unwrap();
+        self.process.wait().unwrap();
+    }
+
+    /// SIGTERM, and the exit status.
+    pub fn stop(&mut self) -> std::process::ExitStatus {
+        let pid = rustix::process::Pid::from_raw(self.process.id() as i32).unwrap();
+        rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+        self.process.wait().unwrap()
+    }
+
+    pub fn data(&self) -> &Path {
+        self.folder.path()
+    }
+
+    pub fn pid(&self) -> u32 {
+        self.process.id()
+    }
+
+    pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        self.client.request(method, format!("{}{path}", self.url))
+    }
+
+    pub async fn send(&self, request: RequestBuilder) -> Answer {
+        Answer::read(request.send().await.unwrap()).await
+    }
+
+    pub async fn get(&self, path: &str) -> Answer {
+        self.send(self.request(Method::GET, path)).await
+    }
+
+    pub async fn delete(&self, path: &str) -> Answer {
+        self.send(self.request(Method::DELETE, path)).await
+    }
+
+    pub async fn post(&self, path: &str, body: &Value) -> Answer {
+        self.send(self.request(Method::POST, path).json(body)).await
+    }
+
+    /// Sends a file and gives its hash.
+    pub async fn upload(&self, bytes: Vec<u8>) -> String {
+        let answer = self.send(self.request(Method::POST, "/v1/blobs").body(bytes)).await;
+        assert!(answer.status.is_success(), "{answer:?}");
+        answer.json()["sha256"].as_str().unwrap().to_owned()
+    }
+
+    /// Sends masks and makes a calibration of them, if they are good.
+    pub async fn calibrate(&self, masks: Vec<u8>) -> Answer {
+        let masks = self.upload(masks).await;
+        self.post("/v1/calibrations", &json!({ "masks": masks })).await
+    }
+
+    /// Sends snapshots and makes a measurement of them, if they are good.
+    pub async fn measure(&self, calibration: &str, data: Vec<u8>) -> Answer {
+        let data = self.upload(data).await;
+        let body = json!({ "calibration": calibration, "data": data });
+        self.post("/v1/measurements", &body).await
+    }
+
+    /// A calibration and a measurement of `snapshots` snapshots of a moving square; gives both ids.
+    pub async fn scene(&self, scene: &samples::Scene) -> (String, String) {
+        let calibration = id(&self.calibrate(scene.masks()).await.expect(201));
+        let measurement = id(&self.measure(&calibration, scene.snapshots()).await.expect(201));
+        (calibration, measurement)
+    }
+}
+
+/// The identifier in an answer.
+pub fn id(answer: &Answer) -> String {
+    answer.json()["id"].as_str().unwrap().to_owned()
+}
+
+impl Drop for TestApp {
+    fn drop(&mut self) {
+        // It may be dead already.
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+fn spawn(data: &Path, arguments: &[String]) -> (Child, String) {
+    let mut process = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+        .args(["serve", "--listen", "127.0.0.1:0", "--min-free-bytes", "1000000", "--data"])
+        .arg(data)
+        .args(arguments)
+        .env("RUST_LOG", std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into()))
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(process.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let announced: Value = serde_json::from_str(&line).expect("the server starts");
+    (process, announced["url"].as_str().unwrap().to_owned())
+}
+
+impl TestApp {
+    /// Where the service listens, as `host:port`.
+    pub fn address(&self) -> String {
+        self.url.trim_start_matches("http://").to_owned()
+    }
+
+    /// The most memory that the server has had resident, in MiB.
+    pub fn peak_memory(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() / 1024
+    }
+}

@@ -1,0 +1,199 @@
+//! Input that is meant to do harm, or that a tired person sends. Issue 2: each gets a 4xx with a clear
+//! message, and the service lives.
+
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use crate::app::{Answer, TestApp, id};
+use crate::samples::{self, Scene, constant, npy, npy_header};
+
+#[tokio::test]
+async fn bad_masks_are_refused_with_what_is_wrong() {
+    let app = TestApp::start().await;
+    let mut nan = vec![0.5f32; 4 * 8 * 8];
+    nan[2 * 64 + 3 * 8 + 5] = f32::NAN;
+    let mut dark_frame = vec![0.5f32; 2 * 8 * 8];
+    dark_frame[64..].fill(0.0);
+    let truncated = |mut file: Vec<u8>, by: usize| {
+        file.truncate(file.len() - by);
+        file
+    };
+    let two_gigabytes = [npy_header("<f4", &[50, 3277, 3277]), vec![0; 900]].concat();
+    let fields_of = |text: &str| {
+        [b"\x93NUMPY\x01\x00".to_vec(), vec![text.len() as u8, 0], text.into()].concat()
+    };
+    let cases: Vec<(&str, Vec<u8>, &str, &[&str])> = vec![
+        ("a truncated TIFF", truncated(samples::tiff(64, 64), 2000), "truncated", &["TIFF"]),
+        ("a TIFF cut in its header", truncated(samples::tiff(8, 8), 100), "", &["TIFF"]),
+        ("2 GB promised in 1 kB", two_gigabytes, "truncated", &["promises"]),
+        ("a truncated npy", truncated(constant(&[2, 8, 8], 0.5), 1), "truncated", &[]),
+        ("a huge side", npy_header("<f4", &[1, 1 << 40, 8]), "over_limit", &["height"]),
+        ("sides that overflow", npy_header("<f4", &[1 << 40, 1 << 40, 1 << 40]), "over_limit", &[]),
+        ("NaN", npy(&[4, 8, 8], nan.into_iter()), "not_finite", &["frame 2", "row 3", "column 5"]),
+        ("infinity", constant(&[2, 8, 8], f32::INFINITY), "not_finite", &["frame 0"]),
+        ("zero masks", constant(&[2, 8, 8], 0.0), "all_masks_zero", &["open"]),
+        ("one zero mask", npy(&[2, 8, 8], dark_frame.into_iter()), "mask_frame_zero", &["frame 1"]),
+        ("values above 1", constant(&[2, 8, 8], 200.0), "above_full_scale", &["200", "full_scale"]),
+        (
+            "complex numbers",
+            [npy_header("<c8", &[1, 8, 8]), vec![0; 512]].concat(),
+            "",
+            &["complex64"],
+        ),
+        ("strings", [npy_header("<U8", &[1, 8, 8]), vec![0; 2048]].concat(), "", &["U8"]),
+        (
+            "objects",
+            fields_of("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n"),
+            "",
+            &[],
+        ),
+        ("a header of nonsense", fields_of("__import__('os').system('true')\n"), "", &["npy"]),
+        ("no axes", npy_header("<f4", &[]), "", &[]),
+        ("an empty axis", npy_header("<f4", &[0, 8, 8]), "malformed", &["empty"]),
+        ("text", b"hello, these are my masks".to_vec(), "unknown_format", &["npy"]),
+        ("one byte", b"x".to_vec(), "unknown_format", &[]),
+        ("a colour PNG", colour_png(), "unsupported_content", &["PNG"]),
+        ("half a PNG", colour_png()[..40].to_vec(), "", &[]),
+        ("a zip", b"PK\x03\x04 and so on".to_vec(), "unknown_format", &["npz"]),
+    ];
+    for (name, file, reason, words) in cases {
+        let answer = app.calibrate(file).await;
+        let detail = answer.problem(422, "invalid_content");
+        assert!(detail.len() > 20, "{name}: {detail}");
+        if !reason.is_empty() {
+            assert_eq!(answer.json()["reason"], reason, "{name}: {detail}");
+        }
+        for word in words {
+            assert!(detail.contains(word), "{name}: {detail:?} does not say {word:?}");
+        }
+        assert!(!detail.contains(app.data().to_str().unwrap()), "{name} shows a path: {detail}");
+    }
+    // The service lives, and nothing of all that is in the way.
+    app.calibrate(Scene::SMALL.masks()).await.expect(201);
+    assert_eq!(std::fs::read_dir(app.data().join("tmp")).unwrap().count(), 0);
+}
+
+/// A PNG of one red pixel.
+fn colour_png() -> Vec<u8> {
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, 1, 1);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.write_header().unwrap().write_image_data(&[255, 0, 0]).unwrap();
+    file
+}
+
+#[tokio::test]
+async fn measurements_that_do_not_fit_are_refused_with_both_sizes() {
+    let app = TestApp::start().await;
+    let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
+    let wrong = app.measure(&calibration, constant(&[1, 32, 64], 1.0)).await;
+    let detail = wrong.problem(422, "size_mismatch");
+    assert!(detail.contains("32x64") && detail.contains("48x64"), "{detail}");
+    assert_eq!(wrong.json()["pointer"], "/data");
+    let turned = app.measure(&calibration, constant(&[64, 48], 1.0)).await;
+    turned.problem(422, "size_mismatch");
+    let dark = app.measure(&calibration, constant(&[2, 48, 64], 0.0)).await;
+    assert!(dark.problem(422, "invalid_content").contains("snapshot 0"));
+    let nan = app.measure(&calibration, constant(&[48, 64], f32::NAN)).await;
+    assert_eq!(nan.json()["reason"], "not_finite");
+}
+
+#[tokio::test]
+async fn bad_fields_are_refused_with_their_place() {
+    let app = TestApp::start().await;
+    let masks = app.upload(Scene::SMALL.masks()).await;
+    let nowhere = "0".repeat(64);
+    let calibrations: Vec<(Value, &str)> = vec![
+        (json!({}), ""),
+        (json!({"masks": nowhere}), "/masks"),
+        (json!({"masks": "../../etc/passwd"}), "/masks"),
+        (json!({"masks": masks, "name": "a\nb"}), "/name"),
+        (json!({"masks": masks, "name": "x".repeat(201)}), "/name"),
+        (json!({"masks": masks, "name": ""}), "/name"),
+        (json!({"masks": masks, "frames": 8}), "/frames"),
+        (json!({"masks": masks, "full_scale": "255"}), "/full_scale"),
+        (json!([masks]), ""),
+    ];
+    for (body, pointer) in calibrations {
+        let answer = app.post("/v1/calibrations", &body).await;
+        answer.problem(422, "invalid_request");
+        assert_eq!(answer.json()["pointer"], pointer, "{body}");
+    }
+    for scale in [json!(0), json!(-1), json!(1e-45), json!(1e39)] {
+        let answer =
+            app.post("/v1/calibrations", &json!({"masks": masks, "full_scale": scale})).await;
+        assert_eq!(
+            (answer.status.as_u16(), &answer.json()["pointer"]),
+            (422, &json!("/full_scale"))
+        );
+    }
+    // A path as a name is a name.
+    let body = json!({"masks": masks, "name": "../../etc/passwd"});
+    let named = app.post("/v1/calibrations", &body).await.expect(201);
+    assert_eq!(named.json()["name"], "../../etc/passwd");
+    let calibration = id(&named);
+    let data = app.upload(Scene::SMALL.snapshots()).await;
+    let good = json!({"calibration": calibration, "data": data});
+    for (field, value) in [
+        ("camera_fps", json!(0)),
+        ("camera_fps", json!(1e300)),
+        ("exposure_s", json!(-0.1)),
+        ("calibration", json!("019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d")),
+        ("calibration", json!("mine")),
+        ("data", json!(nowhere)),
+    ] {
+        let mut body = good.clone();
+        body[field] = value;
+        let answer = app.post("/v1/measurements", &body).await;
+        answer.problem(422, "invalid_request");
+        assert_eq!(answer.json()["pointer"], format!("/{field}"));
+    }
+}
+
+#[tokio::test]
+async fn bodies_that_are_no_json_are_told_apart() {
+    let app = TestApp::start().await;
+    let post = |kind: &'static str, body: Vec<u8>| {
+        app.send(app.request(Method::POST, "/v1/jobs").header("content-type", kind).body(body))
+    };
+    post("application/json", Vec::new()).await.problem(400, "empty_body");
+    post("application/json", b"{".to_vec()).await.problem(400, "malformed_json");
+    post("application/json", b"{} {}".to_vec()).await.problem(422, "invalid_request");
+    post("application/json", vec![0xff, 0xfe]).await.problem(400, "malformed_json");
+    post("text/plain", b"{}".to_vec()).await.problem(415, "unsupported_media_type");
+    post("application/json", vec![b' '; 300_000]).await.problem(413, "too_large");
+    let deep = "[".repeat(100_000).into_bytes();
+    let nested: Answer = post("application/json", deep).await;
+    assert_eq!(nested.status.as_u16() / 100, 4, "{nested:?}");
+}
+
+#[tokio::test]
+async fn odd_requests_are_answered() {
+    let app = TestApp::start().await;
+    app.get("/nowhere").await.problem(404, "not_found");
+    app.get("/v1/jobs/").await.problem(404, "not_found");
+    app.get("/v1/jobs/mine").await.problem(404, "not_found");
+    app.get("/v1/jobs/%ff").await.problem(404, "not_found");
+    app.get("/v1/jobs?limit=0").await.problem(400, "invalid_query");
+    app.get("/v1/jobs?limit=many").await.problem(400, "invalid_query");
+    app.get("/v1/jobs?state=lost").await.problem(400, "invalid_query");
+    app.get("/v1/jobs?colour=red").await.problem(400, "invalid_query");
+    app.get("/v1/jobs?cursor=1").await.problem(400, "invalid_query");
+    app.get("/v1/jobs?label=%00").await.problem(400, "invalid_query");
+    for (method, path, allow) in [
+        (Method::PATCH, "/v1/jobs", "GET,HEAD,POST"),
+        (Method::PUT, "/v1/blobs", "POST"),
+        (Method::DELETE, "/livez", "GET,HEAD"),
+        (Method::from_bytes(b"BREW").unwrap(), "/v1/calibrations", "GET,HEAD,POST"),
+        (Method::GET, "/v1/blobs", "POST"),
+        (Method::TRACE, "/metrics", "GET,HEAD"),
+    ] {
+        let answer = app.send(app.request(method, path)).await;
+        answer.problem(405, "method_not_allowed");
+        assert_eq!(answer.header("allow"), allow, "{path}");
+    }
+    let mine = app.request(Method::GET, "/livez").header("x-request-id", "lab-7.42");
+    assert_eq!(app.send(mine).await.header("x-request-id"), "lab-7.42");
+    let odd = app.request(Method::GET, "/livez").header("x-request-id", "a b\u{e9}");
+    assert_ne!(app.send(odd).await.header("x-request-id").len(), 0);
+}

@@ -1,0 +1,10 @@
+//! The service as lab machines see it: the real program on a free port with a fresh folder.
+
+#![allow(clippy::unwrap_used)] // helpers of tests
+
+mod app;
+mod contract;
+mod hostile;
+mod jobs;
+mod samples;
+mod uploads;

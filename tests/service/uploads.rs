@@ -1,0 +1,142 @@
+//! Sending files.
+
+use reqwest::{Body, Method, multipart};
+use serde_json::json;
+
+use crate::app::TestApp;
+
+/// SHA-256 of "abc".
+const ABC: &str = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+
+#[tokio::test]
+async fn a_file_is_stored_once_under_its_hash() {
+    let app = TestApp::start().await;
+    let post = || app.request(Method::POST, "/v1/blobs").body("abc");
+    let first = app.send(post()).await.expect(201);
+    assert_eq!(first.json()["sha256"], ABC);
+    assert_eq!(first.json()["size"], 3);
+    assert_eq!(first.header("location"), format!("/v1/blobs/{ABC}"));
+    assert_eq!(app.send(post()).await.expect(200).json(), first.json());
+    let put = app.request(Method::PUT, &format!("/v1/blobs/{ABC}")).body("abc");
+    app.send(put).await.expect(200);
+    let form = multipart::Form::new()
+        .text("note", "before the file")
+        .part("file", multipart::Part::bytes(b"abc".to_vec()).file_name("../../etc/passwd"));
+    app.send(app.request(Method::POST, "/v1/blobs").multipart(form)).await.expect(200);
+    assert_eq!(app.get(&format!("/v1/blobs/{ABC}")).await.expect(200).json(), first.json());
+    let head = app.request(Method::HEAD, &format!("/v1/blobs/{ABC}"));
+    assert!(app.send(head).await.expect(200).bytes.is_empty());
+    let path = app.data().join("blobs").join(&ABC[..2]).join(&ABC[2..]);
+    assert_eq!(std::fs::read(path).unwrap(), b"abc");
+}
+
+#[tokio::test]
+async fn what_is_wrong_with_an_upload_is_told_and_nothing_stays() {
+    let app = TestApp::with(&["--workers", "0", "--max-upload-bytes", "100000"]).await;
+    let put = |body: &'static str| app.request(Method::PUT, &format!("/v1/blobs/{ABC}")).body(body);
+    let detail = app.send(put("abd")).await.problem(422, "hash_mismatch");
+    assert!(detail.contains(ABC), "{detail}");
+    app.send(put("")).await.problem(400, "empty_body");
+    let post = |body: Body| app.request(Method::POST, "/v1/blobs").body(body);
+    app.send(post(Body::from(""))).await.problem(400, "empty_body");
+    app.send(post(Body::from(vec![0; 100_001]))).await.problem(413, "too_large");
+    // Without a Content-Length the size is learned on the way.
+    let chunks = (0..20).map(|_| Ok::<_, std::io::Error>(vec![0u8; 10_000]));
+    let stream = Body::wrap_stream(futures_util::stream::iter(chunks));
+    app.send(post(stream)).await.problem(413, "too_large");
+    let form = multipart::Form::new().text("other", "field");
+    let answer = app.send(app.request(Method::POST, "/v1/blobs").multipart(form)).await;
+    assert!(answer.problem(400, "malformed_request").contains("file"));
+    let broken = app
+        .request(Method::POST, "/v1/blobs")
+        .header("content-type", "multipart/form-data; boundary=x")
+        .body("--x\r\nContent-Disposition: form-data; name=\"file\"\r\n\r\nno end");
+    app.send(broken).await.problem(400, "malformed_request");
+    app.get(&format!("/v1/blobs/{ABC}")).await.problem(404, "not_found");
+    for bad in ["abc", "..%2F..%2Fetc%2Fpasswd", &ABC.to_uppercase()] {
+        app.get(&format!("/v1/blobs/{bad}")).await.problem(404, "not_found");
+    }
+    assert_eq!(std::fs::read_dir(app.data().join("tmp")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn a_cut_connection_leaves_nothing_behind() {
+    use tokio::io::AsyncWriteExt;
+    let app = TestApp::start().await;
+    let address = app.address();
+    let mut socket = tokio::net::TcpStream::connect(&address).await.unwrap();
+    let head =
+        format!("POST /v1/blobs HTTP/1.1\r\nHost: {address}\r\nContent-Length: 1000000\r\n\r\n");
+    socket.write_all(head.as_bytes()).await.unwrap();
+    socket.write_all(&[7; 200_000]).await.unwrap();
+    let tmp = app.data().join("tmp");
+    let count = || std::fs::read_dir(&tmp).unwrap().count();
+    while count() == 0 {
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+    drop(socket);
+    let start = std::time::Instant::now();
+    while count() > 0 {
+        assert!(start.elapsed().as_secs() < 10, "the file of a dead upload stays");
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+}
+
+#[tokio::test]
+async fn an_upload_that_stalls_is_given_up() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let app = TestApp::with(&["--workers", "0", "--upload-idle-seconds", "1"]).await;
+    let address = app.address();
+    let mut socket = tokio::net::TcpStream::connect(&address).await.unwrap();
+    let head =
+        format!("POST /v1/blobs HTTP/1.1\r\nHost: {address}\r\nContent-Length: 10\r\n\r\nabc");
+    socket.write_all(head.as_bytes()).await.unwrap();
+    let mut answer = vec![0; 20];
+    socket.read_exact(&mut answer).await.unwrap();
+    assert!(answer.starts_with(b"HTTP/1.1 408"), "{}", String::from_utf8_lossy(&answer));
+}
+
+#[tokio::test]
+async fn too_many_uploads_at_once_are_told_to_come_back() {
+    use tokio::io::AsyncWriteExt;
+    let app = TestApp::with(&["--workers", "0", "--max-uploads", "1"]).await;
+    let address = app.address();
+    let mut socket = tokio::net::TcpStream::connect(&address).await.unwrap();
+    let head =
+        format!("POST /v1/blobs HTTP/1.1\r\nHost: {address}\r\nContent-Length: 10\r\n\r\nabc");
+    socket.write_all(head.as_bytes()).await.unwrap();
+    while std::fs::read_dir(app.data().join("tmp")).unwrap().count() == 0 {
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+    let second = app.send(app.request(Method::POST, "/v1/blobs").body("abc")).await;
+    second.problem(429, "too_many_uploads");
+    assert_eq!(second.header("retry-after"), "5");
+}
+
+/// Issue 2: memory of the server stays under 200 MiB while a 600 MB mask stack is uploaded (and
+/// checked).
+#[tokio::test]
+async fn memory_stays_small_while_a_large_stack_is_uploaded() {
+    const FRAMES: usize = 60;
+    const SIDE: usize = 2240;
+    let app = TestApp::start().await;
+    let header = crate::samples::npy_header("<u2", &[FRAMES, SIDE, SIDE]);
+    let frame = bytes::Bytes::from(
+        (0..SIDE * SIDE)
+            .flat_map(|at| ((at * 2_654_435_761) as u16).to_le_bytes())
+            .collect::<Vec<u8>>(),
+    );
+    let size = header.len() + FRAMES * frame.len();
+    assert!(size > 600_000_000);
+    let mut chunks = vec![Ok::<_, std::io::Error>(bytes::Bytes::from(header))];
+    chunks.extend((0..FRAMES).map(|_| Ok(frame.clone())));
+    let body = Body::wrap_stream(futures_util::stream::iter(chunks));
+    let answer = app.send(app.request(Method::POST, "/v1/blobs").body(body)).await.expect(201);
+    assert_eq!(answer.json()["size"], size);
+    let uploaded = app.peak_memory();
+    let masks = json!({ "masks": answer.json()["sha256"] });
+    app.post("/v1/calibrations", &masks).await.expect(201);
+    let checked = app.peak_memory();
+    eprintln!("peak of the server: {uploaded} MiB after the upload, {checked} MiB after the check");
+    assert!(checked < 200, "{checked} MiB");
+}
