@@ -107,10 +107,6 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
 
-    /// Threads of one worker.
-    #[arg(long, env = "SCI_RECON_WORKER_THREADS", value_name = "N", default_value_t = 1)]
-    pub threads: usize,
-
     /// How much workers stand back for others (0 to 19), so that the API answers at full load.
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
@@ -178,7 +174,6 @@ impl WorkerArguments {
         let mut option = |name: &str, value: std::ffi::OsString| line.extend([name.into(), value]);
         option("--data", self.data.clone().into());
         option("--device", self.engine.device.clone().into());
-        option("--threads", self.engine.threads.to_string().into());
         option("--nice", self.engine.nice.to_string().into());
         let format = if self.log_format == LogFormat::Json { "json" } else { "text" };
         option("--log-format", format.into());
@@ -228,7 +223,7 @@ mod tests {
 
     #[test]
     fn a_worker_gets_the_arguments_that_were_meant_for_it() {
-        let line = ["--data", "some dir", "--device", "cuda:0", "--threads", "3", "--nice", "5"];
+        let line = ["--data", "some dir", "--device", "cuda:0", "--nice", "5"];
         let more = ["--onnxruntime", "lib.so", "--supervised", "--log-format", "json"];
         let first = Worker::try_parse_from(line.iter().chain(&more)).unwrap().arguments;
         let again = Worker::try_parse_from(&first.command_line()[1..]).unwrap().arguments;

@@ -3,7 +3,8 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use sci_recon::{cli, config};
+use sci_recon::cli::{self, CliError};
+use sci_recon::config;
 
 /// Reconstructs video from snapshot compressive measurements, over HTTP or right here.
 #[derive(Debug, Parser)]
@@ -16,13 +17,15 @@ struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Serve(config::ServeArguments),
+    Worker(config::WorkerArguments),
     Reconstruct(cli::reconstruct::Arguments),
     Simulate(cli::simulate::Arguments),
 }
 
 fn main() -> ExitCode {
     let outcome = match Arguments::parse().command {
-        Command::Serve(arguments) => cli::serve::run(&arguments).map_err(Into::into),
+        Command::Serve(arguments) => cli::serve::run(&arguments).map_err(CliError::from),
+        Command::Worker(arguments) => cli::worker::run(&arguments),
         Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
     };

@@ -10,5 +10,6 @@ mod supervisor;
 pub mod reconstruct;
 pub mod serve;
 pub mod simulate;
+pub mod worker;
 
 pub use error::CliError;

@@ -321,7 +321,7 @@ impl Solution {
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
             algorithm: setup.algorithm,
-            schedule: setup.schedule.clone(),
+            schedule: ScheduleSpec::from(&checked(&setup.schedule)?),
             frames,
             height,
             width,
@@ -346,8 +346,9 @@ impl Solution {
             job: None,
             provider: deep.then(|| setup.network.provider().into()),
             onnxruntime: if deep { Some(setup.network.version()?) } else { None },
-            seconds: spent.seconds,
-            cpu_seconds: Some(spent.cpu_seconds),
+            seconds: Some(spent.seconds),
+            cpu_seconds: spent.cpu_seconds,
+            peak_rss_bytes: peak_rss_bytes(),
             finished_at: Timestamp::now().to_string(),
         };
         Ok(Manifest { schema: SCHEMA.into(), content, run })

@@ -17,6 +17,9 @@ use crate::recon::tile::TilePlan;
 /// Name and version of this form of record.
 pub const SCHEMA: &str = "sci-recon/snapshot/1";
 
+/// What the names of all our records begin with.
+pub(super) const SCHEMA_FAMILY: &str = "sci-recon/";
+
 /// Everything that is known about the reconstruction of one snapshot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
@@ -230,10 +233,12 @@ pub struct RunRecord {
     pub provider: Option<String>,
     /// Build of ONNX Runtime; none without a network.
     pub onnxruntime: Option<String>,
-    /// Seconds of computing: wall time on the command line, the sum over the tiles in a job.
-    pub seconds: f64,
-    /// Processor seconds of computing, where they were measured.
-    pub cpu_seconds: Option<f64>,
+    /// Wall time of computing; none for a job, whose workers share their time with others'.
+    pub seconds: Option<f64>,
+    /// Processor seconds of computing: of all tiles together.
+    pub cpu_seconds: f64,
+    /// Largest resident memory of a process that computed.
+    pub peak_rss_bytes: u64,
     /// When it ended, RFC 3339 in UTC.
     pub finished_at: String,
 }
@@ -297,8 +302,9 @@ pub(super) fn sample() -> Manifest {
         job: None,
         provider: None,
         onnxruntime: None,
-        seconds: 1.0,
-        cpu_seconds: None,
+        seconds: None,
+        cpu_seconds: 1.0,
+        peak_rss_bytes: 1,
         finished_at: "2026-01-01T00:00:00.000Z".into(),
     };
     Manifest { schema: SCHEMA.into(), content, run }

@@ -1,14 +1,21 @@
-//! The work itself: solving tiles, writing results, and what is recorded about them.
+//! The work itself: solving tiles, writing results, and the worker that does so for the queue.
 //!
-//! The command line and the worker processes share everything here, so that a job gives the
-//! same frames whichever way it came.
+//! A worker's tasks are one file each: [`prepare`], [`tile`], [`assemble`], [`finish`]. The
+//! command line and the workers share [`solve`] and the writing of results, so that a job gives
+//! the same frames whichever way it came.
 
+mod assemble;
+mod finish;
 mod network;
+mod prepare;
 mod result;
 mod share;
 mod snapshot;
+mod solve;
+mod task;
 mod tile;
 mod usage;
+mod worker;
 
 pub mod manifest;
 
@@ -18,5 +25,6 @@ pub use result::{
 };
 pub use share::ShareDone;
 pub use snapshot::{SnapshotInput, SolveError, TileProgress, blended_frame, solve};
-pub use tile::{TileInput, TileOutcome, reconstruct_tile, typical_white};
+pub use solve::{TileInput, TileOutcome, reconstruct_tile, typical_white};
 pub use usage::{Usage, peak_rss_bytes};
+pub use worker::{Worker, WorkerError};

@@ -1,6 +1,8 @@
 //! Where the denoiser comes from: libonnxruntime and the network that the program carries.
 
+use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
 
 use crate::models::{FASTDVDNET_GRAY, TwoStageModel};
 use crate::recon::ReconError;
@@ -29,12 +31,13 @@ pub enum NetworkError {
 pub struct NetworkSource {
     library: Option<PathBuf>,
     device: Device,
+    version: Arc<OnceLock<String>>,
 }
 
 impl NetworkSource {
     /// `library` is a libonnxruntime, or none for the one beside the executable.
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
-        Self { library, device }
+        Self { library, device, version: Arc::default() }
     }
 
     /// Name of the execution provider, for records.
@@ -47,12 +50,18 @@ impl NetworkSource {
         &FASTDVDNET_GRAY
     }
 
-    /// What the library says about itself; loads it.
+    /// Version of the library, for records; loads it.
     ///
     /// # Errors
     /// As [`NetworkSource::load`].
     pub fn version(&self) -> Result<String, NetworkError> {
-        Ok(self.runtime()?.version())
+        let runtime = self.runtime()?;
+        let path = self.path()?;
+        let read = || {
+            let version = fs::read(&path).ok().and_then(|library| version_in(&library));
+            version.unwrap_or_else(|| runtime.build_info().to_owned())
+        };
+        Ok(self.version.get_or_init(read).clone())
     }
 
     /// A denoiser with sessions of its own, for one thread.
@@ -87,10 +96,29 @@ fn existing(path: &Path) -> Option<PathBuf> {
     path.is_file().then(|| path.to_path_buf())
 }
 
+/// The version that a libonnxruntime gives to its symbols, such as `1.31.1`. What it tells of
+/// its build through its own interface names a commit only.
+fn version_in(library: &[u8]) -> Option<String> {
+    const MARK: &[u8] = b"\0VERS_";
+    let at = library.windows(MARK.len()).position(|window| window == MARK)?;
+    let rest = &library[at + MARK.len()..];
+    let is_version = |byte: &u8| byte.is_ascii_digit() || *byte == b'.';
+    let version: Vec<u8> = rest.iter().copied().take_while(is_version).collect();
+    String::from_utf8(version).ok().filter(|version| version.contains('.'))
+}
+
 #[cfg(test)]
 mod tests {
-    use super::NetworkSource;
+    use super::{NetworkSource, version_in};
     use crate::recon::denoise::onnx::Device;
+
+    #[test]
+    fn the_version_is_that_of_the_symbols() {
+        let library = b"\x7fELF\0VERS_1.31.1\0OrtGetApiBase\0";
+        assert_eq!(version_in(library).as_deref(), Some("1.31.1"));
+        assert_eq!(version_in(b"\0VERS_\0"), None);
+        assert_eq!(version_in(b"nothing"), None);
+    }
 
     #[test]
     fn a_missing_library_is_named() {

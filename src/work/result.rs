@@ -6,9 +6,10 @@ use std::path::Path;
 
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-use super::manifest::Manifest;
+use super::manifest::{Manifest, SCHEMA_FAMILY};
 use crate::formats::{FormatError, exr, npy, png};
 
 const FRAMES: &str = "frames";
@@ -119,8 +120,11 @@ pub fn write_result<E: From<ResultError> + From<FormatError>>(
 /// # Errors
 /// [`ResultError::Foreign`].
 pub fn check_output(folder: &Path) -> Result<(), ResultError> {
+    // Of any version of this program: the form of manifests changes.
     let manifest = fs::read(folder.join(MANIFEST)).ok();
-    if manifest.is_some_and(|text| serde_json::from_slice::<Manifest>(&text).is_ok()) {
+    let manifest = manifest.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
+    let schema = manifest.as_ref().and_then(|manifest| manifest["schema"].as_str());
+    if schema.is_some_and(|schema| schema.starts_with(SCHEMA_FAMILY)) {
         return Ok(());
     }
     match NAMES.into_iter().find(|name| folder.join(name).exists()) {

@@ -7,7 +7,7 @@ use std::thread;
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 
 use super::network::{NetworkError, NetworkSource};
-use super::tile::{TileInput, TileOutcome, reconstruct_tile};
+use super::solve::{TileInput, TileOutcome, reconstruct_tile};
 use crate::recon::ReconError;
 use crate::recon::denoise::Denoiser;
 use crate::recon::gap::{Control, Observer, Progress};

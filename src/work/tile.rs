@@ -1,158 +1,121 @@
-//! One tile: the unit of work.
+//! The task of one tile.
 
-use ndarray::{Array2, Array3};
+use std::io::BufWriter;
 
-use crate::recon::ReconError;
+use ndarray::Axis;
+use serde::{Deserialize, Serialize};
+
+use super::manifest::TileRecord;
+use super::prepare::{Prepared, to_record};
+use super::share::ShareDone;
+use super::solve::{TileInput, TileOutcome, reconstruct_tile};
+use super::task::{Engine, Shared, TaskError};
+use super::usage::{Usage, peak_rss_bytes};
+use crate::formats::planar::{Reader, Writer};
+use crate::formats::{FormatError, Limits};
+use crate::job::{TaskProgress, TaskStage};
 use crate::recon::denoise::Denoiser;
-use crate::recon::gap::{self, Observer, StopReason};
-use crate::recon::schedule::Schedule;
-use crate::recon::sensing::SensingOperator;
+use crate::recon::gap::{Control, Observer, Progress};
+use crate::recon::tile::Tile;
+use crate::store::{ClaimedTask, Completion, Product, StagedBlob, Store};
 
-/// What one tile is made of.
-#[derive(Debug, Clone)]
-pub struct TileInput {
-    /// The masks' window \[B,h,w\] on \[0,1\].
-    pub masks: Array3<f32>,
-    /// The measurement's window \[h,w\].
-    pub measurement: Array2<f32>,
-    /// White level of the scene, above 0: the same for all tiles of a job, or seams would show.
-    pub white: f32,
+/// What is remembered of a tile's task.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct TileTaskRecord {
+    #[serde(flatten)]
+    pub(super) tile: TileRecord,
+    /// Processor seconds from reading the window to storing the frames.
+    pub(super) cpu_seconds: f64,
+    /// Peak memory of the worker so far.
+    pub(super) peak_rss_bytes: u64,
+    /// Execution provider of the network; none without a network.
+    pub(super) provider: Option<String>,
+    /// Build of ONNX Runtime; none without a network.
+    pub(super) onnxruntime: Option<String>,
 }
 
-/// A reconstructed tile and how it came about.
-#[derive(Debug, Clone)]
-pub struct TileOutcome {
-    /// The frames \[B,h,w\] on the measurement's own scale.
-    pub frames: Array3<f32>,
-    /// Iterations whose prior had a total-variation part.
-    pub tv_iterations: usize,
-    /// Passes of the learned denoiser.
-    pub denoiser_passes: usize,
-    /// `||y - H v|| / ||y||` of the result.
-    pub residual: f32,
-    /// Why it ended.
-    pub stop_reason: StopReason,
-}
-
-/// Reconstructs one tile: divides the measurement by the white level, runs the schedule, and
-/// multiplies the frames by it again.
-///
-/// A tile that no light reaches through any mask (a corner outside a round aperture, say) has
-/// frames of 0 and no iterations.
-///
-/// # Errors
-/// As [`gap::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
-pub fn reconstruct_tile<'a>(
-    input: TileInput,
-    schedule: &Schedule,
-    denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
-    observer: &mut dyn Observer,
-) -> Result<TileOutcome, ReconError> {
-    let TileInput { masks, mut measurement, white } = input;
-    if !(white.is_finite() && white > 0.0) {
-        return Err(ReconError::Parameter {
-            name: "white level",
-            value: white.to_string(),
-            range: "a finite number above 0",
-        });
-    }
-    let size = masks.raw_dim();
-    let op = match SensingOperator::new(masks) {
-        Err(ReconError::DarkMasks { .. }) => return Ok(dark(Array3::zeros(size))),
-        other => other?.with_gamma(schedule.gamma)?,
+/// Reads a tile's window, reconstructs it, and writes its frames as a prepared array.
+pub(super) fn run(
+    store: &Store,
+    task: &ClaimedTask,
+    (snapshot, index): (u32, u32),
+    engine: &mut Engine,
+    shared: &Shared,
+) -> Result<Completion, TaskError> {
+    let before = Usage::now();
+    let plan = task.spec.tile_plan()?;
+    let tile = plan.tile(index as usize).ok_or_else(|| TaskError::Record {
+        what: "task",
+        problem: format!("tile {index} of a plan of {}", plan.len()),
+    })?;
+    let schedule = task.spec.schedule.to_schedule()?;
+    let input = window(task, &tile, snapshot as usize)?;
+    let deep = schedule.needs_denoiser();
+    let network = if deep { Some(engine.network()?) } else { None };
+    let denoiser = network.map(|network| network as &mut dyn Denoiser);
+    let share = ShareDone::new(task.spec.schedule.clone());
+    let mut observer = TaskObserver { shared, share, passes: 0 };
+    let outcome = reconstruct_tile(input, &schedule, denoiser, &mut observer)?;
+    let progress = shared.progress();
+    shared.set_progress(TaskProgress { stage: TaskStage::Writing, ..progress });
+    let record = TileTaskRecord {
+        tile: TileRecord::from(&outcome),
+        provider: deep.then(|| engine.source().provider().into()),
+        onnxruntime: if deep { Some(engine.source().version()?) } else { None },
+        cpu_seconds: (Usage::now() - before).cpu_seconds,
+        peak_rss_bytes: peak_rss_bytes(),
     };
-    measurement /= white;
-    // Without the reborrow the operator would have to live as long as the denoiser.
-    let denoiser = denoiser.map(|denoiser| denoiser as &mut dyn Denoiser);
-    let outcome = gap::reconstruct(&op, measurement.view(), schedule, denoiser, observer)?;
-    Ok(TileOutcome {
-        frames: outcome.frames * white,
-        tv_iterations: outcome.tv_iterations,
-        denoiser_passes: outcome.denoiser_passes,
-        residual: outcome.residual,
-        stop_reason: outcome.stop_reason,
+    let blob = write(store, &outcome)?;
+    Ok(Completion { progress, record: to_record(&record)?, product: Product::Tile(blob) })
+}
+
+fn window(task: &ClaimedTask, tile: &Tile, snapshot: usize) -> Result<TileInput, TaskError> {
+    let limits = Limits::default();
+    let masks = Reader::open(&task.masks, &limits)?;
+    let (rows, columns) = (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
+    let frames = 0..masks.info().frames;
+    let measurement = Reader::open(&task.snapshots, &limits)?.read_window(
+        snapshot..snapshot + 1,
+        rows.clone(),
+        columns.clone(),
+    )?;
+    Ok(TileInput {
+        masks: masks.read_window(frames, rows, columns)?,
+        measurement: measurement.index_axis_move(Axis(0), 0),
+        white: Prepared::of(task)?.white,
     })
 }
 
-fn dark(frames: Array3<f32>) -> TileOutcome {
-    TileOutcome {
-        frames,
-        tv_iterations: 0,
-        denoiser_passes: 0,
-        residual: 0.0,
-        stop_reason: StopReason::Converged,
-    }
+fn write(store: &Store, outcome: &TileOutcome) -> Result<StagedBlob, TaskError> {
+    let (frames, height, width) = outcome.frames.dim();
+    let blob = BufWriter::new(store.blob_writer()?);
+    let mut writer = Writer::new(blob, frames, height, width)?;
+    outcome.frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
+    let blob = writer.finish()?.into_inner();
+    let blob = blob.map_err(|error| FormatError::Io {
+        action: "write the tile",
+        source: error.into_error(),
+    })?;
+    Ok(blob.finish()?)
 }
 
-/// The white level of a job from those of its snapshots: their median (the lower of the two in
-/// the middle). One flash among them then doesn't make all others dark for the denoiser, which
-/// a maximum would, and all snapshots of a job share one scale.
-///
-/// None without snapshots.
-pub fn typical_white(mut whites: Vec<f32>) -> Option<f32> {
-    whites.sort_by(f32::total_cmp);
-    let middle = whites.len().checked_sub(1)? / 2;
-    whites.get(middle).copied()
+/// Tells the heartbeat about iterations, and the solver when to stop.
+struct TaskObserver<'a> {
+    shared: &'a Shared,
+    share: ShareDone,
+    passes: u32,
 }
 
-#[cfg(test)]
-mod tests {
-    use super::{TileInput, reconstruct_tile, typical_white};
-    use crate::optics::{iid_masks, measure};
-    use crate::recon::schedule::Schedule;
-    use ndarray::{Array2, Array3};
-
-    fn scene() -> (Array3<f32>, Array3<f32>) {
-        let masks = iid_masks(4, 32, 32, 1).unwrap();
-        let frames = Array3::from_shape_fn((4, 32, 32), |(k, i, j)| {
-            0.5 + 0.3 * ((i + k) as f32 * 0.2).sin() * (j as f32 * 0.1).cos()
+impl Observer for TaskObserver<'_> {
+    fn iteration(&mut self, progress: &Progress) -> Control {
+        let deep = progress.sigma.is_some();
+        self.passes += u32::from(deep);
+        self.shared.set_progress(TaskProgress {
+            stage: if deep { TaskStage::Deep } else { TaskStage::Tv },
+            iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),
+            passes: self.passes,
+            fraction: self.share.after(progress),
         });
-        (masks, frames)
-    }
-
-    #[test]
-    fn frames_come_back_on_the_scale_of_the_measurement() {
-        let (masks, truth) = scene();
-        let y = measure(masks.view(), truth.view()).unwrap();
-        let solve = |y: Array2<f32>, white| {
-            let input = TileInput { masks: masks.clone(), measurement: y, white };
-            reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap().frames
-        };
-        let plain = solve(y.clone(), 0.8);
-        let error = (&plain - &truth).mapv(|d| d * d).mean().unwrap();
-        assert!(error < 2e-3, "{error}");
-        // 64 times as bright: powers of two change no bit of a float's fraction.
-        let bright = solve(y * 64.0, 0.8 * 64.0);
-        assert_eq!(bright, plain * 64.0);
-    }
-
-    #[test]
-    fn a_tile_without_light_is_black() {
-        let input = TileInput {
-            masks: Array3::zeros((3, 16, 16)),
-            measurement: Array2::from_elem((16, 16), 0.1),
-            white: 1.0,
-        };
-        let outcome = reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap();
-        assert!(outcome.frames.iter().all(|&v| v == 0.0));
-        assert_eq!(outcome.tv_iterations, 0);
-    }
-
-    #[test]
-    fn white_must_be_above_zero() {
-        let (masks, _) = scene();
-        for white in [0.0, -1.0, f32::NAN] {
-            let input =
-                TileInput { masks: masks.clone(), measurement: Array2::ones((32, 32)), white };
-            let error = reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap_err();
-            assert!(error.to_string().contains("white level"), "{error}");
-        }
-    }
-
-    #[test]
-    fn one_flash_does_not_set_the_scale() {
-        assert_eq!(typical_white(vec![0.9, 40.0, 1.0]), Some(1.0));
-        assert_eq!(typical_white(vec![2.0, 1.0]), Some(1.0));
-        assert_eq!(typical_white(vec![]), None);
+        if self.shared.stopped() { Control::Cancel } else { Control::Continue }
     }
 }

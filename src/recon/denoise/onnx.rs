@@ -85,12 +85,9 @@ impl Runtime {
         self.device
     }
 
-    /// Version of the library, for records: the branch that it was built from, such as
-    /// `rel-1.31.1`, or all that it tells.
-    pub fn version(&self) -> String {
-        let info = ort::info();
-        let branch = info.split_once("git-branch=").and_then(|(_, rest)| rest.split(',').next());
-        branch.filter(|branch| !branch.is_empty()).unwrap_or(info).to_owned()
+    /// What the library tells of its build, for records.
+    pub fn build_info(&self) -> &'static str {
+        ort::info()
     }
 
     fn session(&self, name: &str, model: &[u8]) -> Result<Session, ReconError> {

@@ -1,0 +1,85 @@
+//! `sci-recon worker`: does the tasks of a data folder.
+
+use std::time::Duration;
+
+use tokio::io::AsyncReadExt;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+use super::{CliError, logging};
+use crate::config::WorkerArguments;
+use crate::job::WorkerId;
+use crate::recon::denoise::onnx::Device;
+use crate::store::Store;
+use crate::work::{NetworkSource, Worker};
+
+/// How long a worker may take to come to the end of an iteration when it is to stop. After that
+/// it ends at once, and its task's lease runs out.
+const GRACE: Duration = Duration::from_secs(30);
+
+/// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
+///
+/// # Errors
+/// Settings that can't be used, no store, or a task that took the computing thread down.
+pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
+    logging::start(settings.log_format);
+    stand_back(settings.engine.nice)?;
+    let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
+    let network = NetworkSource::new(library, Device::parse(&settings.engine.device)?);
+    let failed = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .map_err(|error| failed(&error))?;
+    runtime.block_on(async {
+        let store = Store::open(&settings.data).await.map_err(|error| failed(&error))?;
+        let stop = CancellationToken::new();
+        tokio::spawn(listen(settings.supervised, stop.clone()));
+        let id = settings.id.unwrap_or_else(WorkerId::new);
+        let worker = Worker::new(store.clone(), id, network, stop);
+        let ended = worker.run().await.map_err(|error| failed(&error));
+        store.close().await;
+        ended
+    })
+}
+
+/// Lowers the priority of this process, and so of all its threads.
+fn stand_back(nice: i32) -> Result<(), CliError> {
+    rustix::process::setpriority_process(None, nice)
+        .map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
+}
+
+/// Waits for a reason to stop, tells it on, and sees to it that the process ends.
+async fn listen(supervised: bool, stop: CancellationToken) {
+    tokio::select! {
+        () = terminated() => {}
+        () = abandoned(), if supervised => {}
+    }
+    stop.cancel();
+    tokio::time::sleep(GRACE).await;
+    tracing::warn!("the task does not come to the end of an iteration: left unfinished");
+    std::process::exit(0);
+}
+
+async fn terminated() {
+    let terminate = async {
+        match signal(SignalKind::terminate()) {
+            Ok(mut signal) => {
+                signal.recv().await;
+            }
+            Err(_) => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        () = terminate => {}
+        _ = tokio::signal::ctrl_c() => {}
+    }
+}
+
+/// Waits for the end of the standard input: the server that held its other end is gone.
+async fn abandoned() {
+    let mut sink = [0; 64];
+    let mut stdin = tokio::io::stdin();
+    while !matches!(stdin.read(&mut sink).await, Ok(0) | Err(_)) {}
+}

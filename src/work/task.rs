@@ -1,0 +1,186 @@
+//! One task, whatever its kind: what it shares with the heartbeat, and how it can end.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::network::{NetworkError, NetworkSource};
+use super::result::ResultError;
+use super::{assemble, finish, prepare, tile};
+use crate::formats::FormatError;
+use crate::job::{InvalidField, TaskKind, TaskProgress};
+use crate::recon::ReconError;
+use crate::recon::denoise::fastdvdnet::FastDvdNet;
+use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};
+
+/// What the computing thread and the heartbeat tell each other.
+#[derive(Debug)]
+pub(super) struct Shared {
+    progress: Mutex<TaskProgress>,
+    stop: AtomicBool,
+}
+
+impl Shared {
+    pub(super) fn new() -> Self {
+        Self { progress: Mutex::new(TaskProgress::START), stop: AtomicBool::new(false) }
+    }
+
+    /// Where the task stands.
+    pub(super) fn progress(&self) -> TaskProgress {
+        // Whole values are stored: a poisoned lock holds a good one.
+        *self.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    pub(super) fn set_progress(&self, progress: TaskProgress) {
+        *self.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = progress;
+    }
+
+    /// Asks the computing thread to stop at the next opportunity.
+    pub(super) fn stop(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    pub(super) fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// An error once [`Shared::stop`] was called.
+    pub(super) fn check(&self) -> Result<(), TaskError> {
+        if self.stopped() { Err(TaskError::Stopped) } else { Ok(()) }
+    }
+}
+
+/// Denoisers, of which one stays warm from task to task.
+pub(super) struct Engine {
+    source: NetworkSource,
+    warm: Option<FastDvdNet>,
+}
+
+impl Engine {
+    pub(super) fn new(source: NetworkSource) -> Self {
+        Self { source, warm: None }
+    }
+
+    pub(super) fn source(&self) -> &NetworkSource {
+        &self.source
+    }
+
+    /// The denoiser, loaded at its first use.
+    pub(super) fn network(&mut self) -> Result<&mut FastDvdNet, NetworkError> {
+        match &mut self.warm {
+            Some(network) => Ok(network),
+            warm => Ok(warm.insert(self.source.load()?)),
+        }
+    }
+}
+
+/// How a task can end without a result.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum TaskError {
+    /// It was asked to stop.
+    #[error("stopped")]
+    Stopped,
+    /// The solver refused or failed.
+    #[error(transparent)]
+    Recon(ReconError),
+    /// There is no denoiser.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// A prepared array or a tile can't be read, or a result not be written.
+    #[error(transparent)]
+    Format(#[from] FormatError),
+    /// A result can't be written.
+    #[error(transparent)]
+    Result(#[from] ResultError),
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// Stored tiles are not what was stored.
+    #[error("the stored results of tiles {0:?} are damaged")]
+    Damaged(Vec<u32>),
+    /// A snapshot without light.
+    #[error("snapshot {snapshot}: {source}")]
+    Snapshot {
+        /// Its index.
+        snapshot: u32,
+        /// What is wrong with it.
+        source: ReconError,
+    },
+    /// A record in the database is not what this program writes.
+    #[error("the record of the {what} can't be used: {problem}")]
+    Record {
+        /// Whose record.
+        what: &'static str,
+        /// What is wrong with it.
+        problem: String,
+    },
+}
+
+impl TaskError {
+    /// Whether another attempt may succeed: the machine failed, not the data.
+    pub(super) fn is_retryable(&self) -> bool {
+        match self {
+            Self::Recon(error) => matches!(error, ReconError::Runtime(_)),
+            Self::Format(error) => !error.is_callers_fault(),
+            Self::Snapshot { .. } | Self::Record { .. } => false,
+            _ => true,
+        }
+    }
+}
+
+impl From<ReconError> for TaskError {
+    fn from(error: ReconError) -> Self {
+        match error {
+            ReconError::Cancelled => Self::Stopped,
+            other => Self::Recon(other),
+        }
+    }
+}
+
+/// Errors of a stored schedule, which was checked before it was stored.
+impl From<Vec<InvalidField>> for TaskError {
+    fn from(errors: Vec<InvalidField>) -> Self {
+        let problem = errors.first().map_or_else(String::new, |error| error.detail.clone());
+        Self::Record { what: "schedule", problem }
+    }
+}
+
+/// What a task needs from the database beside its own row; fetched before the blocking part.
+pub(super) enum Material {
+    None,
+    Tiles(Vec<TileResult>),
+    Records(Vec<TaskRecord>),
+}
+
+impl Material {
+    pub(super) async fn of(store: &Store, task: &ClaimedTask) -> Result<Self, StoreError> {
+        Ok(match task.kind {
+            TaskKind::Prepare | TaskKind::Tile { .. } => Self::None,
+            TaskKind::Assemble { snapshot } => {
+                Self::Tiles(store.tile_results(task.job, snapshot).await?)
+            }
+            TaskKind::Manifest => Self::Records(store.task_records(task.job).await?),
+        })
+    }
+}
+
+/// Does a task. Blocks for as long as it takes.
+pub(super) fn perform(
+    store: &Store,
+    task: &ClaimedTask,
+    material: Material,
+    engine: &mut Engine,
+    shared: &Shared,
+) -> Result<Completion, TaskError> {
+    match (task.kind, material) {
+        (TaskKind::Tile { snapshot, tile }, _) => {
+            tile::run(store, task, (snapshot, tile), engine, shared)
+        }
+        (TaskKind::Assemble { snapshot }, Material::Tiles(tiles)) => {
+            assemble::run(store, task, snapshot, &tiles, engine, shared)
+        }
+        (TaskKind::Manifest, Material::Records(records)) => {
+            finish::run(store, task, &records, engine)
+        }
+        _ => prepare::run(task, shared),
+    }
+}

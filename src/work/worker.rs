@@ -1,0 +1,234 @@
+//! The loop of a worker process.
+//!
+//! 1. Claim a task.
+//! 2. Do it on a thread of its own.
+//! 3. Meanwhile, renew the lease, tell the progress and listen for a cancel.
+//! 4. Store what it made, or why it failed.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+use tracing::Instrument;
+
+use super::network::NetworkSource;
+use super::task::{Engine, Material, Shared, TaskError, perform};
+use crate::job::WorkerId;
+use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError};
+
+/// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
+/// against a lab's patience.
+const LEASE: Duration = Duration::from_secs(20);
+/// Time between heartbeats, and so the longest time until a cancel is heard of.
+const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Time between looks for a task.
+const POLL: Duration = Duration::from_millis(200);
+/// Looks without a task between two signs of life.
+const LOOKS_PER_SIGN: u32 = 25;
+/// Pause after the database has failed.
+const TROUBLE: Duration = Duration::from_secs(2);
+
+/// Why a worker had to end.
+#[derive(Debug, thiserror::Error)]
+pub enum WorkerError {
+    /// The database can't even be told that the worker is there.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A task took the computing thread down.
+    #[error("the computing thread panicked")]
+    Panicked,
+}
+
+/// A worker: takes tasks from the queue, one at a time.
+pub struct Worker {
+    store: Store,
+    id: WorkerId,
+    /// On its way between the loop and the computing thread.
+    engine: Option<Engine>,
+    network: NetworkSource,
+    stop: CancellationToken,
+}
+
+/// What the computing thread hands back.
+type Computed = (Engine, Result<Completion, TaskError>);
+
+/// Why a task was stopped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Reason {
+    Cancelled,
+    Lost,
+    Shutdown,
+}
+
+impl Worker {
+    /// A worker under the name `id` that ends, and gives its task back, when `stop` is called.
+    pub fn new(
+        store: Store,
+        id: WorkerId,
+        network: NetworkSource,
+        stop: CancellationToken,
+    ) -> Self {
+        Self { store, id, engine: None, network, stop }
+    }
+
+    /// Works until it is told to stop.
+    ///
+    /// # Errors
+    /// See [`WorkerError`]. A failure of a task or a passing one of the database is none.
+    pub async fn run(mut self) -> Result<(), WorkerError> {
+        self.store.worker_started(self.id, std::process::id()).await?;
+        tracing::info!(worker = %self.id, "waiting for tasks");
+        let mut looks = 0;
+        while !self.stop.is_cancelled() {
+            match self.store.claim(self.id, LEASE).await {
+                Ok(Some(task)) => {
+                    self.work(task).await?;
+                    continue;
+                }
+                Ok(None) => {
+                    looks += 1;
+                    if looks % LOOKS_PER_SIGN == 0 {
+                        self.sign_of_life().await;
+                    }
+                    self.pause(POLL).await;
+                }
+                Err(error) => {
+                    tracing::error!(%error, "no task can be claimed");
+                    self.pause(TROUBLE).await;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    async fn sign_of_life(&self) {
+        if let Err(error) = self.store.worker_seen(self.id).await {
+            tracing::warn!(%error, "the worker's sign of life is not recorded");
+        }
+    }
+
+    async fn pause(&self, length: Duration) {
+        tokio::select! {
+            () = tokio::time::sleep(length) => {}
+            () = self.stop.cancelled() => {}
+        }
+    }
+
+    /// Does one task and tells the store how it ended.
+    async fn work(&mut self, task: ClaimedTask) -> Result<(), WorkerError> {
+        let lease = task.lease;
+        let name = task.kind.name();
+        let span = tracing::info_span!("task", job = %task.job, kind = name, task = %lease.task);
+        let material = match Material::of(&self.store, &task).await {
+            Ok(material) => material,
+            Err(error) => {
+                self.failed(&lease, &error.into()).instrument(span).await;
+                return Ok(());
+            }
+        };
+        let shared = Arc::new(Shared::new());
+        let computing = self.start(task, material, &shared, span.clone());
+        let watching = self.watch(computing, &lease, &shared).instrument(span.clone());
+        let ((engine, outcome), reason) = watching.await?;
+        self.engine = Some(engine);
+        self.end(&lease, outcome, reason).instrument(span).await;
+        Ok(())
+    }
+
+    /// Tells the store how a task ended.
+    async fn end(
+        &self,
+        lease: &Lease,
+        outcome: Result<Completion, TaskError>,
+        reason: Option<Reason>,
+    ) {
+        match (outcome, reason) {
+            (Ok(completion), _) => self.complete(lease, completion).await,
+            (Err(TaskError::Stopped), Some(Reason::Cancelled)) => {
+                tracing::info!("cancelled");
+                said(self.store.cancelled(lease).await);
+            }
+            (Err(TaskError::Stopped), Some(Reason::Shutdown) | None) => {
+                tracing::info!("given back");
+                said(self.store.release_task(lease).await);
+            }
+            (Err(TaskError::Stopped), Some(Reason::Lost)) => {
+                tracing::warn!("the lease ran out and the task is another worker's now");
+            }
+            (Err(TaskError::Damaged(tiles)), _) => {
+                tracing::error!(?tiles, "stored tiles are damaged and will be done again");
+                said(self.store.redo_tiles(lease, &tiles).await);
+            }
+            (Err(error), _) => self.failed(lease, &error).await,
+        }
+    }
+
+    fn start(
+        &mut self,
+        task: ClaimedTask,
+        material: Material,
+        shared: &Arc<Shared>,
+        span: tracing::Span,
+    ) -> JoinHandle<Computed> {
+        let mut engine = self.engine.take().unwrap_or_else(|| Engine::new(self.network.clone()));
+        let (store, shared) = (self.store.clone(), shared.clone());
+        tokio::task::spawn_blocking(move || {
+            let _entered = span.enter();
+            let outcome = perform(&store, &task, material, &mut engine, &shared);
+            (engine, outcome)
+        })
+    }
+
+    /// Waits for the computing thread, with heartbeats; says why it was stopped, if it was.
+    async fn watch(
+        &self,
+        mut computing: JoinHandle<Computed>,
+        lease: &Lease,
+        shared: &Shared,
+    ) -> Result<(Computed, Option<Reason>), WorkerError> {
+        let mut tick = tokio::time::interval(HEARTBEAT);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        // The claim was the first sign of life.
+        tick.tick().await;
+        let mut reason = None;
+        loop {
+            tokio::select! {
+                computed = &mut computing => {
+                    return Ok((computed.map_err(|_| WorkerError::Panicked)?, reason));
+                }
+                () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
+                _ = tick.tick() => match self.store.heartbeat(lease, shared.progress()).await {
+                    Ok(Heartbeat::Continue) => {}
+                    Ok(Heartbeat::Cancelled) => reason = Some(Reason::Cancelled),
+                    Ok(Heartbeat::Lost) => reason = Some(Reason::Lost),
+                    // If this goes on, the lease runs out, and the store will say so.
+                    Err(error) => tracing::error!(%error, "a heartbeat is not recorded"),
+                },
+            }
+            if reason.is_some() {
+                shared.stop();
+            }
+        }
+    }
+
+    async fn complete(&self, lease: &Lease, completion: Completion) {
+        match self.store.complete(lease, completion).await {
+            Ok(Heartbeat::Lost) => tracing::warn!("done, but too late: the lease had run out"),
+            Ok(_) => tracing::info!("done"),
+            Err(error) => self.failed(lease, &error.into()).await,
+        }
+    }
+
+    async fn failed(&self, lease: &Lease, error: &TaskError) {
+        tracing::error!(%error, "the task failed");
+        said(self.store.fail(lease, &error.to_string(), error.is_retryable()).await);
+    }
+}
+
+/// Logs that the store could not be told; the lease runs out then.
+fn said(told: Result<(), StoreError>) {
+    if let Err(error) = told {
+        tracing::error!(%error, "the end of the task is not recorded");
+    }
+}
