@@ -102,16 +102,15 @@ impl Slot {
             status = child.wait() => Some(status),
             () = stopped(&mut self.stop) => None,
         };
-        let status = match ended {
-            Some(status) => status,
+        let end = match ended {
+            Some(Ok(status)) => judge(status),
+            Some(Err(error)) => WorkerEnd::Crashed(error.to_string()),
             None => {
                 drop(stdin);
-                end(id, child).await
+                end(id, child).await;
+                // However it ended, it was told to: nothing is held against its task.
+                WorkerEnd::Left
             }
-        };
-        let end = match status {
-            Ok(status) => judge(status),
-            Err(error) => WorkerEnd::Crashed(error.to_string()),
         };
         self.report(id, &end).await;
     }
@@ -141,13 +140,13 @@ async fn stopped(stop: &mut watch::Receiver<bool>) {
 }
 
 /// Waits for a worker that was told to end, and kills it if it does not.
-async fn end(id: WorkerId, mut child: Child) -> std::io::Result<ExitStatus> {
-    if let Ok(status) = tokio::time::timeout(GRACE, child.wait()).await {
-        return status;
+async fn end(id: WorkerId, mut child: Child) {
+    if tokio::time::timeout(GRACE, child.wait()).await.is_err() {
+        tracing::warn!(worker = %id, "a worker did not end in time and is killed");
+        if let Err(error) = child.kill().await {
+            tracing::error!(worker = %id, %error, "a worker can't be killed");
+        }
     }
-    tracing::warn!(worker = %id, "a worker did not end in time and is killed");
-    child.start_kill()?;
-    child.wait().await
 }
 
 /// Why a worker ended: by itself, from outside, or of a fault that its task may have caused.

@@ -4,7 +4,9 @@
 
 mod app;
 mod contract;
+mod faults;
 mod hostile;
 mod jobs;
+mod pipeline;
 mod samples;
 mod uploads;

@@ -2,6 +2,7 @@
 //!
 //! Every part has one channel `Y`, in scan lines. Values survive bit for bit.
 
+mod order;
 mod read;
 mod write;
 

@@ -1,4 +1,4 @@
-use ndarray::{Array2, Array3, array};
+use ndarray::{Array2, Array3, Axis, array};
 
 use super::{Attributes, read_stack, write_frame, write_stack};
 use crate::formats::test_support::{assert_names, bits, file, ramp};
@@ -115,4 +115,26 @@ fn cut_files_are_refused() {
     let limits = Limits { max_frames: 2, ..Limits::default() };
     let error = read_stack(path.path(), &limits).unwrap_err();
     assert_names(&error.to_string(), &["frames", "3", "2"]);
+}
+
+#[test]
+fn the_same_frames_give_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let frames = awkward();
+    let attributes: Vec<Attributes> = (0..frames.dim().0).map(attributes).collect();
+    // A hash map has another order in each instance, so a few are enough to tell.
+    let files: Vec<(Vec<u8>, Vec<u8>)> = (0..4)
+        .map(|_| {
+            let path = folder.path().join("frame.exr");
+            write_frame(&path, frames.index_axis(Axis(0), 0), &attributes[0]).unwrap();
+            let frame = std::fs::read(&path).unwrap();
+            let (_, height, width) = frames.dim();
+            write_stack(&path, height, width, &attributes, |k| {
+                Ok::<_, FormatError>(frames.index_axis(Axis(0), k).to_owned())
+            })
+            .unwrap();
+            (frame, std::fs::read(&path).unwrap())
+        })
+        .collect();
+    assert!(files.iter().all(|pair| *pair == files[0]));
 }

@@ -15,6 +15,7 @@ use ::exr::meta::attribute::{AttributeValue, ChannelDescription, LineOrder, Samp
 use ::exr::meta::header::{Header, LayerAttributes};
 use ndarray::{Array2, ArrayView2};
 
+use super::order::sort_attributes;
 use super::{CHANNEL, FRAME_TIME};
 use crate::formats::FormatError;
 
@@ -149,7 +150,8 @@ fn write_parts(
     .map_err(|error| match error {
         ExrError::Io(source) => FormatError::Io { action: "write the EXR file", source },
         other => FormatError::Internal(format!("EXR: {other}")),
-    })
+    })?;
+    sort_attributes(path).map_err(FormatError::io("write the EXR file"))
 }
 
 /// Compresses and writes one part, block by block.
