@@ -20,6 +20,7 @@ enum Command {
     Worker(config::WorkerArguments),
     Reconstruct(cli::reconstruct::Arguments),
     Simulate(cli::simulate::Arguments),
+    Demo(cli::demo::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -28,6 +29,7 @@ fn main() -> ExitCode {
         Command::Worker(arguments) => cli::worker::run(&arguments),
         Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
+        Command::Demo(arguments) => cli::demo::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

@@ -7,6 +7,7 @@ mod logging;
 mod progress;
 mod supervisor;
 
+pub mod demo;
 pub mod reconstruct;
 pub mod serve;
 pub mod simulate;

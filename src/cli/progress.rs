@@ -12,13 +12,17 @@ use crate::work::{ShareDone, TileProgress};
 
 const STEPS: u64 = 1000;
 
-/// A bar on standard error that goes from 0 to 1.
-pub(super) fn bar(title: &'static str) -> ProgressBar {
-    let target = match std::io::stderr().is_terminal() {
+/// Standard error if it is a terminal, else nothing.
+pub(super) fn target() -> ProgressDrawTarget {
+    match std::io::stderr().is_terminal() {
         true => ProgressDrawTarget::stderr(),
         false => ProgressDrawTarget::hidden(),
-    };
-    let bar = ProgressBar::with_draw_target(Some(STEPS), target).with_message(title);
+    }
+}
+
+/// A bar that goes from 0 to 1.
+pub(super) fn bar(title: &'static str) -> ProgressBar {
+    let bar = ProgressBar::with_draw_target(Some(STEPS), target()).with_message(title);
     // The template is fixed: if it were wrong, the default style would do.
     let style = ProgressStyle::with_template("{msg:>24} {wide_bar} {percent:>3}% {eta:>4}");
     bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))

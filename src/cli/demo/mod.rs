@@ -1,0 +1,176 @@
+//! `sci-recon demo`: a real clip through the real service.
+
+mod client;
+mod report;
+mod scene;
+mod service;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use indicatif::MultiProgress;
+use ndarray::Array3;
+use serde_json::json;
+
+use super::{CliError, progress};
+use crate::job::Algorithm;
+use client::{Client, JobView};
+use report::{Quality, Report};
+use service::Service;
+
+/// The file that tells a demo's folder from others.
+const REPORT: &str = "demo.json";
+/// What the demo makes in its folder.
+const PARTS: [&str; 4] = ["input", "service", "frames", "service.log"];
+/// Time between looks at the jobs.
+const POLL: Duration = Duration::from_millis(250);
+
+/// Start the service, send a coded snapshot of a real clip, and compare what comes back.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Folder for all files; an earlier demo there is replaced.
+    #[arg(long, value_name = "FOLDER", default_value = "demo-output")]
+    out: PathBuf,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A folder that holds something else, or a failure on the way.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let failed = |error: std::io::Error| CliError::Failure(format!("the runtime: {error}"));
+    let out = fresh_folder(&arguments.out)?;
+    tokio::runtime::Runtime::new().map_err(failed)?.block_on(demo(arguments, &out))
+}
+
+async fn demo(arguments: &Arguments, out: &Path) -> Result<(), CliError> {
+    let started = Instant::now();
+    let say = |text: String| {
+        if !arguments.json {
+            println!("{text}");
+        }
+    };
+    // 1. A lab's files: masks and one snapshot.
+    let truth = scene::make(&out.join("input"))?;
+    let (frames, height, width) = truth.dim();
+    say(format!("made masks and a snapshot of {frames} frames of {height}x{width}"));
+    // 2. The service.
+    let service = Service::start(out).await?;
+    say(format!("the service is at {}", service.url()));
+    // 3. Over HTTP from here on, as a lab machine would.
+    let client = Client::new(service.url());
+    let reports = through_http(&client, out, &truth).await;
+    service.stop().await?;
+    let [gap_tv, pnp_tv_fastdvdnet] = reports?;
+    // 4. The comparison.
+    let report = Report {
+        gap_tv,
+        pnp_tv_fastdvdnet,
+        seconds: started.elapsed().as_secs_f64(),
+        output_dir: out.to_owned(),
+    };
+    fs::write(out.join(REPORT), report.to_json()?)
+        .map_err(|error| CliError::file("write", &out.join(REPORT), &error))?;
+    report.print(arguments.json)
+}
+
+/// Sends the files, asks for both algorithms, waits, and compares the frames that come back.
+async fn through_http(
+    client: &Client,
+    out: &Path,
+    truth: &Array3<f32>,
+) -> Result<[Quality; 2], CliError> {
+    let input = out.join("input");
+    let masks = client.upload(&input.join("masks.npy")).await?;
+    let measurement = client.upload(&input.join("measurement.npy")).await?;
+    let calibration = client.create("/v1/calibrations", &json!({"masks": masks})).await?;
+    let body = json!({"calibration": calibration, "data": measurement});
+    let measurement = client.create("/v1/measurements", &body).await?;
+    let mut jobs = Vec::new();
+    for algorithm in Algorithm::ALL {
+        let name = algorithm.name();
+        let body = json!({"measurement": measurement, "algorithm": name, "label": "demo"});
+        jobs.push((name, client.create("/v1/jobs", &body).await?));
+    }
+    watch(client, &jobs).await?;
+    let mut qualities = Vec::new();
+    for (name, job) in &jobs {
+        let folder = out.join("frames").join(name);
+        let frames = client.download_frames(job, &folder).await?;
+        qualities.push(report::compare(&frames, truth, client.cpu_seconds(job).await?)?);
+    }
+    <[Quality; 2]>::try_from(qualities)
+        .map_err(|_| CliError::Failure("the demo compares two algorithms".into()))
+}
+
+/// Shows the progress of all jobs until they have succeeded.
+async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<(), CliError> {
+    let screen = MultiProgress::with_draw_target(progress::target());
+    let bars: Vec<_> = jobs.iter().map(|(name, _)| screen.add(progress::bar(name))).collect();
+    let mut done = vec![false; jobs.len()];
+    while !done.iter().all(|&done| done) {
+        for (((name, job), bar), done) in jobs.iter().zip(&bars).zip(&mut done) {
+            match client.job(job).await? {
+                JobView::Going(share) => progress::show(bar, share),
+                JobView::Succeeded => {
+                    progress::show(bar, 1.0);
+                    *done = true;
+                }
+                JobView::Ended(reason) => {
+                    return Err(CliError::Failure(format!("the {name} job {reason}")));
+                }
+            }
+        }
+        tokio::time::sleep(POLL).await;
+    }
+    Ok(screen.clear().unwrap_or(()))
+}
+
+/// The absolute path of an empty folder: new, or that of an earlier demo.
+fn fresh_folder(out: &Path) -> Result<PathBuf, CliError> {
+    let unwritable = |error: std::io::Error| CliError::file("write", out, &error);
+    fs::create_dir_all(out).map_err(unwritable)?;
+    let mut entries = fs::read_dir(out).map_err(unwritable)?;
+    if entries.next().is_some() && !out.join(REPORT).is_file() {
+        return Err(CliError::Input(format!(
+            "{} is not empty and not the folder of an earlier demo: name a new one with --out",
+            out.display()
+        )));
+    }
+    // Marked before anything else is made, so that a demo that is broken off can be repeated.
+    fs::write(out.join(REPORT), "{}\n").map_err(unwritable)?;
+    for part in PARTS.map(|part| out.join(part)) {
+        let removed = if part.is_dir() { fs::remove_dir_all(part) } else { fs::remove_file(part) };
+        removed.or_else(|error| match error.kind() {
+            std::io::ErrorKind::NotFound => Ok(()),
+            _ => Err(unwritable(error)),
+        })?;
+    }
+    out.canonicalize().map_err(unwritable)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{REPORT, fresh_folder};
+    use std::fs;
+
+    #[test]
+    fn only_the_folder_of_a_demo_is_cleared() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("demo");
+        fresh_folder(&out).unwrap();
+        fs::create_dir(out.join("frames")).unwrap();
+        fs::write(out.join("notes.txt"), "mine").unwrap();
+        fresh_folder(&out).unwrap();
+        assert!(!out.join("frames").exists() && out.join("notes.txt").exists());
+        fs::remove_file(out.join(REPORT)).unwrap();
+        let error = fresh_folder(&out).unwrap_err().to_string();
+        assert!(error.contains("not the folder of an earlier demo"), "{error}");
+        assert!(out.join("notes.txt").exists());
+    }
+}

@@ -1,0 +1,70 @@
+//! What the demo found.
+
+use std::path::PathBuf;
+
+use ndarray::Array3;
+use serde::Serialize;
+
+use crate::cli::CliError;
+use crate::recon::metrics;
+
+/// The figures of one algorithm.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(super) struct Quality {
+    psnr_db: f64,
+    ssim: f64,
+    /// Processor seconds of computing.
+    cpu_seconds: f64,
+}
+
+/// What `--json` prints, and `demo.json`.
+#[derive(Debug, Serialize)]
+pub(super) struct Report {
+    pub(super) gap_tv: Quality,
+    pub(super) pnp_tv_fastdvdnet: Quality,
+    /// Wall time of the whole demo.
+    pub(super) seconds: f64,
+    pub(super) output_dir: PathBuf,
+}
+
+/// Compares downloaded frames with the true ones.
+pub(super) fn compare(
+    frames: &Array3<f32>,
+    truth: &Array3<f32>,
+    cpu_seconds: f64,
+) -> Result<Quality, CliError> {
+    Ok(Quality {
+        psnr_db: metrics::psnr(frames.view(), truth.view())?,
+        ssim: metrics::ssim(frames.view(), truth.view())?,
+        cpu_seconds,
+    })
+}
+
+impl Report {
+    pub(super) fn to_json(&self) -> Result<String, CliError> {
+        serde_json::to_string(self)
+            .map_err(|error| CliError::Failure(format!("the report: {error}")))
+    }
+
+    pub(super) fn print(&self, json: bool) -> Result<(), CliError> {
+        if json {
+            println!("{}", self.to_json()?);
+            return Ok(());
+        }
+        let (tv, pnp) = (&self.gap_tv, &self.pnp_tv_fastdvdnet);
+        println!("\n{:20}{:>10}{:>9}{:>14}", "", "PSNR", "SSIM", "CPU");
+        for (name, quality) in [("gap-tv", tv), ("pnp-tv-fastdvdnet", pnp)] {
+            let Quality { psnr_db, ssim, cpu_seconds } = quality;
+            println!("{name:20}{psnr_db:>7.2} dB{ssim:>9.4}{cpu_seconds:>12.1} s");
+        }
+        println!(
+            "\nPnP-TV-FastDVDNet is {:.2} dB above GAP-TV; {:.0} s in all.",
+            pnp.psnr_db - tv.psnr_db,
+            self.seconds
+        );
+        let out = self.output_dir.display();
+        println!("The downloaded frames are in {out}/frames, the true ones in {out}/input/clip,");
+        println!("the service's own files in {out}/service.");
+        Ok(())
+    }
+}
