@@ -73,12 +73,12 @@ class LoopScenes:
     def tv(self):
         return {name: round(psnr(v, x), 2) for name, x, gap, v in self.cases}
 
-    def run(self, net, sigmas, tv_weight=0.):
+    def run(self, net, sigmas, tv_weight=0., memory=1.):
         """PSNR after the last pass."""
         rows = {}
         for name, x, gap, v in self.cases:
-            again = solver.Gap(gap.y, gap.masks)
-            again.y1 = gap.y1
+            again = solver.Gap(gap.y, gap.masks, memory)
+            again.excess = gap.excess
             for y in solver.passes(again, v, net, sigmas, tv_weight):
                 pass
             rows[name] = round(psnr(y, x), 2)
@@ -95,6 +95,7 @@ def main():
     p.add_argument('--first', type=float, default=30, help='first sigma (/255)')
     p.add_argument('--last', type=float, default=6, help='last sigma (/255)')
     p.add_argument('--tv-weight', type=float, default=0, help='TV before each deep pass')
+    p.add_argument('--memory', type=float, default=.5, help='of the accumulated residual in the deep passes: 1 accelerated, 0 plain GAP')
     p.add_argument('--no-white', action='store_true')
     a = p.parse_args()
     scenes = LoopScenes(a.data, a.scene)
@@ -103,7 +104,7 @@ def main():
         net = export.weights_of(path) if os.path.isdir(path) else model.load(path)
         row = {'model': path} if a.no_white else {'model': path, 'white': white(net, a.data)}
         if not isinstance(net, model.Block):
-            row['loop'] = scenes.run(net, solver.geometric(a.first, a.last, a.passes), a.tv_weight)
+            row['loop'] = scenes.run(net, solver.geometric(a.first, a.last, a.passes), a.tv_weight, a.memory)
         print(json.dumps(row), flush=True)
 
 

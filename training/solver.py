@@ -77,17 +77,19 @@ def measure(x, masks):
 class Gap:
     """Accelerated generalised alternating projection. The gram diagonal is the sum of squares; where it is zero nothing is known."""
 
-    def __init__(self, y, masks):
-        self.y, self.masks = y, masks
+    def __init__(self, y, masks, memory=1.):
+        """memory: the share of the accumulated residual that is kept. 1 is accelerated GAP, 0 plain GAP. A network that removes what the
+        projection adds never explains the measurement fully; with 1 the residual then winds up without bound."""
+        self.y, self.masks, self.memory = y, masks, memory
         gram = (masks * masks).sum(1, keepdim=True)
         self.inverse = torch.where(gram > 0, 1 / gram.clamp_min(1e-12), torch.zeros_like(gram))
-        self.y1 = torch.zeros_like(y)
+        self.excess = -y   # what stands in for y beyond y itself: the sum of the residuals, less y
 
     def project(self, v):
         """The estimate v moved to where it explains the accumulated measurement."""
         seen = measure(v, self.masks)
-        self.y1 = self.y1 + (self.y - seen)
-        return v + self.masks * (self.inverse * (self.y1 - seen))
+        self.excess = self.memory * (self.excess + self.y - seen)
+        return v + self.masks * (self.inverse * (self.y + self.excess - seen))
 
 
 def tv(x, weight, iterations=5):

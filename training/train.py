@@ -69,6 +69,7 @@ class Iterates:
     def fresh(self):
         x, masks, y = (torch.from_numpy(a).to(self.device) for a in self.queue.get())
         gap, v = solver.start(y, masks, self.rng.randint(20, 50), self.rng.uniform(.07, .15))
+        gap.memory = self.rng.choice([0, .5, .8, 1])   # for the deep passes
         return {'truth': x, 'gap': gap, 'v': v, 'levels': random_levels(self.rng), 'tv': self.rng.choice([0, 0, 0, .02])}
 
     @torch.no_grad()
@@ -215,7 +216,7 @@ def main():
         net = t.averaged()
         row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
         if scenes:
-            row['loop'] = scenes.run(net, solver.geometric(30, 6, 12))
+            row['loop'] = scenes.run(net, solver.geometric(20, 6, 12), memory=.5)
         print('evaluation', json.dumps(row), flush=True)
 
     evaluated, saved, sums = -1e9 if t.step == 0 else t.seconds, t.seconds, collections.defaultdict(float)
