@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 mod app;
+mod cli;
 mod contract;
 mod faults;
 mod hostile;
@@ -10,3 +11,4 @@ mod jobs;
 mod pipeline;
 mod samples;
 mod uploads;
+mod work;

@@ -7,8 +7,13 @@ use super::onnx::{ClipNetwork, Runtime};
 use crate::recon::error::ReconError;
 use crate::recon::schedule::Sigma;
 
-/// Pixels that go through a block at once: about 250 MB of activations in ONNX Runtime.
+/// Pixels that go through a block at once: about 750 MB of activations in ONNX Runtime.
 const PIXELS_AT_ONCE: usize = 4 * 256 * 256;
+
+/// Frames of `plane` pixels that go through a block at once, if the clip has as many.
+pub(in crate::recon) fn frames_at_once(plane: u64) -> u64 {
+    (PIXELS_AT_ONCE as u64 / plane.max(1)).max(1)
+}
 
 /// The two blocks of FastDVDNet, gray.
 ///
@@ -75,7 +80,7 @@ fn run_chunked(
     sigma: Sigma,
 ) -> Result<(), ReconError> {
     let plane = rows * columns;
-    let chunk = (PIXELS_AT_ONCE / plane).max(1);
+    let chunk = frames_at_once(plane as u64) as usize;
     for (index, output) in output.chunks_mut(chunk * plane).enumerate() {
         let start = index * chunk * plane;
         let count = output.len() / plane;

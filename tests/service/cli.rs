@@ -1,0 +1,187 @@
+//! The command line without a server.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+use crate::samples::{Scene, npy};
+
+fn sci_recon(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_sci-recon")).args(arguments).output().unwrap()
+}
+
+fn json(output: &Output) -> Value {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).expect("one JSON object on standard output")
+}
+
+/// Runs a command that must be refused as bad input; gives what it says.
+fn refused(arguments: &[&str]) -> String {
+    let output = sci_recon(arguments);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{message}");
+    assert!(output.stdout.is_empty());
+    message
+}
+
+struct Files {
+    folder: tempfile::TempDir,
+}
+
+impl Files {
+    /// Six frames of a scene, as .npy.
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = Scene::SMALL;
+        let at = |k: usize| (0..48 * 64).map(move |at| scene.pixel(0, k, at / 64, at % 64));
+        std::fs::write(folder.path().join("clip.npy"), npy(&[6, 48, 64], (0..6).flat_map(at)))
+            .unwrap();
+        Self { folder }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn text(&self, name: &str) -> String {
+        self.path(name).to_str().unwrap().to_owned()
+    }
+
+    fn simulate(&self, pattern: &str, out: &str, more: &[&str]) -> Output {
+        let (frames, out) = (self.text("clip.npy"), self.text(out));
+        let line = ["simulate", "--frames", &frames, "--pattern", pattern, "--out", &out];
+        sci_recon(&[&line[..], more].concat())
+    }
+
+    fn reconstruct(&self, simulation: &str, more: &[&str]) -> Output {
+        let file = |name: &str| self.text(&format!("{simulation}/{name}.npy"));
+        let (masks, measurement, truth) = (file("masks"), file("measurement"), file("truth"));
+        let line = ["reconstruct", "--masks", &masks, "--measurement", &measurement];
+        let line = [&line[..], &["--truth", &truth, "--algorithm", "gap-tv", "--json"], more];
+        sci_recon(&line.concat())
+    }
+}
+
+fn bytes(path: &Path) -> Vec<u8> {
+    std::fs::read(path).unwrap()
+}
+
+#[test]
+fn a_simulated_snapshot_is_reconstructed() {
+    let files = Files::new();
+    for pattern in ["iid", "random-squares"] {
+        let made = files.simulate(pattern, pattern, &["--compression-ratio", "4"]);
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        let out = files.text("result");
+        let report = json(&files.reconstruct(pattern, &["--out", &out]));
+        let fields: Vec<&str> = report.as_object().unwrap().keys().map(String::as_str).collect();
+        let mut expected = vec![
+            "algorithm",
+            "frames",
+            "height",
+            "width",
+            "psnr_db",
+            "ssim",
+            "seconds",
+            "denoiser_passes",
+            "tv_iterations",
+            "cpu_seconds",
+            "peak_rss_bytes",
+            "provider",
+            "stop_reason",
+        ];
+        expected.sort_unstable();
+        assert_eq!(fields, expected);
+        assert_eq!(
+            (&report["frames"], &report["height"], &report["width"]),
+            (&4.into(), &48.into(), &64.into())
+        );
+        assert_eq!(report["provider"], Value::Null);
+        assert!(report["psnr_db"].as_f64().unwrap() > 18.0, "{pattern}: {report}");
+        assert!(report["peak_rss_bytes"].as_u64().unwrap() > 1 << 20);
+        // A second result takes the place of the first one.
+        for name in [
+            "frames/frame_0004.exr",
+            "png/frame_0001.png",
+            "stack.exr",
+            "frames.npy",
+            "manifest.json",
+        ] {
+            assert!(files.path("result").join(name).is_file(), "{name}");
+        }
+    }
+    let record: Value =
+        serde_json::from_slice(&bytes(&files.path("random-squares/simulation.json"))).unwrap();
+    assert_eq!(record["apertures"]["rank"], 4);
+    assert_eq!(record["unused_frames"], 2);
+}
+
+#[test]
+fn a_seed_repeats_a_simulation_bit_for_bit() {
+    let files = Files::new();
+    let more = ["--compression-ratio", "3", "--noise-sigma", "5", "--seed"];
+    for (out, seed) in [("a", "7"), ("b", "7"), ("c", "8")] {
+        files.simulate("random-squares", out, &[&more[..], &[seed]].concat());
+    }
+    for name in ["masks.npy", "measurement.npy", "truth.npy", "simulation.json"] {
+        let file = |out: &str| bytes(&files.path(out).join(name));
+        assert_eq!(file("a"), file("b"), "{name}");
+        assert_eq!(file("a") == file("c"), name == "truth.npy", "{name}");
+    }
+}
+
+#[test]
+fn iterations_can_be_fixed_and_threads_change_nothing() {
+    let files = Files::new();
+    files.simulate("iid", "s", &["--compression-ratio", "6"]);
+    let cut = ["--iterations", "33", "--tile", "32", "--overlap", "8"];
+    let mut frames = Vec::new();
+    for threads in ["1", "3"] {
+        let out = files.text(threads);
+        let more = [&cut[..], &["--threads", threads, "--out", &out]].concat();
+        let report = json(&files.reconstruct("s", &more));
+        assert_eq!(report["tv_iterations"], 33);
+        assert_eq!(report["stop_reason"], "max-iterations");
+        frames.push(bytes(&files.path(threads).join("frames.npy")));
+    }
+    assert_eq!(frames[0], frames[1]);
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_the_reason() {
+    let files = Files::new();
+    files.simulate("iid", "four", &["--compression-ratio", "4"]);
+    let [masks, measurement, clip] =
+        ["four/masks.npy", "four/measurement.npy", "clip.npy"].map(|name| files.text(name));
+    std::fs::write(files.path("small.npy"), npy(&[20, 30], (0..600).map(|_| 0.5))).unwrap();
+    let small = files.text("small.npy");
+    let base = ["reconstruct", "--algorithm", "gap-tv", "--masks"];
+    let run = |masks: &str, more: &[&str]| refused(&[&base[..], &[masks], more].concat());
+    let sizes = run(&masks, &["--measurement", &small]);
+    assert!(sizes.contains("20x30") && sizes.contains("48x64"), "{sizes}");
+    let truth = run(&masks, &["--measurement", &measurement, "--truth", &clip]);
+    assert!(truth.contains("6x48x64") && truth.contains("4x48x64"), "{truth}");
+    let snapshot = run(&masks, &["--measurement", &measurement, "--snapshot", "1"]);
+    assert!(snapshot.contains("no snapshot 1"), "{snapshot}");
+    let missing = run("/nowhere/masks.npy", &["--measurement", &measurement]);
+    assert!(missing.contains("/nowhere/masks.npy"), "{missing}");
+    let tile = run(&masks, &["--measurement", &measurement, "--tile", "4"]);
+    assert!(tile.contains("tile size is 4"), "{tile}");
+    std::fs::create_dir_all(files.path("mine/frames")).unwrap();
+    let foreign = run(&masks, &["--measurement", &measurement, "--out", &files.text("mine")]);
+    assert!(foreign.contains("frames"), "{foreign}");
+    let few = refused(&[
+        "simulate",
+        "--frames",
+        &clip,
+        "--compression-ratio",
+        "7",
+        "--pattern",
+        "iid",
+        "--out",
+        &small,
+    ]);
+    assert!(few.contains("6 frames") && few.contains("need 7"), "{few}");
+    refused(&["reconstruct", "--json"]);
+}
