@@ -40,6 +40,10 @@ pub struct StageSpec {
     /// Dual (Chambolle) updates for each TV step; 4 where it is left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tv_updates: Option<usize>,
+    /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the
+    /// next, on [0, 1]; 1 where it is left out.
+    #[serde(default = "one")]
+    pub memory: f32,
     /// The stage ends early once ||v_k - v_(k-1)|| / ||v_k|| is below this; 0 never does.
     #[serde(default)]
     pub tolerance: f32,
@@ -61,6 +65,10 @@ pub enum PriorSpec {
 
 fn yes() -> bool {
     true
+}
+
+fn one() -> f32 {
+    1.0
 }
 
 /// Dual updates of a TV step where the schedule does not say.
@@ -110,6 +118,7 @@ impl StageSpec {
             sigma,
             tv_weight: self.tv_weight.unwrap_or(0.0),
             tv_updates: self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES),
+            memory: self.memory,
             tolerance: self.tolerance,
         })
     }
@@ -234,6 +243,7 @@ impl From<&Schedule> for ScheduleSpec {
                 sigma: stage.sigma.map(|(first, last)| [first.value(), last.value()]),
                 tv_weight: tv.then_some(stage.tv_weight),
                 tv_updates: tv.then_some(stage.tv_updates),
+                memory: stage.memory,
                 tolerance: stage.tolerance,
             }
         };

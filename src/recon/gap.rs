@@ -173,7 +173,8 @@ impl<'a> Run<'a> {
     ) -> Result<StopReason, ReconError> {
         for iteration in 0..stage.iterations {
             let sigma = stage.sigma_at(iteration);
-            let squares = self.op.project(&self.y, self.y1.as_mut(), &self.v, &mut self.x);
+            let y1 = self.y1.as_mut().map(|y1| (y1, stage.memory));
+            let squares = self.op.project(&self.y, y1, &self.v, &mut self.x);
             self.apply(stage, sigma)?;
             let change = relative_change(&self.x, &self.v);
             std::mem::swap(&mut self.v, &mut self.x);

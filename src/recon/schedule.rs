@@ -61,6 +61,10 @@ pub struct Stage {
     pub tv_weight: f32,
     /// Dual updates of the total variation in each iteration.
     pub tv_updates: usize,
+    /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the
+    /// next, on \[0,1\]: 1 is accelerated GAP, 0 is plain GAP. A learned denoiser never explains
+    /// the measurement fully, so with 1 the residual winds up in its stages.
+    pub memory: f32,
     /// The stage ends early once `||v_k - v_(k-1)|| / ||v_k||` falls below this; 0 never.
     pub tolerance: f32,
 }
@@ -88,6 +92,9 @@ impl Stage {
         if !self.tolerance.is_finite() || !(0.0..1.0).contains(&self.tolerance) {
             return parameter("tolerance", self.tolerance.to_string(), "at least 0 and below 1");
         }
+        if !(0.0..=1.0).contains(&self.memory) {
+            return parameter("memory", self.memory.to_string(), "from 0 to 1");
+        }
         if self.prior.is_deep() && self.sigma.is_none() {
             return parameter(
                 "sigma",
@@ -109,7 +116,8 @@ impl Stage {
 /// The plan of a reconstruction (Algorithm 1 of the paper is two stages).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Schedule {
-    /// Accelerated GAP: the residuals add up in `y1`, through all stages.
+    /// Accelerated GAP: the residuals add up in `y1`, through all stages, as far as each stage's
+    /// `memory` keeps them.
     pub accelerated: bool,
     /// Noise term added to the gram diagonal, >= 0.
     pub gamma: f32,
@@ -120,7 +128,7 @@ pub struct Schedule {
 impl Schedule {
     /// GAP-TV.
     pub fn gap_tv() -> Self {
-        Self { accelerated: true, gamma: 0.0, stages: vec![tv_stage(100)] }
+        Self { accelerated: true, gamma: 0.0, stages: vec![tv_stage(150, 3e-4)] }
     }
 
     /// PnP-TV-FastDVDNet: total variation alone, then total variation and the video denoiser.
@@ -129,11 +137,12 @@ impl Schedule {
             prior: Prior::TvFastDvdNet,
             iterations: 24,
             sigma: Some((Sigma(60.0 / 255.0), Sigma(6.0 / 255.0))),
-            tv_weight: 0.02,
+            tv_weight: 0.0,
             tv_updates: 4,
+            memory: 0.8,
             tolerance: 0.0,
         };
-        Self { accelerated: true, gamma: 0.0, stages: vec![tv_stage(40), deep] }
+        Self { accelerated: true, gamma: 0.0, stages: vec![tv_stage(60, 0.0), deep] }
     }
 
     /// Most iterations of all stages together.
@@ -187,14 +196,15 @@ impl Schedule {
     }
 }
 
-fn tv_stage(iterations: usize) -> Stage {
+fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
     Stage {
         prior: Prior::Tv,
         iterations,
         sigma: None,
-        tv_weight: 0.1,
+        tv_weight: 0.15,
         tv_updates: 4,
-        tolerance: 1e-3,
+        memory: 1.0,
+        tolerance,
     }
 }
 

@@ -109,14 +109,15 @@ impl SensingOperator {
     }
 
     /// One projection of GAP: `x = v + H^T (H H^T + gamma)^-1 (t - H v)` with the target
-    /// `t = y`, or, accelerated, `t = y1` after `y1 += y - H v` (Liao et al. 2014).
+    /// `t = y`, or, accelerated, `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that
+    /// is the published `y1 += y - H v` (Liao et al. 2014), with 0 it is plain GAP.
     ///
     /// `y` and `y1` are \[H,W\], `v` and `x` \[B,H,W\], all of the operator's size and in
     /// standard layout. Returns `||y - H v||^2`.
     pub(super) fn project(
         &self,
         y: &Array2<f32>,
-        y1: Option<&mut Array2<f32>>,
+        y1: Option<(&mut Array2<f32>, f32)>,
         v: &Array3<f32>,
         x: &mut Array3<f32>,
     ) -> f64 {
@@ -131,7 +132,7 @@ impl SensingOperator {
         ) else {
             unreachable!("arrays of the solver are in standard layout")
         };
-        let mut accelerated = y1.and_then(|a| a.as_slice_mut());
+        let mut accelerated = y1.and_then(|(y1, memory)| Some((y1.as_slice_mut()?, memory)));
         let mut sum = vec![0.0f32; width];
         let mut squares = 0.0f64;
         // Row by row over all frames: a row of v and of the masks is still in cache when the
@@ -139,7 +140,7 @@ impl SensingOperator {
         for start in (0..plane).step_by(width) {
             let row = start..start + width;
             let stack = Stack { plane, start, width, frames };
-            let target = accelerated.as_deref_mut().map(|a| &mut a[row.clone()]);
+            let target = accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
             squares +=
                 project_row(stack, masks, v, x, &y[row.clone()], target, &inverse[row], &mut sum);
         }
@@ -180,7 +181,7 @@ fn project_row(
     v: &[f32],
     x: &mut [f32],
     y: &[f32],
-    y1: Option<&mut [f32]>,
+    y1: Option<(&mut [f32], f32)>,
     inverse: &[f32],
     sum: &mut [f32],
 ) -> f64 {
@@ -194,11 +195,11 @@ fn project_row(
     }
     let mut squares = 0.0f32;
     match y1 {
-        Some(y1) => {
+        Some((y1, memory)) => {
             for (((s, &y), t), &inverse) in sum.iter_mut().zip(y).zip(y1).zip(inverse) {
                 let residual = y - *s;
                 squares += residual * residual;
-                *t += residual;
+                *t = y + memory * (*t - *s);
                 *s = (*t - *s) * inverse;
             }
         }
@@ -286,7 +287,7 @@ mod tests {
         let v = random(4, (2, 3, 3));
         let mut x = Array3::zeros((2, 3, 3));
         let mut y1 = Array2::from_elem((3, 3), 5.0);
-        op.project(&Array2::from_elem((3, 3), 1.0), Some(&mut y1), &v, &mut x);
+        op.project(&Array2::from_elem((3, 3), 1.0), Some((&mut y1, 1.0)), &v, &mut x);
         assert_eq!(x[[0, 1, 1]], v[[0, 1, 1]]);
         assert!(x.iter().all(|value| value.is_finite()));
     }
