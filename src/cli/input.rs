@@ -3,7 +3,7 @@
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, s};
 
 use super::CliError;
 use crate::formats::mat::{self, SceneArray};
@@ -90,7 +90,7 @@ impl<'a> Source<'a> {
     }
 
     /// Frames \[T,H,W\] divided by the full scale, all finite.
-    pub(super) fn frames(&self) -> Result<Scaled<Array3<f32>>, CliError> {
+    fn frames(&self) -> Result<Array3<f32>, CliError> {
         let mut reader = self.open()?;
         let scale = self.scale(&*reader)?;
         let mut stack = Stack::default();
@@ -106,11 +106,11 @@ impl<'a> Source<'a> {
                 self.path.display()
             )));
         }
-        Ok(Scaled { array, full_scale: scale.value() })
+        Ok(array)
     }
 
     /// As [`Source::frames`], or none if this is a .mat scene that goes without.
-    pub(super) fn frames_if_any(&self) -> Result<Option<Scaled<Array3<f32>>>, CliError> {
+    fn frames_if_any(&self) -> Result<Option<Array3<f32>>, CliError> {
         let limits = Limits::default();
         if mat::is_mat(self.path).map_err(self.refused())?
             && let Err(FormatError::MissingArray { .. }) =
@@ -119,6 +119,32 @@ impl<'a> Source<'a> {
             return Ok(None);
         }
         self.frames().map(Some)
+    }
+
+    /// The frames \[B,H,W\] of one snapshot. A .mat scene may go without; another file may not.
+    pub(super) fn truth(
+        &self,
+        (frames, height, width): (usize, usize, usize),
+        snapshot: usize,
+        snapshots: usize,
+    ) -> Result<Option<Array3<f32>>, CliError> {
+        let Some(truth) = self.frames_if_any()? else { return Ok(None) };
+        let (count, rows, columns) = truth.dim();
+        let first = match count {
+            _ if (rows, columns) != (height, width) => None,
+            _ if count == frames => Some(0),
+            _ if count == frames * snapshots => Some(snapshot * frames),
+            _ => None,
+        };
+        match first {
+            Some(first) => Ok(Some(truth.slice(s![first..first + frames, .., ..]).to_owned())),
+            None => Err(CliError::Input(format!(
+                "the true frames {} are {count}x{rows}x{columns}; {frames}x{height}x{width} (of \
+                 the snapshot) or {}x{height}x{width} (of all snapshots) would fit",
+                self.path.display(),
+                frames * snapshots
+            ))),
+        }
     }
 
     /// SHA-256 of the file.
@@ -132,7 +158,7 @@ impl<'a> Source<'a> {
 pub(super) fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>, CliError> {
     let source = |path| Source { path, array: SceneArray::Truth, full_scale };
     if !path.is_dir() {
-        return Ok(source(path).frames()?.array);
+        return source(path).frames();
     }
     let unreadable = |error| CliError::Input(format!("cannot read {}: {error}", path.display()));
     let entries = fs::read_dir(path).map_err(unreadable)?;
@@ -147,7 +173,7 @@ pub(super) fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f
     let mut stack = Stack::default();
     let mut first = None;
     for file in &files {
-        let picture = source(file).frames()?.array;
+        let picture = source(file).frames()?;
         let size = (picture.dim().1, picture.dim().2);
         let (height, width) = *first.get_or_insert(size);
         if size != (height, width) {

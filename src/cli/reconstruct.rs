@@ -200,7 +200,7 @@ impl<'a> Input<'a> {
             )));
         }
         let truth = match &sources.truth {
-            Some(source) => read_truth(source, masks.array.dim(), arguments.snapshot, snapshots)?,
+            Some(source) => source.truth(masks.array.dim(), arguments.snapshot, snapshots)?,
             None => None,
         };
         Ok(Self { sources, masks, measurement, truth })
@@ -221,33 +221,6 @@ impl<'a> Input<'a> {
         let bar = SnapshotBar::new(&setup.schedule, setup.plan.len());
         let tiles = solve(&input, &setup.network, setup.threads, &bar)?;
         Ok(Solution { white, tiles })
-    }
-}
-
-/// The frames of the snapshot. A scene may go without; a file that was named may not.
-fn read_truth(
-    source: &Source<'_>,
-    (frames, height, width): (usize, usize, usize),
-    snapshot: usize,
-    snapshots: usize,
-) -> Result<Option<Array3<f32>>, CliError> {
-    let Some(truth) = source.frames_if_any()? else { return Ok(None) };
-    let truth = truth.array;
-    let (count, rows, columns) = truth.dim();
-    let first = match count {
-        _ if (rows, columns) != (height, width) => None,
-        _ if count == frames => Some(0),
-        _ if count == frames * snapshots => Some(snapshot * frames),
-        _ => None,
-    };
-    match first {
-        Some(first) => Ok(Some(truth.slice(s![first..first + frames, .., ..]).to_owned())),
-        None => Err(CliError::Input(format!(
-            "the true frames {} are {count}x{rows}x{columns}; {frames}x{height}x{width} (of the \
-             snapshot) or {}x{height}x{width} (of all snapshots) would fit",
-            source.path.display(),
-            frames * snapshots
-        ))),
     }
 }
 
