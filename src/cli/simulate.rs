@@ -36,7 +36,7 @@ pub struct Arguments {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Noise of the measurement on the scale of 255 grey values: S/255 is the standard deviation
-    /// added to y = sum C x, with x and C on [0,1].
+    /// added to y = sum C x, with x and C from 0 to 1.
     #[arg(long, value_name = "S", default_value_t = 0.0)]
     noise_sigma: f32,
     /// Folder for masks.npy, measurement.npy, truth.npy and simulation.json.

@@ -1,7 +1,7 @@
 //! The work itself: solving tiles, writing results, and the worker that does so for the queue.
 //!
-//! A worker's tasks are one file each: [`prepare`], [`tile`], [`assemble`], [`finish`]. The
-//! command line and the workers share [`solve`] and the writing of results, so that a job gives
+//! A worker's tasks are one file each: `prepare`, `tile`, `assemble`, `finish`. The
+//! command line and the workers share `solve` and the writing of results, so that a job gives
 //! the same frames whichever way it came.
 
 mod assemble;
