@@ -4,6 +4,7 @@
 
 mod app;
 mod contract;
+mod deep;
 mod faults;
 mod hostile;
 mod jobs;
