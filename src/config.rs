@@ -38,6 +38,10 @@ pub struct ServeArguments {
     #[command(flatten)]
     pub engine: EngineArguments,
 
+    /// Memory that one worker may need; jobs that need more are refused.
+    #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", default_value_t = 4 << 30)]
+    pub worker_memory_bytes: u64,
+
     /// Largest upload in bytes.
     #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", default_value_t = 8 << 30)]
     pub max_upload_bytes: u64,

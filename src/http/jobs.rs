@@ -119,7 +119,23 @@ async fn resolve(app: &App, request: JobRequest) -> Result<JobSpec, ApiError> {
         snapshots: measurement.snapshots,
     };
     let resolved = request.resolve(calibration.id, shape);
-    resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))
+    let spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
+    check_memory(app, &spec)?;
+    Ok(spec)
+}
+
+/// Refuses a job that no worker could do.
+fn check_memory(app: &App, spec: &JobSpec) -> Result<(), ApiError> {
+    let (needed, allowed) = (spec.worker_bytes() >> 20, app.worker_memory_bytes >> 20);
+    if needed <= allowed {
+        return Ok(());
+    }
+    let detail = format!(
+        "a worker would need up to {needed} MiB for tiles of {0}x{0} pixels and {1} frames, and \
+         may have {allowed} MiB: use smaller tiles",
+        spec.tile.size, spec.shape.frames
+    );
+    Err(ApiError::field("/tile/size", detail))
 }
 
 async fn body(app: &App, id: JobId) -> Result<JobBody, ApiError> {

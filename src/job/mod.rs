@@ -1,6 +1,7 @@
 //! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
 
 mod ids;
+mod memory;
 mod request;
 mod schedule;
 mod state;

@@ -211,3 +211,16 @@ async fn what_was_accepted_survives_a_kill_of_the_server() {
     assert_eq!(with_key(&app, "k", &body).await.expect(200).json()["id"], before["id"]);
     app.get(&format!("/v1/calibrations/{calibration}")).await.expect(200);
 }
+
+#[tokio::test]
+async fn a_job_that_no_worker_has_the_memory_for_is_refused_with_the_numbers() {
+    let app = TestApp::with(&["--workers", "0", "--worker-memory-bytes", "400000000"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let mut body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
+    let refused = app.post("/v1/jobs", &body).await;
+    let detail = refused.problem(422, "invalid_request");
+    assert!(detail.contains("381 MiB") && detail.contains("256x256"), "{detail}");
+    assert_eq!(refused.json()["pointer"], "/tile/size");
+    body["algorithm"] = json!("gap-tv");
+    app.post("/v1/jobs", &body).await.expect(201);
+}

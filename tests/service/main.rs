@@ -5,6 +5,7 @@
 mod app;
 mod cli;
 mod contract;
+mod deep;
 mod faults;
 mod hostile;
 mod jobs;

@@ -1,0 +1,50 @@
+//! Jobs with the deep denoiser, where libonnxruntime is there (`make runtime`).
+
+use serde_json::json;
+
+use crate::app::TestApp;
+use crate::pipeline::values;
+use crate::samples::Scene;
+
+#[tokio::test]
+async fn a_deep_job_runs_and_records_model_and_provider() {
+    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
+    if !std::path::Path::new(&library).exists() {
+        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+        return;
+    }
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({
+        "measurement": measurement,
+        "algorithm": "pnp-tv-fastdvdnet",
+        "snapshots": 0,
+        "schedule": {"stages": [
+            {"prior": "tv", "iterations": 20, "tv_weight": 0.1},
+            {"prior": "tv+fastdvdnet", "iterations": 3, "sigma": [0.2, 0.05], "tv_weight": 0.02},
+        ]},
+    });
+    let job = app.submit(&body).await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    assert_eq!(done["progress"]["passes_done"], 3);
+    let base = format!("/v1/jobs/{job}/snapshots/0");
+    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json().to_string();
+    assert!(manifest.contains("fastdvdnet") && manifest.contains("CPU"), "{manifest}");
+    let frames = values(&app.get(&format!("{base}/frames.npy")).await.expect(200).bytes);
+    assert!(frames.iter().all(|value| value.is_finite()));
+}
+
+#[tokio::test]
+async fn without_the_library_a_deep_job_fails_with_the_reason() {
+    let app = TestApp::with(&["--workers", "1", "--onnxruntime", "/nowhere/lib.so"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
+    let done = app.ended(&app.submit(&body).await).await;
+    assert_eq!(done["state"], "failed");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("/nowhere/lib.so"), "{error}");
+    // The worker lives and does what it can.
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
+}
