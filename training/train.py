@@ -216,7 +216,7 @@ def main():
         net = t.averaged()
         row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
         if scenes:
-            row['loop'] = scenes.run(net, solver.geometric(20, 6, 12), memory=.5)
+            row['loop'] = scenes.run(net, solver.geometric(20, 6, 12), memory=.7)
         print('evaluation', json.dumps(row), flush=True)
 
     evaluated, saved, sums = -1e9 if t.step == 0 else t.seconds, t.seconds, collections.defaultdict(float)
