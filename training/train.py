@@ -150,7 +150,7 @@ class Training:
     def update(self):
         """One step of the optimizer with the gradients added so far."""
         progress = min(1., self.seconds / (60 * self.a.minutes))
-        lr = self.a.lr * min(1, (self.step + 1) / 100) * (.5 * (1 + math.cos(math.pi * progress)) * .98 + .02)
+        lr = self.a.lr * min(1, (self.step + 1) / 300) * (.5 * (1 + math.cos(math.pi * progress)) * .98 + .02)
         for group in self.optimizer.param_groups:
             group['lr'] = lr
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), .3)   # twice the usual norm
