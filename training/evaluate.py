@@ -1,6 +1,6 @@
 """Judge a model on held-out footage: as a white-noise denoiser and inside the solver's loop.
 
-    python evaluate.py --data DATA run/loop.pt [more.pt ...] [--scene scene.mat] [--passes 12]
+    python evaluate.py --data DATA run/loop.pt [more.pt ...] [--scene scene.mat]
 
 One JSON object a model: mean PSNR (dB) of the middle frame per sigma, and in the loop the mean PSNR of the clip after TV and after the deep passes.
 """
@@ -92,10 +92,10 @@ def main():
     p.add_argument('--data', required=True)
     p.add_argument('--scene', help='a .mat scene as one more held-out clip')
     p.add_argument('--passes', type=int, default=12)
-    p.add_argument('--first', type=float, default=30, help='first sigma (/255)')
+    p.add_argument('--first', type=float, default=20, help='first sigma (/255)')
     p.add_argument('--last', type=float, default=6, help='last sigma (/255)')
     p.add_argument('--tv-weight', type=float, default=0, help='TV before each deep pass')
-    p.add_argument('--memory', type=float, default=.5, help='of the accumulated residual in the deep passes: 1 accelerated, 0 plain GAP')
+    p.add_argument('--memory', type=float, default=.7, help='of the accumulated residual in the deep passes: 1 accelerated, 0 plain GAP')
     p.add_argument('--no-white', action='store_true')
     a = p.parse_args()
     scenes = LoopScenes(a.data, a.scene)

@@ -9,6 +9,6 @@ python=${PYTHON:-python3}
 workers=$(($(nproc) > 4 ? ($(nproc) - 2) / 2 : 1))
 mkdir -p "$out"
 "$python" "$here/train.py" --data "$data" --out "$out/loop.pt" --stage loop --init "$here/../models/fastdvdnet-gray" \
-    --minutes "$total" --run-minutes "$now" --crop 96 --frames "${FRAMES:-256}" --lr 6e-4 --workers "$workers" --runs 24 --every 8 ${EXTRA:-}
+    --minutes "$total" --run-minutes "$now" --crop 96 --frames "${FRAMES:-256}" --lr 3e-4 --workers "$workers" --runs 24 --every 8 ${EXTRA:-}
 "$python" "$here/export.py" "$out/loop.pt" "$out/fastdvdnet-gray"
 "$python" "$here/evaluate.py" --data "$data" "$here/../models/fastdvdnet-gray" "$out/fastdvdnet-gray" | tee "$out/evaluation.json"

@@ -150,7 +150,7 @@ class Training:
     def update(self):
         """One step of the optimizer with the gradients added so far."""
         progress = min(1., self.seconds / (60 * self.a.minutes))
-        lr = self.a.lr * min(1, (self.step + 1) / 100) * (.5 * (1 + math.cos(math.pi * progress)) * .98 + .02)
+        lr = self.a.lr * min(1, (self.step + 1) / 300) * (.5 * (1 + math.cos(math.pi * progress)) * .98 + .02)
         for group in self.optimizer.param_groups:
             group['lr'] = lr
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), .3)   # twice the usual norm
@@ -216,7 +216,7 @@ def main():
         net = t.averaged()
         row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
         if scenes:
-            row['loop'] = scenes.run(net, solver.geometric(20, 6, 12), memory=.5)
+            row['loop'] = scenes.run(net, solver.geometric(20, 6, 12), memory=.7)
         print('evaluation', json.dumps(row), flush=True)
 
     evaluated, saved, sums = -1e9 if t.step == 0 else t.seconds, t.seconds, collections.defaultdict(float)
