@@ -146,16 +146,13 @@ async fn send(
     if conditional::is_known(headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
     }
-    let (status, start, length) = match conditional::wanted(headers, &etag, file.size) {
-        Wanted::Whole => (StatusCode::OK, 0, file.size),
-        Wanted::Part { start, length } => (StatusCode::PARTIAL_CONTENT, start, length),
-        Wanted::Outside => return Err(outside(file.size)),
-    };
+    let (status, start, length) = portion(name, &file, &etag, headers)?;
     let mut response = (status, part(&path, start, length).await?).into_response();
     let fields = response.headers_mut();
     fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
     fields.insert(header::CONTENT_LENGTH, length.into());
-    fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
+    let ranges = if comes_in_parts(name) { "bytes" } else { "none" };
+    fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static(ranges));
     fields.insert(header::ETAG, value(etag));
     fields.insert(header::CONTENT_DISPOSITION, value(disposition(job, snapshot, name)));
     if status == StatusCode::PARTIAL_CONTENT {
@@ -163,6 +160,29 @@ async fn send(
         fields.insert(header::CONTENT_RANGE, value(range));
     }
     Ok(response)
+}
+
+/// Status, first byte and length of what is asked for.
+fn portion(
+    name: &str,
+    file: &ResultFile,
+    etag: &str,
+    headers: &HeaderMap,
+) -> Result<(StatusCode, u64, u64), ApiError> {
+    let whole = (StatusCode::OK, 0, file.size);
+    if !comes_in_parts(name) {
+        return Ok(whole);
+    }
+    match conditional::wanted(headers, etag, file.size) {
+        Wanted::Whole => Ok(whole),
+        Wanted::Part { start, length } => Ok((StatusCode::PARTIAL_CONTENT, start, length)),
+        Wanted::Outside => Err(outside(file.size)),
+    }
+}
+
+/// Part of a JSON document would not be one.
+fn comes_in_parts(name: &str) -> bool {
+    media_type(name) != "application/json"
 }
 
 fn outside(size: u64) -> ApiError {
