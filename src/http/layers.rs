@@ -4,7 +4,7 @@ use std::any::Any;
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request, State};
-use axum::http::{HeaderName, HeaderValue, Method};
+use axum::http::{HeaderName, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use tracing::Instrument;
@@ -79,6 +79,15 @@ pub(super) async fn timeout(State(app): State<App>, request: Request, next: Next
             ApiError::new(Code::TimedOut, detail).into_response()
         }
     }
+}
+
+/// After an upload that was refused on the way the connection still holds the rest of its body; a
+/// client that sent its next request into it would lose that request.
+pub(super) async fn close_after_refusal(mut response: Response) -> Response {
+    if response.status().is_client_error() || response.status().is_server_error() {
+        response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
+    }
+    response
 }
 
 /// The answer to a request whose handler panicked.

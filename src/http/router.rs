@@ -3,7 +3,7 @@
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::handler::Handler;
-use axum::middleware::{from_fn, from_fn_with_state};
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::routing::{MethodFilter, MethodRouter, on};
 use tower_http::catch_panic::CatchPanicLayer;
 
@@ -114,7 +114,8 @@ impl Route {
 
     /// As [`Self::slow`], and with uploads' own limits instead of that of JSON bodies.
     fn uploads(mut self) -> Self {
-        self.handlers = self.handlers.layer(DefaultBodyLimit::disable());
+        let close = map_response(layers::close_after_refusal);
+        self.handlers = self.handlers.layer(DefaultBodyLimit::disable()).layer(close);
         self.slow()
     }
 }

@@ -44,6 +44,9 @@ async fn what_is_wrong_with_an_upload_is_told_and_nothing_stays() {
     let chunks = (0..20).map(|_| Ok::<_, std::io::Error>(vec![0u8; 10_000]));
     let stream = Body::wrap_stream(futures_util::stream::iter(chunks));
     app.send(post(stream)).await.problem(413, "too_large");
+    // What is left of a refused body must not run into the next request on the connection.
+    let refused = post(Body::from(vec![0; 100_001])).send().await.unwrap();
+    assert_eq!(refused.headers()["connection"], "close");
     let form = multipart::Form::new().text("other", "field");
     let answer = app.send(app.request(Method::POST, "/v1/blobs").multipart(form)).await;
     assert!(answer.problem(400, "malformed_request").contains("file"));
