@@ -40,7 +40,7 @@ async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
 
 impl TestApp {
     /// The processes of the workers, as the kernel has them.
-    fn workers(&self) -> Vec<rustix::process::Pid> {
+    pub fn workers(&self) -> Vec<rustix::process::Pid> {
         let path = format!("/proc/{0}/task", self.pid());
         let threads = std::fs::read_dir(path).map(|entries| entries.flatten().collect());
         let threads: Vec<std::fs::DirEntry> = threads.unwrap_or_default();
