@@ -8,6 +8,7 @@ mod contract;
 mod dashboard;
 mod deep;
 mod faults;
+mod hangs;
 mod hostile;
 mod jobs;
 mod pipeline;
