@@ -39,7 +39,7 @@ fn kernels(criterion: &mut Criterion) {
     group.throughput(Throughput::Elements(voxels * ITERATIONS as u64));
     group.bench_function(format!("gap-tv, {ITERATIONS} iterations"), |bencher| {
         let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
-        bencher.iter(|| reconstruct(&op, black_box(y.view()), &schedule, None, &mut ()));
+        bencher.iter(|| reconstruct(&op, black_box(y.view()), &schedule, &mut (), &mut ()));
     });
     group.finish();
 }

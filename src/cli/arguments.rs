@@ -53,12 +53,8 @@ impl ScheduleArguments {
             }
         };
         let schedule = checked(&spec)?;
-        if self.algorithm == Algorithm::GapTv && schedule.needs_denoiser() {
-            return Err(CliError::Input(
-                "the schedule has stages with a learned denoiser, which gap-tv has not; use \
-                 --algorithm pnp-tv-fastdvdnet"
-                    .into(),
-            ));
+        if let Some(misfit) = self.algorithm.misfit(&spec) {
+            return Err(CliError::Input(format!("the schedule does not fit: {misfit}")));
         }
         Ok(match self.iterations {
             Some(count) => ScheduleSpec::from(&schedule.with_iterations(count as usize)),
@@ -132,6 +128,6 @@ mod tests {
         let sigma = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5}]}"#;
         assert!(message("pnp-tv-fastdvdnet", sigma).contains("/stages/0/sigma"));
         let deep = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5, "sigma": [0.2, 0.1]}]}"#;
-        assert!(message("gap-tv", deep).contains("--algorithm pnp-tv-fastdvdnet"));
+        assert!(message("gap-tv", deep).contains("ask for pnp-fastdvdnet"));
     }
 }

@@ -253,7 +253,7 @@ impl Solution {
             tv_iterations: summary.tv_iterations,
             cpu_seconds: spent.cpu_seconds,
             peak_rss_bytes: peak_rss_bytes(),
-            provider: setup.schedule.needs_denoiser().then(|| setup.network.provider()),
+            provider: setup.schedule.needs_network().then(|| setup.network.provider()),
             stop_reason: summary.stop_reason,
         })
     }
@@ -289,7 +289,7 @@ impl Solution {
         spent: Spent,
     ) -> Result<Manifest, CliError> {
         let (frames, height, width) = input.masks.array.dim();
-        let deep = setup.schedule.needs_denoiser();
+        let deep = setup.schedule.needs_network();
         let tiles = self.records();
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
@@ -303,7 +303,7 @@ impl Solution {
                 masks_sha256: input.sources.masks.sha256()?,
                 measurement_sha256: input.sources.measurement.sha256()?,
             },
-            model: deep.then(|| ModelRecord::from(setup.network.model())),
+            models: ModelRecord::of(&setup.schedule),
             scale: ScaleRecord {
                 masks_full_scale: input.masks.full_scale,
                 measurement_full_scale: input.measurement.full_scale,

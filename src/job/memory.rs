@@ -1,11 +1,17 @@
 //! How much memory a worker needs for a job: planned when the job is asked for, not hoped for.
 
 use super::JobSpec;
+use super::schedule::{MethodSpec, PriorSpec};
 
 /// The program, its thread stacks and, with the deep denoiser, ONNX Runtime and the network.
 const BASE_BYTES: u64 = 128 << 20;
 /// Arrays of the solver for each voxel of a tile (measured: 16 bytes).
 const SOLVER_BYTES_PER_VOXEL: u64 = 24;
+/// The solver's start of a projection, with momentum or ADMM; and ADMM's multiplier.
+const START_BYTES_PER_VOXEL: u64 = 4;
+/// Clips and groups of the nonlocal prior for each voxel of a tile: four clips with margins, and 40
+/// indices for each 16 pixels.
+const NONLOCAL_BYTES_PER_VOXEL: u64 = 30;
 /// Arrays around the denoiser for each voxel of a tile: padded input, middle and output.
 const DENOISER_BYTES_PER_VOXEL: u64 = 24;
 /// Activations of the network for each pixel of the frames that it takes at once (measured).
@@ -20,8 +26,18 @@ impl JobSpec {
         let side = |length: usize| length.min(self.tile.size) as u64;
         let pixels = side(self.shape.height) * side(self.shape.width);
         let voxels = pixels * self.shape.frames as u64;
-        let solver = BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL;
-        if !self.schedule.needs_denoiser() {
+        let mut per_voxel = SOLVER_BYTES_PER_VOXEL;
+        if self.schedule.method == MethodSpec::Admm {
+            per_voxel += START_BYTES_PER_VOXEL;
+        }
+        if self.schedule.stages.iter().any(|stage| stage.momentum > 0.0) {
+            per_voxel += START_BYTES_PER_VOXEL;
+        }
+        if self.schedule.stages.iter().any(|stage| stage.prior == PriorSpec::Nonlocal) {
+            per_voxel += NONLOCAL_BYTES_PER_VOXEL;
+        }
+        let solver = BASE_BYTES + voxels * per_voxel;
+        if !self.schedule.needs_network() {
             return solver;
         }
         let network = NETWORK_BYTES_PER_PIXEL * pixels.max(NETWORK_PIXELS);

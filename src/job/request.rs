@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::ids::{CalibrationId, MeasurementId};
-use super::schedule::ScheduleSpec;
+use super::schedule::{PriorSpec, ScheduleSpec};
 use super::text::Label;
 use crate::recon::schedule::Schedule;
 use crate::recon::tile::TilePlan;
@@ -17,21 +17,67 @@ pub const MAX_TASKS: usize = 50_000;
 pub enum Algorithm {
     /// GAP with total variation.
     GapTv,
-    /// GAP with total variation, then with TV and FastDVDNet.
+    /// ADMM with total variation.
+    AdmmTv,
+    /// GAP with total variation, then with the nonlocal prior.
+    PnpNonlocal,
+    /// GAP with total variation, then with FFDNet.
+    #[serde(rename = "pnp-ffdnet")]
+    PnpFfdNet,
+    /// GAP with total variation, then with FastDVDNet.
+    #[serde(rename = "pnp-fastdvdnet")]
+    PnpFastDvdNet,
+    /// GAP with total variation, with FastDVDNet, then with the nonlocal prior.
     #[serde(rename = "pnp-tv-fastdvdnet")]
     PnpTvFastDvdNet,
 }
 
 impl Algorithm {
     /// All algorithms.
-    pub const ALL: [Self; 2] = [Self::GapTv, Self::PnpTvFastDvdNet];
+    pub const ALL: [Self; 6] = [
+        Self::GapTv,
+        Self::AdmmTv,
+        Self::PnpNonlocal,
+        Self::PnpFfdNet,
+        Self::PnpFastDvdNet,
+        Self::PnpTvFastDvdNet,
+    ];
 
     /// The name in JSON, on the command line and in the database.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::GapTv => "gap-tv",
+            Self::AdmmTv => "admm-tv",
+            Self::PnpNonlocal => "pnp-nonlocal",
+            Self::PnpFfdNet => "pnp-ffdnet",
+            Self::PnpFastDvdNet => "pnp-fastdvdnet",
             Self::PnpTvFastDvdNet => "pnp-tv-fastdvdnet",
+        }
+    }
+
+    /// What it does, in a sentence.
+    #[must_use]
+    pub fn summary(self) -> &'static str {
+        match self {
+            Self::GapTv => {
+                "Accelerated generalized alternating projection with total variation: seconds, \
+                 no network."
+            }
+            Self::AdmmTv => {
+                "The alternating direction method of multipliers with total variation: for noisy \
+                 measurements."
+            }
+            Self::PnpNonlocal => {
+                "Total variation, then groups of similar patches of several frames, filtered by \
+                 their own covariance: no network."
+            }
+            Self::PnpFfdNet => "Total variation, then FFDNet on each frame.",
+            Self::PnpFastDvdNet => "Total variation, then FastDVDNet over the clip.",
+            Self::PnpTvFastDvdNet => {
+                "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best \
+                 on all masks measured."
+            }
         }
     }
 
@@ -40,8 +86,30 @@ impl Algorithm {
     pub fn default_schedule(self) -> ScheduleSpec {
         ScheduleSpec::from(&match self {
             Self::GapTv => Schedule::gap_tv(),
+            Self::AdmmTv => Schedule::admm_tv(),
+            Self::PnpNonlocal => Schedule::pnp_nonlocal(),
+            Self::PnpFfdNet => Schedule::pnp_ffdnet(),
+            Self::PnpFastDvdNet => Schedule::pnp_fastdvdnet(),
             Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
         })
+    }
+
+    /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
+    /// what the stages don't do.
+    #[must_use]
+    pub fn misfit(self, schedule: &ScheduleSpec) -> Option<String> {
+        let own = self.default_schedule();
+        let known = |prior| {
+            prior == PriorSpec::Tv
+                || own.stages.iter().any(|stage| stage.prior == prior)
+                || (self == Self::PnpTvFastDvdNet && prior == PriorSpec::TvFastDvdNet)
+        };
+        let stranger = schedule.stages.iter().find(|stage| !known(stage.prior))?;
+        let taken = |other: &&Self| other.misfit(schedule).is_none();
+        // Later ones take more.
+        let later = Self::ALL.iter().skip_while(|other| **other != self).skip(1).find(taken);
+        let instead = later.map_or_else(String::new, |other| format!("; ask for {}", other.name()));
+        Some(format!("{} has no stages of {}{instead}", self.name(), stranger.prior.name()))
     }
 }
 
@@ -238,11 +306,10 @@ impl JobRequest {
         let schedule = self.schedule.unwrap_or_else(|| self.algorithm.default_schedule());
         match schedule.to_schedule() {
             Err(wrong) => errors.extend(wrong.into_iter().map(|error| error.under("/schedule"))),
-            Ok(_) if self.algorithm == Algorithm::GapTv && schedule.needs_denoiser() => {
-                let detail = "gap-tv has no deep stages; ask for pnp-tv-fastdvdnet";
-                errors.push(InvalidField::new("/algorithm", detail));
+            Ok(_) => {
+                let misfit = self.algorithm.misfit(&schedule);
+                errors.extend(misfit.map(|detail| InvalidField::new("/algorithm", detail)));
             }
-            Ok(_) => {}
         }
         let tile = self.tile.unwrap_or_default();
         match TilePlan::new(shape.height, shape.width, tile.size, tile.overlap) {
@@ -339,7 +406,7 @@ mod tests {
         assert_eq!(spec.snapshots, SnapshotRange { first: 0, count: 6 });
         assert_eq!(spec.calibration, calibration);
         assert_eq!(spec.tile_plan().unwrap().len(), 2);
-        assert!(!spec.schedule.needs_denoiser());
+        assert!(!spec.schedule.needs_network());
     }
 
     #[test]

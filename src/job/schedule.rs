@@ -6,12 +6,15 @@ use serde::{Deserialize, Serialize};
 
 use super::request::InvalidField;
 use crate::recon::ReconError;
-use crate::recon::schedule::{Prior, Schedule, Sigma, Stage};
+use crate::recon::schedule::{Method, Network, Prior, Schedule, Sigma, Stage};
 
 /// A schedule: the stages of the solver, one after the other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScheduleSpec {
+    /// How projection and prior alternate.
+    #[serde(default)]
+    pub method: MethodSpec,
     /// Use accelerated GAP; its residual accumulator lives through all stages.
     #[serde(default = "yes")]
     pub accelerated: bool,
@@ -20,6 +23,17 @@ pub struct ScheduleSpec {
     pub gamma: f32,
     /// The stages, at least one.
     pub stages: Vec<StageSpec>,
+}
+
+/// How projection and prior alternate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MethodSpec {
+    /// Generalized alternating projection.
+    #[default]
+    Gap,
+    /// Alternating direction method of multipliers.
+    Admm,
 }
 
 /// One stage: a prior and the number of iterations with it.
@@ -31,7 +45,7 @@ pub struct StageSpec {
     /// The most iterations, at least 1.
     pub iterations: usize,
     /// Noise level on [0, 1] at the first and the last iteration, geometric between them.
-    /// Needed by the deep priors and refused for the others.
+    /// Needed by all priors but `tv`, and refused for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sigma: Option<[f32; 2]>,
     /// Weight of the total variation; needed by `tv` and `tv+fastdvdnet`.
@@ -44,6 +58,9 @@ pub struct StageSpec {
     /// next, on [0, 1]; 1 where it is left out.
     #[serde(default = "one")]
     pub memory: f32,
+    /// Extrapolation of the iterates, on [0, 1); 0 where it is left out.
+    #[serde(default)]
+    pub momentum: f32,
     /// The stage ends early once ||v_k - v_(k-1)|| / ||v_k|| is below this; 0 never does.
     #[serde(default)]
     pub tolerance: f32,
@@ -55,6 +72,12 @@ pub enum PriorSpec {
     /// Isotropic total variation of each frame.
     #[serde(rename = "tv")]
     Tv,
+    /// Groups of similar patches, filtered by their own covariance.
+    #[serde(rename = "nonlocal")]
+    Nonlocal,
+    /// FFDNet, frame by frame.
+    #[serde(rename = "ffdnet")]
+    FfdNet,
     /// FastDVDNet over the clip.
     #[serde(rename = "fastdvdnet")]
     FastDvdNet,
@@ -82,6 +105,10 @@ const MAX_ITERATIONS: usize = 10_000;
 const PROJECTION_NS: f64 = 0.6;
 /// Cost of one dual update of TV, CPU-nanoseconds per voxel (measured).
 const TV_UPDATE_NS: f64 = 0.7;
+/// Cost of one nonlocal pass, CPU-nanoseconds per voxel (measured).
+const NONLOCAL_NS: f64 = 1_500.0;
+/// Cost of one pass of FFDNet, CPU-nanoseconds per voxel (measured).
+const FFDNET_PASS_NS: f64 = 3_700.0;
 /// Cost of one pass of FastDVDNet with a shared first stage, CPU-nanoseconds per voxel (measured).
 const DEEP_PASS_NS: f64 = 9_300.0;
 
@@ -89,20 +116,45 @@ impl PriorSpec {
     fn to_prior(self) -> Prior {
         match self {
             Self::Tv => Prior::Tv,
-            Self::FastDvdNet => Prior::FastDvdNet,
+            Self::Nonlocal => Prior::Nonlocal,
+            Self::FfdNet => Prior::Deep(Network::FfdNet),
+            Self::FastDvdNet => Prior::Deep(Network::FastDvdNet),
             Self::TvFastDvdNet => Prior::TvFastDvdNet,
         }
     }
-    /// True if the prior runs the deep denoiser.
+
+    /// The name in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tv => "tv",
+            Self::Nonlocal => "nonlocal",
+            Self::FfdNet => "ffdnet",
+            Self::FastDvdNet => "fastdvdnet",
+            Self::TvFastDvdNet => "tv+fastdvdnet",
+        }
+    }
+
+    /// True if the prior runs a learned denoiser.
     #[must_use]
     pub fn is_deep(self) -> bool {
-        matches!(self, Self::FastDvdNet | Self::TvFastDvdNet)
+        self.to_prior().network().is_some()
     }
 
     /// True if the prior runs total variation.
     #[must_use]
     pub fn has_tv(self) -> bool {
-        matches!(self, Self::Tv | Self::TvFastDvdNet)
+        self.to_prior().uses_tv()
+    }
+
+    /// Cost of one iteration without projection and TV, CPU-nanoseconds per voxel.
+    fn pass_ns(self) -> f64 {
+        match self {
+            Self::Tv => 0.0,
+            Self::Nonlocal => NONLOCAL_NS,
+            Self::FfdNet => FFDNET_PASS_NS,
+            Self::FastDvdNet | Self::TvFastDvdNet => DEEP_PASS_NS,
+        }
     }
 }
 
@@ -119,6 +171,7 @@ impl StageSpec {
             tv_weight: self.tv_weight.unwrap_or(0.0),
             tv_updates: self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES),
             memory: self.memory,
+            momentum: self.momentum,
             tolerance: self.tolerance,
         })
     }
@@ -137,8 +190,7 @@ impl StageSpec {
         let dual_updates =
             u32::try_from(self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES)).unwrap_or(u32::MAX);
         let tv = if self.prior.has_tv() { TV_UPDATE_NS * f64::from(dual_updates) } else { 0.0 };
-        let deep = if self.prior.is_deep() { DEEP_PASS_NS } else { 0.0 };
-        PROJECTION_NS + tv + deep
+        PROJECTION_NS + tv + self.prior.pass_ns()
     }
 }
 
@@ -149,8 +201,12 @@ impl ScheduleSpec {
     /// One entry for each stage that is wrong, with a JSON pointer relative to the schedule.
     pub fn to_schedule(&self) -> Result<Schedule, Vec<InvalidField>> {
         let mut errors = Vec::new();
-        let mut whole =
-            Schedule { accelerated: self.accelerated, gamma: self.gamma, stages: Vec::new() };
+        let method = match self.method {
+            MethodSpec::Gap => Method::Gap,
+            MethodSpec::Admm => Method::Admm,
+        };
+        let (accelerated, gamma) = (self.accelerated, self.gamma);
+        let mut whole = Schedule { method, accelerated, gamma, stages: Vec::new() };
         if self.stages.len() > MAX_STAGES {
             let message = format!("{} stages; at most {MAX_STAGES} are taken", self.stages.len());
             return Err(vec![InvalidField::new("/stages", message)]);
@@ -158,7 +214,7 @@ impl ScheduleSpec {
         for (index, spec) in self.stages.iter().enumerate() {
             let stage = spec.to_stage().and_then(|stage| {
                 // Alone in a schedule, so that the error is known to be this stage's.
-                let alone = Schedule { accelerated: true, gamma: 0.0, stages: vec![stage.clone()] };
+                let alone = Schedule { stages: vec![stage.clone()], ..Schedule::gap_tv() };
                 alone.validate().map(|()| stage)
             });
             match (stage, spec.misfit()) {
@@ -193,9 +249,19 @@ impl ScheduleSpec {
         self.stages.iter().filter(|s| s.prior.is_deep()).map(|s| s.iterations).sum()
     }
 
-    /// True if a stage runs the deep denoiser.
+    /// The networks that the stages need, each once.
     #[must_use]
-    pub fn needs_denoiser(&self) -> bool {
+    pub fn networks(&self) -> Vec<Network> {
+        let mut networks: Vec<Network> =
+            self.stages.iter().filter_map(|stage| stage.prior.to_prior().network()).collect();
+        networks.sort();
+        networks.dedup();
+        networks
+    }
+
+    /// True if a stage runs a learned denoiser.
+    #[must_use]
+    pub fn needs_network(&self) -> bool {
         self.stages.iter().any(|stage| stage.prior.is_deep())
     }
 
@@ -236,7 +302,9 @@ impl From<&Schedule> for ScheduleSpec {
             StageSpec {
                 prior: match stage.prior {
                     Prior::Tv => PriorSpec::Tv,
-                    Prior::FastDvdNet => PriorSpec::FastDvdNet,
+                    Prior::Nonlocal => PriorSpec::Nonlocal,
+                    Prior::Deep(Network::FfdNet) => PriorSpec::FfdNet,
+                    Prior::Deep(Network::FastDvdNet) => PriorSpec::FastDvdNet,
                     Prior::TvFastDvdNet => PriorSpec::TvFastDvdNet,
                 },
                 iterations: stage.iterations,
@@ -244,10 +312,15 @@ impl From<&Schedule> for ScheduleSpec {
                 tv_weight: tv.then_some(stage.tv_weight),
                 tv_updates: tv.then_some(stage.tv_updates),
                 memory: stage.memory,
+                momentum: stage.momentum,
                 tolerance: stage.tolerance,
             }
         };
         Self {
+            method: match schedule.method {
+                Method::Gap => MethodSpec::Gap,
+                Method::Admm => MethodSpec::Admm,
+            },
             accelerated: schedule.accelerated,
             gamma: schedule.gamma,
             stages: schedule.stages.iter().map(stage).collect(),
@@ -272,7 +345,7 @@ mod tests {
 
     #[test]
     fn the_default_schedules_survive_the_way_through_json() {
-        for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
+        for schedule in Schedule::defaults() {
             let spec = ScheduleSpec::from(&schedule);
             let text = serde_json::to_string(&spec).unwrap();
             let read: ScheduleSpec = serde_json::from_str(&text).unwrap();
@@ -302,7 +375,7 @@ mod tests {
 
     #[test]
     fn one_deep_pass_weighs_as_thousands_of_tv_iterations() {
-        let spec = ScheduleSpec::from(&Schedule::pnp_tv_fastdvdnet());
+        let spec = ScheduleSpec::from(&Schedule::pnp_fastdvdnet());
         assert_eq!(spec.share_done(0, 0), 0.0);
         assert!(spec.share_done(1, 0) < 0.01, "after all TV iterations");
         let half = spec.stages[1].iterations / 2;

@@ -1,10 +1,10 @@
-//! Generalized alternating projection with plugged-in priors (Algorithm 1 of the paper).
+//! Alternating projection with plugged-in priors (Algorithm 1 of the paper).
 
 use ndarray::{Array2, Array3, ArrayView2};
 
-use super::denoise::{Denoiser, tv::TotalVariation};
+use super::denoise::{Networks, nonlocal::Nonlocal, tv::TotalVariation};
 use super::error::{ReconError, shape_text};
-use super::schedule::{Schedule, Sigma, Stage};
+use super::schedule::{Method, Prior, Schedule, Sigma, Stage};
 use super::sensing::SensingOperator;
 
 /// Where a reconstruction stands, after an iteration.
@@ -16,12 +16,14 @@ pub struct Progress {
     pub done: usize,
     /// Most iterations there will be; shrinks when a stage converges early.
     pub planned: usize,
-    /// `||y - H v|| / ||y||` before the iteration.
+    /// `||y - H v|| / ||y||` of what the iteration started from.
     pub residual: f32,
     /// `||v_k - v_(k-1)|| / ||v_k||`.
     pub change: f32,
-    /// Level of the learned denoiser in this iteration.
+    /// Level of the prior in this iteration; none for total variation.
     pub sigma: Option<Sigma>,
+    /// Whether a network was run.
+    pub deep: bool,
 }
 
 /// What an observer wants.
@@ -72,7 +74,7 @@ pub struct Outcome {
     pub frames: Array3<f32>,
     /// Iterations whose prior had a total-variation part.
     pub tv_iterations: usize,
-    /// Passes of the learned denoiser.
+    /// Passes of learned denoisers.
     pub denoiser_passes: usize,
     /// `||y - H v|| / ||y||` of the result.
     pub residual: f32,
@@ -85,17 +87,16 @@ pub struct Outcome {
 ///
 /// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
 /// variation and the learned denoiser costs what the acceleration gained. With `gamma` > 0 the
-/// operator's regularised inverse is used. A denoiser is needed only by schedules with a
-/// learned prior.
+/// operator's regularised inverse is used. Networks are asked for when a stage needs them.
 ///
 /// # Errors
-/// Sizes that disagree, an invalid schedule, a missing or failing denoiser, divergence, or
+/// Sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
 /// [`ReconError::Cancelled`] when the observer says so.
-pub fn reconstruct<'a>(
-    op: &'a SensingOperator,
+pub fn reconstruct(
+    op: &SensingOperator,
     y: ArrayView2<'_, f32>,
     schedule: &Schedule,
-    denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+    networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome, ReconError> {
     schedule.validate()?;
@@ -106,10 +107,9 @@ pub fn reconstruct<'a>(
             expected: format!("{} (the masks' size)", shape_text(op.gram().shape())),
         });
     }
-    if denoiser.is_none() && schedule.needs_denoiser() {
-        return Err(ReconError::NoDenoiser);
-    }
-    let mut run = Run::new(op, y, schedule, denoiser);
+    // Before anything is computed, so that a missing network is told at once.
+    schedule.networks().into_iter().try_for_each(|which| networks.network(which).map(|_| ()))?;
+    let mut run = Run::new(op, y, schedule, networks);
     let mut stop_reason = StopReason::MaxIterations;
     for (index, stage) in schedule.stages.iter().enumerate() {
         stop_reason = run.stage(index, stage, observer)?;
@@ -131,8 +131,13 @@ struct Run<'a> {
     y1: Option<Array2<f32>>,
     v: Array3<f32>,
     x: Array3<f32>,
+    /// What is projected, where it is not `v`: extrapolated, or with ADMM's multiplier.
+    start: Option<Array3<f32>>,
+    /// ADMM's multiplier `u`.
+    multiplier: Option<Array3<f32>>,
     tv: TotalVariation,
-    denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+    nonlocal: Option<Nonlocal>,
+    networks: &'a mut dyn Networks,
     done: usize,
     planned: usize,
     tv_iterations: usize,
@@ -144,20 +149,24 @@ impl<'a> Run<'a> {
         op: &'a SensingOperator,
         y: ArrayView2<'_, f32>,
         schedule: &Schedule,
-        denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+        networks: &'a mut dyn Networks,
     ) -> Self {
         let y = y.as_standard_layout().into_owned();
         let squares: f64 = y.iter().map(|&value| f64::from(value) * f64::from(value)).sum();
         let (_, height, width) = op.dim();
+        let zeros = || Array3::zeros(op.dim());
         Self {
             op,
             y_norm: squares.sqrt().max(f64::MIN_POSITIVE),
             y1: schedule.accelerated.then(|| Array2::zeros(y.raw_dim())),
             y,
-            v: Array3::zeros(op.dim()),
-            x: Array3::zeros(op.dim()),
+            v: zeros(),
+            x: zeros(),
+            start: schedule.has_own_start().then(zeros),
+            multiplier: (schedule.method == Method::Admm).then(zeros),
             tv: TotalVariation::new(height, width),
-            denoiser,
+            nonlocal: None,
+            networks,
             done: 0,
             planned: schedule.planned_iterations(),
             tv_iterations: 0,
@@ -171,12 +180,20 @@ impl<'a> Run<'a> {
         stage: &Stage,
         observer: &mut dyn Observer,
     ) -> Result<StopReason, ReconError> {
+        // Its groups belong to the iterates of one stage.
+        self.nonlocal = None;
         for iteration in 0..stage.iterations {
             let sigma = stage.sigma_at(iteration);
             let y1 = self.y1.as_mut().map(|y1| (y1, stage.memory));
-            let squares = self.op.project(&self.y, y1, &self.v, &mut self.x);
+            let start = self.start.as_ref().unwrap_or(&self.v);
+            let squares = self.op.project(&self.y, y1, start, &mut self.x);
+            if let (Some(u), Some(z)) = (&self.multiplier, &mut self.start) {
+                self.x -= u;
+                z.assign(&self.x);
+            }
             self.apply(stage, sigma)?;
             let change = relative_change(&self.x, &self.v);
+            self.prepare_start(stage.momentum);
             std::mem::swap(&mut self.v, &mut self.x);
             self.done += 1;
             if !change.is_finite() {
@@ -195,6 +212,7 @@ impl<'a> Run<'a> {
                 residual: (squares.sqrt() / self.y_norm) as f32,
                 change,
                 sigma,
+                deep: stage.prior.network().is_some(),
             };
             if observer.iteration(&progress) == Control::Cancel {
                 return Err(ReconError::Cancelled);
@@ -212,12 +230,31 @@ impl<'a> Run<'a> {
             self.tv.denoise(&mut self.x, stage.tv_weight, stage.tv_updates);
             self.tv_iterations += 1;
         }
-        if let (true, Some(sigma)) = (stage.prior.is_deep(), sigma) {
-            let denoiser = self.denoiser.as_deref_mut().ok_or(ReconError::NoDenoiser)?;
-            denoiser.denoise(&mut self.x, sigma)?;
+        let Some(sigma) = sigma else { return Ok(()) };
+        if stage.prior == Prior::Nonlocal {
+            let size = self.x.dim();
+            let nonlocal = self.nonlocal.get_or_insert_with(|| Nonlocal::new(size));
+            nonlocal.denoise(&mut self.x, sigma);
+        }
+        if let Some(network) = stage.prior.network() {
+            self.networks.network(network)?.denoise(&mut self.x, sigma)?;
             self.denoiser_passes += 1;
         }
         Ok(())
+    }
+
+    /// What is projected next, from the new iterate in `x` and the old one in `v`. For ADMM
+    /// `start` holds `z`, what went into the denoiser, so that `u = v - z`.
+    fn prepare_start(&mut self, momentum: f32) {
+        let Some(start) = &mut self.start else { return };
+        if let Some(u) = &mut self.multiplier {
+            ndarray::azip!((u in &mut *u, &new in &self.x, &z in &*start) *u = new - z);
+            ndarray::azip!((start in start, &new in &self.x, &old in &self.v, &u in &*u)
+                *start = new + momentum * (new - old) + u);
+        } else {
+            ndarray::azip!((start in start, &new in &self.x, &old in &self.v)
+                *start = new + momentum * (new - old));
+        }
     }
 
     fn residual(&mut self) -> f32 {

@@ -8,7 +8,6 @@
 pub mod denoise;
 pub mod error;
 pub mod gap;
-pub mod memory;
 pub mod metrics;
 pub mod scale;
 pub mod schedule;

@@ -33,7 +33,7 @@ pub(super) fn run(
     task: &ClaimedTask,
     snapshot: u32,
     tiles: &[TileResult],
-    engine: &Engine,
+    engine: &WarmNetworks,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {
     let plan = task.spec.tile_plan()?;
@@ -114,13 +114,12 @@ fn manifest(
     snapshot: u32,
     plan: &TilePlan,
     records: &[TileTaskRecord],
-    engine: &Engine,
+    engine: &WarmNetworks,
 ) -> Result<Manifest, TaskError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);
     let tiles: Vec<_> = records.iter().map(|record| record.tile.clone()).collect();
     let (frames, snapshot) = (spec.shape.frames, snapshot as usize);
-    let model = spec.schedule.needs_denoiser().then(|| engine.source().model());
     let content = Content {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
@@ -133,7 +132,7 @@ fn manifest(
             masks_sha256: calibration.masks.to_string(),
             measurement_sha256: measurement.data.to_string(),
         },
-        model: model.map(ModelRecord::from),
+        models: ModelRecord::of(&spec.schedule),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,

@@ -67,7 +67,7 @@ pub(super) fn run(
     store: &Store,
     task: &ClaimedTask,
     records: &[TaskRecord],
-    engine: &Engine,
+    engine: &WarmNetworks,
 ) -> Result<Completion, TaskError> {
     let snapshots = records.iter().filter_map(snapshot).collect::<Result<Vec<_>, _>>()?;
     let manifest = JobManifest {
@@ -96,11 +96,11 @@ fn snapshot(task: &TaskRecord) -> Option<Result<(u32, SnapshotRecord), TaskError
 fn content(
     task: &ClaimedTask,
     snapshots: Vec<(u32, SnapshotRecord)>,
-    engine: &Engine,
+    engine: &WarmNetworks,
 ) -> Result<JobContent, TaskError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);
-    let deep = spec.schedule.needs_denoiser();
+    let deep = spec.schedule.needs_network();
     let entry = |(snapshot, record): (u32, SnapshotRecord)| {
         let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
         SnapshotEntry { snapshot, summary: record.summary, files: files.collect() }
@@ -114,7 +114,7 @@ fn content(
             masks_sha256: calibration.masks.to_string(),
             measurement_sha256: measurement.data.to_string(),
         },
-        model: deep.then(|| ModelRecord::from(engine.source().model())),
+        models: ModelRecord::of(&spec.schedule),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,

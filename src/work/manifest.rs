@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 use super::result::ResultFile;
 use crate::formats::exr::Attributes;
 use crate::job::{Algorithm, ScheduleSpec, TileSpec};
-use crate::models::TwoStageModel;
+use crate::models::{self, Model};
 use crate::recon::tile::TilePlan;
 
 /// Name and version of this form of record.
@@ -58,8 +58,8 @@ pub struct Content {
     pub snapshot: usize,
     /// The files that went in.
     pub inputs: Inputs,
-    /// The network; none for schedules without one.
-    pub model: Option<ModelRecord>,
+    /// The networks that the schedule names.
+    pub models: Vec<ModelRecord>,
     /// Every scale factor.
     pub scale: ScaleRecord,
     /// How the picture was cut.
@@ -92,10 +92,17 @@ pub struct ModelRecord {
     pub sha256: String,
 }
 
-impl From<&TwoStageModel> for ModelRecord {
-    fn from(model: &TwoStageModel) -> Self {
-        let digest = Sha256::new().chain_update(model.stage1).chain_update(model.stage2).finalize();
-        let sha256 = digest.iter().map(|byte| format!("{byte:02x}")).collect();
+impl ModelRecord {
+    /// Those of a schedule, in a fixed order.
+    pub fn of(schedule: &ScheduleSpec) -> Vec<Self> {
+        schedule.networks().into_iter().map(|network| Self::from(&models::of(network))).collect()
+    }
+}
+
+impl From<&Model> for ModelRecord {
+    fn from(model: &Model) -> Self {
+        let digest = model.files.iter().fold(Sha256::new(), |hash, file| hash.chain_update(file));
+        let sha256 = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
         Self { name: model.name.into(), sha256 }
     }
 }
@@ -290,7 +297,7 @@ pub(super) fn sample() -> Manifest {
         width: 24,
         snapshot: 1,
         inputs: Inputs { masks_sha256: hash.clone(), measurement_sha256: hash },
-        model: Some(ModelRecord::from(&crate::models::FASTDVDNET_GRAY)),
+        models: ModelRecord::of(&crate::job::Algorithm::PnpTvFastDvdNet.default_schedule()),
         scale: ScaleRecord { masks_full_scale: 1.0, measurement_full_scale: 255.0, white: 0.9 },
         tile_plan: (&plan).into(),
         tiles: Vec::new(),

@@ -4,10 +4,13 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
-use crate::models::{FASTDVDNET_GRAY, TwoStageModel};
+use crate::models;
 use crate::recon::ReconError;
 use crate::recon::denoise::fastdvdnet::FastDvdNet;
+use crate::recon::denoise::ffdnet::FfdNet;
 use crate::recon::denoise::onnx::{Device, Runtime};
+use crate::recon::denoise::{Denoiser, Networks};
+use crate::recon::schedule::Network;
 
 /// The library's name beside the executable.
 const LIBRARY: &str = "libonnxruntime.so";
@@ -45,15 +48,10 @@ impl NetworkSource {
         self.device.provider()
     }
 
-    /// The network that is loaded.
-    pub fn model(&self) -> &'static TwoStageModel {
-        &FASTDVDNET_GRAY
-    }
-
     /// Version of the library, for records; loads it.
     ///
     /// # Errors
-    /// As [`NetworkSource::load`].
+    /// No library, or one that can't be loaded.
     pub fn version(&self) -> Result<String, NetworkError> {
         let runtime = self.runtime()?;
         let path = self.path()?;
@@ -64,13 +62,16 @@ impl NetworkSource {
         Ok(self.version.get_or_init(read).clone())
     }
 
-    /// A denoiser with sessions of its own, for one thread.
-    ///
-    /// # Errors
-    /// No library, or one that can't run the network on the device that was asked for.
-    pub fn load(&self) -> Result<FastDvdNet, NetworkError> {
-        let (runtime, model) = (self.runtime()?, self.model());
-        Ok(FastDvdNet::load(&runtime, model.stage1, model.stage2)?)
+    /// A network with sessions of its own, for one thread.
+    fn load(&self, which: Network) -> Result<Box<dyn Denoiser>, NetworkError> {
+        let (runtime, files) = (self.runtime()?, models::of(which).files);
+        Ok(match (which, files) {
+            (Network::FastDvdNet, [first, second]) => {
+                Box::new(FastDvdNet::load(&runtime, first, second)?)
+            }
+            (_, [model, ..]) => Box::new(FfdNet::load(&runtime, model)?),
+            (_, []) => return Err(NetworkError::Missing("the program carries no network".into())),
+        })
     }
 
     fn runtime(&self) -> Result<Runtime, NetworkError> {
@@ -89,6 +90,39 @@ impl NetworkSource {
         existing(&beside).ok_or_else(|| {
             NetworkError::Missing("none is named and none is beside the program".into())
         })
+    }
+}
+
+/// Networks of one thread: each is loaded at its first use and stays warm.
+pub struct WarmNetworks {
+    source: NetworkSource,
+    loaded: Vec<(Network, Box<dyn Denoiser>)>,
+}
+
+impl WarmNetworks {
+    /// Networks from `source`, none of them loaded yet.
+    pub fn new(source: NetworkSource) -> Self {
+        Self { source, loaded: Vec::new() }
+    }
+
+    /// Where they come from.
+    pub fn source(&self) -> &NetworkSource {
+        &self.source
+    }
+}
+
+impl Networks for WarmNetworks {
+    fn network(&mut self, which: Network) -> Result<&mut dyn Denoiser, ReconError> {
+        let index = match self.loaded.iter().position(|(kind, _)| *kind == which) {
+            Some(index) => index,
+            None => {
+                let network = self.source.load(which);
+                let network = network.map_err(|error| ReconError::Runtime(error.to_string()))?;
+                self.loaded.push((which, network));
+                self.loaded.len() - 1
+            }
+        };
+        Ok(self.loaded[index].1.as_mut())
     }
 }
 
@@ -111,6 +145,7 @@ fn version_in(library: &[u8]) -> Option<String> {
 mod tests {
     use super::{NetworkSource, version_in};
     use crate::recon::denoise::onnx::Device;
+    use crate::recon::schedule::Network;
 
     #[test]
     fn the_version_is_that_of_the_symbols() {
@@ -123,7 +158,7 @@ mod tests {
     #[test]
     fn a_missing_library_is_named() {
         let source = NetworkSource::new(Some("/nowhere/libonnxruntime.so".into()), Device::Cpu);
-        let error = source.load().err().unwrap().to_string();
+        let error = source.load(Network::FfdNet).err().unwrap().to_string();
         assert!(error.contains("/nowhere/libonnxruntime.so"), "{error}");
         assert!(error.contains("--onnxruntime"), "{error}");
     }

@@ -6,10 +6,9 @@ use std::thread;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 
-use super::network::{NetworkError, NetworkSource};
+use super::network::{NetworkSource, WarmNetworks};
 use super::solve::{TileInput, TileOutcome, reconstruct_tile};
 use crate::recon::ReconError;
-use crate::recon::denoise::Denoiser;
 use crate::recon::gap::{Control, Observer, Progress};
 use crate::recon::schedule::Schedule;
 use crate::recon::tile::{Tile, TilePlan};
@@ -32,9 +31,6 @@ pub struct SnapshotInput<'a> {
 /// Why a snapshot was not solved.
 #[derive(Debug, thiserror::Error)]
 pub enum SolveError {
-    /// No denoiser.
-    #[error(transparent)]
-    Network(#[from] NetworkError),
     /// The solver refused or failed.
     #[error(transparent)]
     Recon(#[from] ReconError),
@@ -112,10 +108,7 @@ impl Run<'_, '_> {
 
     fn tiles(&self) -> Result<(), SolveError> {
         let schedule = self.input.schedule;
-        let mut network = match schedule.needs_denoiser() {
-            true => Some(self.network.load()?),
-            false => None,
-        };
+        let mut networks = WarmNetworks::new(self.network.clone());
         loop {
             let index = self.next.fetch_add(1, Ordering::Relaxed);
             let Some(tile) = self.input.plan.tile(index) else { return Ok(()) };
@@ -126,9 +119,8 @@ impl Run<'_, '_> {
                 measurement: self.input.measurement.slice(s![rows, columns]).to_owned(),
                 white: self.input.white,
             };
-            let denoiser = network.as_mut().map(|network| network as &mut dyn Denoiser);
             let mut observer = TileObserver { progress: self.progress, stop: &self.stop, tile };
-            let outcome = reconstruct_tile(window, schedule, denoiser, &mut observer)?;
+            let outcome = reconstruct_tile(window, schedule, &mut networks, &mut observer)?;
             self.progress.finished(&tile);
             self.done.lock().map_err(|_| SolveError::Thread)?[index] = Some(outcome);
         }

@@ -3,7 +3,7 @@
 use ndarray::{Array2, Array3};
 
 use crate::recon::ReconError;
-use crate::recon::denoise::Denoiser;
+use crate::recon::denoise::Networks;
 use crate::recon::gap::{self, Observer, StopReason};
 use crate::recon::schedule::Schedule;
 use crate::recon::sensing::SensingOperator;
@@ -26,7 +26,7 @@ pub struct TileOutcome {
     pub frames: Array3<f32>,
     /// Iterations whose prior had a total-variation part.
     pub tv_iterations: usize,
-    /// Passes of the learned denoiser.
+    /// Passes of learned denoisers.
     pub denoiser_passes: usize,
     /// `||y - H v|| / ||y||` of the result.
     pub residual: f32,
@@ -42,10 +42,10 @@ pub struct TileOutcome {
 ///
 /// # Errors
 /// As [`gap::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
-pub fn reconstruct_tile<'a>(
+pub fn reconstruct_tile(
     input: TileInput,
     schedule: &Schedule,
-    denoiser: Option<&'a mut (dyn Denoiser + 'a)>,
+    networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<TileOutcome, ReconError> {
     let TileInput { masks, mut measurement, white } = input;
@@ -62,9 +62,7 @@ pub fn reconstruct_tile<'a>(
         other => other?.with_gamma(schedule.gamma)?,
     };
     measurement /= white;
-    // Without the reborrow the operator would have to live as long as the denoiser.
-    let denoiser = denoiser.map(|denoiser| denoiser as &mut dyn Denoiser);
-    let outcome = gap::reconstruct(&op, measurement.view(), schedule, denoiser, observer)?;
+    let outcome = gap::reconstruct(&op, measurement.view(), schedule, networks, observer)?;
     Ok(TileOutcome {
         frames: outcome.frames * white,
         tv_iterations: outcome.tv_iterations,
@@ -116,7 +114,7 @@ mod tests {
         let y = measure(masks.view(), truth.view()).unwrap();
         let solve = |y: Array2<f32>, white| {
             let input = TileInput { masks: masks.clone(), measurement: y, white };
-            reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap().frames
+            reconstruct_tile(input, &Schedule::gap_tv(), &mut (), &mut ()).unwrap().frames
         };
         let plain = solve(y.clone(), 0.8);
         let error = (&plain - &truth).mapv(|d| d * d).mean().unwrap();
@@ -133,7 +131,7 @@ mod tests {
             measurement: Array2::from_elem((16, 16), 0.1),
             white: 1.0,
         };
-        let outcome = reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap();
+        let outcome = reconstruct_tile(input, &Schedule::gap_tv(), &mut (), &mut ()).unwrap();
         assert!(outcome.frames.iter().all(|&v| v == 0.0));
         assert_eq!(outcome.tv_iterations, 0);
     }
@@ -144,7 +142,7 @@ mod tests {
         for white in [0.0, -1.0, f32::NAN] {
             let input =
                 TileInput { masks: masks.clone(), measurement: Array2::ones((32, 32)), white };
-            let error = reconstruct_tile(input, &Schedule::gap_tv(), None, &mut ()).unwrap_err();
+            let error = reconstruct_tile(input, &Schedule::gap_tv(), &mut (), &mut ()).unwrap_err();
             assert!(error.to_string().contains("white level"), "{error}");
         }
     }

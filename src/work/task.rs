@@ -4,13 +4,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::network::{NetworkError, NetworkSource};
+use super::network::{NetworkError, WarmNetworks};
 use super::result::ResultError;
 use super::{assemble, finish, prepare, tile};
 use crate::formats::FormatError;
 use crate::job::{InvalidField, TaskKind, TaskProgress};
 use crate::recon::ReconError;
-use crate::recon::denoise::fastdvdnet::FastDvdNet;
 use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};
 
 /// What the computing thread and the heartbeat tell each other.
@@ -59,30 +58,6 @@ impl Shared {
     pub(super) fn check(&self) -> Result<(), TaskError> {
         self.lock().1 = Instant::now();
         if self.stopped() { Err(TaskError::Stopped) } else { Ok(()) }
-    }
-}
-
-/// Denoisers, of which one stays warm from task to task.
-pub(super) struct Engine {
-    source: NetworkSource,
-    warm: Option<FastDvdNet>,
-}
-
-impl Engine {
-    pub(super) fn new(source: NetworkSource) -> Self {
-        Self { source, warm: None }
-    }
-
-    pub(super) fn source(&self) -> &NetworkSource {
-        &self.source
-    }
-
-    /// The denoiser, loaded at its first use.
-    pub(super) fn network(&mut self) -> Result<&mut FastDvdNet, NetworkError> {
-        match &mut self.warm {
-            Some(network) => Ok(network),
-            warm => Ok(warm.insert(self.source.load()?)),
-        }
     }
 }
 
@@ -181,7 +156,7 @@ pub(super) fn perform(
     store: &Store,
     task: &ClaimedTask,
     material: Material,
-    engine: &mut Engine,
+    engine: &mut WarmNetworks,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {
     match (task.kind, material) {

@@ -6,15 +6,15 @@ use ndarray::Axis;
 use serde::{Deserialize, Serialize};
 
 use super::manifest::TileRecord;
+use super::network::WarmNetworks;
 use super::prepare::{Prepared, to_record};
 use super::share::ShareDone;
 use super::solve::{TileInput, TileOutcome, reconstruct_tile};
-use super::task::{Engine, Shared, TaskError};
+use super::task::{Shared, TaskError};
 use super::usage::{Usage, peak_rss_bytes};
 use crate::formats::planar::{Reader, Writer};
 use crate::formats::{FormatError, Limits};
 use crate::job::{TaskProgress, TaskStage};
-use crate::recon::denoise::Denoiser;
 use crate::recon::gap::{Control, Observer, Progress};
 use crate::recon::tile::Tile;
 use crate::store::{ClaimedTask, Completion, Product, StagedBlob, Store};
@@ -39,7 +39,7 @@ pub(super) fn run(
     store: &Store,
     task: &ClaimedTask,
     (snapshot, index): (u32, u32),
-    engine: &mut Engine,
+    engine: &mut WarmNetworks,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {
     let before = Usage::now();
@@ -50,12 +50,10 @@ pub(super) fn run(
     })?;
     let schedule = task.spec.schedule.to_schedule()?;
     let input = window(task, &tile, snapshot as usize)?;
-    let deep = schedule.needs_denoiser();
-    let network = if deep { Some(engine.network()?) } else { None };
-    let denoiser = network.map(|network| network as &mut dyn Denoiser);
+    let deep = !schedule.networks().is_empty();
     let share = ShareDone::new(task.spec.schedule.clone());
     let mut observer = TaskObserver { shared, share, passes: 0 };
-    let outcome = reconstruct_tile(input, &schedule, denoiser, &mut observer)?;
+    let outcome = reconstruct_tile(input, &schedule, engine, &mut observer)?;
     let progress = shared.progress();
     shared.set_progress(TaskProgress { stage: TaskStage::Writing, ..progress });
     let record = TileTaskRecord {
@@ -108,14 +106,21 @@ struct TaskObserver<'a> {
 
 impl Observer for TaskObserver<'_> {
     fn iteration(&mut self, progress: &Progress) -> Control {
-        let deep = progress.sigma.is_some();
-        self.passes += u32::from(deep);
+        self.passes += u32::from(progress.deep);
         self.shared.set_progress(TaskProgress {
-            stage: if deep { TaskStage::Deep } else { TaskStage::Tv },
+            stage: stage(progress),
             iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),
             passes: self.passes,
             fraction: self.share.after(progress),
         });
         if self.shared.stopped() { Control::Cancel } else { Control::Continue }
+    }
+}
+
+fn stage(progress: &Progress) -> TaskStage {
+    match (progress.deep, progress.sigma) {
+        (true, _) => TaskStage::Deep,
+        (false, Some(_)) => TaskStage::Nonlocal,
+        (false, None) => TaskStage::Tv,
     }
 }

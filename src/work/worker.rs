@@ -208,7 +208,7 @@ impl Worker {
         shared: &Arc<Shared>,
         span: tracing::Span,
     ) -> JoinHandle<Computed> {
-        let mut engine = self.engine.take().unwrap_or_else(|| Engine::new(self.network.clone()));
+        let mut engine = self.engine.take().unwrap_or_else(|| WarmNetworks::new(self.network.clone()));
         let (store, shared) = (self.store.clone(), shared.clone());
         tokio::task::spawn_blocking(move || {
             let _entered = span.enter();

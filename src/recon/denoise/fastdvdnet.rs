@@ -1,6 +1,6 @@
 //! FastDVDNet over whole clips (Tassano et al., CVPR 2020).
 
-use ndarray::{Array3, ArrayView4, s};
+use ndarray::{Array3, ArrayView2, ArrayView4, ArrayViewMut2, Axis};
 
 use super::Denoiser;
 use super::onnx::{ClipNetwork, Runtime};
@@ -11,7 +11,7 @@ use crate::recon::schedule::Sigma;
 const PIXELS_AT_ONCE: usize = 4 * 256 * 256;
 
 /// Frames of `plane` pixels that go through a block at once, if the clip has as many.
-pub(in crate::recon) fn frames_at_once(plane: u64) -> u64 {
+fn frames_at_once(plane: u64) -> u64 {
     (PIXELS_AT_ONCE as u64 / plane.max(1)).max(1)
 }
 
@@ -51,23 +51,35 @@ impl Denoiser for FastDvdNet {
         self.middle.resize((count + 2) * plane, 0.0);
         self.output.resize(count * plane, 0.0);
         for (k, padded) in self.padded.chunks_exact_mut(plane).enumerate() {
-            let frame = frames.slice(s![reflect(k as isize - 2, count), .., ..]);
-            for (i, row) in padded.chunks_exact_mut(columns).enumerate() {
-                let source = frame.row(reflect(i as isize, height));
-                for (j, value) in row.iter_mut().enumerate() {
-                    *value = source[reflect(j as isize, width)];
-                }
-            }
+            let frame = reflect(k as isize - 2, count);
+            pad_frame(frames.index_axis(Axis(0), frame), padded, columns);
         }
         let size = (rows, columns);
         run_chunked(&mut self.first, &self.padded, &mut self.middle, size, sigma)?;
         run_chunked(&mut self.second, &self.middle, &mut self.output, size, sigma)?;
-        for (mut frame, output) in frames.outer_iter_mut().zip(self.output.chunks_exact(plane)) {
-            for (mut row, output) in frame.outer_iter_mut().zip(output.chunks_exact(columns)) {
-                row.iter_mut().zip(output).for_each(|(value, &denoised)| *value = denoised);
-            }
+        for (frame, output) in frames.outer_iter_mut().zip(self.output.chunks_exact(plane)) {
+            unpad_frame(output, columns, frame);
         }
         Ok(())
+    }
+}
+
+/// Copies a frame into one with rows of `columns` pixels and as many rows as fit, mirrored at its
+/// lower and right ends.
+pub(super) fn pad_frame(frame: ArrayView2<'_, f32>, padded: &mut [f32], columns: usize) {
+    let (height, width) = frame.dim();
+    for (i, row) in padded.chunks_exact_mut(columns).enumerate() {
+        let source = frame.row(reflect(i as isize, height));
+        for (j, value) in row.iter_mut().enumerate() {
+            *value = source[reflect(j as isize, width)];
+        }
+    }
+}
+
+/// Takes a frame out of one that was padded by [`pad_frame`].
+pub(super) fn unpad_frame(padded: &[f32], columns: usize, mut frame: ArrayViewMut2<'_, f32>) {
+    for (mut row, padded) in frame.outer_iter_mut().zip(padded.chunks_exact(columns)) {
+        row.iter_mut().zip(padded).for_each(|(value, &x)| *value = x);
     }
 }
 
