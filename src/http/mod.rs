@@ -9,7 +9,9 @@ mod app;
 mod blobs;
 mod calibrations;
 mod conditional;
+mod dashboard;
 pub mod error;
+mod events;
 mod extract;
 mod health;
 mod intake;
@@ -20,6 +22,7 @@ mod metrics;
 mod page;
 mod results;
 mod router;
+mod system;
 mod upload;
 
 pub use app::App;

@@ -10,7 +10,8 @@ use tower_http::catch_panic::CatchPanicLayer;
 use super::access::{self, Rule};
 use super::app::App;
 use super::{
-    algorithms, blobs, calibrations, health, jobs, layers, measurements, metrics, results,
+    algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
+    metrics, results, system,
 };
 
 /// The largest JSON body.
@@ -39,6 +40,10 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::stack),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::array),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
+        R::at("/v1/events").get(events::listen).slow(),
+        R::at("/v1/system").get(system::show).only(Rule::Admin),
+        R::at("/").get(dashboard::page).only(Rule::Public),
+        R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
         R::at("/livez").get(health::live).only(Rule::Public),
         R::at("/readyz").get(health::ready).only(Rule::Public),
         R::at("/metrics").get(metrics::show).only(Rule::Admin),
@@ -126,7 +131,8 @@ impl Route {
         self
     }
 
-    /// Without a limit on the time of the answer: the check of a large file takes minutes.
+    /// Without a limit on the time of the answer: the check of a large file takes minutes, and
+    /// events never end.
     fn slow(mut self) -> Self {
         self.slow = true;
         self

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::app::{TestApp, id};
 use crate::samples::Scene;
 
-const PUBLIC: [&str; 3] = ["/livez", "/readyz", "/openapi.yaml"];
+const PUBLIC: [&str; 5] = ["/livez", "/readyz", "/openapi.yaml", "/", "/dashboard/{file}"];
 
 /// The path of a route with something in place of its parameters.
 fn filled(path: &str) -> String {

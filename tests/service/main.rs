@@ -6,6 +6,7 @@ mod access;
 mod app;
 mod cli;
 mod contract;
+mod dashboard;
 mod deep;
 mod faults;
 mod hangs;
