@@ -115,6 +115,11 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,
+
+    /// Seconds without progress, on top of four times the planned time of a task, after which its
+    /// worker is held to hang: the worker ends, and another one tries the task.
+    #[arg(long, env = "SCI_RECON_STALL_SECONDS", value_name = "SECONDS", default_value_t = 300)]
+    pub stall_seconds: u64,
 }
 
 /// How log lines look.
@@ -179,6 +184,7 @@ impl WorkerArguments {
         option("--data", self.data.clone().into());
         option("--device", self.engine.device.clone().into());
         option("--nice", self.engine.nice.to_string().into());
+        option("--stall-seconds", self.engine.stall_seconds.to_string().into());
         let format = if self.log_format == LogFormat::Json { "json" } else { "text" };
         option("--log-format", format.into());
         if let Some(library) = &self.engine.onnxruntime {
@@ -228,7 +234,15 @@ mod tests {
     #[test]
     fn a_worker_gets_the_arguments_that_were_meant_for_it() {
         let line = ["--data", "some dir", "--device", "cuda:0", "--nice", "5"];
-        let more = ["--onnxruntime", "lib.so", "--supervised", "--log-format", "json"];
+        let more = [
+            "--stall-seconds",
+            "7",
+            "--onnxruntime",
+            "lib.so",
+            "--supervised",
+            "--log-format",
+            "json",
+        ];
         let first = Worker::try_parse_from(line.iter().chain(&more)).unwrap().arguments;
         let again = Worker::try_parse_from(&first.command_line()[1..]).unwrap().arguments;
         assert_eq!(format!("{first:?}"), format!("{again:?}"));

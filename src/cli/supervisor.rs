@@ -21,6 +21,10 @@ use crate::store::{Store, WorkerEnd};
 const GRACE: Duration = Duration::from_secs(8);
 /// The shortest and the longest pause before a worker is started again.
 const PAUSES: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(15));
+/// Time between looks at a worker's signs of life.
+const LOOK: Duration = Duration::from_secs(5);
+/// A worker that gives no sign of life for so long hangs as a whole; its lease has run out.
+const SILENCE: Duration = Duration::from_secs(30);
 /// A worker that lived for so long did not die of its start.
 const HEALTHY: Duration = Duration::from_secs(20);
 
@@ -98,9 +102,14 @@ impl Slot {
 
     async fn watch(&mut self, id: WorkerId, mut child: Child) {
         let stdin = child.stdin.take();
+        let store = self.store.clone();
         let ended = tokio::select! {
             status = child.wait() => Some(status),
             () = stopped(&mut self.stop) => None,
+            () = silent(&store, id) => {
+                tracing::warn!(worker = %id, "a worker gives no sign of life and is killed");
+                Some(child.kill().await.and(child.wait().await))
+            }
         };
         let end = match ended {
             Some(Ok(status)) => judge(status),
@@ -137,6 +146,20 @@ impl Slot {
 async fn stopped(stop: &mut watch::Receiver<bool>) {
     // An error means that the sender is gone, which is a stop as well.
     let _ = stop.wait_for(|stop| *stop).await;
+}
+
+/// Waits until a worker has given no sign of life for too long, by the clock that does not jump.
+async fn silent(store: &Store, id: WorkerId) {
+    let (mut last, mut since) = (None, Instant::now());
+    while since.elapsed() < SILENCE {
+        tokio::time::sleep(LOOK).await;
+        match store.last_sign(id).await {
+            Ok(sign) if sign == last => {}
+            Ok(sign) => (last, since) = (sign, Instant::now()),
+            // Nobody can give a sign then.
+            Err(_) => since = Instant::now(),
+        }
+    }
 }
 
 /// Waits for a worker that was told to end, and kills it if it does not.

@@ -11,11 +11,7 @@ use crate::config::WorkerArguments;
 use crate::job::WorkerId;
 use crate::recon::denoise::onnx::Device;
 use crate::store::Store;
-use crate::work::{NetworkSource, Worker};
-
-/// How long a worker may take to come to the end of an iteration when it is to stop. After that
-/// it ends at once, and its task's lease runs out.
-const GRACE: Duration = Duration::from_secs(30);
+use crate::work::{NetworkSource, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
 ///
@@ -32,16 +28,26 @@ pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(|error| failed(&error))?;
-    runtime.block_on(async {
+    let ended = runtime.block_on(async {
         let store = Store::open(&settings.data).await.map_err(|error| failed(&error))?;
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
         let id = settings.id.unwrap_or_else(WorkerId::new);
-        let worker = Worker::new(store.clone(), id, network, stop);
-        let ended = worker.run().await.map_err(|error| failed(&error));
+        let stall = Duration::from_secs(settings.engine.stall_seconds);
+        let worker = Worker::new(store.clone(), id, network, stall, stop);
+        let ended = worker.run().await;
         store.close().await;
-        ended
-    })
+        match ended {
+            Err(error @ WorkerError::Unfinished) => {
+                tracing::info!("{error}");
+                Ok(())
+            }
+            ended => ended.map_err(|error| failed(&error)),
+        }
+    });
+    // The computing thread may still be at it, or hang: not waited for.
+    runtime.shutdown_background();
+    ended
 }
 
 /// Lowers the priority of this process, and so of all its threads.
@@ -50,16 +56,13 @@ fn stand_back(nice: i32) -> Result<(), CliError> {
         .map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
 }
 
-/// Waits for a reason to stop, tells it on, and sees to it that the process ends.
+/// Waits for a reason to stop, and tells it on.
 async fn listen(supervised: bool, stop: CancellationToken) {
     tokio::select! {
         () = terminated() => {}
         () = abandoned(), if supervised => {}
     }
     stop.cancel();
-    tokio::time::sleep(GRACE).await;
-    tracing::warn!("the task does not come to the end of an iteration: left unfinished");
-    std::process::exit(0);
 }
 
 async fn terminated() {

@@ -2,6 +2,7 @@
 
 mod ids;
 mod memory;
+mod reason;
 mod request;
 mod schedule;
 mod state;
@@ -9,6 +10,7 @@ mod task;
 mod text;
 
 pub use ids::{CalibrationId, InvalidId, JobId, MeasurementId, TaskId, WorkerId};
+pub use reason::without_paths;
 pub use request::{
     Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,
     SnapshotSelection, TileSpec,

@@ -43,6 +43,8 @@ pub struct ClaimedTask {
     pub kind: TaskKind,
     /// For which job.
     pub job: JobId,
+    /// Its planned processor time in seconds.
+    pub cost: f64,
     /// The job.
     pub spec: JobSpec,
     /// The calibration's record.
@@ -121,7 +123,7 @@ impl Store {
                  stage = 'reading', iterations = 0, passes = 0, fraction = 0
              WHERE id = (SELECT id FROM tasks WHERE state = 'ready' AND ready_at <= ?3
                          ORDER BY priority DESC, job, ordinal LIMIT 1)
-             RETURNING id, job, kind, snapshot, tile, attempt",
+             RETURNING id, job, kind, snapshot, tile, attempt, cost",
         )
         .bind(worker.to_string())
         .bind(now + millis(length))
@@ -173,6 +175,7 @@ impl Store {
             lease,
             kind: tasks::kind(row)?,
             job,
+            cost: row.try_get("cost")?,
             masks: self.dir().blob(&calibration.prepared),
             snapshots: self.dir().blob(&measurement.prepared),
             spec,

@@ -101,6 +101,18 @@ impl Store {
         rows.iter().map(worker).collect()
     }
 
+    /// The last sign of life of a worker; none if it is not on record.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>, StoreError> {
+        let row = sqlx::query("SELECT seen_at FROM workers WHERE id = ?")
+            .bind(id.to_string())
+            .fetch_optional(&self.readers)
+            .await?;
+        row.map(|row| Ok(Timestamp(row.try_get("seen_at")?))).transpose()
+    }
+
     /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
     ///
     /// # Errors

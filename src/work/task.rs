@@ -1,7 +1,8 @@
 //! One task, whatever its kind: what it shares with the heartbeat, and how it can end.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use super::network::{NetworkError, NetworkSource};
 use super::result::ResultError;
@@ -15,23 +16,34 @@ use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileR
 /// What the computing thread and the heartbeat tell each other.
 #[derive(Debug)]
 pub(super) struct Shared {
-    progress: Mutex<TaskProgress>,
+    /// Where the task stands, and its last sign of life.
+    progress: Mutex<(TaskProgress, Instant)>,
     stop: AtomicBool,
 }
 
 impl Shared {
     pub(super) fn new() -> Self {
-        Self { progress: Mutex::new(TaskProgress::START), stop: AtomicBool::new(false) }
+        let progress = Mutex::new((TaskProgress::START, Instant::now()));
+        Self { progress, stop: AtomicBool::new(false) }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, (TaskProgress, Instant)> {
+        // Whole values are stored: a poisoned lock holds a good one.
+        self.progress.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Where the task stands.
     pub(super) fn progress(&self) -> TaskProgress {
-        // Whole values are stored: a poisoned lock holds a good one.
-        *self.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.lock().0
+    }
+
+    /// How long ago the computing thread gave its last sign of life.
+    pub(super) fn silence(&self) -> Duration {
+        self.lock().1.elapsed()
     }
 
     pub(super) fn set_progress(&self, progress: TaskProgress) {
-        *self.progress.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = progress;
+        *self.lock() = (progress, Instant::now());
     }
 
     /// Asks the computing thread to stop at the next opportunity.
@@ -43,8 +55,9 @@ impl Shared {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// An error once [`Shared::stop`] was called.
+    /// A sign of life; an error once [`Shared::stop`] was called.
     pub(super) fn check(&self) -> Result<(), TaskError> {
+        self.lock().1 = Instant::now();
         if self.stopped() { Err(TaskError::Stopped) } else { Ok(()) }
     }
 }

@@ -5,6 +5,7 @@
 //! 3. Meanwhile, renew the lease, tell the progress and listen for a cancel.
 //! 4. Store what it made, or why it failed.
 
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,7 +15,7 @@ use tracing::Instrument;
 
 use super::network::NetworkSource;
 use super::task::{Engine, Material, Shared, TaskError, perform};
-use crate::job::WorkerId;
+use crate::job::{TaskProgress, WorkerId, without_paths};
 use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError};
 
 /// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
@@ -28,6 +29,12 @@ const POLL: Duration = Duration::from_millis(200);
 const LOOKS_PER_SIGN: u32 = 25;
 /// Pause after the database has failed.
 const TROUBLE: Duration = Duration::from_secs(2);
+/// How long a task may take to come to the end of an iteration when the worker is to end. A deep
+/// pass may take longer: it is given up then, and its task given back.
+const GRACE: Duration = Duration::from_secs(5);
+/// A task may be silent for so many times its planned processor time: a machine that does much else
+/// is slow, but not for ever.
+const SLOWNESS: f64 = 4.0;
 
 /// Why a worker had to end.
 #[derive(Debug, thiserror::Error)]
@@ -38,6 +45,12 @@ pub enum WorkerError {
     /// A task took the computing thread down.
     #[error("the computing thread panicked")]
     Panicked,
+    /// A task hangs, as native code may, and nothing but the end of the process ends it.
+    #[error("the task made no progress for {} seconds", .0.as_secs())]
+    Stalled(Duration),
+    /// The worker was to end, and its task did not come to the end of an iteration in time.
+    #[error("the task was given back in the middle of an iteration")]
+    Unfinished,
 }
 
 /// A worker: takes tasks from the queue, one at a time.
@@ -47,6 +60,8 @@ pub struct Worker {
     /// On its way between the loop and the computing thread.
     engine: Option<Engine>,
     network: NetworkSource,
+    /// See [`Worker::new`].
+    stall: Duration,
     stop: CancellationToken,
 }
 
@@ -62,20 +77,24 @@ enum Reason {
 }
 
 impl Worker {
-    /// A worker under the name `id` that ends, and gives its task back, when `stop` is called.
+    /// A worker under the name `id` that ends, and gives its task back, when `stop` is called. A task
+    /// without progress for `stall` on top of four times its planned time is held to hang.
     pub fn new(
         store: Store,
         id: WorkerId,
         network: NetworkSource,
+        stall: Duration,
         stop: CancellationToken,
     ) -> Self {
-        Self { store, id, engine: None, network, stop }
+        Self { store, id, engine: None, network, stall, stop }
     }
 
     /// Works until it is told to stop.
     ///
     /// # Errors
-    /// See [`WorkerError`]. A failure of a task or a passing one of the database is none.
+    /// See [`WorkerError`]. A failure of a task or a passing one of the database is none. After
+    /// [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still runs: the
+    /// process must end.
     pub async fn run(mut self) -> Result<(), WorkerError> {
         self.store.worker_started(self.id, std::process::id()).await?;
         tracing::info!(worker = %self.id, "waiting for tasks");
@@ -128,12 +147,30 @@ impl Worker {
             }
         };
         let shared = Arc::new(Shared::new());
+        let patience = self.stall + Duration::from_secs_f64(SLOWNESS * task.cost);
         let computing = self.start(task, material, &shared, span.clone());
-        let watching = self.watch(computing, &lease, &shared).instrument(span.clone());
-        let ((engine, outcome), reason) = watching.await?;
-        self.engine = Some(engine);
-        self.end(&lease, outcome, reason).instrument(span).await;
-        Ok(())
+        let watching = self.watch(computing, &lease, &shared, patience).instrument(span.clone());
+        match watching.await {
+            Ok(((engine, outcome), reason)) => {
+                self.engine = Some(engine);
+                self.end(&lease, outcome, reason).instrument(span).await;
+                Ok(())
+            }
+            Err(error) => {
+                self.abandon(&lease, &error).instrument(span).await;
+                Err(error)
+            }
+        }
+    }
+
+    /// Parts with a task whose thread does not come back.
+    async fn abandon(&self, lease: &Lease, error: &WorkerError) {
+        match error {
+            WorkerError::Stalled(_) => said(self.store.fail(lease, &error.to_string(), true).await),
+            WorkerError::Unfinished => said(self.store.release_task(lease).await),
+            // Who started this process learns how it ended.
+            WorkerError::Panicked | WorkerError::Store(_) => {}
+        }
     }
 
     /// Tells the store how a task ended.
@@ -186,18 +223,29 @@ impl Worker {
         mut computing: JoinHandle<Computed>,
         lease: &Lease,
         shared: &Shared,
+        patience: Duration,
     ) -> Result<(Computed, Option<Reason>), WorkerError> {
         let mut tick = tokio::time::interval(HEARTBEAT);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         // The claim was the first sign of life.
         tick.tick().await;
         let mut reason = None;
+        let too_late = async {
+            self.stop.cancelled().await;
+            tokio::time::sleep(GRACE).await;
+        };
+        tokio::pin!(too_late);
         loop {
+            let silence = shared.silence();
+            if silence > patience {
+                return Err(WorkerError::Stalled(silence));
+            }
             tokio::select! {
                 computed = &mut computing => {
                     return Ok((computed.map_err(|_| WorkerError::Panicked)?, reason));
                 }
                 () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
+                () = &mut too_late => return Err(WorkerError::Unfinished),
                 _ = tick.tick() => match self.store.heartbeat(lease, shared.progress()).await {
                     Ok(Heartbeat::Continue) => {}
                     Ok(Heartbeat::Cancelled) => reason = Some(Reason::Cancelled),
@@ -213,16 +261,34 @@ impl Worker {
     }
 
     async fn complete(&self, lease: &Lease, completion: Completion) {
-        match self.store.complete(lease, completion).await {
+        let progress = completion.progress;
+        let completed = tokio::select! {
+            completed = self.store.complete(lease, completion) => completed,
+            // Bringing a large result to the disk may take longer than a lease.
+            never = self.keep(lease, progress) => match never {},
+        };
+        match completed {
             Ok(Heartbeat::Lost) => tracing::warn!("done, but too late: the lease had run out"),
             Ok(_) => tracing::info!("done"),
             Err(error) => self.failed(lease, &error.into()).await,
         }
     }
 
+    /// Renews the lease for as long as this is awaited.
+    async fn keep(&self, lease: &Lease, progress: TaskProgress) -> Infallible {
+        loop {
+            tokio::time::sleep(HEARTBEAT).await;
+            if let Err(error) = self.store.heartbeat(lease, progress).await {
+                tracing::error!(%error, "a heartbeat is not recorded");
+            }
+        }
+    }
+
     async fn failed(&self, lease: &Lease, error: &TaskError) {
         tracing::error!(%error, "the task failed");
-        said(self.store.fail(lease, &error.to_string(), error.is_retryable()).await);
+        // The user reads the reason, and has no business with the folders of this machine.
+        let reason = without_paths(&error.to_string());
+        said(self.store.fail(lease, &reason, error.is_retryable()).await);
     }
 }
 

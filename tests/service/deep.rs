@@ -43,7 +43,7 @@ async fn without_the_library_a_deep_job_fails_with_the_reason() {
     let done = app.ended(&app.submit(&body).await).await;
     assert_eq!(done["state"], "failed");
     let error = done["error"].as_str().unwrap();
-    assert!(error.contains("/nowhere/lib.so"), "{error}");
+    assert!(error.contains("lib.so") && !error.contains("/nowhere"), "{error}");
     // The worker lives and does what it can.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");

@@ -40,7 +40,7 @@ async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
 
 impl TestApp {
     /// The processes of the workers, as the kernel has them.
-    fn workers(&self) -> Vec<rustix::process::Pid> {
+    pub fn workers(&self) -> Vec<rustix::process::Pid> {
         let path = format!("/proc/{0}/task", self.pid());
         let threads = std::fs::read_dir(path).map(|entries| entries.flatten().collect());
         let threads: Vec<std::fs::DirEntry> = threads.unwrap_or_default();
@@ -109,7 +109,7 @@ async fn workers_end_with_a_server_that_was_killed() {
     let mut app = TestApp::with(&["--workers", "2"]).await;
     let start = std::time::Instant::now();
     while app.workers().len() < 2 {
-        assert!(start.elapsed().as_secs() < 10, "two workers should run");
+        assert!(start.elapsed().as_secs() < 60, "two workers should run");
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     let workers = app.workers();
@@ -120,7 +120,7 @@ async fn workers_end_with_a_server_that_was_killed() {
     };
     let start = std::time::Instant::now();
     while workers.iter().any(lives) {
-        assert!(start.elapsed().as_secs() < 10, "a worker outlives its server");
+        assert!(start.elapsed().as_secs() < 60, "a worker outlives its server");
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
 }
@@ -136,7 +136,7 @@ async fn a_killed_worker_is_replaced_and_its_task_taken_up_at_once() {
     app.when(&job, |job| job["progress"]["tiles_running"] == 0).await;
     let start = std::time::Instant::now();
     app.when(&job, |job| job["progress"]["tiles_running"] == 1).await;
-    assert!(start.elapsed().as_secs() < 5, "the lease need not run out first");
+    assert!(start.elapsed().as_secs() < 15, "the lease need not run out first");
     assert_ne!(app.workers(), before);
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 }

@@ -7,6 +7,7 @@ mod cli;
 mod contract;
 mod deep;
 mod faults;
+mod hangs;
 mod hostile;
 mod jobs;
 mod pipeline;

@@ -25,7 +25,7 @@ impl TestApp {
             if reached(&job) {
                 return job;
             }
-            assert!(start.elapsed() < Duration::from_secs(120), "{job:#}");
+            assert!(start.elapsed() < Duration::from_secs(600), "{job:#}");
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -163,7 +163,7 @@ async fn cancel_stops_a_running_job_and_retry_takes_it_up_again() {
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
     let cancelled = app.ended(&job).await;
     assert_eq!(cancelled["state"], "cancelled");
-    assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(30), "{:?}", start.elapsed());
     app.post(&format!("/v1/jobs/{job}/retry"), &json!({})).await.expect(202);
     app.when(&job, |job| job["state"] == "running").await;
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);

@@ -80,7 +80,7 @@ async fn a_cut_connection_leaves_nothing_behind() {
     drop(socket);
     let start = std::time::Instant::now();
     while count() > 0 {
-        assert!(start.elapsed().as_secs() < 10, "the file of a dead upload stays");
+        assert!(start.elapsed().as_secs() < 60, "the file of a dead upload stays");
         tokio::time::sleep(std::time::Duration::from_millis(5)).await;
     }
 }

@@ -1,0 +1,96 @@
+//! Tasks and workers that hang or die in native code: libraries that do so stand in for ONNX Runtime.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Signal, kill_process};
+use serde_json::{Value, json};
+
+use crate::app::TestApp;
+use crate::samples::Scene;
+
+/// Builds a library whose entry point does this instead of what it should do.
+fn library(folder: &Path, body: &str) -> PathBuf {
+    let (source, library) = (folder.join("fake.c"), folder.join("libfake.so"));
+    let code = format!(
+        "#include <stdlib.h>\n#include <unistd.h>\nconst void *OrtGetApiBase(void) {{ {body} }}\n"
+    );
+    std::fs::write(&source, code).unwrap();
+    let mut cc = Command::new("cc");
+    let status = cc.args(["-shared", "-fPIC", "-o"]).arg(&library).arg(&source).status().unwrap();
+    assert!(status.success());
+    library
+}
+
+fn deep(measurement: &str) -> Value {
+    json!({
+        "measurement": measurement,
+        "algorithm": "pnp-tv-fastdvdnet",
+        "snapshots": 0,
+        "schedule": {"stages": [{"prior": "fastdvdnet", "iterations": 1, "sigma": [0.2, 0.1]}]},
+    })
+}
+
+async fn with_library(body: &str) -> (tempfile::TempDir, TestApp) {
+    let folder = tempfile::tempdir().unwrap();
+    let library = library(folder.path(), body);
+    let library = library.to_str().unwrap();
+    let arguments = ["--workers", "1", "--stall-seconds", "1", "--onnxruntime", library];
+    (folder, TestApp::with(&arguments).await)
+}
+
+#[tokio::test]
+async fn a_task_that_hangs_is_tried_a_few_times_and_the_service_goes_on() {
+    let (folder, app) = with_library("for (;;) pause();").await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let done = app.ended(&app.submit(&deep(&measurement)).await).await;
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("no progress") && error.contains("(3 attempts)"), "{error}");
+    assert!(!error.contains(folder.path().to_str().unwrap()), "{error}");
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
+}
+
+#[tokio::test]
+async fn a_task_that_kills_its_workers_is_given_up_with_the_reason() {
+    let (_folder, app) = with_library("abort();").await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let done = app.ended(&app.submit(&deep(&measurement)).await).await;
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("SIGABRT") && error.contains("(3 attempts)"), "{error}");
+}
+
+#[tokio::test]
+async fn a_stop_does_not_wait_for_a_task_that_hangs() {
+    let folder = tempfile::tempdir().unwrap();
+    let library = library(folder.path(), "for (;;) pause();");
+    let library = library.to_str().unwrap();
+    let mut app = TestApp::with(&["--workers", "1", "--onnxruntime", library]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&deep(&measurement)).await;
+    app.when(&job, |job| job["progress"]["tiles_running"] == 1).await;
+    let start = Instant::now();
+    assert!(app.stop().success());
+    let took = start.elapsed();
+    assert!((4..8).contains(&took.as_secs()), "a worker gives its task back in 5 s: {took:?}");
+}
+
+#[tokio::test]
+async fn a_worker_that_hangs_as_a_whole_is_replaced() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let start = Instant::now();
+    while app.workers().is_empty() {
+        assert!(start.elapsed() < Duration::from_secs(10), "a worker should run");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // It works: the worker is past its start.
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
+    kill_process(app.workers()[0], Signal::STOP).unwrap();
+    let job = app.submit(&body).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+}
