@@ -31,7 +31,8 @@ pub(super) struct Axis {
     pub(super) weights: Vec<Array2<f64>>,
     /// Mask pixels that are needed.
     pub(super) length: usize,
-    /// The mask coordinate at which the canvas starts.
+    /// The mask coordinate at which the canvas starts, for tests that compute it otherwise.
+    #[cfg(test)]
     pub(super) origin: i64,
 }
 
@@ -79,7 +80,14 @@ impl Axis {
             whole.iter().map(|whole| (whole + first - origin).max(0) as usize).collect();
         let length = start.last().map_or(0, |last| last + taps);
         let phase = phase.into_iter().map(|(index, _)| index).collect();
-        Self { start, phase, weights, length, origin }
+        Self {
+            start,
+            phase,
+            weights,
+            length,
+            #[cfg(test)]
+            origin,
+        }
     }
 }
 
@@ -130,7 +138,7 @@ mod tests {
         let axis = Axis::new(&cells, 5, 1.0, 0.0, 0.0);
         assert_eq!(axis.length, 7);
         assert_eq!(axis.start, [0, 1, 2, 3, 4]);
-        assert_eq!(axis.weights, [ndarray::Array2::eye(3)]);
+        assert_eq!(axis.weights, [ndarray::Array2::<f64>::eye(3)]);
         assert_eq!(axis.origin, -1);
     }
 

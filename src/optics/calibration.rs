@@ -207,8 +207,14 @@ impl Calibrator {
             )));
         }
         let variance = self.variance(capture);
-        let mut mask =
-            RawMask { values: &capture.mean - &self.dark().mean, largest: 0.0, not_positive: 0, negative: 0, mean: 0.0, noise: None };
+        let mut mask = RawMask {
+            values: &capture.mean - &self.dark().mean,
+            largest: 0.0,
+            not_positive: 0,
+            negative: 0,
+            mean: 0.0,
+            noise: None,
+        };
         let (mut total, mut noise, mut good) = (0.0, 0.0, 0u64);
         for (place, value) in mask.values.indexed_iter_mut() {
             let denominator = self.denominator[place];
@@ -248,9 +254,7 @@ impl Calibrator {
             [capture, self.dark(), &self.references.white, &self.references.black]
                 .map(|image| image.variance.as_ref());
         let (capture, dark, white, black) = (capture?, dark?, white?, black?);
-        Some(move |at, value: f32| {
-            capture[at] + dark[at] + value * value * (white[at] + black[at])
-        })
+        Some(move |at, value: f32| capture[at] + dark[at] + value * value * (white[at] + black[at]))
     }
 }
 
@@ -290,7 +294,8 @@ mod tests {
             black_with_mask,
         };
         let capture = average(array![[55.0, 5.0, 90.0, 90.0]]);
-        let four = Calibrator::new(references(Some(average(array![[5.0, 5.0, 5.0, 5.0]])))).unwrap();
+        let four =
+            Calibrator::new(references(Some(average(array![[5.0, 5.0, 5.0, 5.0]])))).unwrap();
         let mask = four.mask(&capture).unwrap();
         // The third pixel has no light, the fourth too little: nothing is known of either.
         assert_eq!(mask.values, array![[0.5, 0.0, 0.0, 0.0]]);

@@ -85,7 +85,7 @@ impl Geometry {
         for (name, value) in
             [("phase_rows", self.phase_rows), ("phase_columns", self.phase_columns)]
         {
-            if !(value.abs() <= FAR) {
+            if !(-FAR..=FAR).contains(&value) {
                 return Err(refused(name, value, "-1000 to 1000 mask pixels"));
             }
         }

@@ -127,8 +127,11 @@ fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
     std::fs::write(&optics, text).unwrap();
     let checked = json(&sci_recon(&["optics", "--check", &optics]));
     assert_eq!(checked["derived"]["sensor_pixels_per_mask_pixel"], 2.0);
-    std::fs::write(files.path("patterns.npy"), npy(&[3, 1, 2], [1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
-        .unwrap();
+    std::fs::write(
+        files.path("patterns.npy"),
+        npy(&[3, 1, 2], [1.0, 0.0, 0.0, 1.0, 1.0, 1.0].into_iter()),
+    )
+    .unwrap();
     let images = files.text("patterns.npy");
     for (pattern, rank, more) in [
         ("rotating-circle", 3, &[][..]),
