@@ -8,6 +8,7 @@ use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
 
 use super::logging;
 use super::supervisor::Supervisor;
@@ -91,13 +92,16 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let workers = worker_arguments(settings, store.dir().root());
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
     tokio::spawn(keep_house(store.clone(), metrics.clone(), settings.upload_hours));
+    let closing = CancellationToken::new();
+    let closer = closing.clone();
     tokio::spawn(async move {
         signal.await;
+        closer.cancel();
         // Fails only if nobody listens any more.
         let _ = stopper.send(true);
     });
     // 5. The API.
-    let service = router(App::new(store.clone(), settings, metrics));
+    let service = router(App::new(store.clone(), settings, metrics, closing));
     let server = axum::serve(listener, service).with_graceful_shutdown(stopped(stop.clone()));
     tokio::select! {
         served = server => served.map_err(io("serve"))?,

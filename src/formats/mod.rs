@@ -11,6 +11,7 @@ mod error;
 mod limits;
 mod samples;
 mod stack;
+mod window;
 
 pub mod exr;
 pub mod mat;
@@ -31,6 +32,7 @@ use ndarray::Array3;
 pub use error::FormatError;
 pub use limits::Limits;
 pub use stack::{Format, FrameReader, FullScale, SampleType, StackInfo};
+pub use window::WindowReader;
 
 const ACCEPTED: &str = "npy, TIFF, PNG (8 or 16 bit grey) and .mat level 5";
 

@@ -13,8 +13,8 @@ use std::path::Path;
 
 use ndarray::{Array3, ArrayView2};
 
-use super::samples::{self, ByteOrder, FrameSink};
-use super::{Format, FormatError, Limits, SampleType, StackInfo};
+use super::samples::FrameSink;
+use super::{Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
 /// The first bytes of every prepared array.
 pub(super) const MAGIC: &[u8] = b"SCIPLNR\0";
@@ -63,8 +63,7 @@ impl<W: Write> Writer<W> {
 /// An open prepared array. Reads at positions, so it may be shared between threads.
 #[derive(Debug)]
 pub struct Reader {
-    file: File,
-    info: StackInfo,
+    windows: WindowReader,
 }
 
 impl Reader {
@@ -98,12 +97,17 @@ impl Reader {
                 format!("{} bytes follow the {shape}", length - promised),
             ));
         }
-        Ok(Self { file, info })
+        Ok(Self { windows: WindowReader::new(file, info, HEADER_BYTES) })
     }
 
     /// Shape and type (always float32 on the scale that the writer chose).
     pub fn info(&self) -> &StackInfo {
-        &self.info
+        self.windows.info()
+    }
+
+    /// The same without the format's name, for those who read windows of several formats.
+    pub fn into_windows(self) -> WindowReader {
+        self.windows
     }
 
     /// Reads a window; the result has the axes (frame, row, column) of the ranges.
@@ -115,32 +119,7 @@ impl Reader {
         rows: Range<usize>,
         columns: Range<usize>,
     ) -> Result<Array3<f32>, FormatError> {
-        let (height, width) = (self.info.height, self.info.width);
-        let inside = |range: &Range<usize>, axis| range.start <= range.end && range.end <= axis;
-        if !(inside(&frames, self.info.frames) && inside(&rows, height) && inside(&columns, width))
-        {
-            return Err(FormatError::Internal(format!(
-                "window {frames:?} x {rows:?} x {columns:?} of a stack {} x {height} x {width}",
-                self.info.frames
-            )));
-        }
-        let shape = (frames.len(), rows.len(), columns.len());
-        // Whole rows lie one after another and are read in one go.
-        let segments = if columns.len() == width { 1 } else { rows.len() };
-        let segment_samples = rows.len() * columns.len() / segments.max(1);
-        let mut bytes = vec![0; segment_samples * SAMPLE_BYTES as usize];
-        let mut values = Vec::with_capacity(shape.0 * shape.1 * shape.2);
-        for frame in frames {
-            for segment in 0..segments {
-                let sample = (frame * height + rows.start + segment) * width + columns.start;
-                self.file
-                    .read_exact_at(&mut bytes, HEADER_BYTES + sample as u64 * SAMPLE_BYTES)
-                    .map_err(FormatError::io("read the window"))?;
-                values.extend(samples::decode(&bytes, SampleType::F32, ByteOrder::Little));
-            }
-        }
-        Array3::from_shape_vec(shape, values)
-            .map_err(|error| FormatError::Internal(error.to_string()))
+        self.windows.read_window(frames, rows, columns)
     }
 }
 

@@ -4,10 +4,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
 
+use super::events::Events;
 use super::metrics::Metrics;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
+use crate::job::Timestamp;
+use crate::recon::denoise::onnx::Device;
 use crate::store::Store;
 
 /// What all handlers share; cheap to clone.
@@ -28,14 +32,44 @@ pub struct Shared {
     /// One file is checked at a time: each takes a core and a frame of memory.
     pub(super) intake: Arc<Semaphore>,
     pub(super) metrics: Metrics,
+    pub(super) events: Events,
+    pub(super) about: About,
+}
+
+/// What `/v1/system` tells of the settings.
+#[derive(Debug)]
+pub(super) struct About {
+    pub(super) started_at: Timestamp,
+    pub(super) device: String,
+    pub(super) provider: &'static str,
+    pub(super) workers: usize,
+    pub(super) uploads: usize,
+}
+
+impl About {
+    fn new(settings: &ServeArguments) -> Self {
+        let device = settings.engine.device.clone();
+        // Workers refuse a device that can't be read, with the reason.
+        let provider = Device::parse(&device).map_or("unknown", Device::provider);
+        let (workers, uploads) = (settings.worker_count(), settings.max_uploads);
+        Self { started_at: Timestamp::now(), device, provider, workers, uploads }
+    }
 }
 
 impl App {
-    /// The app on a store, with these settings.
+    /// The app on a store, with these settings. Answers that have no end of their own end with
+    /// `closing`. Needs a runtime of tokio.
     #[must_use]
-    pub fn new(store: Store, settings: &ServeArguments, metrics: Metrics) -> Self {
+    pub fn new(
+        store: Store,
+        settings: &ServeArguments,
+        metrics: Metrics,
+        closing: CancellationToken,
+    ) -> Self {
         let limits = Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() };
         Self(Arc::new(Shared {
+            events: Events::start(store.clone(), closing),
+            about: About::new(settings),
             store,
             limits,
             max_upload_bytes: settings.max_upload_bytes,

@@ -16,7 +16,7 @@ use crate::job::{
     Algorithm, CalibrationId, JobId, JobRequest, JobSpec, JobState, Label, MeasurementId,
     SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
 };
-use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, StoreError};
+use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
 
 /// A job as it is shown.
 #[derive(Debug, Serialize)]
@@ -85,6 +85,8 @@ pub(super) struct ListQuery {
     calibration: Option<CalibrationId>,
     measurement: Option<MeasurementId>,
     label: Option<Label>,
+    /// A part of the label or identifier.
+    search: Option<Label>,
 }
 
 /// `POST /v1/jobs`
@@ -144,26 +146,37 @@ async fn body(app: &App, id: JobId) -> Result<JobBody, ApiError> {
     Ok(JobBody::new(job, progress))
 }
 
-/// `GET /v1/jobs`
+/// `GET /v1/jobs`, with an ETag, so that watching costs little.
 pub(super) async fn list(
     State(app): State<App>,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<JobBody>>, ApiError> {
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
     let filter = JobFilter {
         state: query.state,
         calibration: query.calibration,
         measurement: query.measurement,
         label: query.label,
+        search: query.search,
         after: query.cursor,
     };
     let page = app.store.jobs(&filter, query.limit.get()).await?;
-    let (mut items, more) = (Vec::new(), page.more);
-    for job in page.items {
-        let progress = app.store.progress(&job).await?;
-        items.push(JobBody::new(job, progress));
+    let progress = app.store.progress_of(&page.items).await?;
+    let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
+    let page = Page { items: items.collect(), more: page.more };
+    tagged(&PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item), &headers)
+}
+
+/// A body with its ETag, or word that the client has it.
+fn tagged<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
+    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
+    let etag = conditional::etag(&Sha256::of(&text));
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
+    if conditional::is_known(headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
     }
-    let page = crate::store::Page { items, more };
-    Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
+    let kind = [(header::CONTENT_TYPE, "application/json")];
+    Ok((tags, kind, text).into_response())
 }
 
 /// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
@@ -172,15 +185,7 @@ pub(super) async fn show(
     Params(id): Params<JobId>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let body = body(&app, id).await?;
-    let text = serde_json::to_vec(&body).map_err(|error| ApiError::internal(&error))?;
-    let etag = conditional::etag(&Sha256::of(&text));
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
-    if conditional::is_known(&headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
-    }
-    let kind = [(header::CONTENT_TYPE, "application/json")];
-    Ok((tags, kind, text).into_response())
+    tagged(&body(&app, id).await?, &headers)
 }
 
 /// `POST /v1/jobs/{job}/cancel`

@@ -8,7 +8,9 @@ mod app;
 mod blobs;
 mod calibrations;
 mod conditional;
+mod dashboard;
 pub mod error;
+mod events;
 mod extract;
 mod health;
 mod intake;
@@ -19,6 +21,7 @@ mod metrics;
 mod page;
 mod results;
 mod router;
+mod system;
 mod upload;
 
 pub use app::App;

@@ -9,7 +9,8 @@ use tower_http::catch_panic::CatchPanicLayer;
 
 use super::app::App;
 use super::{
-    algorithms, blobs, calibrations, health, jobs, layers, measurements, metrics, results,
+    algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
+    metrics, results, system,
 };
 
 /// The largest JSON body.
@@ -38,6 +39,10 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::stack),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::array),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
+        R::at("/v1/events").get(events::listen).slow(),
+        R::at("/v1/system").get(system::show),
+        R::at("/").get(dashboard::page),
+        R::at("/dashboard/{file}").get(dashboard::file),
         R::at("/livez").get(health::live),
         R::at("/readyz").get(health::ready),
         R::at("/metrics").get(metrics::show),
@@ -106,7 +111,8 @@ impl Route {
         self.method("delete", MethodFilter::DELETE, handler)
     }
 
-    /// Without a limit on the time of the answer: the check of a large file takes minutes.
+    /// Without a limit on the time of the answer: the check of a large file takes minutes, and
+    /// events never end.
     fn slow(mut self) -> Self {
         self.slow = true;
         self

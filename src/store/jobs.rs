@@ -60,6 +60,8 @@ pub struct JobFilter {
     pub measurement: Option<MeasurementId>,
     /// Only those with this very label.
     pub label: Option<Label>,
+    /// Only those with this text in the label or the identifier, in upper or lower case.
+    pub search: Option<Label>,
     /// Only those older than this one.
     pub after: Option<JobId>,
 }
@@ -126,13 +128,15 @@ impl Store {
              WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state = ?2)
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
                AND (?5 IS NULL OR label = ?5)
-             ORDER BY id DESC LIMIT ?6",
+               AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
+             ORDER BY id DESC LIMIT ?7",
         )
         .bind(filter.after.map(|id| id.to_string()))
         .bind(filter.state.map(JobState::name))
         .bind(filter.calibration.map(|id| id.to_string()))
         .bind(filter.measurement.map(|id| id.to_string()))
         .bind(filter.label.as_ref().map(Label::as_str))
+        .bind(filter.search.as_ref().map(Label::as_str))
         .bind(i64::from(limit) + 1)
         .fetch_all(&self.readers)
         .await?;

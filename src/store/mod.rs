@@ -9,8 +9,10 @@ mod blobs;
 mod calibrations;
 mod dir;
 mod error;
+mod forecast;
 mod jobs;
 mod losses;
+mod marks;
 mod measurements;
 mod progress;
 mod queue;
@@ -36,13 +38,14 @@ pub use dir::DataDir;
 pub use error::StoreError;
 pub use jobs::{Inserted, Job, JobFilter, NewJob};
 pub use losses::{MAX_FAILURES, MAX_LOSSES};
+pub use marks::JobMark;
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
 pub use progress::{JobProgress, ProgressStage, TaskCounts};
 pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use tasks::{TaskRecord, TileResult};
-pub use workers::{WorkerEnd, WorkerRow};
+pub use workers::{WorkerEnd, WorkerRow, WorkerTask};
 
 /// One page of a list, and the identifier to go on after.
 #[derive(Debug, Clone)]

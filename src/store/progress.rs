@@ -1,20 +1,21 @@
-//! How far a job is and how long it may still take, from what its tasks have reported.
+//! How far jobs are and how long they may still take, from what their tasks have reported.
 //!
 //! All shares are by planned cost. The time left is an upper bound in the sense of Graham: `m`
 //! workers need at most `work / m + (1 - 1/m) * longest task`, with all stages at their most
 //! iterations; it shrinks when the solver converges early.
 
-use std::collections::BTreeMap;
-use std::time::Duration;
+use std::collections::{BTreeMap, HashMap};
 
 use serde::Serialize;
+use serde_json::Value;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::error::StoreError;
-use super::rows::number;
+use super::forecast::Forecast;
+use super::rows::{number, parsed};
 use super::{Job, Store};
-use crate::job::JobState;
+use crate::job::{JobId, JobState};
 
 /// What a job is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -43,6 +44,9 @@ pub struct JobProgress {
     pub percent: f64,
     /// Seconds until it ends, at most; none if it has ended or no worker lives.
     pub eta_seconds: Option<f64>,
+    /// Its place among the jobs that wait, from 1 for the next to be taken up; none if it does not
+    /// wait.
+    pub queue_position: Option<usize>,
     /// Tiles done.
     pub tiles_done: u64,
     /// Tiles in all.
@@ -60,100 +64,50 @@ pub struct JobProgress {
 /// Numbers of tasks by kind and state.
 pub type TaskCounts = BTreeMap<(String, String), u64>;
 
-/// Workers that were silent for longer do not count.
-const WORKER_AGE: Duration = Duration::from_secs(15);
-
 impl Store {
     /// How far a job is.
     ///
     /// # Errors
     /// If the database fails.
     pub async fn progress(&self, job: &Job) -> Result<JobProgress, StoreError> {
-        let row = sqlx::query(
-            "SELECT
-                 coalesce(sum(cost), 0) AS cost,
-                 coalesce(sum(CASE state WHEN 'done' THEN cost WHEN 'running' THEN cost * fraction
-                                         ELSE 0.0 END), 0) AS cost_done,
-                 coalesce(max(CASE state WHEN 'done' THEN 0.0 ELSE cost * (1 - fraction) END), 0)
-                     AS longest,
+        let mut all = self.progress_of(std::slice::from_ref(job)).await?;
+        all.pop().ok_or(StoreError::NotFound { what: "job", id: job.id.to_string() })
+    }
+
+    /// How far each of these jobs is, in their order: a whole page costs as many statements as one.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>, StoreError> {
+        let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
+        let rows = sqlx::query(
+            "SELECT job, sum(cost) AS cost,
+                 sum(CASE state WHEN 'done' THEN cost WHEN 'running' THEN cost * fraction
+                                ELSE 0.0 END) AS cost_done,
+                 max(CASE state WHEN 'done' THEN 0.0 ELSE cost * (1 - fraction) END) AS longest,
                  count(*) FILTER (WHERE kind = 'tile') AS tiles_total,
                  count(*) FILTER (WHERE kind = 'tile' AND state = 'done') AS tiles_done,
                  count(*) FILTER (WHERE kind = 'tile' AND state = 'running') AS tiles_running,
                  count(*) FILTER (WHERE kind = 'assemble' AND state = 'done') AS snapshots_done,
                  count(*) FILTER (WHERE kind = 'prepare' AND state = 'done') AS prepared,
                  count(*) FILTER (WHERE state = 'running' AND stage = 'deep') AS deep,
-                 coalesce(sum(iterations), 0) AS iterations,
-                 coalesce(sum(passes), 0) AS passes
-             FROM tasks WHERE job = ?",
+                 sum(iterations) AS iterations, sum(passes) AS passes
+             FROM tasks WHERE job IN (SELECT value FROM json_each(?)) GROUP BY job",
         )
-        .bind(job.id.to_string())
-        .fetch_one(&self.readers)
+        .bind(Value::from(ids).to_string())
+        .fetch_all(&self.readers)
         .await?;
-        let (cost, done): (f64, f64) = (row.try_get("cost")?, row.try_get("cost_done")?);
-        let left = (cost - done).max(0.0);
-        let eta = self.eta_seconds(job, left, row.try_get("longest")?).await?;
-        let share = if cost > 0.0 { done / cost } else { 0.0 };
-        Ok(JobProgress {
-            stage: stage(job.state, &row)?,
-            // Two digits: an ETag should not change with what nobody sees.
-            percent: if job.state == JobState::Succeeded { 100.0 } else { round(share * 100.0, 2) },
-            eta_seconds: eta.map(|seconds| round(seconds, 1)),
-            tiles_done: number(&row, "tiles_done")?,
-            tiles_total: number(&row, "tiles_total")?,
-            tiles_running: number(&row, "tiles_running")?,
-            snapshots_done: number(&row, "snapshots_done")?,
-            iterations_done: number(&row, "iterations")?,
-            passes_done: number(&row, "passes")?,
-        })
-    }
-
-    async fn eta_seconds(
-        &self,
-        job: &Job,
-        left: f64,
-        longest: f64,
-    ) -> Result<Option<f64>, StoreError> {
-        if !matches!(job.state, JobState::Queued | JobState::Running) {
-            return Ok(None);
-        }
-        let workers = self.live_workers(WORKER_AGE).await?.len();
-        let Ok(workers @ 1..) = u32::try_from(workers) else { return Ok(None) };
-        let workers = f64::from(workers);
-        let work = left + self.cost_ahead(job).await?;
-        let rate = self.seconds_per_cost().await?;
-        Ok(Some(rate * (work / workers + (1.0 - 1.0 / workers) * longest)))
-    }
-
-    /// What is left of the jobs that are served before this one.
-    async fn cost_ahead(&self, job: &Job) -> Result<f64, StoreError> {
-        let row = sqlx::query(
-            "SELECT coalesce(sum(cost * (1 - fraction)), 0.0) AS cost FROM tasks
-             WHERE state IN ('blocked', 'ready', 'running')
-               AND (priority > ?1 OR (priority = ?1 AND job < ?2))",
-        )
-        .bind(job.spec.priority)
-        .bind(job.id.to_string())
-        .fetch_one(&self.readers)
-        .await?;
-        Ok(row.try_get("cost")?)
-    }
-
-    /// Seconds that a planned CPU-second takes on this machine: measured on the last tiles done, by
-    /// what they really did and not by what was planned; 1 before there are any.
-    async fn seconds_per_cost(&self) -> Result<f64, StoreError> {
-        let row = sqlx::query(
-            "SELECT sum(seconds) AS seconds, sum(spent) AS spent FROM (
-                 SELECT seconds, cost * fraction AS spent FROM tasks
-                 WHERE state = 'done' AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)",
-        )
-        .fetch_one(&self.readers)
-        .await?;
-        let seconds: Option<f64> = row.try_get("seconds")?;
-        let spent: Option<f64> = row.try_get("spent")?;
-        Ok(match (seconds, spent) {
-            (Some(seconds), Some(spent)) if spent > 0.0 && seconds > 0.0 => seconds / spent,
-            _ => 1.0,
-        })
+        let by_job: Result<HashMap<JobId, &SqliteRow>, StoreError> =
+            rows.iter().map(|row| Ok((parsed(row, "job")?, row))).collect();
+        let (by_job, waits) = (by_job?, |job: &Job| has_eta(job.state));
+        let forecast = if jobs.iter().any(waits) { self.forecast().await? } else { None };
+        let gone = |id: JobId| StoreError::NotFound { what: "job", id: id.to_string() };
+        jobs.iter()
+            .map(|job| {
+                let row = by_job.get(&job.id).ok_or_else(|| gone(job.id))?;
+                progress(job, row, forecast.as_ref())
+            })
+            .collect()
     }
 
     /// The number of tasks by kind and state, with zeros for what there is none of.
@@ -175,6 +129,36 @@ impl Store {
         }
         Ok(counts)
     }
+}
+
+fn has_eta(state: JobState) -> bool {
+    matches!(state, JobState::Queued | JobState::Running)
+}
+
+fn progress(
+    job: &Job,
+    row: &SqliteRow,
+    forecast: Option<&Forecast>,
+) -> Result<JobProgress, StoreError> {
+    let (cost, done): (f64, f64) = (row.try_get("cost")?, row.try_get("cost_done")?);
+    let longest: f64 = row.try_get("longest")?;
+    let forecast = forecast.filter(|_| has_eta(job.state));
+    let left = (cost - done).max(0.0);
+    let eta = forecast.and_then(|forecast| forecast.eta_seconds(job.id, left, longest));
+    let share = if cost > 0.0 { done / cost } else { 0.0 };
+    Ok(JobProgress {
+        stage: stage(job.state, row)?,
+        // Two digits: an ETag should not change with what nobody sees.
+        percent: if job.state == JobState::Succeeded { 100.0 } else { round(share * 100.0, 2) },
+        eta_seconds: eta.map(|seconds| round(seconds, 1)),
+        queue_position: forecast.and_then(|forecast| forecast.position(job.id)),
+        tiles_done: number(row, "tiles_done")?,
+        tiles_total: number(row, "tiles_total")?,
+        tiles_running: number(row, "tiles_running")?,
+        snapshots_done: number(row, "snapshots_done")?,
+        iterations_done: number(row, "iterations")?,
+        passes_done: number(row, "passes")?,
+    })
 }
 
 fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage, StoreError> {

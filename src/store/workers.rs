@@ -2,25 +2,45 @@
 
 use std::time::Duration;
 
+use serde::Serialize;
 use sqlx::{Row, SqliteConnection};
 
 use super::Store;
 use super::error::StoreError;
 use super::losses::{self, Loss};
-use super::rows::{number, parsed};
-use crate::job::{Timestamp, WorkerId};
+use super::rows::{number, number_if, parsed, parsed_if};
+use crate::job::{JobId, Timestamp, WorkerId};
 
 /// A worker process on record.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct WorkerRow {
     /// Its identifier.
     pub id: WorkerId,
     /// Its process.
     pub pid: u32,
+    /// The version of its program.
+    pub version: String,
     /// When it started.
     pub started_at: Timestamp,
     /// Its last sign of life.
     pub seen_at: Timestamp,
+    /// What it has in hand.
+    pub task: Option<WorkerTask>,
+}
+
+/// A task in a worker's hands.
+#[derive(Debug, Clone, Serialize)]
+pub struct WorkerTask {
+    /// The job.
+    pub job: JobId,
+    /// The kind of task.
+    pub kind: String,
+    /// The snapshot, if it is about one.
+    pub snapshot: Option<u32>,
+    /// The tile, if it is one.
+    pub tile: Option<u32>,
+    /// What it is doing.
+    pub stage: Option<String>,
 }
 
 /// How a worker came to its end, as far as the one who watched it can tell.
@@ -94,11 +114,30 @@ impl Store {
     /// # Errors
     /// If the database fails.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>, StoreError> {
-        let rows = sqlx::query("SELECT * FROM workers WHERE seen_at >= ? ORDER BY id")
-            .bind(since(age))
-            .fetch_all(&self.readers)
-            .await?;
+        let rows = sqlx::query(
+            "SELECT workers.id, pid, version, started_at, seen_at, job, kind, snapshot, tile, stage
+             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = 'running'
+             WHERE seen_at >= ? ORDER BY workers.id",
+        )
+        .bind(since(age))
+        .fetch_all(&self.readers)
+        .await?;
         rows.iter().map(worker).collect()
+    }
+
+    /// Version of ONNX Runtime that the last worker told that finished a tile with it; none before.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn last_onnxruntime(&self) -> Result<Option<String>, StoreError> {
+        let row = sqlx::query(
+            "SELECT record ->> 'onnxruntime' AS version FROM tasks
+             WHERE state = 'done' AND kind = 'tile' AND record ->> 'onnxruntime' IS NOT NULL
+             ORDER BY job DESC LIMIT 1",
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        row.map(|row| row.try_get("version").map_err(StoreError::from)).transpose()
     }
 
     /// The last sign of life of a worker; none if it is not on record.
@@ -147,7 +186,19 @@ fn worker(row: &sqlx::sqlite::SqliteRow) -> Result<WorkerRow, StoreError> {
     Ok(WorkerRow {
         id: parsed(row, "id")?,
         pid: number(row, "pid")?,
+        version: row.try_get("version")?,
         started_at: Timestamp(row.try_get("started_at")?),
         seen_at: Timestamp(row.try_get("seen_at")?),
+        task: parsed_if(row, "job")?.map(|job| worker_task(row, job)).transpose()?,
+    })
+}
+
+fn worker_task(row: &sqlx::sqlite::SqliteRow, job: JobId) -> Result<WorkerTask, StoreError> {
+    Ok(WorkerTask {
+        job,
+        kind: row.try_get("kind")?,
+        snapshot: number_if(row, "snapshot")?,
+        tile: number_if(row, "tile")?,
+        stage: row.try_get("stage")?,
     })
 }

@@ -5,6 +5,7 @@
 mod app;
 mod cli;
 mod contract;
+mod dashboard;
 mod deep;
 mod faults;
 mod hangs;

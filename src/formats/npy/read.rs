@@ -2,12 +2,38 @@
 
 use std::fs::File;
 use std::io::{self, Read};
+use std::path::Path;
 
 use ndarray::Array2;
 
 use super::header::{Header, MAGIC, MAX_HEADER_BYTES, unsupported};
 use crate::formats::samples::{self, ByteOrder};
-use crate::formats::{Format, FormatError, FrameReader, Limits, StackInfo};
+use crate::formats::{
+    Format, FormatError, FrameReader, Limits, SampleType, StackInfo, WindowReader,
+};
+
+/// Opens an npy stack of shape (frame, row, column), float32, little-endian and in C order, of which
+/// windows are then read: the form in which this program writes frames.
+///
+/// # Errors
+/// Those of reading a header, and [`FormatError::Unsupported`] for another form.
+pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader, FormatError> {
+    let mut file = File::open(path).map_err(FormatError::io("open the array"))?;
+    let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
+    limits.check_file(Format::Npy, length)?;
+    let (header, start) = read_header(&mut file, length)?;
+    let plain = (header.sample, header.order, header.fortran_order)
+        == (SampleType::F32, ByteOrder::Little, false);
+    let (true, [frames, height, width]) = (plain, &*header.shape) else {
+        return Err(unsupported(format!("{} of {} dimensions", header.sample, header.shape.len())));
+    };
+    limits.check_shape(Format::Npy, *frames, *height, *width)?;
+    let [frames, height, width] =
+        [frames, height, width].map(|n| usize::try_from(*n).unwrap_or(usize::MAX));
+    let info = StackInfo::new(Format::Npy, SampleType::F32, frames, height, width);
+    check_length(&info, length.saturating_sub(start))?;
+    Ok(WindowReader::new(file, info, start))
+}
 
 /// An npy file of shape (frame, row, column) or (row, column).
 #[derive(Debug)]

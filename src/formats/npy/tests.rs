@@ -228,3 +228,23 @@ proptest! {
         survive(&bytes[..position]);
     }
 }
+
+#[test]
+fn windows_of_a_written_stack_are_read_alone() {
+    let stack = ramp((3, 5, 7), 1000);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("frames.npy");
+    super::write_f32(&path, stack.view()).unwrap();
+    let reader = super::open_windows(&path, &Limits::default()).unwrap();
+    let window = reader.read_window(1..3, 2..4, 1..6).unwrap();
+    assert_eq!(window, stack.slice(ndarray::s![1..3, 2..4, 1..6]));
+    assert!(reader.read_window(0..1, 0..6, 0..1).is_err());
+    // Another form is refused and not read wrongly.
+    let bytes = std::fs::read(&path).unwrap();
+    for (from, to) in [("<f4", ">f4"), ("False", "True "), ("(3, 5, 7)", "(3, 35)  ")] {
+        let text = String::from_utf8_lossy(&bytes[..128]).replace(from, to);
+        let changed = [&bytes[..10], &text.as_bytes()[text.len() - 118..], &bytes[128..]].concat();
+        std::fs::write(&path, changed).unwrap();
+        assert!(super::open_windows(&path, &Limits::default()).is_err(), "{to}");
+    }
+}

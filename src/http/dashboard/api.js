@@ -1,0 +1,87 @@
+// The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
+
+/** A refused or failed request. */
+export class Refused extends Error {
+  constructor(status, problem) {
+    super(problem.detail ?? problem.title ?? `the service answered ${status}`);
+    this.status = status;
+    this.code = problem.code ?? "unknown";
+    this.errors = problem.errors ?? [];
+  }
+}
+
+const known = new Map();
+const KNOWN = 60;
+
+/** Asks with `If-None-Match`; gives the very object of last time if nothing has changed. */
+export async function get(path, signal) {
+  const before = known.get(path);
+  const headers = before ? { "If-None-Match": before.etag } : {};
+  const response = await fetch(path, { headers, signal, cache: "no-store" });
+  if (response.status === 304 && before) return before.data;
+  if (!response.ok) throw await refused(response);
+  const data = await response.json();
+  const etag = response.headers.get("ETag");
+  if (etag) remember(path, { etag, data });
+  return data;
+}
+
+function remember(path, answer) {
+  known.delete(path);
+  known.set(path, answer);
+  if (known.size > KNOWN) known.delete(known.keys().next().value);
+}
+
+async function refused(response) {
+  let problem = {};
+  try {
+    problem = await response.json();
+  } catch {
+    // Not from the service itself: the status must do.
+  }
+  return new Refused(response.status, problem);
+}
+
+/** Sends JSON, gives JSON (or null where there is no body). */
+export async function send(method, path, body) {
+  const headers = body === undefined ? {} : { "Content-Type": "application/json" };
+  const response = await fetch(path, { method, headers, body: body === undefined ? null : JSON.stringify(body) });
+  if (!response.ok) throw await refused(response);
+  return response.status === 204 ? null : response.json();
+}
+
+/** Uploads a file and tells how much of it has gone; gives the blob's record. */
+export function upload(file, progress, signal) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open("POST", "/v1/blobs");
+    request.setRequestHeader("Content-Type", "application/octet-stream");
+    request.upload.onprogress = (event) => progress(event.loaded, event.total || file.size);
+    request.onload = () => {
+      let body = {};
+      try {
+        body = JSON.parse(request.responseText);
+      } catch {
+        // As above.
+      }
+      if (request.status >= 200 && request.status < 300) resolve(body);
+      else reject(new Refused(request.status, body));
+    };
+    request.onerror = () => reject(new Error("the connection was lost; send the file again"));
+    request.onabort = () => reject(new DOMException("stopped", "AbortError"));
+    signal?.addEventListener("abort", () => request.abort());
+    request.send(file);
+  });
+}
+
+/** Fetches a picture. */
+export async function picture(path, signal) {
+  const response = await fetch(path, { signal });
+  if (!response.ok) throw await refused(response);
+  return createImageBitmap(await response.blob());
+}
+
+/** True for the end of a request that a view gave up on. */
+export function gaveUp(error) {
+  return error?.name === "AbortError";
+}

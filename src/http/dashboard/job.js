@@ -1,0 +1,159 @@
+// One job: how far it is, what went in, what came out.
+
+import { announce, facts, h, put, say } from "./dom.js";
+import { bytes, duration, figure, momentInFull, nameOf, shapeOf, stageOf } from "./format.js";
+import { actions } from "./actions.js";
+import { get } from "./api.js";
+import { left } from "./jobs.js";
+import { watch } from "./live.js";
+
+export async function job(root, [id], signal) {
+  const found = await get(`/v1/jobs/${id}`, signal);
+  document.title = `${nameOf(found)} – sci-recon`;
+  const state = h("span");
+  const buttons = h("span", { class: "row" });
+  const progress = h("div", { class: "progressline" });
+  const problem = h("div");
+  const snapshot = snapshotChoice(found);
+  const files = card("Files", h("p", { class: "muted" }, "…"));
+  const manifest = card("Manifest");
+  const cards = h("div", { class: "cards" }, details(found), files, manifest, repeat(found));
+  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, cards);
+
+  let shown = null;
+  let ready = null;
+  const gone = () => (location.hash = "#/jobs");
+  const refresh = async (ids) => {
+    if (ids && !ids.has(id)) return;
+    const now = await get(`/v1/jobs/${id}`, signal);
+    if (now === shown) return;
+    if (now.state !== shown?.state) {
+      put(state, h("span", { class: `badge ${now.state}` }, now.state));
+      put(buttons, actions(now, (action) => (action === "delete" ? gone() : refresh(null))));
+      put(problem, now.error && h("p", { class: "trouble", role: "alert" }, now.error));
+      if (shown) announce(`The job is ${now.state}`);
+    }
+    put(progress, line(now));
+    const done = `${now.progress.snapshots_done} ${now.state}`;
+    if (done !== ready) await results(now);
+    ready = done;
+    shown = now;
+  };
+  const results = async (now) => {
+    await showFiles(files, id, snapshot.value(), signal);
+    await showManifest(manifest, now, snapshot.value(), signal);
+  };
+  snapshot.listen(() => results(shown ?? found));
+  watch(refresh, signal);
+}
+
+export function card(title, ...content) {
+  return h("section", { class: "card", "aria-label": title }, h("h2", null, title), h("div", { class: "content" }, content));
+}
+
+/** Which snapshot is shown, where there are several. */
+function snapshotChoice(found) {
+  const { first, count } = found.snapshots;
+  const input = h("input", { type: "number", id: "snapshot", min: first, max: first + count - 1, value: first });
+  const element = count > 1 && h("label", { class: "row", for: "snapshot" }, "Snapshot", input, `of ${first} to ${first + count - 1}`);
+  const value = () => Math.min(first + count - 1, Math.max(first, Number(input.value) || first));
+  return { element, value, listen: (call) => input.addEventListener("change", call) };
+}
+
+function line(now) {
+  const { percent, tiles_done: done, tiles_total: total } = now.progress;
+  const over = ["succeeded", "failed", "cancelled"].includes(now.state);
+  const parts = [
+    `${percent.toFixed(percent < 10 ? 1 : 0)} %`,
+    stageOf(now),
+    left(now),
+    `${done} of ${total} tiles`,
+    now.progress.iterations_done > 0 && !over && `${now.progress.iterations_done} iterations`,
+  ];
+  return [h("progress", { max: 100, value: percent, "aria-label": "Progress" }), h("span", null, parts.filter(Boolean).join(" · "))];
+}
+
+function details(found) {
+  return card("Job", facts([
+    ["Frames", shapeOf(found)],
+    ["Algorithm", found.algorithm],
+    ["Schedule", schedule(found.schedule)],
+    ["Tiles", `${found.tile.size} pixels, ${found.tile.overlap} shared`],
+    ["Priority", found.priority],
+    ["Calibration", h("code", null, found.calibration)],
+    ["Measurement", h("code", null, found.measurement)],
+    ["Identifier", h("code", null, found.id)],
+    ["Created", momentInFull(found.created_at)],
+  ]));
+}
+
+function schedule(found) {
+  return found.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ");
+}
+
+async function showFiles(element, id, snapshot, signal) {
+  const { ready, files } = await get(`/v1/jobs/${id}/snapshots/${snapshot}`, signal);
+  const link = (file) => h("a", { class: "button small", href: file.href, download: true }, `${file.name} `, h("span", { class: "muted" }, bytes(file.size)));
+  const whole = files.filter((file) => !file.name.includes("/"));
+  const single = files.filter((file) => file.name.includes("/"));
+  put(element.querySelector(".content"), ready
+    ? [h("div", { class: "row" }, whole.map(link)), h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map(link)))]
+    : h("p", { class: "muted" }, "The frames of this snapshot are not written yet."));
+}
+
+async function showManifest(element, now, snapshot, signal) {
+  const body = element.querySelector(".content");
+  if (now.state !== "succeeded") {
+    put(body, h("p", { class: "muted" }, "It is written when the job has succeeded."));
+    return;
+  }
+  const manifest = await get(`/v1/jobs/${now.id}/snapshots/${snapshot}/manifest.json`, signal);
+  const { content, run } = manifest;
+  put(body, warnings(manifest), facts([
+    ["Residual ‖y − Hx‖ / ‖y‖", figure(content.summary.residual)],
+    ["Ended", content.summary.stop_reason === "converged" ? "converged" : "all planned iterations done"],
+    ["Iterations", `${content.summary.tv_iterations} with TV, ${content.summary.denoiser_passes} deep`],
+    ["White level", figure(content.scale.white)],
+    ["Network", content.model ? `${content.model.name}, ${content.model.sha256.slice(0, 12)}…` : "none"],
+    ["Provider", run.provider ? `${run.provider}, ONNX Runtime ${run.onnxruntime}` : "none"],
+    ["Computing", duration(run.cpu_seconds)],
+    ["Memory", bytes(run.peak_rss_bytes)],
+    ...quality(content.quality),
+  ]), h("details", null, h("summary", null, "All of it"), h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
+}
+
+function warnings(manifest) {
+  const found = manifest.content.warnings ?? manifest.warnings ?? [];
+  return found.map((warning) => h("p", { class: "warn" }, typeof warning === "string" ? warning : warning.detail ?? JSON.stringify(warning)));
+}
+
+/** Figures against the truth, where the manifest has them. */
+export function quality(found) {
+  if (!found) return [];
+  return Object.entries(found).filter(([, value]) => typeof value === "number").map(([name, value]) => [name.toUpperCase(), figure(value, 4)]);
+}
+
+/** The line that asks for the same job again. */
+function repeat(found) {
+  const last = found.snapshots.first + found.snapshots.count - 1;
+  const body = {
+    measurement: found.measurement,
+    algorithm: found.algorithm,
+    snapshots: [found.snapshots.first, last],
+    schedule: found.schedule,
+    tile: found.tile,
+    priority: found.priority,
+    label: found.label,
+  };
+  // A label may hold quotes, which the shell would take for its own.
+  const json = JSON.stringify(body).replaceAll("'", "'\\''");
+  const text = `curl -sS ${location.origin}/v1/jobs --json '${json}'`;
+  const copy = h("button", { type: "button", class: "small" }, "Copy");
+  copy.addEventListener("click", async () => {
+    await navigator.clipboard.writeText(text);
+    say(copy, "Copied");
+    announce("The line is copied");
+  });
+  if (!navigator.clipboard) copy.hidden = true;
+  return card("Again", h("p", { class: "muted" }, "The line that asks for the same job:"), h("pre", { tabindex: 0, class: "line" }, text), copy);
+}

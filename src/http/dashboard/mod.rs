@@ -1,0 +1,210 @@
+//! The dashboard: pages for people, carried by the binary and answered compressed.
+//!
+//! Plain HTML, CSS and JavaScript modules that use the API like any other client. Nothing comes from
+//! another server and nothing runs that is not one of these files: the policy below says so to the
+//! browser.
+
+use std::io::Write;
+use std::sync::LazyLock;
+
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+
+use super::conditional;
+use super::error::{ApiError, Code};
+use super::extract::Params;
+use crate::job::Sha256;
+
+/// What the browser may load and run: our own files, and pictures that a module has fetched.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
+     img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
+     frame-ancestors 'none'";
+
+const PAGE: &str = "index.html";
+
+macro_rules! files {
+    ($($name:literal),+ $(,)?) => {
+        [$(($name, include_bytes!($name).as_slice())),+]
+    };
+}
+
+/// Name and content of every file.
+const FILES: &[(&str, &[u8])] = &files![
+    "index.html",
+    "style.css",
+    "icon.svg",
+    "main.js",
+    "actions.js",
+    "api.js",
+    "dom.js",
+    "format.js",
+    "job.js",
+    "jobs.js",
+    "live.js",
+    "rows.js",
+    "submit.js",
+    "system.js",
+];
+
+/// A file in both of its representations, each with its own strong ETag.
+#[derive(Debug)]
+struct Asset {
+    name: &'static str,
+    plain: Representation,
+    packed: Representation,
+}
+
+#[derive(Debug)]
+struct Representation {
+    bytes: Vec<u8>,
+    etag: String,
+}
+
+impl Representation {
+    fn new(bytes: Vec<u8>) -> Self {
+        Self { etag: conditional::etag(&Sha256::of(&bytes)), bytes }
+    }
+}
+
+static ASSETS: LazyLock<Vec<Asset>> = LazyLock::new(|| FILES.iter().map(asset).collect());
+
+fn asset(&(name, bytes): &(&'static str, &[u8])) -> Asset {
+    let plain = Representation::new(bytes.to_vec());
+    // Writing into memory does not fail; if it did, the file would be sent as it is.
+    let packed = pack(bytes).unwrap_or_else(|_| bytes.to_vec());
+    Asset { name, plain, packed: Representation::new(packed) }
+}
+
+fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(bytes)?;
+    encoder.finish()
+}
+
+/// `GET /`
+pub(super) async fn page(headers: HeaderMap) -> Result<Response, ApiError> {
+    send(PAGE, &headers)
+}
+
+/// `GET /dashboard/{file}`
+pub(super) async fn file(
+    Params(name): Params<String>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    send(&name, &headers)
+}
+
+fn send(name: &str, headers: &HeaderMap) -> Result<Response, ApiError> {
+    let asset = ASSETS.iter().find(|asset| asset.name == name).ok_or_else(|| {
+        ApiError::new(Code::NotFound, "the dashboard has no file of this name; it begins at /")
+    })?;
+    let gzip = takes_gzip(headers);
+    let file = if gzip { &asset.packed } else { &asset.plain };
+    let known = conditional::is_known(headers, &file.etag);
+    let mut response = match known {
+        true => StatusCode::NOT_MODIFIED.into_response(),
+        false => file.bytes.clone().into_response(),
+    };
+    let fields = response.headers_mut();
+    let mut set = |name: HeaderName, value: &'static str| {
+        fields.insert(name, HeaderValue::from_static(value));
+    };
+    set(header::CONTENT_TYPE, media_type(name));
+    // Asked for again each time, and answered in a few bytes if nothing has changed: after an
+    // update of the service nobody sees a mixture of old and new modules.
+    set(header::CACHE_CONTROL, "no-cache");
+    set(header::VARY, "accept-encoding");
+    set(header::CONTENT_SECURITY_POLICY, POLICY);
+    set(header::X_CONTENT_TYPE_OPTIONS, "nosniff");
+    set(header::REFERRER_POLICY, "no-referrer");
+    if gzip && !known {
+        set(header::CONTENT_ENCODING, "gzip");
+    }
+    if let Ok(etag) = HeaderValue::try_from(&file.etag) {
+        fields.insert(header::ETAG, etag);
+    }
+    Ok(response)
+}
+
+/// True if the client lists gzip and does not rule it out.
+fn takes_gzip(headers: &HeaderMap) -> bool {
+    let lists = headers.get_all(header::ACCEPT_ENCODING).iter().filter_map(|v| v.to_str().ok());
+    lists.flat_map(|list| list.split(',')).any(|item| {
+        let (coding, weight) = item.split_once(';').unwrap_or((item, ""));
+        let weight: String = weight.split_whitespace().collect();
+        let refused = weight.strip_prefix("q=").is_some_and(|q| q.parse() == Ok(0.0f32));
+        coding.trim().eq_ignore_ascii_case("gzip") && !refused
+    })
+}
+
+fn media_type(name: &str) -> &'static str {
+    match name.rsplit_once('.').map(|(_, kind)| kind) {
+        Some("js") => "text/javascript; charset=utf-8",
+        Some("css") => "text/css; charset=utf-8",
+        Some("svg") => "image/svg+xml",
+        _ => "text/html; charset=utf-8",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ASSETS, FILES, takes_gzip};
+    use axum::http::HeaderMap;
+
+    #[test]
+    fn every_module_that_is_imported_is_served_and_every_file_is_listed() {
+        let names: Vec<&str> = FILES.iter().map(|(name, _)| *name).collect();
+        for (name, bytes) in FILES {
+            let text = std::str::from_utf8(bytes).unwrap();
+            for import in text.split("from \"./").skip(1).chain(text.split("import(\"./").skip(1)) {
+                let import = import.split('"').next().unwrap();
+                assert!(names.contains(&import), "{name} imports {import}");
+            }
+            for path in text.split("\"/dashboard/").skip(1) {
+                let path = path.split('"').next().unwrap();
+                assert!(names.contains(&path), "{name} names {path}");
+            }
+        }
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/http/dashboard");
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let name = entry.unwrap().file_name().into_string().unwrap();
+            assert!(name == "mod.rs" || names.contains(&name.as_str()), "{name} is not served");
+        }
+    }
+
+    #[test]
+    fn text_of_users_never_becomes_markup() {
+        for (name, bytes) in FILES.iter().filter(|(name, _)| name.ends_with(".js")) {
+            let text = std::str::from_utf8(bytes).unwrap();
+            for forbidden in ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write"] {
+                assert!(!text.contains(forbidden), "{name} uses {forbidden}");
+            }
+            assert!(text.lines().count() < 400, "{name} wants to be two modules");
+        }
+    }
+
+    #[test]
+    fn all_files_together_are_small_when_packed() {
+        let bytes: usize = ASSETS.iter().map(|asset| asset.packed.bytes.len()).sum();
+        assert!(bytes < 150_000, "{bytes} bytes");
+    }
+
+    #[test]
+    fn gzip_is_sent_to_those_who_take_it() {
+        let takes = |value: &str| {
+            takes_gzip(&HeaderMap::from_iter([(
+                "accept-encoding".parse().unwrap(),
+                value.parse().unwrap(),
+            )]))
+        };
+        for yes in ["gzip", "gzip, deflate, br", "br, GZIP;q=0.5", "deflate;q=0, gzip; q=1"] {
+            assert!(takes(yes), "{yes}");
+        }
+        for no in ["", "br", "gzip;q=0", "gzip; q=0.0", "x-gzipped"] {
+            assert!(!takes(no), "{no}");
+        }
+        assert!(!takes_gzip(&HeaderMap::new()));
+    }
+}

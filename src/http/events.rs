@@ -1,0 +1,143 @@
+//! `/v1/events`: says which jobs have changed, for those who would poll otherwise.
+//!
+//! Workers are other processes, so the server looks at the database once a second, as long as
+//! somebody listens, and compares what it sees with what it saw before.
+
+use std::collections::HashMap;
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::HeaderName;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream;
+use serde::Serialize;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
+use tokio_util::sync::CancellationToken;
+
+use super::app::App;
+use super::error::{ApiError, Code};
+use crate::job::JobId;
+use crate::store::{JobMark, Store};
+
+/// Time between two looks.
+const LOOK: Duration = Duration::from_secs(1);
+/// Listeners at the same time: each holds a connection.
+const PLACES: usize = 128;
+/// The most jobs that an event names; beyond that a list is cheaper to read again.
+const NAMED: usize = 200;
+
+/// What listeners are told.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+struct Change {
+    /// Jobs that are new or have changed.
+    changed: Vec<JobId>,
+    /// Jobs that were deleted.
+    deleted: Vec<JobId>,
+    /// True if there are more than are named: read the list again.
+    more: bool,
+}
+
+/// Those who listen.
+#[derive(Debug)]
+pub(super) struct Events {
+    sender: broadcast::Sender<Arc<str>>,
+    places: Arc<Semaphore>,
+    closing: CancellationToken,
+}
+
+impl Events {
+    /// Begins to look, until `closing`.
+    pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
+        let (sender, _) = broadcast::channel(16);
+        tokio::spawn(closing.clone().run_until_cancelled_owned(look(store, sender.clone())));
+        Self { sender, places: Arc::new(Semaphore::new(PLACES)), closing }
+    }
+}
+
+async fn look(store: Store, sender: broadcast::Sender<Arc<str>>) {
+    let mut before: Option<HashMap<JobId, JobMark>> = None;
+    let mut tick = tokio::time::interval(LOOK);
+    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        tick.tick().await;
+        if sender.receiver_count() == 0 {
+            before = None;
+            continue;
+        }
+        // A failing database shows in every other answer, too.
+        let Ok(now) = store.job_marks().await else { continue };
+        if let Some(change) = before.as_ref().and_then(|before| change(before, &now))
+            && let Ok(text) = serde_json::to_string(&change)
+        {
+            // Fails only if the last listener has just gone.
+            let _ = sender.send(text.into());
+        }
+        before = Some(now);
+    }
+}
+
+/// What differs, if anything does.
+fn change(before: &HashMap<JobId, JobMark>, now: &HashMap<JobId, JobMark>) -> Option<Change> {
+    let changed = now.iter().filter(|(id, mark)| before.get(id) != Some(mark)).map(|(id, _)| *id);
+    let mut changed: Vec<JobId> = changed.collect();
+    let mut deleted: Vec<JobId> =
+        before.keys().filter(|id| !now.contains_key(id)).copied().collect();
+    if changed.is_empty() && deleted.is_empty() {
+        return None;
+    }
+    let more = changed.len() > NAMED || deleted.len() > NAMED;
+    for list in [&mut changed, &mut deleted] {
+        list.sort_unstable_by(|a, b| b.cmp(a));
+        list.truncate(NAMED);
+    }
+    Some(Change { changed, deleted, more })
+}
+
+/// `GET /v1/events`
+pub(super) async fn listen(State(app): State<App>) -> Result<Response, ApiError> {
+    let place = app.events.places.clone().try_acquire_owned().map_err(|_| {
+        ApiError::new(Code::Unavailable, "all places for listeners are taken; poll instead")
+    })?;
+    let listener = Listener {
+        receiver: app.events.sender.subscribe(),
+        closing: app.events.closing.clone(),
+        greeted: false,
+        _place: place,
+    };
+    let events = stream::unfold(listener, Listener::next);
+    // Proxies must not gather events into larger packets.
+    let unbuffered: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
+    Ok(([unbuffered], Sse::new(events).keep_alive(KeepAlive::default())).into_response())
+}
+
+struct Listener {
+    receiver: broadcast::Receiver<Arc<str>>,
+    closing: CancellationToken,
+    greeted: bool,
+    _place: OwnedSemaphorePermit,
+}
+
+impl Listener {
+    async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
+        if !self.greeted {
+            self.greeted = true;
+            return Some((Ok(Event::default().event("hello").data("{}")), self));
+        }
+        let received = tokio::select! {
+            received = self.receiver.recv() => received,
+            () = self.closing.cancelled() => return None,
+        };
+        let event = match received {
+            Ok(text) => Event::default().event("jobs").data(text),
+            // A slow listener has missed some: it must read the list again.
+            Err(broadcast::error::RecvError::Lagged(_)) => {
+                Event::default().event("hello").data("{}")
+            }
+            Err(broadcast::error::RecvError::Closed) => return None,
+        };
+        Some((Ok(event), self))
+    }
+}

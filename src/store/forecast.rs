@@ -1,0 +1,94 @@
+//! The order in which waiting jobs are served, and what that means in seconds.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use sqlx::Row;
+
+use super::Store;
+use super::error::StoreError;
+use super::rows::parsed;
+use crate::job::{JobId, JobState};
+
+/// Workers that were silent for longer do not count.
+const WORKER_AGE: Duration = Duration::from_secs(15);
+
+/// What is ahead of every unfinished job.
+#[derive(Debug)]
+pub(super) struct Forecast {
+    /// Workers that live.
+    workers: u32,
+    /// Seconds that a planned CPU-second takes.
+    rate: f64,
+    ahead: HashMap<JobId, Ahead>,
+}
+
+/// What is served before a job.
+#[derive(Debug, Clone, Copy)]
+struct Ahead {
+    /// Planned CPU-seconds.
+    cost: f64,
+    /// The job's place among those that wait, from 1; none if it does not wait.
+    position: Option<usize>,
+}
+
+impl Forecast {
+    /// Seconds until a job ends, at most, of which `left` planned CPU-seconds are left, `longest` of
+    /// them in one task; none if no worker lives.
+    pub(super) fn eta_seconds(&self, job: JobId, left: f64, longest: f64) -> Option<f64> {
+        let workers = f64::from(self.workers);
+        let work = left + self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
+        let seconds = self.rate * (work / workers + (1.0 - 1.0 / workers) * longest);
+        (self.workers > 0).then_some(seconds)
+    }
+
+    /// The job's place among those that wait, from 1.
+    pub(super) fn position(&self, job: JobId) -> Option<usize> {
+        self.ahead.get(&job)?.position
+    }
+}
+
+impl Store {
+    /// What is ahead of every unfinished job; none if there is no such job.
+    pub(super) async fn forecast(&self) -> Result<Option<Forecast>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT job, sum(cost * (1 - fraction)) AS cost,
+                 (SELECT state FROM jobs WHERE id = job) AS state
+             FROM tasks WHERE state IN ('blocked', 'ready', 'running')
+             GROUP BY priority, job ORDER BY priority DESC, job",
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        if rows.is_empty() {
+            return Ok(None);
+        }
+        let (mut cost, mut waiting, mut ahead) = (0.0, 0, HashMap::with_capacity(rows.len()));
+        for row in &rows {
+            let waits = parsed::<JobState>(row, "state")? == JobState::Queued;
+            waiting += usize::from(waits);
+            ahead.insert(parsed(row, "job")?, Ahead { cost, position: waits.then_some(waiting) });
+            cost += row.try_get::<f64, _>("cost")?;
+        }
+        let workers = self.live_workers(WORKER_AGE).await?.len();
+        let workers = u32::try_from(workers).unwrap_or(u32::MAX);
+        Ok(Some(Forecast { workers, rate: self.seconds_per_cost().await?, ahead }))
+    }
+
+    /// Seconds that a planned CPU-second takes on this machine: measured on the last tiles done, by
+    /// what they really did and not by what was planned; 1 before there are any.
+    async fn seconds_per_cost(&self) -> Result<f64, StoreError> {
+        let row = sqlx::query(
+            "SELECT sum(seconds) AS seconds, sum(spent) AS spent FROM (
+                 SELECT seconds, cost * fraction AS spent FROM tasks
+                 WHERE state = 'done' AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)",
+        )
+        .fetch_one(&self.readers)
+        .await?;
+        let seconds: Option<f64> = row.try_get("seconds")?;
+        let spent: Option<f64> = row.try_get("spent")?;
+        Ok(match (seconds, spent) {
+            (Some(seconds), Some(spent)) if spent > 0.0 && seconds > 0.0 => seconds / spent,
+            _ => 1.0,
+        })
+    }
+}

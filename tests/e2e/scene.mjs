@@ -1,0 +1,45 @@
+// A small scene, made here, so that a run needs no downloads: a square that moves over a ramp, seen
+// through random masks. Written as npy, as a lab would send it.
+
+/** `frames` frames of `height` x `width` and a snapshot of them; gives the files' bytes. */
+export function scene(frames, height, width, seed = 1) {
+  const masks = new Float32Array(frames * height * width);
+  const truth = new Float32Array(masks.length);
+  const measurement = new Float32Array(height * width);
+  let state = seed >>> 0;
+  const random = () => {
+    // xorshift: the same numbers on every machine.
+    state ^= state << 13;
+    state ^= state >>> 17;
+    state ^= state << 5;
+    return (state >>> 0) / 2 ** 32;
+  };
+  const side = Math.round(Math.min(height, width) / 4);
+  for (let frame = 0; frame < frames; frame += 1) {
+    const left = Math.round((width - side) * (frame + 0.5) / frames);
+    const top = Math.round(height / 3);
+    for (let row = 0; row < height; row += 1) {
+      for (let column = 0; column < width; column += 1) {
+        const at = (frame * height + row) * width + column;
+        const inside = row >= top && row < top + side && column >= left && column < left + side;
+        const wave = 0.35 + 0.2 * Math.sin(column / 9) * Math.cos(row / 13);
+        truth[at] = inside ? 0.95 : wave;
+        masks[at] = random() < 0.5 ? 0 : 1;
+        measurement[row * width + column] += masks[at] * truth[at];
+      }
+    }
+  }
+  return {
+    masks: npy([frames, height, width], masks),
+    measurement: npy([1, height, width], measurement),
+    truth: npy([frames, height, width], truth),
+  };
+}
+
+/** An npy file of little-endian float32. */
+function npy(shape, values) {
+  const text = `{'descr': '<f4', 'fortran_order': False, 'shape': (${shape.join(", ")}), }`;
+  const header = `${text.padEnd(Math.ceil((text.length + 11) / 64) * 64 - 11)}\n`;
+  const start = Buffer.from([0x93, 0x4e, 0x55, 0x4d, 0x50, 0x59, 1, 0, header.length & 255, header.length >> 8]);
+  return Buffer.concat([start, Buffer.from(header, "latin1"), Buffer.from(values.buffer)]);
+}
