@@ -8,9 +8,11 @@ mod progress;
 mod supervisor;
 
 pub mod demo;
+pub mod optics;
 pub mod reconstruct;
 pub mod serve;
 pub mod simulate;
+pub mod token;
 pub mod worker;
 
 pub use error::CliError;

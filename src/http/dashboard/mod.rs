@@ -46,6 +46,7 @@ const FILES: &[(&str, &[u8])] = &files![
     "rows.js",
     "submit.js",
     "system.js",
+    "token.js",
 ];
 
 /// A file in both of its representations, each with its own strong ETag.
