@@ -27,7 +27,5 @@ const FASTDVDNET_GRAY: Model = Model {
     ],
 };
 
-const FFDNET_GRAY: Model = Model {
-    name: "ffdnet-gray",
-    files: &[include_bytes!("../models/ffdnet-gray/model.onnx")],
-};
+const FFDNET_GRAY: Model =
+    Model { name: "ffdnet-gray", files: &[include_bytes!("../models/ffdnet-gray/model.onnx")] };

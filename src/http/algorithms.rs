@@ -3,12 +3,16 @@
 use axum::Json;
 use serde::Serialize;
 
-use crate::job::{Algorithm, ScheduleSpec, TileSpec};
+use crate::job::{Algorithm, PriorSpec, ScheduleSpec, TileSpec};
+use crate::models;
 
 /// An algorithm as it is shown.
 #[derive(Debug, Serialize)]
 pub(super) struct AlgorithmBody {
     name: Algorithm,
+    summary: &'static str,
+    networks: Vec<&'static str>,
+    priors: Vec<PriorSpec>,
     schedule: ScheduleSpec,
     planned_iterations: usize,
     planned_passes: usize,
@@ -27,6 +31,9 @@ pub(super) async fn list() -> Json<ListBody> {
         let schedule = name.default_schedule();
         AlgorithmBody {
             name,
+            summary: name.summary(),
+            networks: schedule.networks().into_iter().map(|which| models::of(which).name).collect(),
+            priors: name.priors(),
             planned_iterations: schedule.planned_iterations(),
             planned_passes: schedule.planned_passes(),
             schedule,

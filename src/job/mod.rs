@@ -17,7 +17,7 @@ pub use request::{
     Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,
     SnapshotSelection, TileSpec,
 };
-pub use schedule::{PriorSpec, ScheduleSpec, StageSpec};
+pub use schedule::{MethodSpec, PriorSpec, ScheduleSpec, StageSpec};
 pub use state::{IllegalTransition, JobState};
 pub use task::{TaskKind, TaskProgress, TaskStage, TaskState};
 pub use text::{InvalidText, Label, Sha256, Timestamp};

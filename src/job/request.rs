@@ -94,17 +94,25 @@ impl Algorithm {
         })
     }
 
+    /// The priors that a schedule of this algorithm may name.
+    #[must_use]
+    pub fn priors(self) -> Vec<PriorSpec> {
+        use PriorSpec as P;
+        match self {
+            Self::GapTv | Self::AdmmTv => vec![P::Tv],
+            Self::PnpNonlocal => vec![P::Tv, P::Nonlocal],
+            Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
+            Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNet],
+            Self::PnpTvFastDvdNet => vec![P::Tv, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal],
+        }
+    }
+
     /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
     /// what the stages don't do.
     #[must_use]
     pub fn misfit(self, schedule: &ScheduleSpec) -> Option<String> {
-        let own = self.default_schedule();
-        let known = |prior| {
-            prior == PriorSpec::Tv
-                || own.stages.iter().any(|stage| stage.prior == prior)
-                || (self == Self::PnpTvFastDvdNet && prior == PriorSpec::TvFastDvdNet)
-        };
-        let stranger = schedule.stages.iter().find(|stage| !known(stage.prior))?;
+        let own = self.priors();
+        let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;
         let taken = |other: &&Self| other.misfit(schedule).is_none();
         // Later ones take more.
         let later = Self::ALL.iter().skip_while(|other| **other != self).skip(1).find(taken);

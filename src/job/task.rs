@@ -95,8 +95,10 @@ pub enum TaskStage {
     Reading,
     /// Iterations with total variation as the prior.
     Tv,
-    /// Iterations with the deep denoiser.
+    /// Iterations with a learned denoiser.
     Deep,
+    /// Iterations with the nonlocal prior.
+    Nonlocal,
     /// Blending and writing.
     Writing,
 }
@@ -109,6 +111,7 @@ impl TaskStage {
             Self::Reading => "reading",
             Self::Tv => "tv",
             Self::Deep => "deep",
+            Self::Nonlocal => "nonlocal",
             Self::Writing => "writing",
         }
     }

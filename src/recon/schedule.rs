@@ -97,8 +97,9 @@ pub struct Stage {
     /// the measurement fully, so with 1 the residual winds up in its stages.
     pub memory: f32,
     /// Extrapolation of the iterates, on \[0,1): the projection starts from
-    /// `v_k + momentum (v_k - v_(k-1))`. Together with `memory` it makes fewer passes do: about
-    /// 0.8 is the most that was stable with a memory of 0.75.
+    /// `v_k + momentum (v_k - v_(k-1))`. It makes fewer passes do. Where the
+    /// prior passes everything (even brightness), an error `e` follows `e_(k+1) =
+    /// -memory momentum (e_k - e_(k-1))`: it grows if the product is above 1/2, so that is refused.
     pub momentum: f32,
     /// The stage ends early once `||v_k - v_(k-1)|| / ||v_k||` falls below this; 0 never.
     pub tolerance: f32,
@@ -132,6 +133,14 @@ impl Stage {
         }
         if !(0.0..1.0).contains(&self.momentum) {
             return parameter("momentum", self.momentum.to_string(), "at least 0 and below 1");
+        }
+        let product = self.memory * self.momentum;
+        if product > 0.5 {
+            return parameter(
+                "momentum",
+                format!("{} with memory {}", self.momentum, self.memory),
+                "such that momentum times memory is at most 0.5; above, the brightness diverges",
+            );
         }
         if self.prior.has_level() && self.sigma.is_none() {
             return parameter(
@@ -288,7 +297,7 @@ fn deep_stage(network: Network, iterations: usize, first: f32, last: f32) -> Sta
         sigma: Some((Sigma(first / 255.0), Sigma(last / 255.0))),
         tv_weight: 0.0,
         memory: 0.85,
-        momentum: 0.8,
+        momentum: 0.5,
         ..tv_stage(iterations, 0.0)
     }
 }
@@ -297,7 +306,8 @@ fn deep_stage(network: Network, iterations: usize, first: f32, last: f32) -> Sta
 fn nonlocal_stage(iterations: usize, first: f32, last: f32) -> Stage {
     Stage {
         prior: Prior::Nonlocal,
-        memory: 0.75,
+        memory: 0.6,
+        momentum: 0.8,
         ..deep_stage(Network::FastDvdNet, iterations, first, last)
     }
 }
@@ -348,6 +358,14 @@ mod tests {
         assert_eq!(pnp.clone().with_iterations(200).planned_iterations(), 200);
         let short = pnp.with_iterations(7);
         assert_eq!((short.stages.len(), short.planned_iterations()), (1, 7));
+    }
+
+    #[test]
+    fn momentum_that_diverges_is_refused() {
+        let mut schedule = Schedule::pnp_nonlocal();
+        schedule.stages[1].memory = 0.75;
+        let error = schedule.validate().unwrap_err().to_string();
+        assert!(error.contains("memory 0.75") && error.contains("0.5"), "{error}");
     }
 
     #[test]

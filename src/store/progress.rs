@@ -27,8 +27,10 @@ pub enum ProgressStage {
     Preparing,
     /// Tiles run, all of those running with TV.
     Tv,
-    /// Tiles run, at least one with the deep denoiser.
+    /// Tiles run, at least one with a learned denoiser.
     Deep,
+    /// Tiles run, none with a learned denoiser, at least one with the nonlocal prior.
+    Nonlocal,
     /// Frames are blended and written.
     Assembling,
     /// The job has come to its end.
@@ -91,6 +93,7 @@ impl Store {
                  count(*) FILTER (WHERE kind = 'assemble' AND state = 'done') AS snapshots_done,
                  count(*) FILTER (WHERE kind = 'prepare' AND state = 'done') AS prepared,
                  count(*) FILTER (WHERE state = 'running' AND stage = 'deep') AS deep,
+                 count(*) FILTER (WHERE state = 'running' AND stage = 'nonlocal') AS nonlocal,
                  sum(iterations) AS iterations, sum(passes) AS passes
              FROM tasks WHERE job IN (SELECT value FROM json_each(?)) GROUP BY job",
         )
@@ -171,6 +174,8 @@ fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage, StoreError> 
                 ProgressStage::Preparing
             } else if count("deep")? > 0 {
                 ProgressStage::Deep
+            } else if count("nonlocal")? > 0 {
+                ProgressStage::Nonlocal
             } else if count("tiles_done")? == count("tiles_total")? {
                 ProgressStage::Assembling
             } else {

@@ -11,7 +11,7 @@ use super::manifest::{
 };
 use super::prepare::{Prepared, to_record};
 use super::result::{ResultFile, ResultSpec, write_result};
-use super::task::{Engine, Shared, TaskError};
+use super::task::{Shared, TaskError};
 use super::tile::TileTaskRecord;
 use crate::formats::Limits;
 use crate::formats::planar::Reader;
@@ -33,14 +33,13 @@ pub(super) fn run(
     task: &ClaimedTask,
     snapshot: u32,
     tiles: &[TileResult],
-    engine: &WarmNetworks,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {
     let plan = task.spec.tile_plan()?;
     check(&plan, tiles, shared)?;
     let records = tiles.iter().map(record).collect::<Result<Vec<_>, _>>()?;
     let paths: Vec<PathBuf> = tiles.iter().map(|tile| tile.path.clone()).collect();
-    let manifest = manifest(task, snapshot, &plan, &records, engine)?;
+    let manifest = manifest(task, snapshot, &plan, &records)?;
     let (height, width) = plan.dim();
     let spec = ResultSpec {
         height,
@@ -114,7 +113,6 @@ fn manifest(
     snapshot: u32,
     plan: &TilePlan,
     records: &[TileTaskRecord],
-    engine: &WarmNetworks,
 ) -> Result<Manifest, TaskError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);

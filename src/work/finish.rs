@@ -9,7 +9,7 @@ use super::assemble::SnapshotRecord;
 use super::manifest::{Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord};
 use super::prepare::{Prepared, to_record};
 use super::result::ResultFile;
-use super::task::{Engine, TaskError};
+use super::task::TaskError;
 use crate::job::{
     Algorithm, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp,
 };
@@ -34,7 +34,7 @@ struct JobContent {
     schedule: ScheduleSpec,
     shape: SceneShape,
     inputs: Inputs,
-    model: Option<ModelRecord>,
+    models: Vec<ModelRecord>,
     scale: ScaleRecord,
     tile_plan: TilePlanRecord,
     snapshots: Vec<SnapshotEntry>,
@@ -67,13 +67,12 @@ pub(super) fn run(
     store: &Store,
     task: &ClaimedTask,
     records: &[TaskRecord],
-    engine: &WarmNetworks,
 ) -> Result<Completion, TaskError> {
     let snapshots = records.iter().filter_map(snapshot).collect::<Result<Vec<_>, _>>()?;
     let manifest = JobManifest {
         schema: SCHEMA.into(),
         run: job_run(task, records, &snapshots),
-        content: content(task, snapshots, engine)?,
+        content: content(task, snapshots)?,
     };
     let staged = store.staged_dir()?;
     let text = serde_json::to_string_pretty(&manifest)
@@ -96,11 +95,9 @@ fn snapshot(task: &TaskRecord) -> Option<Result<(u32, SnapshotRecord), TaskError
 fn content(
     task: &ClaimedTask,
     snapshots: Vec<(u32, SnapshotRecord)>,
-    engine: &WarmNetworks,
 ) -> Result<JobContent, TaskError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);
-    let deep = spec.schedule.needs_network();
     let entry = |(snapshot, record): (u32, SnapshotRecord)| {
         let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
         SnapshotEntry { snapshot, summary: record.summary, files: files.collect() }

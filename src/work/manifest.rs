@@ -261,9 +261,8 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
         ("measurementSha256".to_owned(), content.inputs.measurement_sha256.clone()),
         ("whiteLevel".to_owned(), content.scale.white.to_string()),
     ];
-    if let Some(model) = &content.model {
-        shared.push(("model".to_owned(), model.name.clone()));
-        shared.push(("modelSha256".to_owned(), model.sha256.clone()));
+    for model in &content.models {
+        shared.push((format!("model {}", model.name), model.sha256.clone()));
     }
     let camera = content.camera.as_ref();
     let times = camera.and_then(|camera| camera.frame_times_s.as_deref());

@@ -63,7 +63,7 @@ impl NetworkSource {
     }
 
     /// A network with sessions of its own, for one thread.
-    fn load(&self, which: Network) -> Result<Box<dyn Denoiser>, NetworkError> {
+    fn load(&self, which: Network) -> Result<Box<dyn Denoiser + Send>, NetworkError> {
         let (runtime, files) = (self.runtime()?, models::of(which).files);
         Ok(match (which, files) {
             (Network::FastDvdNet, [first, second]) => {
@@ -96,7 +96,7 @@ impl NetworkSource {
 /// Networks of one thread: each is loaded at its first use and stays warm.
 pub struct WarmNetworks {
     source: NetworkSource,
-    loaded: Vec<(Network, Box<dyn Denoiser>)>,
+    loaded: Vec<(Network, Box<dyn Denoiser + Send>)>,
 }
 
 impl WarmNetworks {

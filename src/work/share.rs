@@ -37,7 +37,7 @@ mod tests {
 
     #[test]
     fn an_early_end_of_a_stage_jumps_to_its_end() {
-        let schedule = Schedule::pnp_tv_fastdvdnet();
+        let schedule = Schedule::pnp_fastdvdnet();
         let passes = schedule.stages[1].iterations;
         let mut share = ShareDone::new(ScheduleSpec::from(&schedule));
         let at = |stage, done| Progress {
@@ -47,6 +47,7 @@ mod tests {
             residual: 0.1,
             change: 0.1,
             sigma: None,
+            deep: stage > 0,
         };
         let first = share.after(&at(0, 1));
         // The stage of total variation ended after three iterations.

@@ -164,11 +164,9 @@ pub(super) fn perform(
             tile::run(store, task, (snapshot, tile), engine, shared)
         }
         (TaskKind::Assemble { snapshot }, Material::Tiles(tiles)) => {
-            assemble::run(store, task, snapshot, &tiles, engine, shared)
+            assemble::run(store, task, snapshot, &tiles, shared)
         }
-        (TaskKind::Manifest, Material::Records(records)) => {
-            finish::run(store, task, &records, engine)
-        }
+        (TaskKind::Manifest, Material::Records(records)) => finish::run(store, task, &records),
         _ => prepare::run(task, shared),
     }
 }

@@ -14,7 +14,8 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::network::NetworkSource;
-use super::task::{Engine, Material, Shared, TaskError, perform};
+use super::network::WarmNetworks;
+use super::task::{Material, Shared, TaskError, perform};
 use crate::job::{TaskProgress, WorkerId, without_paths};
 use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError};
 
@@ -58,7 +59,7 @@ pub struct Worker {
     store: Store,
     id: WorkerId,
     /// On its way between the loop and the computing thread.
-    engine: Option<Engine>,
+    engine: Option<WarmNetworks>,
     network: NetworkSource,
     /// See [`Worker::new`].
     stall: Duration,
@@ -66,7 +67,7 @@ pub struct Worker {
 }
 
 /// What the computing thread hands back.
-type Computed = (Engine, Result<Completion, TaskError>);
+type Computed = (WarmNetworks, Result<Completion, TaskError>);
 
 /// Why a task was stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -208,7 +209,8 @@ impl Worker {
         shared: &Arc<Shared>,
         span: tracing::Span,
     ) -> JoinHandle<Computed> {
-        let mut engine = self.engine.take().unwrap_or_else(|| WarmNetworks::new(self.network.clone()));
+        let mut engine =
+            self.engine.take().unwrap_or_else(|| WarmNetworks::new(self.network.clone()));
         let (store, shared) = (self.store.clone(), shared.clone());
         tokio::task::spawn_blocking(move || {
             let _entered = span.enter();

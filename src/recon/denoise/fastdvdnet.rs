@@ -117,10 +117,10 @@ fn reflect(index: isize, length: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::{FastDvdNet, reflect};
-    use crate::models::FASTDVDNET_GRAY;
+    use crate::models;
     use crate::recon::denoise::Denoiser;
     use crate::recon::denoise::onnx::{Device, Runtime};
-    use crate::recon::schedule::Sigma;
+    use crate::recon::schedule::{Network, Sigma};
     use ndarray::{Array3, s};
     use rand::{Rng, SeedableRng};
     use std::path::PathBuf;
@@ -133,7 +133,7 @@ mod tests {
             return None;
         };
         let runtime = Runtime::open(&library, Device::Cpu).unwrap();
-        let (stage1, stage2) = (FASTDVDNET_GRAY.stage1, FASTDVDNET_GRAY.stage2);
+        let [stage1, stage2] = models::of(Network::FastDvdNet).files else { unreachable!() };
         Some(FastDvdNet::load(&runtime, stage1, stage2).unwrap())
     }
 

@@ -96,7 +96,8 @@ impl Nonlocal {
         self.filter_groups(sigma);
         let filtered = self.guide.chunks_exact_mut(row_length);
         let sums = self.sum.chunks_exact(row_length).zip(self.cover.chunks_exact(row_length));
-        for ((mut row, guide), (sum, cover)) in frames.rows_mut().into_iter().zip(filtered).zip(sums)
+        for ((mut row, guide), (sum, cover)) in
+            frames.rows_mut().into_iter().zip(filtered).zip(sums)
         {
             for (((value, guide), sum), cover) in row.iter_mut().zip(guide).zip(sum).zip(cover) {
                 *value = sum / cover;
