@@ -89,6 +89,31 @@ pub fn write_u16(
     encode_u16(BufWriter::new(file), frame, black, white)
 }
 
+/// The bytes of an 8-bit grey PNG for looking at: `black` becomes 0, `white` 255, linear between,
+/// clipped outside; NaN becomes 0. `frame` has the axes (row, column).
+///
+/// Errors: [`FormatError::Internal`] unless `black < white`, both finite.
+pub fn encode_u8(
+    frame: ArrayView2<'_, f32>,
+    black: f32,
+    white: f32,
+) -> Result<Vec<u8>, FormatError> {
+    if !(black.is_finite() && white.is_finite() && black < white) {
+        return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
+    }
+    let [height, width] = [frame.nrows(), frame.ncols()].map(|n| u32::try_from(n).unwrap_or(0));
+    let mut file = Vec::new();
+    let mut encoder = Encoder::new(&mut file, width, height);
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(BitDepth::Eight);
+    let factor = 255.0 / (white - black);
+    let bytes: Vec<u8> = frame.iter().map(|v| ((v - black) * factor).round() as u8).collect();
+    let mut png = encoder.write_header().map_err(encoding_error)?;
+    png.write_image_data(&bytes).map_err(encoding_error)?;
+    png.finish().map_err(encoding_error)?;
+    Ok(file)
+}
+
 fn encode_u16(
     writer: impl Write,
     frame: ArrayView2<'_, f32>,

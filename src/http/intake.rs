@@ -11,7 +11,7 @@ use crate::formats::validate::{
     MaskCheck, MaskStatistics, MeasurementCheck, MeasurementStatistics,
 };
 use crate::formats::{self, FormatError, FrameReader, FullScale, Limits, StackInfo, planar};
-use crate::job::Sha256;
+use crate::job::{Captures, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
 
 /// What an upload turned out to be.
@@ -52,6 +52,32 @@ pub(super) fn masks(
     let statistics =
         MaskCheck::run(&mut *reader, scale, |mask| writer.write_frame(mask)).map_err(refused)?;
     Ok(Prepared { info, statistics, file: finish(writer)? })
+}
+
+/// Looks at the headers of captures: they must be stacks of one size, before a worker averages them.
+pub(super) fn captures(
+    store: &Store,
+    limits: &Limits,
+    captures: &Captures,
+) -> Result<(), ApiError> {
+    let mut first = None;
+    for (place, uploads) in captures.lists() {
+        for (index, upload) in uploads.iter().enumerate() {
+            let place = format!("{place}/{index}");
+            let opened = formats::open_stack(&store.dir().blob(upload), limits);
+            let info = *opened.map_err(|error| ApiError::from(error).at(&place))?.info();
+            let size = (info.height, info.width);
+            let (height, width) = *first.get_or_insert(size);
+            if size != (height, width) {
+                let detail = format!(
+                    "this capture is {}x{} (rows x columns), but those before it are {height}x{width}",
+                    info.height, info.width
+                );
+                return Err(ApiError::new(Code::SizeMismatch, detail).at(&place));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Checks a measurement against its calibration and writes it with its full scale divided out.

@@ -20,6 +20,8 @@ mod layers;
 mod measurements;
 mod metrics;
 mod page;
+mod report_page;
+mod reports;
 mod results;
 mod router;
 mod system;
@@ -27,4 +29,5 @@ mod upload;
 
 pub use app::App;
 pub use metrics::Metrics;
+pub use report_page::report_page;
 pub use router::{Route, router, routes};

@@ -6,6 +6,7 @@
 //! is open while anything is computed or uploaded.
 
 mod blobs;
+mod calibrating;
 mod calibrations;
 mod dir;
 mod error;
@@ -34,6 +35,9 @@ use sqlx::sqlite::{
 };
 
 pub use blobs::{Blob, Origin};
+pub use calibrating::{
+    CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration, Unready,
+};
 pub use calibrations::{Calibration, NewCalibration};
 pub use dir::DataDir;
 pub use error::StoreError;
