@@ -15,6 +15,7 @@ mod events;
 mod extract;
 mod health;
 mod intake;
+mod intake_check;
 mod jobs;
 mod layers;
 mod measurements;

@@ -7,7 +7,8 @@ use std::time::Duration;
 use tracing::Instrument;
 
 use super::calibrate::{
-    self, CalibrateError, CaptureFiles, MadeMasks, Report, average_masks, read_patterns, scale_masks,
+    self, CalibrateError, CaptureFiles, MadeMasks, Report, average_masks, read_patterns,
+    scale_masks,
 };
 use super::task::Shared;
 use super::worker::{HEARTBEAT, LEASE, Worker, WorkerError, said};

@@ -66,7 +66,8 @@ fn clip(path: &Path, frames: usize, side: Option<usize>) -> Result<Clip, CliErro
     if let Some(value) = frames.iter().find(|value| !(-1e-6..=1.0 + 1e-6).contains(*value)) {
         return Err(refused(format!("{value} times the full scale; a scene lies between 0 and 1")));
     }
-    let name = path.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+    let name =
+        path.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     Ok(Clip { name, frames })
 }
 

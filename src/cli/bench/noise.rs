@@ -136,8 +136,10 @@ impl Bench<'_> {
         patterns: &Array3<f32>,
         clips: &[Clip],
     ) -> Result<Curve, CliError> {
-        let optics =
-            HybridAperture { normalisation: Normalisation::Throughput, ..HybridAperture::default() };
+        let optics = HybridAperture {
+            normalisation: Normalisation::Throughput,
+            ..HybridAperture::default()
+        };
         let (mut by_clip, mut throughput) = (Vec::new(), 0.0);
         for clip in clips {
             let (_, height, width) = clip.frames.dim();
@@ -147,7 +149,8 @@ impl Bench<'_> {
             throughput += made.throughput / clips.len() as f64;
             by_clip.push(self.clip(&made, clip, masks)?);
         }
-        let level = |index: usize| by_clip.iter().map(|values: &Vec<f64>| values[index]).sum::<f64>();
+        let level =
+            |index: usize| by_clip.iter().map(|values: &Vec<f64>| values[index]).sum::<f64>();
         Ok(Curve {
             masks,
             light_throughput: throughput,
@@ -244,7 +247,11 @@ mod tests {
     fn a_crossing_lies_between_the_levels_beside_it() {
         let sigmas = [0.0, 10.0, 20.0];
         assert_eq!(crossing(&sigmas, &[20.0, 19.0, 18.0], &[21.0, 18.0, 15.0]), Some(5.0));
-        assert_eq!(crossing(&sigmas, &[22.0, 19.0, 18.0], &[21.0, 18.0, 15.0]), None, "always ahead");
+        assert_eq!(
+            crossing(&sigmas, &[22.0, 19.0, 18.0], &[21.0, 18.0, 15.0]),
+            None,
+            "always ahead"
+        );
         assert_eq!(crossing(&sigmas, &[20.0, 19.0, 14.0], &[21.0, 18.0, 15.0]), None, "and back");
         assert_eq!(crossing(&sigmas, &[20.0, 17.0, 14.0], &[21.0, 18.0, 15.0]), None);
     }
