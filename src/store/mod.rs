@@ -17,6 +17,7 @@ mod marks;
 mod measurements;
 mod progress;
 mod queue;
+mod reports;
 mod results;
 mod rows;
 mod staging;
@@ -35,9 +36,7 @@ use sqlx::sqlite::{
 };
 
 pub use blobs::{Blob, Origin};
-pub use calibrating::{
-    CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration, Unready,
-};
+pub use calibrating::{CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration};
 pub use calibrations::{Calibration, NewCalibration};
 pub use dir::DataDir;
 pub use error::StoreError;
@@ -47,6 +46,7 @@ pub use marks::JobMark;
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
 pub use progress::{JobProgress, ProgressStage, TaskCounts};
 pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
+pub use reports::Unready;
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use tasks::{TaskRecord, TileResult};

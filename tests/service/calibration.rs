@@ -409,7 +409,7 @@ async fn a_measurement_is_checked_against_its_calibration() {
     let data = app.upload(lab.moved(2, 1)).await;
     let moved = post(&|body| body["data"] = json!(data)).await;
     assert_eq!(codes(&moved), ["shifted_masks"]);
-    assert!(moved["warnings"][0]["detail"].as_str().unwrap().contains("2 rows and 1 columns"));
+    assert!(moved["warnings"][0]["detail"].as_str().unwrap().contains("-2 rows and -1 columns"));
     let full = post(&|body| body["saturation"] = json!(900)).await;
     assert!(codes(&full).contains(&"saturated".to_owned()), "{full:#}");
     // A measurement that lacks a pattern of its calibration.
