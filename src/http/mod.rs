@@ -19,9 +19,11 @@ mod layers;
 mod measurements;
 mod metrics;
 mod page;
+mod pictures;
 mod results;
 mod router;
 mod system;
+mod tiles;
 mod upload;
 
 pub use app::App;

@@ -22,6 +22,7 @@ mod staging;
 mod tasks;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod workers;
 
 use std::path::Path;
@@ -45,6 +46,7 @@ pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use tasks::{TaskRecord, TileResult};
+pub use tiles::{TileHistory, TileState};
 pub use workers::{WorkerEnd, WorkerRow, WorkerTask};
 
 /// One page of a list, and the identifier to go on after.

@@ -38,14 +38,22 @@ const FILES: &[(&str, &[u8])] = &files![
     "main.js",
     "actions.js",
     "api.js",
+    "contrast.js",
+    "convergence.js",
     "dom.js",
     "format.js",
     "job.js",
     "jobs.js",
     "live.js",
+    "pane.js",
+    "player.js",
     "rows.js",
+    "slice.js",
     "submit.js",
     "system.js",
+    "tilemap.js",
+    "view.js",
+    "viewer.js",
 ];
 
 /// A file in both of its representations, each with its own strong ETag.
