@@ -25,7 +25,8 @@ pub struct ServeArguments {
     )]
     pub listen: SocketAddr,
 
-    /// Listen at an address that other machines reach, though there is no access control yet.
+    /// Listen at an address that other machines reach though there are no tokens: whoever reaches it
+    /// may do everything.
     #[arg(long, env = "SCI_RECON_ALLOW_REMOTE")]
     pub allow_remote: bool,
 
@@ -137,19 +138,20 @@ pub enum LogFormat {
 pub enum ConfigError {
     /// The service would be open to everyone.
     #[error(
-        "{0} can be reached from other machines, and there is no access control yet: listen at \
-         127.0.0.1, or say --allow-remote if the network is trusted"
+        "{0} can be reached from other machines, and everyone could do everything: make a token \
+         (sci-recon token create), listen at 127.0.0.1, or say --allow-remote if the network is \
+         trusted"
     )]
     Remote(SocketAddr),
 }
 
 impl ServeArguments {
-    /// Checks what can't be checked field by field.
+    /// Checks what can't be checked field by field; `open` says that there are no tokens.
     ///
     /// # Errors
     /// See [`ConfigError`].
-    pub fn check(&self) -> Result<(), ConfigError> {
-        if !self.listen.ip().is_loopback() && !self.allow_remote {
+    pub fn check(&self, open: bool) -> Result<(), ConfigError> {
+        if open && !self.listen.ip().is_loopback() && !self.allow_remote {
             return Err(ConfigError::Remote(self.listen));
         }
         Ok(())
@@ -222,7 +224,7 @@ mod tests {
     fn only_this_machine_is_served_unless_told_so() {
         let serve = |listen: &[&str]| {
             let line = [&["serve", "--data", "d"], listen].concat();
-            Serve::try_parse_from(line).unwrap().arguments.check()
+            Serve::try_parse_from(line).unwrap().arguments.check(true)
         };
         assert!(serve(&[]).is_ok());
         assert!(serve(&["--listen", "[::1]:0"]).is_ok());

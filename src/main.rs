@@ -21,6 +21,7 @@ enum Command {
     Reconstruct(cli::reconstruct::Arguments),
     Simulate(cli::simulate::Arguments),
     Demo(cli::demo::Arguments),
+    Token(cli::token::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -30,6 +31,7 @@ fn main() -> ExitCode {
         Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
         Command::Demo(arguments) => cli::demo::run(&arguments),
+        Command::Token(arguments) => cli::token::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

@@ -11,6 +11,7 @@ pub mod demo;
 pub mod reconstruct;
 pub mod serve;
 pub mod simulate;
+pub mod token;
 pub mod worker;
 
 pub use error::CliError;

@@ -64,7 +64,6 @@ fn io(action: &'static str) -> impl FnOnce(std::io::Error) -> ServeError {
 /// # Errors
 /// If it can't start.
 pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
-    settings.check()?;
     logging::start(settings.log_format);
     tokio::runtime::Runtime::new().map_err(io("start the runtime"))?.block_on(serve(settings))
 }
@@ -74,6 +73,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let store = Store::open(&settings.data).await?;
     let taken = || ServeError::Taken(store.dir().root().display().to_string());
     let _lock = store.dir().try_lock_server()?.ok_or_else(taken)?;
+    settings.check(store.is_open().await?)?;
     // 2. What an earlier server left.
     let swept = store.dir().sweep_tmp()?;
     store.forget_workers(Duration::from_secs(60)).await?;

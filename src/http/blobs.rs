@@ -7,6 +7,7 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use tokio::sync::OwnedSemaphorePermit;
 
+use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code};
 use super::extract::Params;
@@ -17,45 +18,52 @@ use crate::store::{Blob, StagedBlob};
 /// `POST /v1/blobs`: the file as the raw body, or as the field `file` of a form.
 pub(super) async fn create(
     State(app): State<App>,
+    access: Access,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let _permit = begin(&app, &headers)?;
+    let _permit = begin(&app, &access, &headers).await?;
     let staged = if is_form(&headers) {
         receive_form(&app, request).await?
     } else {
         upload::receive(&app, request.into_body().into_data_stream()).await?
     };
-    store(&app, staged).await
+    store(&app, &access, staged).await
 }
 
 /// `PUT /v1/blobs/{sha256}`: the raw body, which must have this hash.
 pub(super) async fn put(
     State(app): State<App>,
+    access: Access,
     Params(sha256): Params<Sha256>,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    let _permit = begin(&app, &headers)?;
+    let _permit = begin(&app, &access, &headers).await?;
     let staged = upload::receive(&app, body.into_data_stream()).await?;
     if staged.sha256() != sha256 {
         let detail = format!("the address says {sha256}, the bytes have {}", staged.sha256());
         return Err(ApiError::new(Code::HashMismatch, detail));
     }
-    store(&app, staged).await
+    store(&app, &access, staged).await
 }
 
 /// `GET /v1/blobs/{sha256}`: whether the file is there, and its size.
 pub(super) async fn show(
     State(app): State<App>,
+    access: Access,
     Params(sha256): Params<Sha256>,
 ) -> Result<Json<Blob>, ApiError> {
-    Ok(Json(app.store.upload(sha256).await?))
+    Ok(Json(app.store.upload(&access.lab, sha256).await?))
 }
 
 /// Takes one of the places for uploads and refuses what is too large.
-fn begin(app: &App, headers: &HeaderMap) -> Result<OwnedSemaphorePermit, ApiError> {
-    upload::admit(app, headers)?;
+async fn begin(
+    app: &App,
+    access: &Access,
+    headers: &HeaderMap,
+) -> Result<OwnedSemaphorePermit, ApiError> {
+    upload::admit(app, access, headers).await?;
     app.uploads.clone().try_acquire_owned().map_err(|_| {
         ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
     })
@@ -79,8 +87,10 @@ async fn receive_form(app: &App, request: Request) -> Result<StagedBlob, ApiErro
     Err(malformed("the form has no field named file".into()))
 }
 
-async fn store(app: &App, staged: StagedBlob) -> Result<Response, ApiError> {
-    let (blob, new) = app.store.store_upload(staged).await?;
+async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response, ApiError> {
+    // Again, for an upload that did not say its length before.
+    upload::check_quota(app, access, staged.size()).await?;
+    let (blob, new) = app.store.store_upload(&access.lab, access.token, staged).await?;
     let status = if new { StatusCode::CREATED } else { StatusCode::OK };
     let location = [(header::LOCATION, format!("/v1/blobs/{}", blob.sha256))];
     Ok((status, location, Json(blob)).into_response())

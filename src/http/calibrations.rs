@@ -6,6 +6,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
+use super::access::Access;
 use super::app::App;
 use super::error::ApiError;
 use super::extract::{Body, Params, QueryOf};
@@ -38,15 +39,16 @@ pub(super) struct ListQuery {
 /// `POST /v1/calibrations`
 pub(super) async fn create(
     State(app): State<App>,
+    access: Access,
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response, ApiError> {
     let (masks, full_scale) = (request.masks, request.full_scale);
-    app.store.upload(masks).await.map_err(|error| missing("/masks", error))?;
+    app.store.upload(&access.lab, masks).await.map_err(|error| missing("/masks", error))?;
     let prepared =
         intake::run(&app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
     let Prepared { info, statistics, file } = prepared.await?;
     let facts = facts(request, &info, &statistics);
-    let calibration = app.store.add_calibration(facts, file).await?;
+    let calibration = app.store.add_calibration(&access.lab, facts, file).await?;
     let location = [(header::LOCATION, format!("/v1/calibrations/{}", calibration.id))];
     Ok((StatusCode::CREATED, location, Json(calibration)).into_response())
 }
@@ -82,25 +84,28 @@ pub(super) fn missing(pointer: &str, error: crate::store::StoreError) -> ApiErro
 /// `GET /v1/calibrations`
 pub(super) async fn list(
     State(app): State<App>,
+    access: Access,
     QueryOf(query): QueryOf<ListQuery>,
 ) -> Result<Json<PageBody<Calibration>>, ApiError> {
-    let page = app.store.calibrations(query.cursor, query.limit.get()).await?;
+    let page = app.store.calibrations(&access.lab, query.cursor, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
 /// `GET /v1/calibrations/{calibration}`
 pub(super) async fn show(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<CalibrationId>,
 ) -> Result<Json<Calibration>, ApiError> {
-    Ok(Json(app.store.calibration(id).await?))
+    Ok(Json(app.store.calibration(&access.lab, id).await?))
 }
 
 /// `DELETE /v1/calibrations/{calibration}`
 pub(super) async fn delete(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<CalibrationId>,
 ) -> Result<StatusCode, ApiError> {
-    app.store.delete_calibration(id).await?;
+    app.store.delete_calibration(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -17,6 +17,8 @@ pub enum Code {
     MalformedRequest,
     InvalidQuery,
     EmptyBody,
+    Unauthorized,
+    Forbidden,
     NotFound,
     NotReady,
     MethodNotAllowed,
@@ -36,6 +38,7 @@ pub enum Code {
     Unavailable,
     TimedOut,
     InsufficientStorage,
+    QuotaExceeded,
 }
 
 impl Code {
@@ -54,6 +57,8 @@ impl Code {
                 (S::BAD_REQUEST, "invalid_query", "A query parameter is wrong", false)
             }
             Self::EmptyBody => (S::BAD_REQUEST, "empty_body", "The body is empty", false),
+            Self::Unauthorized => (S::UNAUTHORIZED, "unauthorized", "Who is there?", false),
+            Self::Forbidden => (S::FORBIDDEN, "forbidden", "The token does not allow it", false),
             Self::NotFound => (S::NOT_FOUND, "not_found", "There is no such thing", false),
             Self::NotReady => (S::NOT_FOUND, "not_ready", "It is not there yet", true),
             Self::MethodNotAllowed => {
@@ -106,6 +111,9 @@ impl Code {
             }
             Self::InsufficientStorage => {
                 (S::INSUFFICIENT_STORAGE, "insufficient_storage", "The disk is full", true)
+            }
+            Self::QuotaExceeded => {
+                (S::INSUFFICIENT_STORAGE, "quota_exceeded", "The token's limit is reached", false)
             }
         }
     }

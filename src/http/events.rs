@@ -17,9 +17,10 @@ use serde::Serialize;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
 use tokio_util::sync::CancellationToken;
 
+use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code};
-use crate::job::JobId;
+use crate::job::{JobId, Lab};
 use crate::store::{JobMark, Store};
 
 /// Time between two looks.
@@ -30,7 +31,7 @@ const PLACES: usize = 128;
 const NAMED: usize = 200;
 
 /// What listeners are told.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Default, Serialize)]
 struct Change {
     /// Jobs that are new or have changed.
     changed: Vec<JobId>,
@@ -40,10 +41,16 @@ struct Change {
     more: bool,
 }
 
+/// Marks of jobs, and whose they are.
+type Marks = HashMap<(Lab, JobId), JobMark>;
+
+/// What the listeners of each lab are told, as JSON.
+type Changes = Arc<HashMap<Lab, String>>;
+
 /// Those who listen.
 #[derive(Debug)]
 pub(super) struct Events {
-    sender: broadcast::Sender<Arc<str>>,
+    sender: broadcast::Sender<Changes>,
     places: Arc<Semaphore>,
     closing: CancellationToken,
 }
@@ -57,8 +64,8 @@ impl Events {
     }
 }
 
-async fn look(store: Store, sender: broadcast::Sender<Arc<str>>) {
-    let mut before: Option<HashMap<JobId, JobMark>> = None;
+async fn look(store: Store, sender: broadcast::Sender<Changes>) {
+    let mut before: Option<Marks> = None;
     let mut tick = tokio::time::interval(LOOK);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
@@ -69,39 +76,49 @@ async fn look(store: Store, sender: broadcast::Sender<Arc<str>>) {
         }
         // A failing database shows in every other answer, too.
         let Ok(now) = store.job_marks().await else { continue };
-        if let Some(change) = before.as_ref().and_then(|before| change(before, &now))
-            && let Ok(text) = serde_json::to_string(&change)
-        {
+        let changes = before.as_ref().map(|before| changes(before, &now)).unwrap_or_default();
+        if !changes.is_empty() {
             // Fails only if the last listener has just gone.
-            let _ = sender.send(text.into());
+            let _ = sender.send(changes.into());
         }
         before = Some(now);
     }
 }
 
-/// What differs, if anything does.
-fn change(before: &HashMap<JobId, JobMark>, now: &HashMap<JobId, JobMark>) -> Option<Change> {
-    let changed = now.iter().filter(|(id, mark)| before.get(id) != Some(mark)).map(|(id, _)| *id);
-    let mut changed: Vec<JobId> = changed.collect();
-    let mut deleted: Vec<JobId> =
-        before.keys().filter(|id| !now.contains_key(id)).copied().collect();
-    if changed.is_empty() && deleted.is_empty() {
-        return None;
+/// What differs, for each lab for which anything does.
+fn changes(before: &Marks, now: &Marks) -> HashMap<Lab, String> {
+    let mut changes: HashMap<&Lab, Change> = HashMap::new();
+    for ((lab, job), _) in now.iter().filter(|(id, mark)| before.get(id) != Some(mark)) {
+        changes.entry(lab).or_default().changed.push(*job);
     }
-    let more = changed.len() > NAMED || deleted.len() > NAMED;
-    for list in [&mut changed, &mut deleted] {
-        list.sort_unstable_by(|a, b| b.cmp(a));
-        list.truncate(NAMED);
+    for (lab, job) in before.keys().filter(|id| !now.contains_key(id)) {
+        changes.entry(lab).or_default().deleted.push(*job);
     }
-    Some(Change { changed, deleted, more })
+    let text = |(lab, change): (&Lab, Change)| {
+        Some((lab.clone(), serde_json::to_string(&change.cut()).ok()?))
+    };
+    changes.into_iter().filter_map(text).collect()
+}
+
+impl Change {
+    /// Newest first, and no more than are named.
+    fn cut(mut self) -> Self {
+        self.more = self.changed.len() > NAMED || self.deleted.len() > NAMED;
+        for list in [&mut self.changed, &mut self.deleted] {
+            list.sort_unstable_by(|a, b| b.cmp(a));
+            list.truncate(NAMED);
+        }
+        self
+    }
 }
 
 /// `GET /v1/events`
-pub(super) async fn listen(State(app): State<App>) -> Result<Response, ApiError> {
+pub(super) async fn listen(State(app): State<App>, access: Access) -> Result<Response, ApiError> {
     let place = app.events.places.clone().try_acquire_owned().map_err(|_| {
         ApiError::new(Code::Unavailable, "all places for listeners are taken; poll instead")
     })?;
     let listener = Listener {
+        lab: access.lab,
         receiver: app.events.sender.subscribe(),
         closing: app.events.closing.clone(),
         greeted: false,
@@ -114,7 +131,8 @@ pub(super) async fn listen(State(app): State<App>) -> Result<Response, ApiError>
 }
 
 struct Listener {
-    receiver: broadcast::Receiver<Arc<str>>,
+    lab: Lab,
+    receiver: broadcast::Receiver<Changes>,
     closing: CancellationToken,
     greeted: bool,
     _place: OwnedSemaphorePermit,
@@ -126,17 +144,23 @@ impl Listener {
             self.greeted = true;
             return Some((Ok(Event::default().event("hello").data("{}")), self));
         }
-        let received = tokio::select! {
-            received = self.receiver.recv() => received,
-            () = self.closing.cancelled() => return None,
-        };
-        let event = match received {
-            Ok(text) => Event::default().event("jobs").data(text),
-            // A slow listener has missed some: it must read the list again.
-            Err(broadcast::error::RecvError::Lagged(_)) => {
-                Event::default().event("hello").data("{}")
+        let event = loop {
+            let received = tokio::select! {
+                received = self.receiver.recv() => received,
+                () = self.closing.cancelled() => return None,
+            };
+            match received {
+                Ok(changes) => {
+                    if let Some(text) = changes.get(&self.lab) {
+                        break Event::default().event("jobs").data(text);
+                    }
+                }
+                // A slow listener has missed some: it must read the list again.
+                Err(broadcast::error::RecvError::Lagged(_)) => {
+                    break Event::default().event("hello").data("{}");
+                }
+                Err(broadcast::error::RecvError::Closed) => return None,
             }
-            Err(broadcast::error::RecvError::Closed) => return None,
         };
         Some((Ok(event), self))
     }

@@ -6,6 +6,7 @@ use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
+use super::access::Access;
 use super::app::App;
 use super::calibrations::missing;
 use super::conditional;
@@ -13,7 +14,7 @@ use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
-    Algorithm, CalibrationId, JobId, JobRequest, JobSpec, JobState, Label, MeasurementId,
+    Algorithm, CalibrationId, JobId, JobRequest, JobSpec, JobState, Lab, Label, MeasurementId,
     SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
 };
 use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
@@ -92,27 +93,28 @@ pub(super) struct ListQuery {
 /// `POST /v1/jobs`
 pub(super) async fn create(
     State(app): State<App>,
+    access: Access,
     headers: HeaderMap,
     Body(request): Body<JobRequest>,
 ) -> Result<Response, ApiError> {
     let idempotency_key = idempotency_key(&headers)?;
     // Hashed as it was understood, so that white space and the order of fields do not matter.
     let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
-    let spec = resolve(&app, request).await?;
-    let new = NewJob { spec, request: Sha256::of(&text), idempotency_key };
+    let spec = resolve(&app, &access.lab, request).await?;
+    let new = NewJob { lab: access.lab.clone(), spec, request: Sha256::of(&text), idempotency_key };
     let (id, status) = match app.store.add_job(new).await? {
         Inserted::New(id) => (id, StatusCode::CREATED),
         Inserted::Before(id) => (id, StatusCode::OK),
     };
     let location = [(header::LOCATION, format!("/v1/jobs/{id}"))];
-    Ok((status, location, Json(body(&app, id).await?)).into_response())
+    Ok((status, location, Json(body(&app, &access.lab, id).await?)).into_response())
 }
 
 /// Checks a request against the measurement that it names.
-async fn resolve(app: &App, request: JobRequest) -> Result<JobSpec, ApiError> {
-    let measurement = app.store.measurement(request.measurement).await;
+async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, ApiError> {
+    let measurement = app.store.measurement(lab, request.measurement).await;
     let measurement = measurement.map_err(|error| missing("/measurement", error))?.facts;
-    let calibration = app.store.calibration(measurement.calibration).await;
+    let calibration = app.store.calibration(lab, measurement.calibration).await;
     let calibration = calibration.map_err(|error| missing("/measurement", error))?;
     let shape = SceneShape {
         frames: calibration.facts.frames,
@@ -140,8 +142,8 @@ fn check_memory(app: &App, spec: &JobSpec) -> Result<(), ApiError> {
     Err(ApiError::field("/tile/size", detail))
 }
 
-async fn body(app: &App, id: JobId) -> Result<JobBody, ApiError> {
-    let job = app.store.job(id).await?;
+async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody, ApiError> {
+    let job = app.store.job(lab, id).await?;
     let progress = app.store.progress(&job).await?;
     Ok(JobBody::new(job, progress))
 }
@@ -149,6 +151,7 @@ async fn body(app: &App, id: JobId) -> Result<JobBody, ApiError> {
 /// `GET /v1/jobs`, with an ETag, so that watching costs little.
 pub(super) async fn list(
     State(app): State<App>,
+    access: Access,
     QueryOf(query): QueryOf<ListQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
@@ -160,7 +163,7 @@ pub(super) async fn list(
         search: query.search,
         after: query.cursor,
     };
-    let page = app.store.jobs(&filter, query.limit.get()).await?;
+    let page = app.store.jobs(&access.lab, &filter, query.limit.get()).await?;
     let progress = app.store.progress_of(&page.items).await?;
     let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
     let page = Page { items: items.collect(), more: page.more };
@@ -173,47 +176,56 @@ pub(super) async fn list(
 /// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
 pub(super) async fn show(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<JobId>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    conditional::json(&body(&app, id).await?, &headers)
+    conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }
 
 /// `POST /v1/jobs/{job}/cancel`
 pub(super) async fn cancel(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<JobId>,
 ) -> Result<Response, ApiError> {
-    app.store.cancel_job(id).await?;
-    accepted(&app, id).await
+    app.store.cancel_job(&access.lab, id).await?;
+    accepted(&app, &access.lab, id).await
 }
 
 /// `POST /v1/jobs/{job}/retry`
 pub(super) async fn retry(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<JobId>,
 ) -> Result<Response, ApiError> {
-    app.store.retry_job(id).await?;
-    accepted(&app, id).await
+    app.store.retry_job(&access.lab, id).await?;
+    accepted(&app, &access.lab, id).await
 }
 
-async fn accepted(app: &App, id: JobId) -> Result<Response, ApiError> {
+async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response, ApiError> {
     let retry_after: (HeaderName, &str) = (header::RETRY_AFTER, "1");
-    Ok((StatusCode::ACCEPTED, [retry_after], Json(body(app, id).await?)).into_response())
+    Ok((StatusCode::ACCEPTED, [retry_after], Json(body(app, lab, id).await?)).into_response())
 }
 
 /// `DELETE /v1/jobs/{job}`
 pub(super) async fn delete(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<JobId>,
 ) -> Result<StatusCode, ApiError> {
-    app.store.delete_job(id).await?;
+    app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
 /// The job, if it has this snapshot; else there is no such thing.
-pub(super) async fn with_snapshot(app: &App, id: JobId, snapshot: u32) -> Result<Job, ApiError> {
-    let job = app.store.job(id).await?;
+pub(super) async fn with_snapshot(
+    app: &App,
+    lab: &Lab,
+    id: JobId,
+    snapshot: u32,
+) -> Result<Job, ApiError> {
+    let job = app.store.job(lab, id).await?;
     if job.spec.snapshots.contains(snapshot) {
         return Ok(job);
     }

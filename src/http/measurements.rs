@@ -6,6 +6,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
+use super::access::Access;
 use super::app::App;
 use super::calibrations::missing;
 use super::error::{ApiError, Code};
@@ -46,19 +47,20 @@ pub(super) struct ListQuery {
 /// `POST /v1/measurements`
 pub(super) async fn create(
     State(app): State<App>,
+    access: Access,
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response, ApiError> {
     check_times(&request)?;
     let (data, full_scale) = (request.data, request.full_scale);
-    let calibration = app.store.calibration(request.calibration).await;
+    let calibration = app.store.calibration(&access.lab, request.calibration).await;
     let calibration = calibration.map_err(|error| missing("/calibration", error))?;
-    app.store.upload(data).await.map_err(|error| missing("/data", error))?;
+    app.store.upload(&access.lab, data).await.map_err(|error| missing("/data", error))?;
     let prepared = intake::run(&app, move |store, limits| {
         intake::measurement(store, limits, &data, full_scale, &calibration)
     });
     let Prepared { info, statistics, file } = prepared.await?;
     let facts = facts(request, &info, statistics.full_scale.value());
-    let measurement = app.store.add_measurement(facts, file).await?;
+    let measurement = app.store.add_measurement(&access.lab, facts, file).await?;
     let location = [(header::LOCATION, format!("/v1/measurements/{}", measurement.id))];
     Ok((StatusCode::CREATED, location, Json(measurement)).into_response())
 }
@@ -101,26 +103,29 @@ fn facts(request: MeasurementRequest, info: &StackInfo, full_scale: f32) -> NewM
 /// `GET /v1/measurements`
 pub(super) async fn list(
     State(app): State<App>,
+    access: Access,
     QueryOf(query): QueryOf<ListQuery>,
 ) -> Result<Json<PageBody<Measurement>>, ApiError> {
     let filter = MeasurementFilter { calibration: query.calibration, after: query.cursor };
-    let page = app.store.measurements(filter, query.limit.get()).await?;
+    let page = app.store.measurements(&access.lab, filter, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
 /// `GET /v1/measurements/{measurement}`
 pub(super) async fn show(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<MeasurementId>,
 ) -> Result<Json<Measurement>, ApiError> {
-    Ok(Json(app.store.measurement(id).await?))
+    Ok(Json(app.store.measurement(&access.lab, id).await?))
 }
 
 /// `DELETE /v1/measurements/{measurement}`
 pub(super) async fn delete(
     State(app): State<App>,
+    access: Access,
     Params(id): Params<MeasurementId>,
 ) -> Result<StatusCode, ApiError> {
-    app.store.delete_measurement(id).await?;
+    app.store.delete_measurement(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -3,6 +3,7 @@
 //! Handlers are thin: take the request apart, make one or two calls, answer. Errors are
 //! problem+json (RFC 9457); [`error`] has the only table of status codes.
 
+mod access;
 mod algorithms;
 mod app;
 mod blobs;

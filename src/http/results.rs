@@ -12,13 +12,14 @@ use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
 use tokio_util::io::ReaderStream;
 
+use super::access::Access;
 use super::app::App;
 use super::conditional::{self, Wanted};
 use super::error::{ApiError, Code};
 use super::extract::Params;
 use super::jobs::with_snapshot;
 use crate::job::JobId;
-use crate::store::{ResultFile, StoreError};
+use crate::store::{Job, ResultFile, StoreError};
 
 /// The files of a snapshot.
 #[derive(Debug, Serialize)]
@@ -41,11 +42,12 @@ struct FileBody {
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}`
 pub(super) async fn snapshot(
     State(app): State<App>,
+    access: Access,
     Params((job, snapshot)): Params<(JobId, u32)>,
 ) -> Result<Json<SnapshotBody>, ApiError> {
-    with_snapshot(&app, job, snapshot).await?;
-    let files = app.store.result_files(job, Some(snapshot)).await?;
-    let show = |file: ResultFile| FileBody { href: href(job, snapshot, &file.name), file };
+    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
+    let files = app.store.result_files(&job, Some(snapshot)).await?;
+    let show = |file: ResultFile| FileBody { href: href(job.id, snapshot, &file.name), file };
     let ready = !files.is_empty();
     Ok(Json(SnapshotBody { snapshot, ready, files: files.into_iter().map(show).collect() }))
 }
@@ -64,55 +66,61 @@ fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
 /// `GET /v1/jobs/{job}/manifest.json`
 pub(super) async fn job_manifest(
     State(app): State<App>,
+    access: Access,
     Params(job): Params<JobId>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    app.store.job(job).await?;
-    send(&app, job, None, "manifest.json", &headers).await
+    let job = app.store.job(&access.lab, job).await?;
+    send(&app, &job, None, "manifest.json", &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/manifest.json`
 pub(super) async fn manifest(
     State(app): State<App>,
+    access: Access,
     Params((job, snapshot)): Params<(JobId, u32)>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    with_snapshot(&app, job, snapshot).await?;
-    send(&app, job, Some(snapshot), "manifest.json", &headers).await
+    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
+    send(&app, &job, Some(snapshot), "manifest.json", &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/stack.exr`
 pub(super) async fn stack(
     State(app): State<App>,
+    access: Access,
     Params((job, snapshot)): Params<(JobId, u32)>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    with_snapshot(&app, job, snapshot).await?;
-    send(&app, job, Some(snapshot), "stack.exr", &headers).await
+    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
+    send(&app, &job, Some(snapshot), "stack.exr", &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames.npy`
 pub(super) async fn array(
     State(app): State<App>,
+    access: Access,
     Params((job, snapshot)): Params<(JobId, u32)>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    with_snapshot(&app, job, snapshot).await?;
-    send(&app, job, Some(snapshot), "frames.npy", &headers).await
+    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
+    send(&app, &job, Some(snapshot), "frames.npy", &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}`, where the frame is `1.exr` or `1.png`.
 pub(super) async fn frame(
     State(app): State<App>,
+    access: Access,
     Params((job, snapshot, frame)): Params<(JobId, u32, String)>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let frames = with_snapshot(&app, job, snapshot).await?.spec.shape.frames;
+    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
+    let frames = job.spec.shape.frames;
     let name = frame_file(&frame, frames).ok_or_else(|| {
         let detail = format!("frames are 1.exr to {frames}.exr, and the same with .png");
         ApiError::new(Code::NotFound, detail)
     })?;
-    send(&app, job, Some(snapshot), &name, &headers).await
+    send(&app, &job, Some(snapshot), &name, &headers).await
 }
 
 /// The result file that `1.exr` or `1.png` means, counted from 1 to `frames`.
@@ -130,7 +138,7 @@ fn frame_file(frame: &str, frames: usize) -> Option<String> {
 /// Answers with a result file, or the part of it that is asked for.
 async fn send(
     app: &App,
-    job: JobId,
+    job: &Job,
     snapshot: Option<u32>,
     name: &str,
     headers: &HeaderMap,
@@ -154,7 +162,7 @@ async fn send(
     let ranges = if comes_in_parts(name) { "bytes" } else { "none" };
     fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static(ranges));
     fields.insert(header::ETAG, value(etag));
-    fields.insert(header::CONTENT_DISPOSITION, value(disposition(job, snapshot, name)));
+    fields.insert(header::CONTENT_DISPOSITION, value(disposition(job.id, snapshot, name)));
     if status == StatusCode::PARTIAL_CONTENT {
         let range = format!("bytes {start}-{}/{}", start + length - 1, file.size);
         fields.insert(header::CONTENT_RANGE, value(range));

@@ -7,6 +7,7 @@ use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::routing::{MethodFilter, MethodRouter, on};
 use tower_http::catch_panic::CatchPanicLayer;
 
+use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
@@ -51,23 +52,27 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::calibration_spread),
         R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::calibration_tile),
         R::at("/v1/events").get(events::listen).slow(),
-        R::at("/v1/system").get(system::show),
-        R::at("/").get(dashboard::page),
-        R::at("/dashboard/{file}").get(dashboard::file),
-        R::at("/livez").get(health::live),
-        R::at("/readyz").get(health::ready),
-        R::at("/metrics").get(metrics::show),
-        R::at("/openapi.yaml").get(health::contract),
+        R::at("/v1/system").get(system::show).only(Rule::Admin),
+        R::at("/").get(dashboard::page).only(Rule::Public),
+        R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
+        R::at("/livez").get(health::live).only(Rule::Public),
+        R::at("/readyz").get(health::ready).only(Rule::Public),
+        R::at("/metrics").get(metrics::show).only(Rule::Admin),
+        R::at("/openapi.yaml").get(health::contract).only(Rule::Public),
     ]
 }
 
 /// The router with all routes and layers.
 pub fn router(app: App) -> Router {
     let timeout = from_fn_with_state(app.clone(), layers::timeout);
+    let close = map_response(layers::close_after_refusal);
     let mut router = Router::new();
     for route in routes() {
+        let guard = from_fn_with_state((app.clone(), route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
+        let handlers = handlers.route_layer(guard);
+        let handlers = if route.uploads { handlers.layer(close.clone()) } else { handlers };
         router = router.route(route.path, handlers);
     }
     router
@@ -87,12 +92,21 @@ pub struct Route {
     /// The methods as they stand in the contract, in lower case.
     pub methods: Vec<&'static str>,
     handlers: MethodRouter<App>,
+    rule: Rule,
     slow: bool,
+    uploads: bool,
 }
 
 impl Route {
     fn at(path: &'static str) -> Self {
-        Self { path, methods: Vec::new(), handlers: MethodRouter::new(), slow: false }
+        Self {
+            path,
+            methods: Vec::new(),
+            handlers: MethodRouter::new(),
+            rule: Rule::ByMethod,
+            slow: false,
+            uploads: false,
+        }
     }
 
     fn method<H, T>(mut self, name: &'static str, filter: MethodFilter, handler: H) -> Self
@@ -122,6 +136,12 @@ impl Route {
         self.method("delete", MethodFilter::DELETE, handler)
     }
 
+    /// For others than those who read or submit data of a lab.
+    fn only(mut self, rule: Rule) -> Self {
+        self.rule = rule;
+        self
+    }
+
     /// Without a limit on the time of the answer: the check of a large file takes minutes, and
     /// events never end.
     fn slow(mut self) -> Self {
@@ -131,8 +151,8 @@ impl Route {
 
     /// As [`Self::slow`], and with uploads' own limits instead of that of JSON bodies.
     fn uploads(mut self) -> Self {
-        let close = map_response(layers::close_after_refusal);
-        self.handlers = self.handlers.layer(DefaultBodyLimit::disable()).layer(close);
+        self.handlers = self.handlers.layer(DefaultBodyLimit::disable());
+        self.uploads = true;
         self.slow()
     }
 }

@@ -5,6 +5,7 @@ use axum::http::HeaderMap;
 use axum::response::Response;
 use serde::Serialize;
 
+use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code};
@@ -34,10 +35,11 @@ struct TileBody {
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles`
 pub(super) async fn list(
     State(app): State<App>,
+    access: Access,
     Params((id, snapshot)): Params<(JobId, u32)>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let job = with_snapshot(&app, id, snapshot).await?;
+    let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
     let plan = job.spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
     let states = app.store.tile_states(id, snapshot).await?;
     let show = |state: TileState| {
@@ -52,10 +54,11 @@ pub(super) async fn list(
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history`
 pub(super) async fn history(
     State(app): State<App>,
+    access: Access,
     Params((id, snapshot, tile)): Params<(JobId, u32, u32)>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    with_snapshot(&app, id, snapshot).await?;
+    with_snapshot(&app, &access.lab, id, snapshot).await?;
     let history: Option<TileHistory> = app.store.tile_history(id, snapshot, tile).await?;
     let none = || ApiError::new(Code::NotFound, format!("the job has no tile {tile}"));
     conditional::json(&history.ok_or_else(none)?, &headers)

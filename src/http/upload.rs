@@ -7,6 +7,7 @@ use axum::http::{HeaderMap, header};
 use futures_util::{Stream, StreamExt};
 use tokio::sync::mpsc;
 
+use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code};
 use crate::store::{StagedBlob, Store, StoreError};
@@ -76,12 +77,13 @@ fn write(store: &Store, mut chunks: mpsc::Receiver<Bytes>) -> Result<StagedBlob,
 }
 
 /// Refuses an upload that says by its length that it can't be taken, before its first byte.
-pub(super) fn admit(app: &App, headers: &HeaderMap) -> Result<(), ApiError> {
+pub(super) async fn admit(app: &App, access: &Access, headers: &HeaderMap) -> Result<(), ApiError> {
     let length = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok());
     let length: u64 = length.and_then(|text| text.parse().ok()).unwrap_or(0);
     if length > app.max_upload_bytes {
         return Err(too_large(app));
     }
+    check_quota(app, access, length).await?;
     let (free, _) = app.store.dir().disk()?;
     if free < length.saturating_add(app.min_free_bytes) {
         let detail = format!(
@@ -91,6 +93,18 @@ pub(super) fn admit(app: &App, headers: &HeaderMap) -> Result<(), ApiError> {
         return Err(ApiError::new(Code::InsufficientStorage, detail));
     }
     Ok(())
+}
+
+/// Refuses an upload with which the token would keep more here than it may.
+pub(super) async fn check_quota(app: &App, access: &Access, length: u64) -> Result<(), ApiError> {
+    let (Some(token), Some(limit)) = (access.token, access.max_bytes) else { return Ok(()) };
+    let kept = app.store.token_bytes(token).await?;
+    if kept.saturating_add(length) <= limit {
+        return Ok(());
+    }
+    let detail =
+        format!("the upload has {length} bytes, and the token keeps {kept} of the {limit} it may");
+    Err(ApiError::new(Code::QuotaExceeded, detail))
 }
 
 fn too_large(app: &App) -> ApiError {

@@ -82,6 +82,10 @@ identifier!(
     TaskId
 );
 identifier!(
+    /// A token; not its secret.
+    TokenId
+);
+identifier!(
     /// A worker process, from its start to its end.
     WorkerId
 );

@@ -1,5 +1,6 @@
 //! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
 
+mod access;
 mod ids;
 mod memory;
 mod reason;
@@ -9,7 +10,8 @@ mod state;
 mod task;
 mod text;
 
-pub use ids::{CalibrationId, InvalidId, JobId, MeasurementId, TaskId, WorkerId};
+pub use access::{Lab, Role, Secret};
+pub use ids::{CalibrationId, InvalidId, JobId, MeasurementId, TaskId, TokenId, WorkerId};
 pub use reason::without_paths;
 pub use request::{
     Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,

@@ -11,6 +11,12 @@ use serde::{Deserialize, Serialize};
 #[error("{0}")]
 pub struct InvalidText(String);
 
+impl InvalidText {
+    pub(super) fn new(text: String) -> Self {
+        Self(text)
+    }
+}
+
 /// A name that a user gives to a thing. It is shown and searched for, and never becomes a path.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]

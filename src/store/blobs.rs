@@ -7,7 +7,7 @@ use super::error::StoreError;
 use super::rows::{integer, number, parsed};
 use super::staging::StagedBlob;
 use super::{Store, dir, on_files};
-use crate::job::{Sha256, Timestamp};
+use crate::job::{Lab, Sha256, Timestamp, TokenId};
 
 /// A stored file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -16,7 +16,7 @@ pub struct Blob {
     pub sha256: Sha256,
     /// Its size in bytes.
     pub size: u64,
-    /// When it was first stored.
+    /// When the lab first sent it.
     pub created_at: Timestamp,
 }
 
@@ -42,34 +42,46 @@ impl Origin {
 }
 
 impl Store {
-    /// Stores an upload. Says whether it is new.
+    /// Stores an upload of a lab. Says whether it is new to the lab: that another one has it shows
+    /// nowhere. It counts against the limit of the token that sent it first.
     ///
     /// # Errors
     /// If the file or its row can't be written.
-    pub async fn store_upload(&self, staged: StagedBlob) -> Result<(Blob, bool), StoreError> {
+    pub async fn store_upload(
+        &self,
+        lab: &Lab,
+        token: Option<TokenId>,
+        staged: StagedBlob,
+    ) -> Result<(Blob, bool), StoreError> {
         let sha256 = staged.sha256();
         let mut transaction = self.write().await?;
-        let before = sqlx::query("SELECT 1 FROM blobs WHERE sha256 = ? AND origin = 'upload'")
-            .bind(sha256.to_string())
-            .fetch_optional(&mut *transaction)
-            .await?;
+        let before = held(&mut transaction, lab, sha256).await?;
         self.publish(&mut transaction, staged, Origin::Upload).await?;
-        let blob = find(&mut transaction, sha256).await?;
+        let now = Timestamp::now().0;
+        sqlx::query(
+            "INSERT INTO holdings (lab, sha256, token, created_at, touched_at) VALUES (?, ?, ?, ?, ?)
+             ON CONFLICT (lab, sha256) DO UPDATE SET touched_at = excluded.touched_at",
+        )
+        .bind(lab.as_str())
+        .bind(sha256.to_string())
+        .bind(token.map(|id| id.to_string()))
+        .bind(now)
+        .bind(now)
+        .execute(&mut *transaction)
+        .await?;
+        let blob = held(&mut transaction, lab, sha256).await?;
         transaction.commit().await?;
         let blob = blob.ok_or_else(|| not_found(sha256))?;
         Ok((blob, before.is_none()))
     }
 
-    /// The uploaded file with this hash.
+    /// The file with this hash, if the lab has uploaded it.
     ///
     /// # Errors
     /// [`StoreError::NotFound`].
-    pub async fn upload(&self, sha256: Sha256) -> Result<Blob, StoreError> {
-        let row = sqlx::query("SELECT * FROM blobs WHERE sha256 = ? AND origin = 'upload'")
-            .bind(sha256.to_string())
-            .fetch_optional(&self.readers)
-            .await?;
-        row.as_ref().map(blob).transpose()?.ok_or_else(|| not_found(sha256))
+    pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob, StoreError> {
+        let mut connection = self.readers.acquire().await?;
+        held(&mut connection, lab, sha256).await?.ok_or_else(|| not_found(sha256))
     }
 
     /// Puts a file in its place and writes its row, in one step for all other processes.
@@ -106,7 +118,8 @@ impl Store {
         sha256: Sha256,
     ) -> Result<(), StoreError> {
         let removed = sqlx::query(
-            "DELETE FROM blobs WHERE sha256 = ?1 AND origin <> 'upload'
+            "DELETE FROM blobs WHERE sha256 = ?1
+                 AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)",
@@ -128,8 +141,17 @@ impl Store {
     /// If the database or a file can't be written.
     pub async fn collect(&self, before: Timestamp) -> Result<usize, StoreError> {
         let mut transaction = self.write().await?;
+        sqlx::query(
+            "DELETE FROM holdings AS h WHERE touched_at < ?
+                 AND NOT EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = sha256)
+                 AND NOT EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = sha256)",
+        )
+        .bind(before.0)
+        .execute(&mut *transaction)
+        .await?;
         let rows = sqlx::query(
             "DELETE FROM blobs WHERE touched_at < ?
+                 AND NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
@@ -159,14 +181,20 @@ impl Store {
     }
 }
 
-async fn find(
+/// The file, if the lab has uploaded it.
+async fn held(
     connection: &mut SqliteConnection,
+    lab: &Lab,
     sha256: Sha256,
 ) -> Result<Option<Blob>, StoreError> {
-    let row = sqlx::query("SELECT * FROM blobs WHERE sha256 = ?")
-        .bind(sha256.to_string())
-        .fetch_optional(connection)
-        .await?;
+    let row = sqlx::query(
+        "SELECT sha256, size, holdings.created_at FROM holdings JOIN blobs USING (sha256)
+         WHERE lab = ? AND sha256 = ?",
+    )
+    .bind(lab.as_str())
+    .bind(sha256.to_string())
+    .fetch_optional(connection)
+    .await?;
     row.as_ref().map(blob).transpose()
 }
 

@@ -8,7 +8,7 @@ use super::blobs::Origin;
 use super::error::StoreError;
 use super::rows::{integer, number, parsed, parsed_if, single};
 use super::{Page, StagedBlob, Store};
-use crate::job::{CalibrationId, Label, Sha256, Timestamp};
+use crate::job::{CalibrationId, Lab, Label, Sha256, Timestamp};
 
 /// What is known of a calibration when its masks have been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -59,6 +59,7 @@ impl Store {
     /// [`StoreError::NotFound`] if the upload is gone; or if the file or the row can't be written.
     pub async fn add_calibration(
         &self,
+        lab: &Lab,
         facts: NewCalibration,
         prepared: StagedBlob,
     ) -> Result<Calibration, StoreError> {
@@ -72,10 +73,11 @@ impl Store {
         let mut transaction = self.write().await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         sqlx::query(
-            "INSERT INTO calibrations (id, name, masks, prepared, format, sample, frames, height,
+            "INSERT INTO calibrations (lab, id, name, masks, prepared, format, sample, frames, height,
                  width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         )
+        .bind(lab.as_str())
         .bind(calibration.id.to_string())
         .bind(facts.name.as_ref().map(Label::as_str))
         .bind(facts.masks.to_string())
@@ -97,30 +99,48 @@ impl Store {
         Ok(calibration)
     }
 
-    /// The calibration with this identifier.
+    /// The lab's calibration with this identifier.
     ///
     /// # Errors
     /// [`StoreError::NotFound`].
-    pub async fn calibration(&self, id: CalibrationId) -> Result<Calibration, StoreError> {
-        let row = sqlx::query("SELECT * FROM calibrations WHERE id = ?")
-            .bind(id.to_string())
-            .fetch_optional(&self.readers)
-            .await?;
+    pub async fn calibration(
+        &self,
+        lab: &Lab,
+        id: CalibrationId,
+    ) -> Result<Calibration, StoreError> {
+        self.find_calibration(Some(lab), id).await
+    }
+
+    /// As [`Self::calibration`]; without a lab, for those who work for all of them.
+    pub(super) async fn find_calibration(
+        &self,
+        lab: Option<&Lab>,
+        id: CalibrationId,
+    ) -> Result<Calibration, StoreError> {
+        let row =
+            sqlx::query("SELECT * FROM calibrations WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)")
+                .bind(id.to_string())
+                .bind(lab.map(Lab::as_str))
+                .fetch_optional(&self.readers)
+                .await?;
         row.as_ref().map(calibration).transpose()?.ok_or_else(|| not_found(id))
     }
 
-    /// A page of calibrations, newest first, older than `after`.
+    /// A page of the lab's calibrations, newest first, older than `after`.
     ///
     /// # Errors
     /// If the database fails.
     pub async fn calibrations(
         &self,
+        lab: &Lab,
         after: Option<CalibrationId>,
         limit: u32,
     ) -> Result<Page<Calibration>, StoreError> {
         let rows = sqlx::query(
-            "SELECT * FROM calibrations WHERE (?1 IS NULL OR id < ?1) ORDER BY id DESC LIMIT ?2",
+            "SELECT * FROM calibrations WHERE lab = ?1 AND (?2 IS NULL OR id < ?2)
+             ORDER BY id DESC LIMIT ?3",
         )
+        .bind(lab.as_str())
         .bind(after.map(|id| id.to_string()))
         .bind(i64::from(limit) + 1)
         .fetch_all(&self.readers)
@@ -132,7 +152,8 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::NotFound`], [`StoreError::InUse`].
-    pub async fn delete_calibration(&self, id: CalibrationId) -> Result<(), StoreError> {
+    pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
+        self.calibration(lab, id).await?;
         let mut transaction = self.write().await?;
         let row = sqlx::query("SELECT count(*) AS users FROM measurements WHERE calibration = ?")
             .bind(id.to_string())

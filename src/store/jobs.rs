@@ -7,12 +7,14 @@ use super::error::StoreError;
 use super::rows::{json, number, parsed};
 use super::{Page, Store, dir, on_files, tasks};
 use crate::job::{
-    CalibrationId, JobId, JobSpec, JobState, Label, MeasurementId, Sha256, TaskKind, Timestamp,
+    CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, TaskKind, Timestamp,
 };
 
 /// A job to be accepted.
 #[derive(Debug, Clone)]
 pub struct NewJob {
+    /// Whose it is.
+    pub lab: Lab,
     /// What is to be done.
     pub spec: JobSpec,
     /// The hash of the request as it was sent.
@@ -35,6 +37,8 @@ pub enum Inserted {
 pub struct Job {
     /// Its identifier.
     pub id: JobId,
+    /// Whose it is.
+    pub lab: Lab,
     /// What is to be done.
     pub spec: JobSpec,
     /// Where it stands.
@@ -74,7 +78,7 @@ impl Store {
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted, StoreError> {
         let mut transaction = self.write().await?;
         if let Some(key) = &new.idempotency_key
-            && let Some(job) = with_key(&mut transaction, key, new.request).await?
+            && let Some(job) = with_key(&mut transaction, &new.lab, key, new.request).await?
         {
             return Ok(Inserted::Before(job));
         }
@@ -83,8 +87,8 @@ impl Store {
             .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
         sqlx::query(
             "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-                 idempotency_key, request, created_at)
-             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?)",
+                 idempotency_key, request, created_at, lab)
+             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?)",
         )
         .bind(id.to_string())
         .bind(new.spec.calibration.to_string())
@@ -92,9 +96,10 @@ impl Store {
         .bind(new.spec.label.as_ref().map(Label::as_str))
         .bind(spec)
         .bind(new.spec.priority)
-        .bind(&new.idempotency_key)
+        .bind(new.idempotency_key.as_ref().map(|key| key_of(&new.lab, key)))
         .bind(new.request.to_string())
         .bind(Timestamp::now().0)
+        .bind(new.lab.as_str())
         .execute(&mut *transaction)
         .await
         .map_err(|error| {
@@ -106,29 +111,36 @@ impl Store {
         Ok(Inserted::New(id))
     }
 
-    /// The job with this identifier.
+    /// The lab's job with this identifier.
     ///
     /// # Errors
     /// [`StoreError::NotFound`].
-    pub async fn job(&self, id: JobId) -> Result<Job, StoreError> {
-        let row = sqlx::query("SELECT * FROM jobs WHERE id = ?")
+    pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job, StoreError> {
+        let row = sqlx::query("SELECT * FROM jobs WHERE id = ? AND lab = ?")
             .bind(id.to_string())
+            .bind(lab.as_str())
             .fetch_optional(&self.readers)
             .await?;
         row.as_ref().map(job).transpose()?.ok_or_else(|| not_found(id))
     }
 
-    /// A page of jobs, newest first.
+    /// A page of the lab's jobs, newest first.
     ///
     /// # Errors
     /// If the database fails.
-    pub async fn jobs(&self, filter: &JobFilter, limit: u32) -> Result<Page<Job>, StoreError> {
+    pub async fn jobs(
+        &self,
+        lab: &Lab,
+        filter: &JobFilter,
+        limit: u32,
+    ) -> Result<Page<Job>, StoreError> {
         let rows = sqlx::query(
             "SELECT * FROM jobs
              WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state = ?2)
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
                AND (?5 IS NULL OR label = ?5)
                AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
+             AND lab = ?8
              ORDER BY id DESC LIMIT ?7",
         )
         .bind(filter.after.map(|id| id.to_string()))
@@ -138,6 +150,7 @@ impl Store {
         .bind(filter.label.as_ref().map(Label::as_str))
         .bind(filter.search.as_ref().map(Label::as_str))
         .bind(i64::from(limit) + 1)
+        .bind(lab.as_str())
         .fetch_all(&self.readers)
         .await?;
         Page::cut(&rows, limit, job)
@@ -148,7 +161,8 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has succeeded or failed.
-    pub async fn cancel_job(&self, id: JobId) -> Result<(), StoreError> {
+    pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+        self.job(lab, id).await?;
         let mut transaction = self.write().await?;
         let before = state(&mut transaction, id).await?;
         if matches!(before, JobState::Cancelling | JobState::Cancelled) {
@@ -166,7 +180,8 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has not failed or been cancelled.
-    pub async fn retry_job(&self, id: JobId) -> Result<(), StoreError> {
+    pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+        self.job(lab, id).await?;
         let mut transaction = self.write().await?;
         set_state(&mut transaction, id, JobState::Queued, None).await?;
         sqlx::query(
@@ -193,7 +208,8 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::NotFound`]; [`StoreError::NotFinal`] if it still runs or waits.
-    pub async fn delete_job(&self, id: JobId) -> Result<(), StoreError> {
+    pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+        self.job(lab, id).await?;
         let mut transaction = self.write().await?;
         let state = state(&mut transaction, id).await?;
         if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
@@ -316,14 +332,20 @@ async fn snapshots(connection: &mut SqliteConnection, id: JobId) -> Result<Vec<u
     rows.iter().map(|row| number(row, "snapshot")).collect()
 }
 
-/// The job that was made with this key; an error if its request was another one.
+/// A key as it is stored: good for one job of a lab.
+fn key_of(lab: &Lab, key: &str) -> String {
+    format!("{lab} {key}")
+}
+
+/// The job that the lab made with this key; an error if its request was another one.
 async fn with_key(
     connection: &mut SqliteConnection,
+    lab: &Lab,
     key: &str,
     request: Sha256,
 ) -> Result<Option<JobId>, StoreError> {
     let row = sqlx::query("SELECT id, request FROM jobs WHERE idempotency_key = ?")
-        .bind(key)
+        .bind(key_of(lab, key))
         .fetch_optional(connection)
         .await?;
     let Some(row) = row else { return Ok(None) };
@@ -338,6 +360,7 @@ async fn with_key(
 fn job(row: &SqliteRow) -> Result<Job, StoreError> {
     Ok(Job {
         id: parsed(row, "id")?,
+        lab: parsed(row, "lab")?,
         spec: json(row, "spec")?,
         state: parsed(row, "state")?,
         error: row.try_get("error")?,

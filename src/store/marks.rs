@@ -7,7 +7,7 @@ use sqlx::Row;
 use super::Store;
 use super::error::StoreError;
 use super::rows::parsed;
-use crate::job::{JobId, JobState};
+use crate::job::{JobId, JobState, Lab};
 
 /// The mark of a job: it differs when the job's state or what its workers have told differs.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,28 +19,29 @@ pub struct JobMark {
 }
 
 impl Store {
-    /// The marks of all jobs. Reads indexes and the tasks that run.
+    /// The marks of all jobs, and whose they are. Reads indexes and the tasks that run.
     ///
     /// # Errors
     /// If the database fails.
-    pub async fn job_marks(&self) -> Result<HashMap<JobId, JobMark>, StoreError> {
+    pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>, StoreError> {
         let mut marks = HashMap::new();
-        for row in &sqlx::query("SELECT id, state FROM jobs").fetch_all(&self.readers).await? {
+        let rows = sqlx::query("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
+        for row in &rows {
             let state = parsed(row, "state")?;
             marks.insert(
-                parsed(row, "id")?,
+                (parsed(row, "lab")?, parsed(row, "id")?),
                 JobMark { state, tasks: 0, iterations: 0, fraction: 0.0 },
             );
         }
         let rows = sqlx::query(
-            "SELECT job, count(*) AS tasks, sum(ordinal) AS ordinals, sum(iterations) AS iterations,
+            "SELECT job, (SELECT lab FROM jobs WHERE id = job) AS lab, count(*) AS tasks, sum(ordinal) AS ordinals, sum(iterations) AS iterations,
                  sum(fraction) AS fraction
              FROM tasks WHERE state = 'running' GROUP BY job",
         )
         .fetch_all(&self.readers)
         .await?;
         for row in &rows {
-            if let Some(mark) = marks.get_mut(&parsed(row, "job")?) {
+            if let Some(mark) = marks.get_mut(&(parsed(row, "lab")?, parsed(row, "job")?)) {
                 // Which tasks run, and not only how many: one may have ended and another begun.
                 mark.tasks =
                     row.try_get::<i64, _>("tasks")? << 32 ^ row.try_get::<i64, _>("ordinals")?;

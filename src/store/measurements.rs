@@ -9,7 +9,7 @@ use super::calibrations::{gone_if_foreign_key, label};
 use super::error::StoreError;
 use super::rows::{integer, number, parsed, single};
 use super::{Page, StagedBlob, Store};
-use crate::job::{CalibrationId, Label, MeasurementId, Sha256, Timestamp};
+use crate::job::{CalibrationId, Lab, Label, MeasurementId, Sha256, Timestamp};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -70,6 +70,7 @@ impl Store {
     /// row can't be written.
     pub async fn add_measurement(
         &self,
+        lab: &Lab,
         facts: NewMeasurement,
         prepared: StagedBlob,
     ) -> Result<Measurement, StoreError> {
@@ -83,10 +84,11 @@ impl Store {
         let mut transaction = self.write().await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         sqlx::query(
-            "INSERT INTO measurements (id, name, calibration, data, prepared, format, sample,
+            "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
                  snapshots, height, width, full_scale, camera_fps, exposure_s, created_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         )
+        .bind(lab.as_str())
         .bind(measurement.id.to_string())
         .bind(facts.name.as_ref().map(Label::as_str))
         .bind(facts.calibration.to_string())
@@ -111,32 +113,49 @@ impl Store {
         Ok(measurement)
     }
 
-    /// The measurement with this identifier.
+    /// The lab's measurement with this identifier.
     ///
     /// # Errors
     /// [`StoreError::NotFound`].
-    pub async fn measurement(&self, id: MeasurementId) -> Result<Measurement, StoreError> {
-        let row = sqlx::query("SELECT * FROM measurements WHERE id = ?")
-            .bind(id.to_string())
-            .fetch_optional(&self.readers)
-            .await?;
+    pub async fn measurement(
+        &self,
+        lab: &Lab,
+        id: MeasurementId,
+    ) -> Result<Measurement, StoreError> {
+        self.find_measurement(Some(lab), id).await
+    }
+
+    /// As [`Self::measurement`]; without a lab, for those who work for all of them.
+    pub(super) async fn find_measurement(
+        &self,
+        lab: Option<&Lab>,
+        id: MeasurementId,
+    ) -> Result<Measurement, StoreError> {
+        let row =
+            sqlx::query("SELECT * FROM measurements WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)")
+                .bind(id.to_string())
+                .bind(lab.map(Lab::as_str))
+                .fetch_optional(&self.readers)
+                .await?;
         row.as_ref().map(measurement).transpose()?.ok_or_else(|| not_found(id))
     }
 
-    /// A page of measurements, newest first.
+    /// A page of the lab's measurements, newest first.
     ///
     /// # Errors
     /// If the database fails.
     pub async fn measurements(
         &self,
+        lab: &Lab,
         filter: MeasurementFilter,
         limit: u32,
     ) -> Result<Page<Measurement>, StoreError> {
         let rows = sqlx::query(
             "SELECT * FROM measurements
-             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR calibration = ?2)
-             ORDER BY id DESC LIMIT ?3",
+             WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
+             ORDER BY id DESC LIMIT ?4",
         )
+        .bind(lab.as_str())
         .bind(filter.after.map(|id| id.to_string()))
         .bind(filter.calibration.map(|id| id.to_string()))
         .bind(i64::from(limit) + 1)
@@ -149,7 +168,8 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::NotFound`], [`StoreError::InUse`].
-    pub async fn delete_measurement(&self, id: MeasurementId) -> Result<(), StoreError> {
+    pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<(), StoreError> {
+        self.measurement(lab, id).await?;
         let mut transaction = self.write().await?;
         let row = sqlx::query("SELECT count(*) AS users FROM jobs WHERE measurement = ?")
             .bind(id.to_string())

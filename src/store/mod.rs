@@ -23,6 +23,7 @@ mod tasks;
 #[cfg(test)]
 mod tests;
 mod tiles;
+mod tokens;
 mod workers;
 
 use std::path::Path;
@@ -47,6 +48,7 @@ pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use tasks::{TaskRecord, TileResult};
 pub use tiles::{TileHistory, TileState};
+pub use tokens::Token;
 pub use workers::{WorkerEnd, WorkerRow, WorkerTask};
 
 /// One page of a list, and the identifier to go on after.

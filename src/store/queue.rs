@@ -168,8 +168,8 @@ impl Store {
         .fetch_one(&self.readers)
         .await?;
         let spec: JobSpec = json(&found, "spec")?;
-        let calibration = self.calibration(spec.calibration).await?;
-        let measurement = self.measurement(spec.measurement).await?;
+        let calibration = self.find_calibration(None, spec.calibration).await?;
+        let measurement = self.find_measurement(None, spec.measurement).await?;
         let prepared: Option<String> = found.try_get("prepared")?;
         Ok(ClaimedTask {
             lease,

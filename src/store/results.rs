@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::Store;
 use super::error::StoreError;
 use super::rows::{integer, number, parsed};
+use super::{Job, Store};
 use crate::job::{JobId, Sha256};
 
 /// The snapshot of files that belong to the whole job.
@@ -32,13 +32,13 @@ impl Store {
     /// [`StoreError::NotFound`] if the job has not made it, or not yet.
     pub async fn result_file(
         &self,
-        job: JobId,
+        job: &Job,
         snapshot: Option<u32>,
         name: &str,
     ) -> Result<(ResultFile, PathBuf), StoreError> {
         let row =
             sqlx::query("SELECT * FROM result_files WHERE job = ? AND snapshot = ? AND name = ?")
-                .bind(job.to_string())
+                .bind(job.id.to_string())
                 .bind(snapshot.map_or(WHOLE_JOB, i64::from))
                 .bind(name)
                 .fetch_optional(&self.readers)
@@ -46,8 +46,8 @@ impl Store {
         let not_found = || StoreError::NotFound { what: "result file", id: name.to_owned() };
         let file = row.as_ref().map(result_file).transpose()?.ok_or_else(not_found)?;
         let folder = match snapshot {
-            Some(snapshot) => self.dir().snapshot_results(job, snapshot),
-            None => self.dir().results(job),
+            Some(snapshot) => self.dir().snapshot_results(job.id, snapshot),
+            None => self.dir().results(job.id),
         };
         // The name is the one on record, which a worker wrote: not the one in the request.
         let path = folder.join(&file.name);
@@ -60,12 +60,12 @@ impl Store {
     /// If the database fails.
     pub async fn result_files(
         &self,
-        job: JobId,
+        job: &Job,
         snapshot: Option<u32>,
     ) -> Result<Vec<ResultFile>, StoreError> {
         let rows =
             sqlx::query("SELECT * FROM result_files WHERE job = ? AND snapshot = ? ORDER BY name")
-                .bind(job.to_string())
+                .bind(job.id.to_string())
                 .bind(snapshot.map_or(WHOLE_JOB, i64::from))
                 .fetch_all(&self.readers)
                 .await?;

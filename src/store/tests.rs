@@ -34,8 +34,9 @@ impl Lab {
             writer.write_all(bytes).unwrap();
             writer.finish().unwrap()
         };
-        let (masks, _) = store.store_upload(upload(b"masks")).await.unwrap();
-        let (data, _) = store.store_upload(upload(b"data")).await.unwrap();
+        let local = crate::job::Lab::local();
+        let (masks, _) = store.store_upload(&local, None, upload(b"masks")).await.unwrap();
+        let (data, _) = store.store_upload(&local, None, upload(b"data")).await.unwrap();
         let facts = NewCalibration {
             name: None,
             masks: masks.sha256,
@@ -49,7 +50,8 @@ impl Lab {
             dead_pixels: 0,
             clipped_negatives: 0,
         };
-        let calibration = store.add_calibration(facts, upload(b"prepared masks")).await.unwrap();
+        let calibration =
+            store.add_calibration(&local, facts, upload(b"prepared masks")).await.unwrap();
         let facts = NewMeasurement {
             name: None,
             calibration: calibration.id,
@@ -63,7 +65,8 @@ impl Lab {
             camera_fps: Some(30.0),
             exposure_s: None,
         };
-        let measurement = store.add_measurement(facts, upload(b"prepared data")).await.unwrap();
+        let measurement =
+            store.add_measurement(&local, facts, upload(b"prepared data")).await.unwrap();
         let worker = WorkerId::new();
         store.worker_started(worker, 1).await.unwrap();
         Self { store, measurement: measurement.id, worker, _folder: folder }
@@ -82,7 +85,12 @@ impl Lab {
         key: Option<&str>,
         request: &[u8],
     ) -> Result<Inserted, StoreError> {
-        let measurement = self.store.measurement(self.measurement).await.unwrap().facts;
+        let measurement = self
+            .store
+            .measurement(&crate::job::Lab::local(), self.measurement)
+            .await
+            .unwrap()
+            .facts;
         let shape = crate::job::SceneShape { frames: 8, height: 64, width: 96, snapshots: 2 };
         let job = JobRequest {
             measurement: self.measurement,
@@ -95,8 +103,12 @@ impl Lab {
             label: None,
         };
         let spec = job.resolve(measurement.calibration, shape).unwrap();
-        let new =
-            NewJob { spec, request: Sha256::of(request), idempotency_key: key.map(Into::into) };
+        let new = NewJob {
+            lab: crate::job::Lab::local(),
+            spec,
+            request: Sha256::of(request),
+            idempotency_key: key.map(Into::into),
+        };
         self.store.add_job(new).await
     }
 
@@ -141,7 +153,7 @@ impl Lab {
     }
 
     async fn state(&self, job: JobId) -> JobState {
-        self.store.job(job).await.unwrap().state
+        self.store.job(&crate::job::Lab::local(), job).await.unwrap().state
     }
 }
 
@@ -165,12 +177,13 @@ async fn a_job_runs_in_order_and_leaves_its_results_and_no_tiles() {
         TaskKind::Manifest,
     ];
     assert_eq!(lab.work_off().await, order);
-    let done = lab.store.job(job).await.unwrap();
+    let done = lab.store.job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(done.state, JobState::Succeeded);
     assert!(done.finished_at >= done.started_at);
-    let (file, path) = lab.store.result_file(job, Some(1), "frames/frame_0001.exr").await.unwrap();
+    let (file, path) =
+        lab.store.result_file(&done, Some(1), "frames/frame_0001.exr").await.unwrap();
     assert_eq!(Sha256::of(&std::fs::read(path).unwrap()), file.sha256);
-    assert!(lab.store.result_file(job, None, "manifest.json").await.unwrap().1.exists());
+    assert!(lab.store.result_file(&done, None, "manifest.json").await.unwrap().1.exists());
     let progress = lab.store.progress(&done).await.unwrap();
     assert_eq!((progress.percent, progress.tiles_done, progress.snapshots_done), (100.0, 4, 2));
     // Two uploads and two prepared files are left.
@@ -240,17 +253,20 @@ async fn cancel_stops_running_tasks_at_their_heartbeat() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
     let task = lab.claim().await.unwrap();
-    lab.store.cancel_job(job).await.unwrap();
+    lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(lab.state(job).await, JobState::Cancelling);
-    assert!(lab.store.delete_job(job).await.is_err());
+    assert!(lab.store.delete_job(&crate::job::Lab::local(), job).await.is_err());
     let beat = lab.store.heartbeat(&task.lease, TaskProgress::START).await.unwrap();
     assert_eq!(beat, Heartbeat::Cancelled);
     lab.store.cancelled(&task.lease).await.unwrap();
     assert_eq!(lab.state(job).await, JobState::Cancelled);
     assert!(lab.claim().await.is_none());
-    lab.store.retry_job(job).await.unwrap();
+    lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(lab.work_off().await.len(), 8);
-    assert!(matches!(lab.store.cancel_job(job).await, Err(StoreError::State(_))));
+    assert!(matches!(
+        lab.store.cancel_job(&crate::job::Lab::local(), job).await,
+        Err(StoreError::State(_))
+    ));
 }
 
 #[tokio::test]
@@ -259,7 +275,7 @@ async fn cancel_ends_a_job_whose_last_worker_finished_or_died() {
     for dies in [false, true] {
         let job = lab.submit(0).await;
         let task = lab.claim().await.unwrap();
-        lab.store.cancel_job(job).await.unwrap();
+        lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
         if dies {
             lab.store.worker_ended(lab.worker, &WorkerEnd::Killed).await.unwrap();
         } else {
@@ -274,11 +290,14 @@ async fn cancel_ends_a_job_whose_last_worker_finished_or_died() {
 async fn a_waiting_job_is_cancelled_at_once_and_twice_is_no_error() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    lab.store.cancel_job(job).await.unwrap();
-    lab.store.cancel_job(job).await.unwrap();
+    lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
+    lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(lab.state(job).await, JobState::Cancelled);
-    lab.store.delete_job(job).await.unwrap();
-    assert!(matches!(lab.store.job(job).await, Err(StoreError::NotFound { .. })));
+    lab.store.delete_job(&crate::job::Lab::local(), job).await.unwrap();
+    assert!(matches!(
+        lab.store.job(&crate::job::Lab::local(), job).await,
+        Err(StoreError::NotFound { .. })
+    ));
 }
 
 #[tokio::test]
@@ -289,13 +308,13 @@ async fn an_error_that_no_repetition_helps_fails_the_job_at_once() {
     lab.work(&prepare).await;
     let (task, sibling) = (lab.claim().await.unwrap(), lab.claim().await.unwrap());
     lab.store.fail(&task.lease, "the masks are gone", false).await.unwrap();
-    let failed = lab.store.job(job).await.unwrap();
+    let failed = lab.store.job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(failed.state, JobState::Failed);
     assert_eq!(failed.error.unwrap(), "tile 0 of snapshot 0: the masks are gone");
     let beat = lab.store.heartbeat(&sibling.lease, TaskProgress::START).await.unwrap();
     assert_eq!(beat, Heartbeat::Cancelled, "the others need not go on");
     lab.store.cancelled(&sibling.lease).await.unwrap();
-    lab.store.retry_job(job).await.unwrap();
+    lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(lab.work_off().await.len(), 7, "all but the prepare task");
     assert_eq!(lab.state(job).await, JobState::Succeeded);
 }
@@ -310,7 +329,7 @@ async fn a_task_that_crashes_its_workers_is_given_up() {
         let end = WorkerEnd::Crashed("signal 11".into());
         lab.store.worker_ended(lab.worker, &end).await.unwrap();
     }
-    let error = lab.store.job(job).await.unwrap().error.unwrap();
+    let error = lab.store.job(&crate::job::Lab::local(), job).await.unwrap().error.unwrap();
     assert_eq!(error, "preparing: the worker process died: signal 11 (3 attempts)");
 }
 
@@ -356,7 +375,15 @@ async fn a_key_makes_one_job() {
     assert_eq!(lab.add(0, Some("k"), b"a").await.unwrap(), Inserted::Before(first));
     let other = lab.add(0, Some("k"), b"b").await;
     assert!(matches!(other, Err(StoreError::KeyReused { job, .. }) if job == first));
-    assert_eq!(lab.store.jobs(&JobFilter::default(), 10).await.unwrap().items.len(), 1);
+    assert_eq!(
+        lab.store
+            .jobs(&crate::job::Lab::local(), &JobFilter::default(), 10)
+            .await
+            .unwrap()
+            .items
+            .len(),
+        1
+    );
 }
 
 #[tokio::test]
@@ -370,7 +397,7 @@ async fn pages_join_without_gaps() {
     let mut filter = JobFilter::default();
     let mut seen = Vec::new();
     loop {
-        let page = lab.store.jobs(&filter, 2).await.unwrap();
+        let page = lab.store.jobs(&crate::job::Lab::local(), &filter, 2).await.unwrap();
         seen.extend(page.items.iter().map(|job| job.id));
         filter.after = seen.last().copied();
         if !page.more {
@@ -384,16 +411,16 @@ async fn pages_join_without_gaps() {
 async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    let calibration = lab.store.job(job).await.unwrap().spec.calibration;
+    let calibration = lab.store.job(&crate::job::Lab::local(), job).await.unwrap().spec.calibration;
     let in_use = |result| matches!(result, Err(StoreError::InUse { users: 1, .. }));
-    assert!(in_use(lab.store.delete_calibration(calibration).await));
-    assert!(in_use(lab.store.delete_measurement(lab.measurement).await));
+    assert!(in_use(lab.store.delete_calibration(&crate::job::Lab::local(), calibration).await));
+    assert!(in_use(lab.store.delete_measurement(&crate::job::Lab::local(), lab.measurement).await));
     let soon = Timestamp(Timestamp::now().0 + 1000);
     assert_eq!(lab.store.collect(soon).await.unwrap(), 0);
-    lab.store.cancel_job(job).await.unwrap();
-    lab.store.delete_job(job).await.unwrap();
-    lab.store.delete_measurement(lab.measurement).await.unwrap();
-    lab.store.delete_calibration(calibration).await.unwrap();
+    lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
+    lab.store.delete_job(&crate::job::Lab::local(), job).await.unwrap();
+    lab.store.delete_measurement(&crate::job::Lab::local(), lab.measurement).await.unwrap();
+    lab.store.delete_calibration(&crate::job::Lab::local(), calibration).await.unwrap();
     assert_eq!(lab.store.blob_totals().await.unwrap().0, 2, "uploads wait for their age");
     assert_eq!(lab.store.collect(soon).await.unwrap(), 2);
     let left = walk(&lab.store.dir().blobs());

@@ -17,6 +17,7 @@ pub struct TestApp {
     url: String,
     client: Client,
     arguments: Vec<String>,
+    token: std::sync::RwLock<Option<String>>,
 }
 
 /// An answer whose body has been read.
@@ -71,17 +72,31 @@ impl TestApp {
         Self::with(&["--workers", "0"]).await
     }
 
+    /// A service with one worker that writes all there is to say to this file.
+    pub async fn logging(log: &Path) -> Self {
+        let log = std::fs::File::create(log).unwrap();
+        Self::spawned(&["--workers", "1"], "trace", log.into()).await
+    }
+
     pub async fn with(arguments: &[&str]) -> Self {
+        let level = std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into());
+        Self::spawned(arguments, &level, Stdio::inherit()).await
+    }
+
+    async fn spawned(arguments: &[&str], level: &str, log: Stdio) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let arguments: Vec<String> = arguments.iter().map(|&text| text.to_owned()).collect();
-        let (process, url) = spawn(folder.path(), &arguments);
-        Self { folder, process, url, client: Client::new(), arguments }
+        let (process, url) = spawn(folder.path(), &arguments, level, log);
+        let token = std::sync::RwLock::default();
+        Self { folder, process, url, client: Client::new(), arguments, token }
     }
 
     /// Kills the server as a power cut would, and starts another one on the same folder.
     pub fn restart(&mut self) {
         self.kill();
-        (self.process, self.url) = spawn(self.folder.path(), &self.arguments);
+        let level = std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into());
+        (self.process, self.url) =
+            spawn(self.folder.path(), &self.arguments, &level, Stdio::inherit());
     }
 
     /// SIGKILL.
@@ -106,7 +121,30 @@ impl TestApp {
     }
 
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
-        self.client.request(method, format!("{}{path}", self.url))
+        let request = self.client.request(method, format!("{}{path}", self.url));
+        match &*self.token.read().unwrap() {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        }
+    }
+
+    /// From now on, requests carry this token.
+    pub fn sign_in(&self, token: &str) {
+        *self.token.write().unwrap() = Some(token.to_owned());
+    }
+
+    /// From now on, requests carry no token.
+    pub fn sign_out(&self) {
+        *self.token.write().unwrap() = None;
+    }
+
+    /// What `sci-recon token` prints for these arguments.
+    pub fn token(&self, arguments: &[&str]) -> String {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        let output = command.args(["token", "--data"]).arg(self.data()).args(arguments).output();
+        let output = output.unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
     pub async fn send(&self, request: RequestBuilder) -> Answer {
@@ -166,12 +204,13 @@ impl Drop for TestApp {
     }
 }
 
-fn spawn(data: &Path, arguments: &[String]) -> (Child, String) {
+fn spawn(data: &Path, arguments: &[String], level: &str, log: Stdio) -> (Child, String) {
     let mut process = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
         .args(["serve", "--listen", "127.0.0.1:0", "--min-free-bytes", "1000000", "--data"])
         .arg(data)
         .args(arguments)
-        .env("RUST_LOG", std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into()))
+        .env("RUST_LOG", level)
+        .stderr(log)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .spawn()

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used)] // helpers of tests
 
+mod access;
 mod app;
 mod cli;
 mod contract;

@@ -1,5 +1,14 @@
 // The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
 
+import { authorization, signIn } from "./token.js";
+
+/** As `fetch`, with the token that the service wants, if it wants one. */
+export async function ask(path, options = {}) {
+  const token = authorization();
+  const response = await fetch(path, { ...options, headers: { ...options.headers, ...token } });
+  return response.status === 401 && signIn(token.Authorization) ? ask(path, options) : response;
+}
+
 /** A refused or failed request. */
 export class Refused extends Error {
   constructor(status, problem) {
@@ -17,7 +26,7 @@ const KNOWN = 60;
 export async function get(path, signal) {
   const before = known.get(path);
   const headers = before ? { "If-None-Match": before.etag } : {};
-  const response = await fetch(path, { headers, signal, cache: "no-store" });
+  const response = await ask(path, { headers, signal, cache: "no-store" });
   if (response.status === 304 && before) return before.data;
   if (!response.ok) throw await refused(response);
   const data = await response.json();
@@ -45,7 +54,7 @@ async function refused(response) {
 /** Sends JSON, gives JSON (or null where there is no body). */
 export async function send(method, path, body) {
   const headers = body === undefined ? {} : { "Content-Type": "application/json" };
-  const response = await fetch(path, { method, headers, body: body === undefined ? null : JSON.stringify(body) });
+  const response = await ask(path, { method, headers, body: body === undefined ? null : JSON.stringify(body) });
   if (!response.ok) throw await refused(response);
   return response.status === 204 ? null : response.json();
 }
@@ -56,6 +65,7 @@ export function upload(file, progress, signal) {
     const request = new XMLHttpRequest();
     request.open("POST", "/v1/blobs");
     request.setRequestHeader("Content-Type", "application/octet-stream");
+    for (const [name, value] of Object.entries(authorization())) request.setRequestHeader(name, value);
     request.upload.onprogress = (event) => progress(event.loaded, event.total || file.size);
     request.onload = () => {
       let body = {};
@@ -76,7 +86,7 @@ export function upload(file, progress, signal) {
 
 /** Fetches a picture. */
 export async function picture(path, signal) {
-  const response = await fetch(path, { signal });
+  const response = await ask(path, { signal });
   if (!response.ok) throw await refused(response);
   return createImageBitmap(await response.blob());
 }

@@ -3,7 +3,7 @@
 // A tab that nobody looks at holds no connection: browsers have few of them for one server.
 
 import { say } from "./dom.js";
-import { gaveUp } from "./api.js";
+import { ask, gaveUp } from "./api.js";
 
 const POLL = 2000;
 const RETRY = 5000;
@@ -64,7 +64,7 @@ async function listen(tell, signal) {
 
 /** Reads server-sent events until they end. */
 async function stream(tell, signal) {
-  const response = await fetch("/v1/events", { signal, headers: { Accept: "text/event-stream" } });
+  const response = await ask("/v1/events", { signal, headers: { Accept: "text/event-stream" } });
   if (!response.ok) throw new Error("no events");
   const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";

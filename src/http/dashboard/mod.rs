@@ -52,6 +52,7 @@ const FILES: &[(&str, &[u8])] = &files![
     "submit.js",
     "system.js",
     "tilemap.js",
+    "token.js",
     "view.js",
     "viewer.js",
 ];

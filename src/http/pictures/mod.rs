@@ -18,6 +18,7 @@ pub(super) use cache::Pictures;
 use names::{CalibrationPicture, JobPicture, MeasurementPicture};
 use render::{Picture, Region, TILE, spread};
 
+use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code};
@@ -67,25 +68,28 @@ type CalibrationPath = (CalibrationId, CalibrationPicture);
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}`
 pub(super) async fn job_preview(
     State(app): State<App>,
+    access: Access,
     Params(path): Params<JobPath>,
     QueryOf(query): QueryOf<PreviewQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    preview(&app, names::of_job(&app, path).await?, &query, &headers).await
+    preview(&app, names::of_job(&app, &access.lab, path).await?, &query, &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread`
 pub(super) async fn job_spread(
     State(app): State<App>,
+    access: Access,
     Params(path): Params<JobPath>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    tell_spread(&app, names::of_job(&app, path).await?, &headers).await
+    tell_spread(&app, names::of_job(&app, &access.lab, path).await?, &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}`
 pub(super) async fn job_tile(
     State(app): State<App>,
+    access: Access,
     Params((job, snapshot, name, level, row, column)): Params<(
         JobId,
         u32,
@@ -97,32 +101,35 @@ pub(super) async fn job_tile(
     QueryOf(query): QueryOf<TileQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let picture = names::of_job(&app, (job, snapshot, name)).await?;
+    let picture = names::of_job(&app, &access.lab, (job, snapshot, name)).await?;
     tile(&app, picture, (level, row, column), &query, &headers).await
 }
 
 /// `GET /v1/measurements/{measurement}/pictures/{picture}`
 pub(super) async fn measurement_preview(
     State(app): State<App>,
+    access: Access,
     Params(path): Params<MeasurementPath>,
     QueryOf(query): QueryOf<PreviewQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    preview(&app, names::of_measurement(&app, path).await?, &query, &headers).await
+    preview(&app, names::of_measurement(&app, &access.lab, path).await?, &query, &headers).await
 }
 
 /// `GET /v1/measurements/{measurement}/pictures/{picture}/spread`
 pub(super) async fn measurement_spread(
     State(app): State<App>,
+    access: Access,
     Params(path): Params<MeasurementPath>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    tell_spread(&app, names::of_measurement(&app, path).await?, &headers).await
+    tell_spread(&app, names::of_measurement(&app, &access.lab, path).await?, &headers).await
 }
 
 /// `GET /v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}`
 pub(super) async fn measurement_tile(
     State(app): State<App>,
+    access: Access,
     Params((id, name, level, row, column)): Params<(
         MeasurementId,
         MeasurementPicture,
@@ -133,32 +140,35 @@ pub(super) async fn measurement_tile(
     QueryOf(query): QueryOf<TileQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let picture = names::of_measurement(&app, (id, name)).await?;
+    let picture = names::of_measurement(&app, &access.lab, (id, name)).await?;
     tile(&app, picture, (level, row, column), &query, &headers).await
 }
 
 /// `GET /v1/calibrations/{calibration}/pictures/{picture}`
 pub(super) async fn calibration_preview(
     State(app): State<App>,
+    access: Access,
     Params(path): Params<CalibrationPath>,
     QueryOf(query): QueryOf<PreviewQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    preview(&app, names::of_calibration(&app, path).await?, &query, &headers).await
+    preview(&app, names::of_calibration(&app, &access.lab, path).await?, &query, &headers).await
 }
 
 /// `GET /v1/calibrations/{calibration}/pictures/{picture}/spread`
 pub(super) async fn calibration_spread(
     State(app): State<App>,
+    access: Access,
     Params(path): Params<CalibrationPath>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    tell_spread(&app, names::of_calibration(&app, path).await?, &headers).await
+    tell_spread(&app, names::of_calibration(&app, &access.lab, path).await?, &headers).await
 }
 
 /// `GET /v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}`
 pub(super) async fn calibration_tile(
     State(app): State<App>,
+    access: Access,
     Params((id, name, level, row, column)): Params<(
         CalibrationId,
         CalibrationPicture,
@@ -169,7 +179,7 @@ pub(super) async fn calibration_tile(
     QueryOf(query): QueryOf<TileQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    let picture = names::of_calibration(&app, (id, name)).await?;
+    let picture = names::of_calibration(&app, &access.lab, (id, name)).await?;
     tile(&app, picture, (level, row, column), &query, &headers).await
 }
 

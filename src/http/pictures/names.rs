@@ -9,7 +9,7 @@ use super::source::{Files, Stack};
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code};
 use crate::http::jobs::with_snapshot;
-use crate::job::{CalibrationId, JobId, MeasurementId, Sha256};
+use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
 use crate::store::{Calibration, Job, Measurement, StoreError};
 
 /// A picture of a job's snapshot.
@@ -92,9 +92,10 @@ impl TryFrom<String> for CalibrationPicture {
 /// The picture of a job.
 pub(super) async fn of_job(
     app: &App,
+    lab: &Lab,
     (id, snapshot, name): (JobId, u32, JobPicture),
 ) -> Result<Picture, ApiError> {
-    let job = with_snapshot(app, id, snapshot).await?;
+    let job = with_snapshot(app, lab, id, snapshot).await?;
     let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
     let stack = frames_of(app, &job, snapshot).await?;
     match name {
@@ -102,8 +103,8 @@ pub(super) async fn of_job(
         JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
         JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
         JobPicture::Residual => {
-            let masks = masks_of(app, &app.store.calibration(job.spec.calibration).await?);
-            let measurement = app.store.measurement(job.spec.measurement).await?;
+            let masks = masks_of(app, &app.store.calibration(lab, job.spec.calibration).await?);
+            let measurement = app.store.measurement(lab, job.spec.measurement).await?;
             Ok(stack.residual(&masks, &snapshots_of(app, &measurement), snapshot as usize))
         }
         _ => Err(outside(format!(
@@ -116,9 +117,10 @@ pub(super) async fn of_job(
 /// The picture of a measurement.
 pub(super) async fn of_measurement(
     app: &App,
+    lab: &Lab,
     (id, MeasurementPicture(snapshot)): (MeasurementId, MeasurementPicture),
 ) -> Result<Picture, ApiError> {
-    let stack = snapshots_of(app, &app.store.measurement(id).await?);
+    let stack = snapshots_of(app, &app.store.measurement(lab, id).await?);
     let count = stack.shape.0;
     if snapshot < count {
         return Ok(stack.frame(snapshot));
@@ -129,9 +131,10 @@ pub(super) async fn of_measurement(
 /// The picture of a calibration.
 pub(super) async fn of_calibration(
     app: &App,
+    lab: &Lab,
     (id, name): (CalibrationId, CalibrationPicture),
 ) -> Result<Picture, ApiError> {
-    let stack = masks_of(app, &app.store.calibration(id).await?);
+    let stack = masks_of(app, &app.store.calibration(lab, id).await?);
     let count = stack.shape.0;
     match name {
         CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
@@ -165,7 +168,7 @@ fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Stack {
 async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiError> {
     let spec = &job.spec;
     let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
-    match app.store.result_file(job.id, Some(snapshot), "frames.npy").await {
+    match app.store.result_file(job, Some(snapshot), "frames.npy").await {
         Ok((file, path)) => {
             return Ok(Stack {
                 shape,
@@ -207,7 +210,10 @@ mod tests {
         let long = "frame-99999999999999999999999";
         assert!(job(long).is_err());
         assert!(MeasurementPicture::try_from("snapshot-3".to_owned()).is_ok());
-        assert_eq!(CalibrationPicture::try_from("mask-1".to_owned()), Ok(CalibrationPicture::Mask(1)));
+        assert_eq!(
+            CalibrationPicture::try_from("mask-1".to_owned()),
+            Ok(CalibrationPicture::Mask(1))
+        );
         assert!(CalibrationPicture::try_from("masks".to_owned()).is_err());
     }
 }

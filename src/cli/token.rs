@@ -1,0 +1,132 @@
+//! `sci-recon token`: lets labs in and out.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use rand::TryRngCore;
+
+use super::CliError;
+use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
+use crate::store::{Store, StoreError, Token};
+
+/// Makes, lists and revokes tokens. With the first one the service is closed to all without one.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Folder of the service's data; the service may be running.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    data: PathBuf,
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// Makes a token and prints it: once, for it is stored nowhere.
+    Create(Create),
+    /// Shows all tokens, without their secrets.
+    List,
+    /// Revokes a token, at once and for ever.
+    Revoke {
+        /// Its identifier, as `list` shows it.
+        id: TokenId,
+    },
+}
+
+#[derive(Debug, Args)]
+struct Create {
+    /// The lab whose data it opens; data from before there were tokens belong to `local`.
+    #[arg(long, value_name = "NAME")]
+    lab: Lab,
+    /// read: look and download; submit: also upload, ask for jobs, cancel and delete; admin: also
+    /// see the figures of the whole service.
+    #[arg(long, value_name = "ROLE", default_value = "submit")]
+    role: Role,
+    /// Bytes of uploads that it may keep here [default: no limit].
+    #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u64).range(..1 << 53))]
+    max_bytes: Option<u64>,
+    /// Whom it is for.
+    #[arg(long, value_name = "TEXT")]
+    note: Option<Label>,
+}
+
+/// Does what the arguments say.
+///
+/// # Errors
+/// If there is no such token, or the store can't be used.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    if !arguments.data.join("sci-recon.db").is_file()
+        && !matches!(arguments.action, Action::Create(_))
+    {
+        let text = format!("{} is no data folder of a service", arguments.data.display());
+        return Err(CliError::Input(text));
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
+    runtime.block_on(async {
+        let store = Store::open(&arguments.data).await?;
+        let text = act(&store, &arguments.action).await?;
+        store.close().await;
+        let mut stdout = std::io::stdout();
+        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
+    })
+}
+
+async fn act(store: &Store, action: &Action) -> Result<String, CliError> {
+    match action {
+        Action::Create(create) => make(store, create).await,
+        Action::List => Ok(table(&store.tokens().await?)),
+        Action::Revoke { id } => {
+            store.revoke_token(*id).await?;
+            Ok(format!("revoked {id}"))
+        }
+    }
+}
+
+async fn make(store: &Store, create: &Create) -> Result<String, CliError> {
+    let mut bytes = [0; 32];
+    rand::rngs::OsRng
+        .try_fill_bytes(&mut bytes)
+        .map_err(|error| CliError::Failure(format!("no random numbers: {error}")))?;
+    let secret = Secret::from_bytes(bytes);
+    let token = Token {
+        id: TokenId::new(),
+        lab: create.lab.clone(),
+        role: create.role,
+        note: create.note.clone(),
+        max_bytes: create.max_bytes,
+        created_at: Timestamp::now(),
+        revoked_at: None,
+    };
+    store.add_token(&token, &secret).await?;
+    Ok(secret.reveal().to_owned())
+}
+
+fn table(tokens: &[(Token, u64)]) -> String {
+    let mut lines = vec![format!(
+        "{:36}  {:16}  {:6}  {:>14}  {:>14}  {:24}  {:24}  note",
+        "id", "lab", "role", "bytes", "limit", "made", "revoked"
+    )];
+    for (token, bytes) in tokens {
+        let limit = token.max_bytes.map_or_else(|| "none".into(), |limit| limit.to_string());
+        let revoked = token.revoked_at.map_or_else(|| "no".into(), |at| at.to_string());
+        lines.push(format!(
+            "{:36}  {:16}  {:6}  {bytes:>14}  {limit:>14}  {:24}  {revoked:24}  {}",
+            token.id.to_string(),
+            token.lab.as_str(),
+            token.role.name(),
+            token.created_at.to_string(),
+            token.note.as_ref().map_or("", Label::as_str),
+        ));
+    }
+    lines.join("\n")
+}
+
+impl From<StoreError> for CliError {
+    fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::NotFound { .. } => Self::Input(error.to_string()),
+            other => Self::Failure(other.to_string()),
+        }
+    }
+}

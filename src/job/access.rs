@@ -1,0 +1,162 @@
+//! Who may do what: labs, roles and tokens.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::Serialize;
+
+use super::text::{InvalidText, Sha256};
+
+/// A lab, to which data belong: no lab sees another one's.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+#[serde(transparent)]
+pub struct Lab(String);
+
+impl Lab {
+    /// The lab of all who use a service without tokens.
+    #[must_use]
+    pub fn local() -> Self {
+        Self("local".into())
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl FromStr for Lab {
+    type Err = InvalidText;
+
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
+        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+        if (1..=40).contains(&text.len()) && text.chars().all(plain) {
+            return Ok(Self(text.into()));
+        }
+        Err(InvalidText::new(format!(
+            "{text:?} can't be the name of a lab; it has 1 to 40 of a-z, 0-9 and -"
+        )))
+    }
+}
+
+impl fmt::Display for Lab {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// What a token is good for. Each role may do what those before it may.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Role {
+    /// Look at the lab's data and download results.
+    Read,
+    /// Upload, ask for jobs, cancel and delete.
+    Submit,
+    /// See the figures of the whole service, too.
+    Admin,
+}
+
+impl Role {
+    /// All roles, from the weakest on.
+    pub const ALL: [Self; 3] = [Self::Read, Self::Submit, Self::Admin];
+
+    /// The role's name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Read => "read",
+            Self::Submit => "submit",
+            Self::Admin => "admin",
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Role {
+    type Err = InvalidText;
+
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
+        let found = Self::ALL.into_iter().find(|role| role.name() == text);
+        found.ok_or_else(|| {
+            InvalidText::new(format!("{text:?} is not a role; roles are read, submit and admin"))
+        })
+    }
+}
+
+/// A token as its holder has it. It shows itself to nobody who only prints it for debugging.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(String);
+
+/// With this, a token that was left lying about is known for what it is.
+const PREFIX: &str = "sci_";
+
+impl Secret {
+    /// The token of 256 random bits.
+    #[must_use]
+    pub fn from_bytes(bytes: [u8; 32]) -> Self {
+        Self(format!("{PREFIX}{}", Sha256::new(bytes)))
+    }
+
+    /// The text, if it has the form of a token.
+    #[must_use]
+    pub fn parse(text: &str) -> Option<Self> {
+        text.strip_prefix(PREFIX)?.parse::<Sha256>().ok()?;
+        Some(Self(text.into()))
+    }
+
+    /// What is stored instead of the token. Its bits are random, so a plain hash keeps it.
+    #[must_use]
+    pub fn hash(&self) -> Sha256 {
+        Sha256::of(self.0.as_bytes())
+    }
+
+    /// The token itself, to be shown once to the one it is made for.
+    #[must_use]
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Secret(..)")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Lab, Role, Secret};
+
+    #[test]
+    fn labs_have_plain_names() {
+        assert!("optics-2".parse::<Lab>().is_ok());
+        for bad in ["", "a b", "A", "a/b", "..", "\u{e9}", &"x".repeat(41)] {
+            assert!(bad.parse::<Lab>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn roles_are_ordered_and_named() {
+        assert!(Role::Read < Role::Submit && Role::Submit < Role::Admin);
+        for role in Role::ALL {
+            assert_eq!(role.name().parse::<Role>().unwrap(), role);
+        }
+    }
+
+    #[test]
+    fn a_secret_is_parsed_but_not_printed() {
+        let secret = Secret::from_bytes([7; 32]);
+        assert_eq!(Secret::parse(secret.reveal()).unwrap(), secret);
+        assert!(!format!("{secret:?}").contains("0707"));
+        for bad in ["", "sci_", "sci_xyz", &secret.reveal()[4..]] {
+            assert_eq!(Secret::parse(bad), None, "{bad}");
+        }
+    }
+}

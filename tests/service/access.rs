@@ -1,0 +1,223 @@
+//! Tokens, roles and labs: who may do what, and that nobody learns of another lab's data.
+
+use std::process::{Command, Stdio};
+
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use crate::app::{TestApp, id};
+use crate::samples::Scene;
+
+const PUBLIC: [&str; 5] = ["/livez", "/readyz", "/openapi.yaml", "/", "/dashboard/{file}"];
+
+/// The path of a route with something in place of its parameters.
+fn filled(path: &str) -> String {
+    let nothing = "019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d";
+    path.replace("{sha256}", &"0".repeat(64))
+        .replace("{snapshot}", "0")
+        .replace("{frame}", "1.exr")
+        .split('/')
+        .map(|part| if part.starts_with('{') { nothing } else { part })
+        .collect::<Vec<_>>()
+        .join("/")
+}
+
+#[tokio::test]
+async fn no_route_but_the_public_ones_lets_anyone_in_without_a_token() {
+    let app = TestApp::start().await;
+    app.get("/v1/jobs").await.expect(200);
+    let token = app.token(&["create", "--lab", "a", "--role", "admin"]);
+    let routes = sci_recon::http::routes();
+    assert!(routes.len() > 20);
+    for bad in [None, Some("sci_wrong".to_owned()), Some(format!("sci_{}", "0".repeat(64)))] {
+        if let Some(bad) = &bad {
+            app.sign_in(bad);
+        }
+        for route in &routes {
+            for method in &route.methods {
+                let method: Method = method.to_uppercase().parse().unwrap();
+                let answer = app.send(app.request(method, &filled(route.path))).await;
+                if PUBLIC.contains(&route.path) {
+                    assert_ne!(answer.status, 401, "{}", route.path);
+                } else {
+                    answer.problem(401, "unauthorized");
+                    assert!(answer.header("www-authenticate").starts_with("Bearer"));
+                }
+            }
+        }
+    }
+    app.sign_in(&token);
+    app.get("/v1/jobs").await.expect(200);
+    app.get("/metrics").await.expect(200);
+    // A revoked token is worth nothing, at once, and the service stays closed.
+    let listed = app.token(&["list"]);
+    assert!(!listed.contains(&token));
+    let revoked = listed.lines().nth(1).unwrap().split(' ').next().unwrap().to_owned();
+    app.token(&["revoke", &revoked]);
+    app.get("/v1/jobs").await.problem(401, "unauthorized");
+    app.sign_out();
+    app.get("/v1/jobs").await.problem(401, "unauthorized");
+}
+
+#[tokio::test]
+async fn a_role_may_do_what_it_is_for_and_no_more() {
+    let app = TestApp::start().await;
+    let read = app.token(&["create", "--lab", "a", "--role", "read"]);
+    let submit = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&submit);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let job = id(&app.post("/v1/jobs", &body).await.expect(201));
+    app.get("/metrics").await.problem(403, "forbidden");
+    app.sign_in(&read);
+    app.get(&format!("/v1/jobs/{job}")).await.expect(200);
+    app.post("/v1/jobs", &body).await.problem(403, "forbidden");
+    app.delete(&format!("/v1/jobs/{job}")).await.problem(403, "forbidden");
+    let upload = app.send(app.request(Method::POST, "/v1/blobs").body("x")).await;
+    assert!(upload.problem(403, "forbidden").contains("submit"));
+    assert_eq!(upload.header("connection"), "close");
+    // Pages show pictures with a cookie, and can do no more with it.
+    app.sign_out();
+    let cookie = format!("sci_recon_token={submit}");
+    let by_cookie = |method, path: &str| app.request(method, path).header("cookie", &cookie);
+    app.send(by_cookie(Method::GET, "/v1/jobs")).await.expect(200);
+    let cancel = format!("/v1/jobs/{job}/cancel");
+    app.send(by_cookie(Method::POST, &cancel)).await.problem(401, "unauthorized");
+}
+
+#[tokio::test]
+async fn another_labs_data_are_not_there() {
+    let app = TestApp::start().await;
+    let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
+    app.sign_in(&a);
+    let masks = app.upload(Scene::SMALL.masks()).await;
+    let (calibration, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let keyed = || app.request(Method::POST, "/v1/jobs").header("idempotency-key", "k");
+    let job = id(&app.send(keyed().json(&body)).await.expect(201));
+    let nowhere = "019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d";
+    app.sign_in(&b);
+    // Whatever is asked: the answer is that for what does not exist, word for word.
+    let same = |theirs: crate::app::Answer, unknown: crate::app::Answer, (x, y): (&str, &str)| {
+        assert_eq!(theirs.status, unknown.status);
+        let text = String::from_utf8(theirs.bytes).unwrap().replace(x, y);
+        assert_eq!(text, String::from_utf8(unknown.bytes).unwrap());
+    };
+    let ids = [("calibrations", &calibration), ("measurements", &measurement), ("jobs", &job)];
+    for (kind, id) in ids {
+        for method in [Method::GET, Method::DELETE] {
+            let ask = |id: &str| app.request(method.clone(), &format!("/v1/{kind}/{id}"));
+            let theirs = app.send(ask(id)).await;
+            theirs.problem(404, "not_found");
+            same(theirs, app.send(ask(nowhere)).await, (id, nowhere));
+        }
+        assert_eq!(app.get(&format!("/v1/{kind}")).await.json()["items"], json!([]));
+    }
+    for (method, end) in [
+        (Method::POST, "/cancel"),
+        (Method::POST, "/retry"),
+        (Method::GET, "/manifest.json"),
+        (Method::GET, "/snapshots/0"),
+        (Method::GET, "/snapshots/0/manifest.json"),
+        (Method::GET, "/snapshots/0/stack.exr"),
+        (Method::GET, "/snapshots/0/frames.npy"),
+        (Method::GET, "/snapshots/0/frames/1.exr"),
+    ] {
+        let ask = |id: &str| app.request(method.clone(), &format!("/v1/jobs/{id}{end}"));
+        let theirs = app.send(ask(&job)).await;
+        theirs.problem(404, "not_found");
+        same(theirs, app.send(ask(nowhere)).await, (&job, nowhere));
+    }
+    let zeros = "0".repeat(64);
+    let named = |masks: &str| json!({ "masks": masks });
+    let theirs = app.post("/v1/calibrations", &named(&masks)).await;
+    theirs.problem(422, "invalid_request");
+    same(theirs, app.post("/v1/calibrations", &named(&zeros)).await, (&masks, &zeros));
+    let of = |calibration: &str| json!({"calibration": calibration, "data": zeros});
+    let theirs = app.post("/v1/measurements", &of(&calibration)).await;
+    same(theirs, app.post("/v1/measurements", &of(nowhere)).await, (&calibration, nowhere));
+    let theirs = app.post("/v1/jobs", &body).await;
+    let unknown = json!({"measurement": nowhere, "algorithm": "gap-tv"});
+    same(theirs, app.post("/v1/jobs", &unknown).await, (&measurement, nowhere));
+    // A file that another lab has is new to this one.
+    app.get(&format!("/v1/blobs/{masks}")).await.problem(404, "not_found");
+    let sent = app.send(app.request(Method::POST, "/v1/blobs").body(Scene::SMALL.masks())).await;
+    assert_eq!(sent.expect(201).json()["sha256"], masks);
+    // So is a key.
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let own = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_ne!(id(&app.send(keyed().json(&own)).await.expect(201)), job);
+    // The bytes are stored once, and stay when one of the labs is done with them.
+    let blobs = std::fs::read_dir(app.data().join("blobs")).unwrap().count();
+    assert_eq!(blobs, 4, "masks, data, and what was prepared of each");
+}
+
+#[tokio::test]
+async fn a_token_keeps_no_more_than_it_may() {
+    let app = TestApp::start().await;
+    app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "1000"]));
+    app.upload(vec![1; 600]).await;
+    let send = |bytes: Vec<u8>| app.send(app.request(Method::POST, "/v1/blobs").body(bytes));
+    let detail = send(vec![2; 600]).await.problem(507, "quota_exceeded");
+    assert!(detail.contains("600") && detail.contains("1000"), "{detail}");
+    // Also if it does not say how long it is.
+    let chunks = futures_util::stream::iter([Ok::<_, std::io::Error>(vec![3u8; 600])]);
+    let body = reqwest::Body::wrap_stream(chunks);
+    let answer = app.send(app.request(Method::POST, "/v1/blobs").body(body)).await;
+    answer.problem(507, "quota_exceeded");
+    send(vec![4; 400]).await.expect(201);
+}
+
+#[test]
+fn a_service_that_others_reach_wants_tokens() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.args(["serve", "--listen", "0.0.0.0:0", "--workers", "0", "--data"]).arg(folder.path());
+    let refused = command.output().unwrap();
+    assert_eq!(refused.status.code(), Some(2));
+    let text = String::from_utf8(refused.stderr).unwrap();
+    assert!(text.contains("token create"), "{text}");
+    let mut create = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    create.args(["token", "--data"]).arg(folder.path()).args(["create", "--lab", "a"]);
+    assert!(create.output().unwrap().status.success());
+    let mut served = command.stdout(Stdio::piped()).spawn().unwrap();
+    let mut line = String::new();
+    let stdout = served.stdout.take().unwrap();
+    std::io::BufRead::read_line(&mut std::io::BufReader::new(stdout), &mut line).unwrap();
+    served.kill().unwrap();
+    served.wait().unwrap();
+    assert!(serde_json::from_str::<Value>(&line).is_ok(), "{line}");
+}
+
+#[tokio::test]
+async fn a_token_stands_in_no_log_and_no_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("log");
+    let mut app = TestApp::logging(&log).await;
+    let token = app.token(&["create", "--lab", "a", "--role", "admin"]);
+    app.sign_in(&token);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let job = app.submit(&body).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    app.get("/v1/nowhere").await.expect(404);
+    app.stop();
+    let secret = token.trim_start_matches("sci_").as_bytes().to_owned();
+    let mut files = vec![log];
+    let mut folders = vec![app.data().to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() { folders.push(path) } else { files.push(path) }
+        }
+    }
+    assert!(files.len() > 10);
+    for file in files {
+        let bytes = std::fs::read(&file).unwrap();
+        assert!(
+            !bytes.is_empty() || file.ends_with("server.lock") || file.ends_with("migrate.lock")
+        );
+        let found = bytes.windows(secret.len()).any(|window| window == secret);
+        assert!(!found, "{} holds the token", file.display());
+    }
+}
