@@ -92,7 +92,7 @@ function details(found) {
     ["Schedule", schedule(found.schedule)],
     ["Tiles", `${found.tile.size} pixels, ${found.tile.overlap} shared`],
     ["Priority", found.priority],
-    ["Calibration", h("code", null, found.calibration)],
+    ["Calibration", h("a", { href: `#/calibrations/${found.calibration}` }, h("code", null, found.calibration))],
     ["Measurement", h("code", null, found.measurement)],
     ["Identifier", h("code", null, found.id)],
     ["Created", momentInFull(found.created_at)],

@@ -38,6 +38,8 @@ const FILES: &[(&str, &[u8])] = &files![
     "main.js",
     "actions.js",
     "api.js",
+    "calibrations.js",
+    "compare.js",
     "contrast.js",
     "convergence.js",
     "dom.js",
