@@ -21,11 +21,13 @@ mod layers;
 mod measurements;
 mod metrics;
 mod page;
+mod pictures;
 mod report_page;
 mod reports;
 mod results;
 mod router;
 mod system;
+mod tiles;
 mod upload;
 
 pub use app::App;

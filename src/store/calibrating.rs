@@ -16,7 +16,7 @@ use super::error::StoreError;
 use super::losses::{Loss, MAX_FAILURES, MAX_LOSSES};
 use super::queue::millis;
 use super::rows::{json, number, parsed};
-use super::{Calibration, Heartbeat, NewCalibration, Page, StagedBlob, Store, workers};
+use super::{Calibration, Heartbeat, NewCalibration, StagedBlob, Store, workers};
 use crate::job::{CalibrationId, CalibrationReport, Captures, Lab, Label, Timestamp, WorkerId};
 
 /// The right to work on a calibration, until it runs out.

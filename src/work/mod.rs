@@ -8,6 +8,7 @@ mod assemble;
 pub mod calibrate;
 mod calibration_task;
 mod finish;
+mod history;
 mod network;
 mod prepare;
 mod result;

@@ -13,6 +13,7 @@ mod faults;
 mod hangs;
 mod hostile;
 mod jobs;
+mod pictures;
 mod pipeline;
 mod samples;
 mod uploads;
