@@ -14,8 +14,8 @@ use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
-    Algorithm, CalibrationId, JobId, JobRequest, JobSpec, JobState, Lab, Label, MeasurementId,
-    SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
+    Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
+    MeasurementId, SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
 };
 use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
 
@@ -33,6 +33,8 @@ pub(super) struct JobBody {
     schedule: ScheduleSpec,
     tile: TileSpec,
     priority: i32,
+    /// What the check of the measurement found.
+    warnings: Vec<Finding>,
     error: Option<String>,
     created_at: Timestamp,
     started_at: Option<Timestamp>,
@@ -52,6 +54,7 @@ impl JobBody {
             tile,
             priority,
             label,
+            warnings,
         } = job.spec;
         let Job { id, state, error, created_at, started_at, finished_at, .. } = job;
         Self {
@@ -66,6 +69,7 @@ impl JobBody {
             schedule,
             tile,
             priority,
+            warnings,
             error,
             created_at,
             started_at,
@@ -123,9 +127,17 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, A
         snapshots: measurement.snapshots,
     };
     let resolved = request.resolve(calibration.id, shape);
-    let spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
+    let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
+    spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
     check_memory(app, &spec)?;
     Ok(spec)
+}
+
+/// The warnings about the snapshots of a job.
+fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding> {
+    let concerns =
+        |warning: &Finding| warning.snapshot.is_none_or(|snapshot| snapshots.contains(snapshot));
+    warnings.into_iter().filter(concerns).collect()
 }
 
 /// Refuses a job that no worker could do.
@@ -167,19 +179,10 @@ pub(super) async fn list(
     let progress = app.store.progress_of(&page.items).await?;
     let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
     let page = Page { items: items.collect(), more: page.more };
-    tagged(&PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item), &headers)
-}
-
-/// A body with its ETag, or word that the client has it.
-fn tagged<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
-    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
-    let etag = conditional::etag(&Sha256::of(&text));
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
-    if conditional::is_known(headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
-    }
-    let kind = [(header::CONTENT_TYPE, "application/json")];
-    Ok((tags, kind, text).into_response())
+    conditional::json(
+        &PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item),
+        &headers,
+    )
 }
 
 /// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
@@ -189,7 +192,7 @@ pub(super) async fn show(
     Params(id): Params<JobId>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    tagged(&body(&app, &access.lab, id).await?, &headers)
+    conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }
 
 /// `POST /v1/jobs/{job}/cancel`

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Finding;
 use super::ids::{CalibrationId, MeasurementId};
 use super::schedule::{PriorSpec, ScheduleSpec};
 use super::text::Label;
@@ -290,6 +291,9 @@ pub struct JobSpec {
     pub priority: i32,
     /// The label.
     pub label: Option<Label>,
+    /// What the check of the measurement found.
+    #[serde(default)]
+    pub warnings: Vec<Finding>,
 }
 
 impl JobRequest {
@@ -343,6 +347,7 @@ impl JobRequest {
             tile,
             priority,
             label,
+            warnings: Vec::new(),
         })
     }
 }

@@ -107,6 +107,7 @@ struct TaskObserver<'a> {
 impl Observer for TaskObserver<'_> {
     fn iteration(&mut self, progress: &Progress) -> Control {
         self.passes += u32::from(progress.deep);
+        self.shared.note(progress);
         self.shared.set_progress(TaskProgress {
             stage: stage(progress),
             iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),

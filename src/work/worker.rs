@@ -21,9 +21,9 @@ use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError}
 
 /// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
 /// against a lab's patience.
-const LEASE: Duration = Duration::from_secs(20);
+pub(super) const LEASE: Duration = Duration::from_secs(20);
 /// Time between heartbeats, and so the longest time until a cancel is heard of.
-const HEARTBEAT: Duration = Duration::from_secs(1);
+pub(super) const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Time between looks for a task.
 const POLL: Duration = Duration::from_millis(200);
 /// Looks without a task between two signs of life.
@@ -101,6 +101,10 @@ impl Worker {
         tracing::info!(worker = %self.id, "waiting for tasks");
         let mut looks = 0;
         while !self.stop.is_cancelled() {
+            // Calibrations come first: people wait for them before they measure.
+            if self.calibrate().await? {
+                continue;
+            }
             match self.store.claim(self.id, LEASE).await {
                 Ok(Some(task)) => {
                     self.work(task).await?;
@@ -120,6 +124,19 @@ impl Worker {
             }
         }
         Ok(())
+    }
+
+    pub(super) fn store(&self) -> &Store {
+        &self.store
+    }
+
+    pub(super) fn id(&self) -> WorkerId {
+        self.id
+    }
+
+    /// Waits until the worker is told to stop.
+    pub(super) async fn stopped(&self) {
+        self.stop.cancelled().await;
     }
 
     async fn sign_of_life(&self) {
@@ -154,6 +171,9 @@ impl Worker {
         match watching.await {
             Ok(((engine, outcome), reason)) => {
                 self.engine = Some(engine);
+                if outcome.is_ok() && reason.is_none() {
+                    self.last_news(&lease, &shared).instrument(span.clone()).await;
+                }
                 self.end(&lease, outcome, reason).instrument(span).await;
                 Ok(())
             }
@@ -248,7 +268,7 @@ impl Worker {
                 }
                 () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
                 () = &mut too_late => return Err(WorkerError::Unfinished),
-                _ = tick.tick() => match self.store.heartbeat(lease, shared.progress()).await {
+                _ = tick.tick() => match self.beat(lease, shared).await {
                     Ok(Heartbeat::Continue) => {}
                     Ok(Heartbeat::Cancelled) => reason = Some(Reason::Cancelled),
                     Ok(Heartbeat::Lost) => reason = Some(Reason::Lost),
@@ -259,6 +279,20 @@ impl Worker {
             if reason.is_some() {
                 shared.stop();
             }
+        }
+    }
+
+    /// A heartbeat with all that there is to tell.
+    async fn beat(&self, lease: &Lease, shared: &Shared) -> Result<Heartbeat, StoreError> {
+        let news = shared.news();
+        self.store.heartbeat_with(lease, shared.progress(), news.as_deref()).await
+    }
+
+    /// Tells what the solver did after the last heartbeat.
+    async fn last_news(&self, lease: &Lease, shared: &Shared) {
+        if let Some(news) = shared.news() {
+            let told = self.store.heartbeat_with(lease, shared.progress(), Some(&news)).await;
+            said(told.map(|_| ()));
         }
     }
 
@@ -295,7 +329,7 @@ impl Worker {
 }
 
 /// Logs that the store could not be told; the lease runs out then.
-fn said(told: Result<(), StoreError>) {
+pub(super) fn said(told: Result<(), StoreError>) {
     if let Err(error) = told {
         tracing::error!(%error, "the end of the task is not recorded");
     }

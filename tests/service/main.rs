@@ -4,6 +4,7 @@
 
 mod access;
 mod app;
+mod calibration;
 mod cli;
 mod contract;
 mod dashboard;
@@ -12,6 +13,7 @@ mod faults;
 mod hangs;
 mod hostile;
 mod jobs;
+mod pictures;
 mod pipeline;
 mod samples;
 mod uploads;
