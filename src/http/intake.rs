@@ -80,7 +80,8 @@ pub(super) fn measurement(
     Ok(Prepared { info, statistics, file: finish(writer)? })
 }
 
-fn open(
+/// Opens an upload; of a .mat file this array. Its full scale is the one given, or its type's.
+pub(super) fn open(
     path: &Path,
     limits: &Limits,
     array: SceneArray,

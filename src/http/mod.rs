@@ -21,6 +21,7 @@ mod measurements;
 mod metrics;
 mod page;
 mod pictures;
+mod quality;
 mod results;
 mod router;
 mod system;

@@ -130,19 +130,12 @@ async function showManifest(element, now, snapshot, signal) {
     ["Provider", run.provider ? `${run.provider}, ONNX Runtime ${run.onnxruntime}` : "none"],
     ["Computing", duration(run.cpu_seconds)],
     ["Memory", bytes(run.peak_rss_bytes)],
-    ...quality(content.quality),
   ]), h("details", null, h("summary", null, "All of it"), h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
 }
 
 function warnings(manifest) {
   const found = manifest.content.warnings ?? manifest.warnings ?? [];
   return found.map((warning) => h("p", { class: "warn" }, typeof warning === "string" ? warning : warning.detail ?? JSON.stringify(warning)));
-}
-
-/** Figures against the truth, where the manifest has them. */
-export function quality(found) {
-  if (!found) return [];
-  return Object.entries(found).filter(([, value]) => typeof value === "number").map(([name, value]) => [name.toUpperCase(), figure(value, 4)]);
 }
 
 /** The line that asks for the same job again. */
