@@ -1,6 +1,6 @@
 //! How good frames are, where the truth is known: PSNR and SSIM against an upload.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use axum::extract::State;
 use axum::http::HeaderMap;
@@ -19,7 +19,7 @@ use crate::formats::mat::SceneArray;
 use crate::formats::{FormatError, FrameReader, Limits, npy};
 use crate::job::{JobId, SceneShape, Sha256};
 use crate::recon::metrics;
-use crate::store::StoreError;
+use crate::store::{Job, StoreError};
 
 /// The query.
 #[derive(Debug, Deserialize)]
@@ -60,12 +60,7 @@ pub(super) async fn show(
 ) -> Result<Response, ApiError> {
     let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
     app.store.upload(&access.lab, query.truth).await?;
-    let (_, path) = match app.store.result_file(&job, Some(snapshot), "frames.npy").await {
-        Err(StoreError::NotFound { .. }) => {
-            return Err(ApiError::new(Code::NotReady, "the frames are not written yet"));
-        }
-        other => other?,
-    };
+    let path = frames(&app, &job, snapshot).await?;
     let (shape, truth) = (job.spec.shape, query.truth);
     let frames = intake::run(&app, move |store, limits| {
         let upload = store.dir().blob(&truth);
@@ -73,6 +68,17 @@ pub(super) async fn show(
         compare(&path, opened.0, opened.1.value(), snapshot as usize, shape)
     });
     conditional::json(&summary(truth, frames.await?), &headers)
+}
+
+/// Where the frames of a snapshot are.
+async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf, ApiError> {
+    match app.store.result_file(job, Some(snapshot), "frames.npy").await {
+        Ok((_, path)) => Ok(path),
+        Err(StoreError::NotFound { .. }) => {
+            Err(ApiError::new(Code::NotReady, "the frames are not written yet"))
+        }
+        Err(error) => Err(error.into()),
+    }
 }
 
 fn summary(truth: Sha256, frames: Vec<FrameQuality>) -> QualityBody {

@@ -5,6 +5,7 @@ import { bytes, duration, figure, momentInFull, nameOf, shapeOf, stageOf } from 
 import { actions } from "./actions.js";
 import { gaveUp, get } from "./api.js";
 import { left } from "./jobs.js";
+import { findings } from "./report.js";
 import { TileMap } from "./tilemap.js";
 import { Viewer } from "./viewer.js";
 import { watch } from "./live.js";
@@ -16,13 +17,14 @@ export async function job(root, [id], signal) {
   const buttons = h("span", { class: "row" });
   const progress = h("div", { class: "progressline" });
   const problem = h("div");
+  const warned = findings(found.warnings);
   const snapshot = snapshotChoice(found);
   const files = card("Files", h("p", { class: "muted" }, "…"));
   const manifest = card("Manifest");
   const viewer = new Viewer(found, signal);
   const tiles = new TileMap(found, signal);
   const cards = h("div", { class: "cards" }, tiles.plotCard, tiles.tilesCard, files, manifest, details(found), repeat(found));
-  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, viewer.element, cards);
+  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, warned ?? "", viewer.element, cards);
 
   let shown = null;
   let ready = null;
