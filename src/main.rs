@@ -21,6 +21,8 @@ enum Command {
     Reconstruct(cli::reconstruct::Arguments),
     Simulate(cli::simulate::Arguments),
     Optics(cli::optics::Arguments),
+    Calibrate(cli::calibrate::Arguments),
+    Bench(cli::bench::Arguments),
     Demo(cli::demo::Arguments),
     Token(cli::token::Arguments),
 }
@@ -31,6 +33,8 @@ fn main() -> ExitCode {
         Command::Worker(arguments) => cli::worker::run(&arguments),
         Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
         Command::Optics(arguments) => cli::optics::run(&arguments),
+        Command::Calibrate(arguments) => cli::calibrate::run(&arguments),
+        Command::Bench(arguments) => cli::bench::run(&arguments),
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
         Command::Demo(arguments) => cli::demo::run(&arguments),
         Command::Token(arguments) => cli::token::run(&arguments),

@@ -7,6 +7,8 @@ mod logging;
 mod progress;
 mod supervisor;
 
+pub mod bench;
+pub mod calibrate;
 pub mod demo;
 pub mod optics;
 pub mod reconstruct;

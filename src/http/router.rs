@@ -11,7 +11,7 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, pictures, quality, results, system, tiles,
+    metrics, pictures, quality, reports, results, system, tiles,
 };
 
 /// The largest JSON body.
@@ -27,6 +27,9 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).uploads(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
         R::at("/v1/calibrations/{calibration}").get(calibrations::show).delete(calibrations::delete),
+        R::at("/v1/calibrations/{calibration}/report.json").get(reports::json),
+        R::at("/v1/calibrations/{calibration}/report.html").get(reports::html),
+        R::at("/v1/calibrations/{calibration}/maps/{map}").get(reports::map),
         R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
         R::at("/v1/measurements/{measurement}").get(measurements::show).delete(measurements::delete),
         R::at("/v1/algorithms").get(algorithms::list),

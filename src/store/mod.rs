@@ -6,6 +6,7 @@
 //! is open while anything is computed or uploaded.
 
 mod blobs;
+mod calibrating;
 mod calibrations;
 mod dir;
 mod error;
@@ -16,6 +17,7 @@ mod marks;
 mod measurements;
 mod progress;
 mod queue;
+mod reports;
 mod results;
 mod rows;
 mod staging;
@@ -35,6 +37,7 @@ use sqlx::sqlite::{
 };
 
 pub use blobs::{Blob, Origin};
+pub use calibrating::{CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration};
 pub use calibrations::{Calibration, NewCalibration};
 pub use dir::DataDir;
 pub use error::StoreError;
@@ -44,6 +47,7 @@ pub use marks::JobMark;
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
 pub use progress::{JobProgress, ProgressStage, TaskCounts};
 pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
+pub use reports::Unready;
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use tasks::{TaskRecord, TileResult};

@@ -2,6 +2,7 @@
 
 import { announce, facts, h, put, say } from "./dom.js";
 import { bytes, figure, moment, nameOf } from "./format.js";
+import { findings } from "./report.js";
 import { gaveUp, get, send, upload } from "./api.js";
 
 const HINT = "npy, TIFF, PNG (16 bit) or .mat";
@@ -17,7 +18,7 @@ export async function submit(root, [query], signal) {
     ready();
   };
   const measurement = measurementStep(form, ready, reset, signal);
-  const calibration = calibrationStep(form, known.items, measurement.wake, reset, query.get("calibration"), signal);
+  const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, reset, query.get("calibration"), signal);
   const job = jobStep(algorithms.items);
   const element = h("form", { class: "steps" }, calibration, measurement.element, job.element, h("div", { class: "row" }, button), result);
   element.addEventListener("submit", async (event) => {
@@ -191,24 +192,19 @@ function calibrationVerdict(item) {
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): nothing is known there`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
-      ...more(item),
+      ["Report", h("a", { href: `/v1/calibrations/${item.id}/report.html` }, "what is known of the masks")],
     ]),
   ];
 }
 
 function measurementVerdict(item) {
+  const wrong = findings(item.warnings);
   return [
-    h("p", { class: "good" }, "The measurement fits the calibration."),
+    h("p", { class: wrong ? "warn" : "good" }, wrong ? "The measurement is taken, but:" : "The measurement fits the calibration."),
+    wrong,
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
       ["Full scale", figure(item.full_scale)],
-      ...more(item),
     ]),
   ];
-}
-
-/** What a check found beyond the sizes, where the service tells it. */
-function more(item) {
-  const warnings = (item.warnings ?? []).map((warning) => ["Warning", h("span", { class: "warn" }, warning.detail ?? String(warning))]);
-  return [item.grade && ["Grade", String(item.grade)], ...warnings];
 }
