@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Array3, s};
 
-use super::CliError;
+use super::{CliError, npz};
 use crate::formats::mat::{self, SceneArray};
 use crate::formats::validate::{MaskCheck, MeasurementCheck};
 use crate::formats::{self, FormatError, FrameReader, FullScale, Limits};
@@ -157,6 +157,9 @@ impl<'a> Source<'a> {
 /// Frames \[T,H,W\] of a file, or of a folder of pictures in the order of their names.
 pub(super) fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>, CliError> {
     let source = |path| Source { path, array: SceneArray::Truth, full_scale };
+    if npz::is_npz(path) {
+        return source(npz::extract(path)?.path()).frames();
+    }
     if !path.is_dir() {
         return source(path).frames();
     }

@@ -4,6 +4,7 @@ mod arguments;
 mod error;
 mod input;
 mod logging;
+mod npz;
 mod progress;
 mod supervisor;
 

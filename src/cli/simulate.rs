@@ -20,7 +20,7 @@ use masks::{Apertures, MaskArguments, SimulatedMasks};
 /// Simulate a snapshot: make masks and measure known frames through them.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// The scene: npy, multi-page TIFF, a .mat scene's `orig`, or a folder of PNGs.
+    /// The scene: npy, npz, multi-page TIFF, a .mat scene's `orig`, or a folder of PNGs.
     #[arg(long, value_name = "FILE")]
     frames: PathBuf,
     /// Value in the frames' file that means 1 [default: 255 for uint8 and .mat scenes, 65535 for

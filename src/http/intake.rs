@@ -131,7 +131,8 @@ pub(super) fn measurement(
     Ok(Measured { prepared: Prepared { info, statistics, file }, findings })
 }
 
-fn open(
+/// Opens an upload; of a .mat file this array. Its full scale is the one given, or its type's.
+pub(super) fn open(
     path: &Path,
     limits: &Limits,
     array: SceneArray,

@@ -22,6 +22,7 @@ mod measurements;
 mod metrics;
 mod page;
 mod pictures;
+mod quality;
 mod report_page;
 mod reports;
 mod results;

@@ -11,7 +11,7 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, pictures, reports, results, system, tiles,
+    metrics, pictures, quality, reports, results, system, tiles,
 };
 
 /// The largest JSON body.
@@ -43,6 +43,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::stack),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::array),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::job_preview),

@@ -129,7 +129,7 @@ export async function view(page, checks, frames) {
 }
 
 /** Chooses two jobs and compares them. */
-export async function compare(page, checks, labels) {
+export async function compare(page, checks, labels, truth) {
   await page.click("#nav >> text=Jobs");
   for (const label of labels) await page.check(`tr:has-text("${label}") input[type=checkbox]`);
   await page.click("text=Compare the two");
@@ -137,6 +137,10 @@ export async function compare(page, checks, labels) {
   await page.waitForTimeout(1200);
   const [one, other] = [await brightness(page, 0), await brightness(page, 1)];
   checks.that(one.left > 1 && other.left > 1, "both panes show frames");
+  await page.setInputFiles("#truth", { name: "truth.npy", mimeType: "application/octet-stream", buffer: truth });
+  await page.waitForSelector(".quality");
+  const psnr = await page.$$eval(".quality:nth-last-child(2) td", (cells) => cells.map((cell) => Number.parseFloat(cell.textContent)));
+  checks.that(psnr.every((value) => value > 10 && value < 80) && Math.max(...psnr) > 25, `PSNR is told: ${psnr} dB`);
   await checks.look(page, "compare");
   await page.fill("#flicker-rate", "10");
   const titles = await page.evaluate(() => new Promise((resolve) => {

@@ -39,7 +39,7 @@ async function everything() {
   const { measurement } = await service.call("GET", `/v1/jobs/${id}`);
   const other = await service.submit({ measurement, algorithm: "gap-tv", label: "ten iterations", schedule: { stages: [{ prior: "tv", iterations: 10, tv_weight: 0.05 }] } });
   await service.when(other.id, (job) => job.state === "succeeded");
-  await checks.step("compare", () => compare(page, checks, ["ten iterations", HOSTILE]));
+  await checks.step("compare", () => compare(page, checks, ["ten iterations", HOSTILE], shown.truth));
   await service.submit(long(measurement, "long job"));
   await checks.step("manage", () => manage(page, checks, "long job"));
   checks.that((await page.textContent(`.list a >> text=${HOSTILE}`)) === HOSTILE, "the list shows the name as text");

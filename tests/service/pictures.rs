@@ -106,6 +106,43 @@ async fn frames_are_shown_as_they_are() {
 }
 
 #[tokio::test]
+async fn frames_are_judged_where_the_truth_is_known() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let job = job(&app, tv(60, 4)).await;
+    let path = format!("/v1/jobs/{job}/snapshots/1/quality?truth=");
+    let scene = Scene::SMALL;
+    let truth = |snapshots: std::ops::Range<usize>| {
+        let (frames, height, width) = (scene.frames, scene.height, scene.width);
+        let shape = [snapshots.len() * frames, height, width];
+        let pixels = snapshots.flat_map(move |snapshot| {
+            (0..frames * height * width).map(move |at| {
+                let (row, column) = (at / width % height, at % width);
+                scene.pixel(snapshot, at / (height * width), row, column)
+            })
+        });
+        crate::samples::npy(&shape, pixels)
+    };
+    let one = app.upload(truth(1..2)).await;
+    app.ended(&job).await;
+    let quality = app.get(&format!("{path}{one}")).await.expect(200).json();
+    let psnr = quality["psnr"].as_f64().unwrap();
+    assert!((24.0..60.0).contains(&psnr), "{quality:#}");
+    assert!((0.5..1.0).contains(&quality["ssim"].as_f64().unwrap()), "{quality:#}");
+    let frames = quality["frames"].as_array().unwrap();
+    let mean = frames.iter().map(|frame| frame["psnr"].as_f64().unwrap()).sum::<f64>() / 4.0;
+    assert!((mean - psnr).abs() < 1e-9);
+    // The truth of all snapshots tells the same of this one; that of another one does not.
+    let all = app.upload(truth(0..2)).await;
+    assert_eq!(app.get(&format!("{path}{all}")).await.json()["psnr"], quality["psnr"]);
+    let other = app.upload(truth(0..1)).await;
+    assert!(app.get(&format!("{path}{other}")).await.json()["psnr"].as_f64().unwrap() < psnr);
+    let three = app.upload(crate::samples::constant(&[3, 48, 64], 0.5)).await;
+    app.get(&format!("{path}{three}")).await.problem(422, "size_mismatch");
+    app.get(&format!("{path}{}", "0".repeat(64))).await.problem(404, "not_found");
+    app.get(path.trim_end_matches("?truth=")).await.problem(400, "invalid_query");
+}
+
+#[tokio::test]
 async fn tiles_show_while_others_run_and_tell_how_the_solver_goes() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let job = job(&app, tv(5_000, 8)).await;

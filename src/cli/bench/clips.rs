@@ -44,7 +44,7 @@ pub(super) fn read_clips(
 }
 
 fn is_clip(path: &Path) -> bool {
-    let kinds = ["npy", "mat", "tif", "tiff"];
+    let kinds = ["npy", "npz", "mat", "tif", "tiff"];
     let kind = path.extension().and_then(|kind| kind.to_str()).unwrap_or_default();
     path.is_dir() || kinds.iter().any(|known| kind.eq_ignore_ascii_case(known))
 }

@@ -28,7 +28,7 @@ use crate::work::{NetworkSource, SnapshotInput, blended_frame, solve};
 /// through six.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// A folder of clips: folders of PNGs, .npy, .mat or TIFF files. A folder of PNGs is one clip.
+    /// A folder of clips: folders of PNGs, .npy, .npz, .mat or TIFF files. A folder of PNGs is one clip.
     #[arg(long, value_name = "FOLDER")]
     clips: PathBuf,
     /// Frames in one snapshot: the first N of each clip are used.

@@ -7,6 +7,7 @@ import { announce, facts, h, say } from "./dom.js";
 import { ask, tell } from "./actions.js";
 import { figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
+import { report } from "./report.js";
 
 export async function calibrations(root, _, signal) {
   const body = h("tbody");
@@ -60,9 +61,8 @@ export async function calibration(root, [id], signal) {
   const masks = new Masks(item, signal);
   root.append(
     h("div", { class: "row head" }, h("h1", null, nameOf(item)), h("span", { class: "grow" }),
-      h("a", { class: "button", href: `/v1/calibrations/${id}/report.html` }, "Report"),
       h("a", { class: "button", href: `#/new?calibration=${id}` }, "Use for a new job"), remove),
-    masks.element, h("div", { class: "cards" }, about(item)));
+    masks.element, h("div", { class: "cards" }, report(item, signal), about(item)));
   await masks.show();
 }
 

@@ -4,9 +4,9 @@ import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
-import { announce, h, say } from "./dom.js";
-import { duration, figure, nameOf, shapeOf } from "./format.js";
-import { get } from "./api.js";
+import { announce, h, put, say } from "./dom.js";
+import { bytes, duration, figure, nameOf, shapeOf } from "./format.js";
+import { gaveUp, get, upload } from "./api.js";
 
 export async function compare(root, [first, second], signal) {
   const jobs = await Promise.all([first, second].map((id) => get(`/v1/jobs/${id}`, signal)));
@@ -22,7 +22,29 @@ export async function compare(root, [first, second], signal) {
   } else {
     root.append(h("p", { class: "note" }, "Both jobs must have succeeded before their frames can be compared."));
   }
-  root.append(figures(jobs, manifests));
+  const table = h("div");
+  root.append(h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), table, manifests.every(Boolean) && truth(jobs, manifests, table, signal)));
+  put(table, figures(jobs, manifests));
+}
+
+/** Asks for the true frames, and for both jobs' PSNR and SSIM against them. */
+function truth(jobs, manifests, table, signal) {
+  const input = h("input", { type: "file", id: "truth" });
+  const status = h("p", { class: "muted", "aria-live": "polite" }, "Where the true frames are known, PSNR and SSIM are told: npy, TIFF or .mat, on the scale of the frames.");
+  input.addEventListener("change", async () => {
+    const file = input.files[0];
+    if (!file) return;
+    try {
+      const { sha256 } = await upload(file, (done, total) => say(status, `${bytes(done)} of ${bytes(total)}`), signal);
+      say(status, "The frames are compared …");
+      const found = await Promise.all(jobs.map((job) => get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/quality?truth=${sha256}`, signal)));
+      put(table, figures(jobs, manifests, found));
+      say(status, `Compared with ${file.name}.`);
+    } catch (error) {
+      if (!gaveUp(error)) put(status, h("span", { class: "warn" }, error.message));
+    }
+  });
+  return h("div", null, h("div", { class: "row" }, h("label", { for: "truth" }, "True frames"), input), status);
 }
 
 async function manifest(job, signal) {
@@ -111,10 +133,9 @@ class Pair {
 }
 
 /** What the two jobs were and what came of them. */
-function figures(jobs, manifests) {
+function figures(jobs, manifests, measured) {
   const row = (name, value) => h("tr", null, h("th", { scope: "row" }, name), jobs.map((job, index) => h("td", null, value(job, manifests[index]) ?? "–")));
-  const names = new Set(manifests.flatMap((found) => Object.entries(found?.content.quality ?? {}).filter(([, value]) => typeof value === "number").map(([name]) => name)));
-  const quality = [...names].map((name) => row(name.toUpperCase(), (_, found) => figure(found?.content.quality?.[name], 4)));
+  const rowOf = (name, unit, digits) => measured && h("tr", { class: "quality" }, h("th", { scope: "row" }, name.toUpperCase()), measured.map((found) => h("td", null, `${figure(found[name], digits)}${unit}`)));
   const body = h("tbody", null,
     row("State", (job) => h("span", { class: `badge ${job.state}` }, job.state)),
     row("Algorithm", (job) => job.algorithm),
@@ -125,8 +146,7 @@ function figures(jobs, manifests) {
     row("Ended", (_, found) => found && (found.content.summary.stop_reason === "converged" ? "converged" : "all planned iterations done")),
     row("Computing", (_, found) => found && duration(found.run.cpu_seconds)),
     row("Network", (_, found) => found?.content.model?.name),
-    quality);
+    rowOf("psnr", " dB", 4), rowOf("ssim", "", 4));
   const head = h("thead", null, h("tr", null, h("td"), jobs.map((job) => h("th", { scope: "col" }, h("a", { href: `#/jobs/${job.id}` }, nameOf(job))))));
-  const note = quality.length === 0 && h("p", { class: "muted" }, "PSNR and SSIM are shown for jobs whose manifest has them, which needs the true frames.");
-  return h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Figures of both jobs" }, h("table", { class: "figures" }, head, body)), note);
+  return h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Figures of both jobs" }, h("table", { class: "figures" }, head, body));
 }

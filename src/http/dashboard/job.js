@@ -5,6 +5,7 @@ import { bytes, duration, figure, momentInFull, nameOf, shapeOf, stageOf } from 
 import { actions } from "./actions.js";
 import { gaveUp, get } from "./api.js";
 import { left } from "./jobs.js";
+import { findings } from "./report.js";
 import { TileMap } from "./tilemap.js";
 import { Viewer } from "./viewer.js";
 import { watch } from "./live.js";
@@ -16,13 +17,14 @@ export async function job(root, [id], signal) {
   const buttons = h("span", { class: "row" });
   const progress = h("div", { class: "progressline" });
   const problem = h("div");
+  const warned = findings(found.warnings);
   const snapshot = snapshotChoice(found);
   const files = card("Files", h("p", { class: "muted" }, "…"));
   const manifest = card("Manifest");
   const viewer = new Viewer(found, signal);
   const tiles = new TileMap(found, signal);
   const cards = h("div", { class: "cards" }, tiles.plotCard, tiles.tilesCard, files, manifest, details(found), repeat(found));
-  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, viewer.element, cards);
+  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, warned ?? "", viewer.element, cards);
 
   let shown = null;
   let ready = null;
@@ -130,19 +132,12 @@ async function showManifest(element, now, snapshot, signal) {
     ["Provider", run.provider ? `${run.provider}, ONNX Runtime ${run.onnxruntime}` : "none"],
     ["Computing", duration(run.cpu_seconds)],
     ["Memory", bytes(run.peak_rss_bytes)],
-    ...quality(content.quality),
   ]), h("details", null, h("summary", null, "All of it"), h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
 }
 
 function warnings(manifest) {
   const found = manifest.content.warnings ?? manifest.warnings ?? [];
   return found.map((warning) => h("p", { class: "warn" }, typeof warning === "string" ? warning : warning.detail ?? JSON.stringify(warning)));
-}
-
-/** Figures against the truth, where the manifest has them. */
-export function quality(found) {
-  if (!found) return [];
-  return Object.entries(found).filter(([, value]) => typeof value === "number").map(([name, value]) => [name.toUpperCase(), figure(value, 4)]);
 }
 
 /** The line that asks for the same job again. */

@@ -8,6 +8,10 @@ import { table, textColumn } from "./rows.js";
 import { watch } from "./live.js";
 
 const PAGE = 100;
+/** Changed jobs that are asked for one by one; more of them are cheaper as a page. */
+const SOME = 8;
+/** Time after which places in the queue are looked at again though no waiting job has changed. */
+const STALE = 10_000;
 const STATES = ["queued", "running", "succeeded", "failed", "cancelling", "cancelled"];
 
 export async function jobs(root, [query], signal) {
@@ -20,7 +24,7 @@ export async function jobs(root, [query], signal) {
   const empty = h("p", { class: "note", hidden: true });
   root.className = "fill";
   const scroller = h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Jobs, newest first" });
-  const rows = table("Jobs", columns(chosen, () => choose(), (action, job) => refresh(job)), scroller, rowHeight);
+  const rows = table("Jobs", columns(chosen, () => choose(), () => refresh(null)), scroller, rowHeight);
   root.append(
     h("div", { class: "bar" }, h("h1", null, "Jobs"),
       h("label", { for: "state" }, "State"), state,
@@ -42,9 +46,8 @@ export async function jobs(root, [query], signal) {
     if (!list.complete && last + PAGE / 2 > list.items.length) list.more().then((more) => more && draw());
   }
 
-  async function refresh() {
-    const [first] = rows.range();
-    await list.refresh(first);
+  async function refresh(ids) {
+    if (!(ids && (await list.some(ids)))) await list.refresh(rows.range()[0]);
     draw();
   }
 
@@ -97,8 +100,23 @@ class JobList {
     return asked === this.query ? page : null;
   }
 
+  /** Reads a few changed jobs again; false if the list may have other rows now, or is old. */
+  async some(ids) {
+    const filtered = this.query.has("state") || this.query.has("search");
+    const rows = [...ids].map((id) => this.items.findIndex((job) => job.id === id));
+    if (filtered || ids.size > SOME || rows.includes(-1) || Date.now() - this.read > STALE) return false;
+    const asked = this.query;
+    const found = await Promise.all([...ids].map((id) => get(`/v1/jobs/${id}`, this.signal)));
+    if (asked === this.query) {
+      const fresh = new Map(found.map((job) => [job.id, job]));
+      this.items = this.items.map((job) => fresh.get(job.id) ?? job);
+    }
+    return true;
+  }
+
   /** Reads the first page again, and the one with the row `first` if that is another one. */
   async refresh(first) {
+    this.read = Date.now();
     this.take(null, await this.page(null));
     if (first >= PAGE) {
       const cursor = this.items[first - 1]?.id;

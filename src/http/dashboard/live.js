@@ -22,7 +22,7 @@ export function watch(changed, signal) {
       await changed(ids);
       link(true);
     } catch (error) {
-      if (!gaveUp(error)) link(false);
+      if (!gaveUp(error)) link(error.status < 500);
     }
     pending.busy = false;
     run();
@@ -96,7 +96,7 @@ export async function every(period, look, signal) {
         await look();
         link(true);
       } catch (error) {
-        if (!gaveUp(error)) link(false);
+        if (!gaveUp(error)) link(error.status < 500);
       }
     }
     await pause(period, signal);
@@ -126,7 +126,7 @@ function seen(signal) {
   });
 }
 
-/** Shows whether the service answers. */
+/** Shows whether the service answers; a refusal is an answer. */
 export function link(good) {
   const element = document.getElementById("link");
   say(element, good ? "live" : "no connection, trying again");

@@ -49,6 +49,7 @@ const FILES: &[(&str, &[u8])] = &files![
     "live.js",
     "pane.js",
     "player.js",
+    "report.js",
     "rows.js",
     "slice.js",
     "submit.js",

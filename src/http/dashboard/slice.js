@@ -98,7 +98,9 @@ export class Slice {
     const zoom = view.zoom ?? canvas.clientWidth / view.width;
     const left = view.zoom === null ? 0 : view.x - canvas.clientWidth / zoom / 2;
     const [first, last] = [Math.max(0, Math.floor(left / TILE)), Math.ceil(Math.min(view.width, left + canvas.clientWidth / zoom) / TILE)];
-    this.fetch(base, ...this.window(), first, last);
+    const window = this.window();
+    if (!window) return;
+    this.fetch(base, ...window, first, last);
     context.imageSmoothingEnabled = false;
     const tall = height / this.frames;
     for (const [at, bitmap] of this.cells) {

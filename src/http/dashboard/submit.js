@@ -2,6 +2,7 @@
 
 import { announce, facts, h, put, say } from "./dom.js";
 import { bytes, figure, moment, nameOf } from "./format.js";
+import { findings } from "./report.js";
 import { gaveUp, get, send, upload } from "./api.js";
 
 const HINT = "npy, TIFF, PNG (16 bit) or .mat";
@@ -192,24 +193,18 @@ function calibrationVerdict(item) {
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): nothing is known there`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
       ["Report", h("a", { href: `/v1/calibrations/${item.id}/report.html` }, "what is known of the masks")],
-      ...more(item),
     ]),
   ];
 }
 
 function measurementVerdict(item) {
+  const wrong = findings(item.warnings);
   return [
-    h("p", { class: "good" }, "The measurement fits the calibration."),
+    h("p", { class: wrong ? "warn" : "good" }, wrong ? "The measurement is taken, but:" : "The measurement fits the calibration."),
+    wrong,
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
       ["Full scale", figure(item.full_scale)],
-      ...more(item),
     ]),
   ];
-}
-
-/** What a check found beyond the sizes, where the service tells it. */
-function more(item) {
-  const warnings = (item.warnings ?? []).map((warning) => ["Warning", h("span", { class: "warn" }, warning.detail ?? String(warning))]);
-  return [item.grade && ["Grade", String(item.grade)], ...warnings];
 }

@@ -26,7 +26,7 @@ export class Viewer {
       this.rightContrast.touched = false;
       this.offerRight();
     });
-    this.slice = new Slice(this.view, frames, height, () => this.sliceBase(), () => this.rightContrast.window(), signal);
+    this.slice = new Slice(this.view, frames, height, () => this.sliceBase(), () => this.frameWindow, signal);
     this.right.marks.push((context, target, scale) => this.slice.mark(context, target, scale));
     this.right.tools.append(this.choice);
     this.zoom = h("span", { class: "muted" });
@@ -119,7 +119,6 @@ export class Viewer {
     this.rightContrast.element.hidden = false;
     this.right.tell("");
     this.showRight();
-    this.slice.redraw();
   }
 
   /** The spread of what is shown, of the middle frame for all of them: one window for a whole film. */
@@ -135,6 +134,8 @@ export class Viewer {
 
   showRight() {
     if (!this.ready) return;
+    // The slice is made of frames, whatever the pane shows.
+    if (this.mode() === "frame") this.frameWindow = this.rightContrast.window();
     this.right.show(this.source(this.player.frame), ...this.rightContrast.window());
     this.slice.show(this.player.frame);
   }

@@ -1,0 +1,80 @@
+// The report on a calibration: grade, what is wrong and what to do, and how alike the masks are.
+
+import { facts, h, put, s } from "./dom.js";
+import { figure } from "./format.js";
+import { get } from "./api.js";
+
+/** What a check found, each with what to do about it; null where there is nothing. */
+export function findings(found) {
+  if (!found?.length) return null;
+  const about = (item) => (item.snapshot !== undefined && item.snapshot !== null ? `Snapshot ${item.snapshot}: ` : "");
+  return h("ul", { class: "findings" }, found.map((item) => h("li", { class: item.severity },
+    h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about(item), item.detail,
+    item.remedy && h("span", { class: "muted" }, ` ${item.remedy}`))));
+}
+
+/** A card with the report, as soon as there is one. */
+export function report(item, signal) {
+  const body = h("div", null, h("p", { class: "muted" }, "…"));
+  const element = h("section", { class: "card", "aria-label": "Report" },
+    h("h2", { class: "row" }, "Report", h("span", { class: "grow" }), h("a", { href: `/v1/calibrations/${item.id}/report.html` }, "as a page")), body);
+  load(item, body, signal);
+  return element;
+}
+
+async function load(item, body, signal) {
+  try {
+    show(body, await get(`/v1/calibrations/${item.id}/report.json`, signal));
+  } catch (error) {
+    if (signal.aborted) return;
+    put(body, h("p", { class: "muted" }, error.message));
+    // A worker is making it.
+    if (error.code === "not_ready") setTimeout(() => signal.aborted || load(item, body, signal), 2000);
+  }
+}
+
+function show(body, found) {
+  const { masks, captures } = found;
+  put(body,
+    h("p", null, "Grade: ", h("span", { class: `grade ${found.grade}` }, found.grade)),
+    findings(found.findings) ?? h("p", { class: "muted" }, "Nothing is wrong with it."),
+    facts([
+      ["Deviation over the frames", figure(masks.deviation)],
+      ["1st to 99th percentile", `${figure(masks.percentile_1)} to ${figure(masks.percentile_99)}`],
+      ["Gram diagonal", `${figure(masks.gram[0])} to ${figure(masks.gram[2])}, mean ${figure(masks.gram[1])}`],
+      ["Pixels open in all masks", masks.stuck_pixels],
+      ["Values at 0", masks.values_at_zero],
+      masks.correlation_mean !== null && ["Correlation of two masks", `${figure(masks.correlation_mean)} in the mean, ${figure(masks.correlation_largest)} at most`],
+      captures && ["Light throughput", figure(captures.light_throughput)],
+      captures && ["Noise of a mask value", figure(captures.noise)],
+      captures && ["Dynamic range", captures.dynamic_range_db === null ? "–" : `${figure(captures.dynamic_range_db)} dB`],
+      captures && ["Evenness of the light", figure(captures.illumination_flatness)],
+    ]),
+    h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)));
+}
+
+/** The correlation of every two masks: grey at 0, blue above, orange below. */
+function matrix(values) {
+  const count = values.length;
+  const cell = (value, row, column) => s("rect", {
+    x: column, y: row, width: 1.02, height: 1.02, class: value < 0 ? "less" : "more", "fill-opacity": Math.min(1, Math.abs(value)).toFixed(3),
+  }, s("title", null, `masks ${row + 1} and ${column + 1}: ${figure(value)}`));
+  // Of long series a picture of the whole matrix, but no element for each of its cells.
+  const step = Math.max(1, Math.ceil(count / 64));
+  const kept = values.filter((_, row) => row % step === 0).map((line) => line.filter((_, column) => column % step === 0));
+  return h("figure", null, h("figcaption", { class: "muted" }, step > 1 ? `Correlation of every ${step}th mask` : "Correlation of the masks"),
+    s("svg", { viewBox: `0 0 ${kept.length} ${kept.length}`, class: "matrix", role: "img", "aria-label": `Correlation matrix of ${count} masks` },
+      kept.map((line, row) => line.map((value, column) => cell(value, row, column)))));
+}
+
+/** The mean of every mask. */
+function bars(values) {
+  const most = Math.max(...values, 1e-9);
+  const [width, height] = [300, 120];
+  const each = width / values.length;
+  const bar = (value, index) => s("rect", {
+    x: (index * each + each * 0.1).toFixed(2), width: (each * 0.8).toFixed(2), y: (height - (height * Math.max(0, value)) / most).toFixed(2), height: ((height * Math.max(0, value)) / most).toFixed(2), class: "more",
+  }, s("title", null, `mask ${index + 1}: ${figure(value)}`));
+  return h("figure", null, h("figcaption", { class: "muted" }, `Mean of each mask, from 0 to ${figure(most)}`),
+    s("svg", { viewBox: `0 0 ${width} ${height}`, class: "bars", role: "img", "aria-label": `Means of ${values.length} masks, ${figure(Math.min(...values))} to ${figure(most)}` }, values.map(bar)));
+}

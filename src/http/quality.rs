@@ -1,0 +1,134 @@
+//! How good frames are, where the truth is known: PSNR and SSIM against an upload.
+
+use std::path::{Path, PathBuf};
+
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::response::Response;
+use ndarray::{Array2, Axis};
+use serde::{Deserialize, Serialize};
+
+use super::access::Access;
+use super::app::App;
+use super::conditional;
+use super::error::{ApiError, Code};
+use super::extract::{Params, QueryOf};
+use super::intake;
+use super::jobs::with_snapshot;
+use crate::formats::mat::SceneArray;
+use crate::formats::{FormatError, FrameReader, Limits, npy};
+use crate::job::{JobId, SceneShape, Sha256};
+use crate::recon::metrics;
+use crate::store::{Job, StoreError};
+
+/// The query.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct QualityQuery {
+    /// The upload with the true frames.
+    truth: Sha256,
+    /// The stored number that means 1.
+    full_scale: Option<f32>,
+}
+
+/// The figures as they are shown.
+#[derive(Debug, Serialize)]
+struct QualityBody {
+    truth: Sha256,
+    /// Mean over the frames, in dB; null if a frame equals its truth.
+    psnr: f64,
+    /// Mean over the frames; null for frames smaller than the window.
+    ssim: Option<f64>,
+    frames: Vec<FrameQuality>,
+}
+
+/// The figures of one frame.
+#[derive(Debug, Serialize)]
+struct FrameQuality {
+    frame: usize,
+    psnr: f64,
+    ssim: Option<f64>,
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/quality`
+pub(super) async fn show(
+    State(app): State<App>,
+    access: Access,
+    Params((id, snapshot)): Params<(JobId, u32)>,
+    QueryOf(query): QueryOf<QualityQuery>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
+    app.store.upload(&access.lab, query.truth).await?;
+    let path = frames(&app, &job, snapshot).await?;
+    let (shape, truth) = (job.spec.shape, query.truth);
+    let frames = intake::run(&app, move |store, limits| {
+        let upload = store.dir().blob(&truth);
+        let opened = intake::open(&upload, limits, SceneArray::Truth, query.full_scale)?;
+        compare(&path, opened.0, opened.1.value(), snapshot as usize, shape)
+    });
+    conditional::json(&summary(truth, frames.await?), &headers)
+}
+
+/// Where the frames of a snapshot are.
+async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf, ApiError> {
+    match app.store.result_file(job, Some(snapshot), "frames.npy").await {
+        Ok((_, path)) => Ok(path),
+        Err(StoreError::NotFound { .. }) => {
+            Err(ApiError::new(Code::NotReady, "the frames are not written yet"))
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn summary(truth: Sha256, frames: Vec<FrameQuality>) -> QualityBody {
+    let count = frames.len().max(1) as f64;
+    let psnr = frames.iter().map(|frame| frame.psnr).sum::<f64>() / count;
+    let ssim = frames.iter().map(|frame| frame.ssim).sum::<Option<f64>>();
+    QualityBody { truth, psnr, ssim: ssim.map(|sum| sum / count), frames }
+}
+
+/// Compares the frames of a snapshot with those of a truth that has the frames of this snapshot, or
+/// of all snapshots of the measurement. Memory holds a frame of each.
+fn compare(
+    path: &Path,
+    mut truth: Box<dyn FrameReader + Send>,
+    full_scale: f32,
+    snapshot: usize,
+    shape: SceneShape,
+) -> Result<Vec<FrameQuality>, ApiError> {
+    let SceneShape { frames, height, width, snapshots } = shape;
+    let found = *truth.info();
+    let all = frames * snapshots as usize;
+    if (found.height, found.width) != (height, width) || ![frames, all].contains(&found.frames) {
+        let detail = format!(
+            "the truth has {} frames of {}x{}; it should have {frames} of {height}x{width} for this \
+             snapshot, or {all} for all",
+            found.frames, found.height, found.width
+        );
+        return Err(ApiError::new(Code::SizeMismatch, detail));
+    }
+    let before = if found.frames == all { snapshot * frames } else { 0 };
+    for _ in 0..before {
+        next(&mut *truth)?;
+    }
+    let result = npy::open_windows(path, &Limits::default())?;
+    let figures = |k: usize| -> Result<FrameQuality, ApiError> {
+        let truth = (next(&mut *truth)? / full_scale).insert_axis(Axis(0));
+        let frame = result.read_window(k..k + 1, 0..height, 0..width)?;
+        let psnr = metrics::psnr(frame.view(), truth.view());
+        let psnr = psnr.map_err(|error| ApiError::internal(&error))?;
+        // Refuses only what is smaller than its window.
+        Ok(FrameQuality {
+            frame: k + 1,
+            psnr,
+            ssim: metrics::ssim(frame.view(), truth.view()).ok(),
+        })
+    };
+    (0..frames).map(figures).collect()
+}
+
+fn next(reader: &mut (dyn FrameReader + Send)) -> Result<Array2<f32>, ApiError> {
+    let missing = || FormatError::Internal("a stack has fewer frames than it says".into());
+    Ok(reader.next_frame()?.ok_or_else(missing)?)
+}
