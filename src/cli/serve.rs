@@ -150,6 +150,11 @@ async fn keep_house(store: Store, metrics: Metrics, upload_hours: u64) {
         if count % 720 != 0 {
             continue;
         }
+        match store.expire_partials().await {
+            Ok(0) => {}
+            Ok(uploads) => tracing::info!(uploads, "ended uploads that did not go on"),
+            Err(error) => tracing::error!(%error, "old uploads can't be ended"),
+        }
         let age = i64::try_from(upload_hours.saturating_mul(3_600_000)).unwrap_or(i64::MAX);
         match store.collect(Timestamp(Timestamp::now().0.saturating_sub(age))).await {
             Ok(0) => {}

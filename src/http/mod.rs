@@ -4,6 +4,7 @@
 //! problem+json (RFC 9457); [`error`] has the only table of status codes.
 
 mod access;
+mod admission;
 mod algorithms;
 mod app;
 mod blobs;
@@ -23,6 +24,7 @@ mod page;
 mod results;
 mod router;
 mod system;
+pub mod tus;
 mod upload;
 
 pub use app::App;

@@ -5,18 +5,23 @@ use std::io::Write;
 use axum::body::Bytes;
 use axum::http::{HeaderMap, header};
 use futures_util::{Stream, StreamExt};
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
 
 use super::access::Access;
+use super::admission::{self, Room};
 use super::app::App;
 use super::error::{ApiError, Code};
 use crate::store::{StagedBlob, Store, StoreError};
 
 /// Chunks between the network and the disk.
-const CHUNKS: usize = 4;
+pub(super) const CHUNKS: usize = 4;
 
 /// Receives a stream into a file that is not yet in the store. What is broken off leaves nothing.
-pub(super) async fn receive<S, E>(app: &App, mut stream: S) -> Result<StagedBlob, ApiError>
+pub(super) async fn receive<S, E>(
+    app: &App,
+    mut room: Room,
+    mut stream: S,
+) -> Result<StagedBlob, ApiError>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
@@ -28,8 +33,9 @@ where
     while let Some(chunk) = next(app, &mut stream).await? {
         size += chunk.len() as u64;
         if size > app.max_upload_bytes {
-            return Err(too_large(app));
+            return Err(admission::too_large(app));
         }
+        room.take(app, chunk.len() as u64).await?;
         // A writer that takes no more has failed, and says why below.
         if sender.send(chunk).await.is_err() {
             break;
@@ -44,7 +50,8 @@ where
     Ok(staged)
 }
 
-async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>, ApiError>
+/// The next chunk, if there is one and it comes in time.
+pub(super) async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>, ApiError>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
@@ -76,38 +83,22 @@ fn write(store: &Store, mut chunks: mpsc::Receiver<Bytes>) -> Result<StagedBlob,
     writer.finish()
 }
 
-/// Refuses an upload that says by its length that it can't be taken, before its first byte.
-pub(super) async fn admit(app: &App, access: &Access, headers: &HeaderMap) -> Result<(), ApiError> {
+/// Refuses an upload that says by its length that it can't be taken, before its first byte; gives
+/// the room that was reserved for it.
+pub(super) async fn admit(
+    app: &App,
+    access: &Access,
+    headers: &HeaderMap,
+) -> Result<Room, ApiError> {
     let length = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok());
     let length: u64 = length.and_then(|text| text.parse().ok()).unwrap_or(0);
-    if length > app.max_upload_bytes {
-        return Err(too_large(app));
-    }
-    check_quota(app, access, length).await?;
-    let (free, _) = app.store.dir().disk()?;
-    if free < length.saturating_add(app.min_free_bytes) {
-        let detail = format!(
-            "the upload has {length} bytes, but of the {free} bytes free {} are kept in reserve",
-            app.min_free_bytes
-        );
-        return Err(ApiError::new(Code::InsufficientStorage, detail));
-    }
-    Ok(())
+    admission::check_length(app, access, length).await?;
+    Room::reserve(app, length).await
 }
 
-/// Refuses an upload with which the token would keep more here than it may.
-pub(super) async fn check_quota(app: &App, access: &Access, length: u64) -> Result<(), ApiError> {
-    let (Some(token), Some(limit)) = (access.token, access.max_bytes) else { return Ok(()) };
-    let kept = app.store.token_bytes(token).await?;
-    if kept.saturating_add(length) <= limit {
-        return Ok(());
-    }
-    let detail =
-        format!("the upload has {length} bytes, and the token keeps {kept} of the {limit} it may");
-    Err(ApiError::new(Code::QuotaExceeded, detail))
-}
-
-fn too_large(app: &App) -> ApiError {
-    let detail = format!("an upload has at most {} bytes", app.max_upload_bytes);
-    ApiError::new(Code::TooLarge, detail)
+/// Takes one of the places for uploads.
+pub(super) fn place(app: &App) -> Result<OwnedSemaphorePermit, ApiError> {
+    app.uploads.clone().try_acquire_owned().map_err(|_| {
+        ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
+    })
 }

@@ -1,6 +1,7 @@
 //! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
 
 mod access;
+mod disk;
 mod ids;
 mod memory;
 mod reason;
@@ -11,7 +12,9 @@ mod task;
 mod text;
 
 pub use access::{Lab, Role, Secret};
-pub use ids::{CalibrationId, InvalidId, JobId, MeasurementId, TaskId, TokenId, WorkerId};
+pub use ids::{
+    CalibrationId, InvalidId, JobId, MeasurementId, PartialId, TaskId, TokenId, WorkerId,
+};
 pub use reason::without_paths;
 pub use request::{
     Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,

@@ -13,6 +13,8 @@ use crate::job::{
 /// A job to be accepted.
 #[derive(Debug, Clone)]
 pub struct NewJob {
+    /// So many jobs may wait and run, with this one.
+    pub most_jobs: u64,
     /// Whose it is.
     pub lab: Lab,
     /// What is to be done.
@@ -74,7 +76,8 @@ impl Store {
     /// Accepts a job: the job and its tasks, or nothing.
     ///
     /// # Errors
-    /// [`StoreError::KeyReused`]; [`StoreError::NotFound`] if the measurement is gone.
+    /// [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::NotFound`] if the
+    /// measurement is gone.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted, StoreError> {
         let mut transaction = self.write().await?;
         if let Some(key) = &new.idempotency_key
@@ -82,13 +85,15 @@ impl Store {
         {
             return Ok(Inserted::Before(job));
         }
+        check_queue(&mut transaction, new.most_jobs).await?;
         let id = JobId::new();
+        let disk_bytes = super::rows::integer(new.spec.disk_bytes());
         let spec = serde_json::to_string(&new.spec)
             .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
         sqlx::query(
             "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-                 idempotency_key, request, created_at, lab)
-             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?)",
+                 idempotency_key, request, created_at, lab, disk_bytes)
+             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
         )
         .bind(id.to_string())
         .bind(new.spec.calibration.to_string())
@@ -100,6 +105,7 @@ impl Store {
         .bind(new.request.to_string())
         .bind(Timestamp::now().0)
         .bind(new.lab.as_str())
+        .bind(disk_bytes)
         .execute(&mut *transaction)
         .await
         .map_err(|error| {
@@ -109,6 +115,20 @@ impl Store {
         tasks::insert(&mut transaction, id, &new.spec).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
+    }
+
+    /// The job that the lab made with this key, if it made one; an error if it asked for another.
+    ///
+    /// # Errors
+    /// [`StoreError::KeyReused`].
+    pub async fn job_with_key(
+        &self,
+        lab: &Lab,
+        key: &str,
+        request: Sha256,
+    ) -> Result<Option<JobId>, StoreError> {
+        let mut connection = self.readers.acquire().await?;
+        with_key(&mut connection, lab, key, request).await
     }
 
     /// The lab's job with this identifier.
@@ -330,6 +350,17 @@ async fn snapshots(connection: &mut SqliteConnection, id: JobId) -> Result<Vec<u
     .fetch_all(connection)
     .await?;
     rows.iter().map(|row| number(row, "snapshot")).collect()
+}
+
+/// Refuses a job if enough wait and run.
+async fn check_queue(connection: &mut SqliteConnection, most: u64) -> Result<(), StoreError> {
+    let row = sqlx::query(
+        "SELECT count(*) AS jobs FROM jobs WHERE state IN ('queued', 'running', 'cancelling')",
+    )
+    .fetch_one(connection)
+    .await?;
+    let jobs = number(&row, "jobs")?;
+    if jobs < most { Ok(()) } else { Err(StoreError::QueueFull { jobs, most }) }
 }
 
 /// A key as it is stored: good for one job of a lab.

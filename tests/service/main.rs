@@ -13,6 +13,7 @@ mod hangs;
 mod hostile;
 mod jobs;
 mod pipeline;
+mod resumable;
 mod samples;
 mod uploads;
 mod work;
