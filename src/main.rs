@@ -20,6 +20,7 @@ enum Command {
     Worker(config::WorkerArguments),
     Reconstruct(cli::reconstruct::Arguments),
     Simulate(cli::simulate::Arguments),
+    Optics(cli::optics::Arguments),
     Demo(cli::demo::Arguments),
     Token(cli::token::Arguments),
 }
@@ -29,6 +30,7 @@ fn main() -> ExitCode {
         Command::Serve(arguments) => cli::serve::run(&arguments).map_err(CliError::from),
         Command::Worker(arguments) => cli::worker::run(&arguments),
         Command::Reconstruct(arguments) => cli::reconstruct::run(&arguments),
+        Command::Optics(arguments) => cli::optics::run(&arguments),
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
         Command::Demo(arguments) => cli::demo::run(&arguments),
         Command::Token(arguments) => cli::token::run(&arguments),

@@ -8,6 +8,7 @@ mod progress;
 mod supervisor;
 
 pub mod demo;
+pub mod optics;
 pub mod reconstruct;
 pub mod serve;
 pub mod simulate;

@@ -1,16 +1,21 @@
 //! `sci-recon simulate`: masks and a measurement of a known scene.
 
+mod captures;
+mod masks;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use ndarray::{Array2, Array3, ArrayView3, s};
 use serde::Serialize;
 
 use super::CliError;
 use super::input::read_clip;
+use super::optics::OpticsFile;
 use crate::formats::npy;
-use crate::optics::{ApertureGrid, OpticsError, iid_masks, measure, noisy, random_squares};
+use crate::optics::{OpticsError, illumination, measure, noisy};
+use masks::{Apertures, MaskArguments, SimulatedMasks};
 
 /// Simulate a snapshot: make masks and measure known frames through them.
 #[derive(Debug, Args)]
@@ -29,12 +34,15 @@ pub struct Arguments {
     #[arg(long, value_name = "N", default_value_t = 1,
           value_parser = clap::value_parser!(u16).range(1..))]
     snapshots: u16,
-    /// Kind of the masks.
-    #[arg(long)]
-    pattern: Pattern,
+    #[command(flatten)]
+    masks: MaskArguments,
     /// Seed of all that is random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Also write the raw captures that a lab would take, with this number of repeats of each, as
+    /// 16-bit numbers into the folder captures; captures.json there lists them.
+    #[arg(long, value_name = "REPEATS", value_parser = clap::value_parser!(u16).range(1..=1000))]
+    captures: Option<u16>,
     /// Noise of the measurement on the scale of 255 grey values: S/255 is the standard deviation
     /// added to y = sum C x, with x and C from 0 to 1.
     #[arg(long, value_name = "S", default_value_t = 0.0)]
@@ -42,15 +50,6 @@ pub struct Arguments {
     /// Folder for masks.npy, measurement.npy, truth.npy and simulation.json.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
-}
-
-/// Kinds of masks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Pattern {
-    /// Independent binary pixels, half of them open, as in the public benchmark.
-    Iid,
-    /// The hybrid coded aperture: a lithography mask seen through random sub-apertures.
-    RandomSquares,
 }
 
 /// `simulation.json`.
@@ -68,17 +67,14 @@ struct Record {
     /// Standard deviation that was added to the measurement, on its own scale.
     noise_sigma: f32,
     mask_mean: f32,
+    /// Share of the light of the whole open aperture, without a mask, that the masks pass.
+    light_throughput: f64,
+    /// That share where a mask is 1.
+    mask_scale: f32,
+    /// Value of the first measurement of `captures` that means 1; none without captures.
+    capture_full_scale: Option<f32>,
+    optics: OpticsFile,
     apertures: Option<Apertures>,
-}
-
-/// The sub-apertures of random squares.
-#[derive(Debug, Serialize)]
-struct Apertures {
-    rows: usize,
-    columns: usize,
-    rank: usize,
-    /// For each frame, `1` for each open sub-aperture and `0` for the others, row by row.
-    open: Vec<String>,
 }
 
 /// Runs the command.
@@ -98,12 +94,17 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
             arguments.snapshots
         )));
     }
-    let truth = frames.slice(s![..used, .., ..]);
-    let (masks, apertures) = make_masks(arguments.pattern, (ratio, height, width), arguments.seed)?;
+    let optics = arguments.masks.optics()?;
+    let light = illumination((height, width), optics.vignetting())?;
+    // The illumination stays part of the scene: this is what can be seen of it.
+    let truth = &frames.slice(s![..used, .., ..]) * &light;
+    let made = arguments.masks.make(&optics, (ratio, height, width), arguments.seed)?;
+    let SimulatedMasks { masks, throughput, scale, apertures } = made;
+    let truth = truth.view();
     let snapshots = measure_all(&masks, truth, arguments.noise_sigma / 255.0, arguments.seed)?;
-    let record = Record {
+    let mut record = Record {
         program_version: env!("CARGO_PKG_VERSION"),
-        pattern: arguments.pattern.name(),
+        pattern: arguments.masks.pattern(),
         seed: arguments.seed,
         compression_ratio: ratio,
         snapshots: snapshots.len(),
@@ -112,37 +113,27 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         unused_frames: count - used,
         noise_sigma: arguments.noise_sigma / 255.0,
         mask_mean: masks.mean().unwrap_or(0.0),
+        light_throughput: throughput,
+        mask_scale: scale,
+        capture_full_scale: None,
+        optics,
         apertures,
     };
-    write(&arguments.out, &masks, &snapshots, truth, &record)
-}
-
-impl Pattern {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Iid => "iid",
-            Self::RandomSquares => "random-squares",
-        }
+    fs::create_dir_all(&arguments.out)
+        .map_err(|error| CliError::file("make", &arguments.out, &error))?;
+    if let Some(repeats) = arguments.captures {
+        let lab = captures::Lab {
+            camera: record.optics.camera(),
+            illumination: light.view(),
+            masks: masks.view(),
+            scale,
+            repeats: repeats.into(),
+            seed: arguments.seed,
+        };
+        let full_scale = lab.write(&arguments.out.join("captures"), snapshots.len(), truth)?;
+        record.capture_full_scale = Some(full_scale);
     }
-}
-
-/// The masks \[B,H,W\], and the sub-apertures behind them if there are any.
-fn make_masks(
-    pattern: Pattern,
-    (frames, height, width): (usize, usize, usize),
-    seed: u64,
-) -> Result<(Array3<f32>, Option<Apertures>), CliError> {
-    Ok(match pattern {
-        Pattern::Iid => (iid_masks(frames, height, width, seed)?, None),
-        Pattern::RandomSquares => {
-            let (masks, openings) = random_squares(frames, height, width, seed)?;
-            let ApertureGrid { rows, columns } = ApertureGrid::for_frames(frames);
-            let ones =
-                |row: &Vec<bool>| row.iter().map(|&open| if open { '1' } else { '0' }).collect();
-            let open = openings.rows().iter().map(ones).collect();
-            (masks, Some(Apertures { rows, columns, rank: openings.rank(), open }))
-        }
-    })
+    write(&arguments.out, &masks, &snapshots, truth, &record)
 }
 
 /// One measurement for each `B` frames of the truth.
@@ -170,7 +161,6 @@ fn write(
     record: &Record,
 ) -> Result<(), CliError> {
     let failed = |error| CliError::file("write", out, &error);
-    fs::create_dir_all(out).map_err(failed)?;
     npy::write_f32(&out.join("masks.npy"), masks.view())?;
     npy::write_f32(&out.join("truth.npy"), truth)?;
     let measurement = out.join("measurement.npy");

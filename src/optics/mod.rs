@@ -3,15 +3,38 @@
 //! Knows arrays only. Everything random comes from a ChaCha generator with a stated seed, so
 //! that a simulation can be repeated bit for bit.
 
+mod axis;
+mod calibration;
+mod camera;
+mod check;
+mod findings;
+mod geometry;
 mod iid;
+mod masks;
 mod multiplex;
+mod order;
+mod patterns;
+mod projection;
 mod simulate;
 mod squares;
+mod study;
 
+pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
+pub use camera::{Camera, illumination};
+pub use check::{MeasurementFigures, MeasurementStudy, REACH, judge_measurement};
+pub use findings::{
+    CaptureFigures, Finding, PatternFigures, Severity, judge_captures, judge_masks,
+};
+pub use geometry::Geometry;
 pub use iid::iid_masks;
-pub use multiplex::Multiplexing;
+pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
+pub use multiplex::{Draw, Multiplexing};
+pub use order::{Expected, Reordered, pattern_likeness, reordered};
+pub use patterns::{Circle, check_patterns, pattern_rank, single_apertures};
+pub use projection::{Method, Placement, Projector};
 pub use simulate::{measure, noisy};
 pub use squares::{ApertureGrid, random_squares};
+pub use study::{MaskFigures, MaskStudy, flatness};
 
 use thiserror::Error;
 
@@ -48,6 +71,12 @@ pub enum OpticsError {
         /// Rank that is possible.
         wanted: usize,
     },
+    /// Patterns, or a lithography mask, that can't be used.
+    #[error("{0}")]
+    Pattern(String),
+    /// Raw captures that can't be calibrated with.
+    #[error("{0}")]
+    Captures(String),
     /// Masks and frames that do not belong together.
     #[error("the frames are {frames}, the masks {masks}; both must have the same size")]
     Sizes {
@@ -59,7 +88,7 @@ pub enum OpticsError {
 }
 
 /// The generator of everything random here: the same on every machine.
-fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
+pub fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
     rand::SeedableRng::seed_from_u64(seed)
 }
 

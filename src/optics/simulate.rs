@@ -77,4 +77,19 @@ mod tests {
         assert_eq!(noisy(y.clone(), 0.0, 5).unwrap(), y);
         assert!(noisy(y, f32::NAN, 5).is_err());
     }
+
+    #[test]
+    fn a_measurement_is_the_forward_operator_whose_adjoint_the_solver_has() {
+        // <H x, y> = <x, H^T y>, with masks of the whole chain of optics.
+        let (masks, _) = crate::optics::random_squares(4, 12, 9, 3).unwrap();
+        let mut rng = crate::optics::generator(8);
+        let frames =
+            Array3::from_shape_simple_fn((4, 12, 9), || rand::Rng::random::<f32>(&mut rng));
+        let y = Array2::from_shape_simple_fn((12, 9), || rand::Rng::random::<f32>(&mut rng) - 0.5);
+        let forward = measure(masks.view(), frames.view()).unwrap();
+        let adjoint =
+            crate::recon::sensing::SensingOperator::new(masks).unwrap().adjoint(y.view()).unwrap();
+        let (left, right) = ((&forward * &y).sum(), (&frames * &adjoint).sum());
+        assert!((left - right).abs() < 1e-4 * left.abs().max(1.0), "{left} {right}");
+    }
 }

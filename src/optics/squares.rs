@@ -1,9 +1,8 @@
 //! "Random squares": the masks of the hybrid coded aperture in the paper's simulation.
 
-use ndarray::{Array2, Array3, ArrayView2, s};
-use rand::Rng;
+use ndarray::Array3;
 
-use super::{Multiplexing, OpticsError, check_size, generator};
+use super::{Draw, HybridAperture, Multiplexing, OpticsError, check_size, generator};
 
 /// A grid of square sub-apertures. Opening one shifts the projected lithography mask by whole
 /// mask pixels, neighbours by one pixel more.
@@ -33,7 +32,8 @@ impl ApertureGrid {
     }
 }
 
-/// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them.
+/// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them: the paper's
+/// simulation.
 ///
 /// A random binary lithography mask (half of it open) is seen through the sub-apertures of
 /// [`ApertureGrid::for_frames`], half of them open in each frame: the mask of a frame is the sum
@@ -51,34 +51,11 @@ pub fn random_squares(
     check_size(frames, height, width)?;
     let grid = ApertureGrid::for_frames(frames);
     let mut rng = generator(seed);
-    let openings = Multiplexing::random(frames, grid.count(), grid.count() / 2, &mut rng)?;
-    let lithography =
-        Array2::from_shape_simple_fn((height + grid.rows - 1, width + grid.columns - 1), || {
-            f32::from(u8::from(rng.random::<bool>()))
-        });
-    let mut masks = Array3::zeros((frames, height, width));
-    for (mut mask, open) in masks.outer_iter_mut().zip(openings.rows()) {
-        for (aperture, _) in open.iter().enumerate().filter(|(_, open)| **open) {
-            mask += &shifted(&lithography, grid, aperture, height, width);
-        }
-    }
-    let largest = masks.fold(0.0f32, |largest, &value| largest.max(value));
-    if largest > 0.0 {
-        masks /= largest;
-    }
-    Ok((masks, openings))
-}
-
-/// The lithography mask as seen through one sub-aperture.
-fn shifted(
-    lithography: &Array2<f32>,
-    grid: ApertureGrid,
-    aperture: usize,
-    height: usize,
-    width: usize,
-) -> ArrayView2<'_, f32> {
-    let (row, column) = (aperture / grid.columns, aperture % grid.columns);
-    lithography.slice(s![row..row + height, column..column + width])
+    let draw = Draw::of(grid.count() / 2);
+    let openings = Multiplexing::random(frames, grid.count(), draw, &mut rng)?;
+    let patterns = openings.patterns(grid);
+    let projected = HybridAperture::default().masks(patterns.view(), (height, width), &mut rng)?;
+    Ok((projected.masks, openings))
 }
 
 #[cfg(test)]

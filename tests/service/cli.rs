@@ -118,6 +118,77 @@ fn a_simulated_snapshot_is_reconstructed() {
 }
 
 #[test]
+fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
+    let files = Files::new();
+    let optics = files.text("optics.toml");
+    let mut text = String::from_utf8(sci_recon(&["optics"]).stdout).unwrap();
+    text = text.replace("magnification = 1.0", "magnification = 2.0");
+    text = text.replace("vignetting = 0.0", "vignetting = 0.5");
+    std::fs::write(&optics, text).unwrap();
+    let checked = json(&sci_recon(&["optics", "--check", &optics]));
+    assert_eq!(checked["derived"]["sensor_pixels_per_mask_pixel"], 2.0);
+    std::fs::write(
+        files.path("patterns.npy"),
+        npy(&[3, 1, 2], [1.0, 0.0, 0.0, 1.0, 1.0, 1.0].into_iter()),
+    )
+    .unwrap();
+    let images = files.text("patterns.npy");
+    for (pattern, rank, more) in [
+        ("rotating-circle", 3, &[][..]),
+        ("single-apertures", 3, &["--normalise", "throughput"]),
+        ("images", 2, &["--images", &images]),
+    ] {
+        let base = ["--compression-ratio", "3", "--optics", &optics];
+        let made = files.simulate(pattern, pattern, &[&base[..], more].concat());
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        let record: Value =
+            serde_json::from_slice(&bytes(&files.path(pattern).join("simulation.json"))).unwrap();
+        assert_eq!(record["apertures"]["rank"], rank, "{record:#}");
+        assert_eq!(record["optics"]["light"]["vignetting"], 0.5);
+        let mean = record["mask_mean"].as_f64().unwrap();
+        let share = record["light_throughput"].as_f64().unwrap();
+        let scale = record["mask_scale"].as_f64().unwrap();
+        assert!((mean * scale - share).abs() < 1e-6, "{record:#}");
+    }
+    // Half of the light is lost at the corners, and the truth is what can be seen.
+    let truth = std::fs::read(files.path("images/truth.npy")).unwrap();
+    let first = crate::pipeline::values(&truth)[63];
+    let expected = Scene::SMALL.pixel(0, 0, 0, 63) / 2.0;
+    assert!((first - expected).abs() < 1e-3, "{first}");
+}
+
+#[test]
+fn optics_that_can_not_be_are_refused_at_once() {
+    let files = Files::new();
+    let optics = files.text("optics.toml");
+    let refuse = |text: &str, pattern: &str, ratio: &str, more: &[&str]| {
+        std::fs::write(&optics, text).unwrap();
+        let base = ["--compression-ratio", ratio, "--optics", &optics];
+        let output = files.simulate(pattern, "bad", &[&base[..], more].concat());
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        message
+    };
+    let message = refuse("[mask]\ndistance_um = 0", "random-squares", "4", &[]);
+    assert!(message.contains("distance_um is 0"), "{message}");
+    let message = refuse("[sub_apertures]\nopen_share = 1.1", "random-squares", "4", &[]);
+    assert!(message.contains("no more sub-apertures can be open than there are"), "{message}");
+    let message = refuse("[sub_apertures]\nrank = 5", "random-squares", "4", &[]);
+    assert!(message.contains("rank 5 can't be reached"), "{message}");
+    let two = "[sub_apertures]\nrows = 1\ncolumns = 2";
+    let message = refuse(two, "single-apertures", "4", &[]);
+    assert!(message.contains("4 frames need as many"), "{message}");
+    let folder = files.path("pictures");
+    std::fs::create_dir_all(&folder).unwrap();
+    for (name, size) in [("1.png", 4), ("2.png", 5)] {
+        image::GrayImage::new(size, 4).save(folder.join(name)).unwrap();
+    }
+    let images = ["--images", folder.to_str().unwrap()];
+    let message = refuse("", "images", "2", &images);
+    assert!(message.contains("4x5") && message.contains("4x4"), "{message}");
+}
+
+#[test]
 fn a_seed_repeats_a_simulation_bit_for_bit() {
     let files = Files::new();
     let more = ["--compression-ratio", "3", "--noise-sigma", "5", "--seed"];

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-use ndarray::{ArrayView2, ArrayView3};
+use ndarray::{Array2, ArrayView2, ArrayView3};
 
 use super::header::MAGIC;
 use crate::formats::FormatError;
@@ -67,9 +67,40 @@ pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<(), Fo
     Ok(())
 }
 
-/// A version 1.0 header, padded as NumPy does so that the data starts at a multiple of 64.
+/// Writes (or overwrites) the file `path` with `count` frames (row, column) of `height` x `width`
+/// numbers, as they are made: shape (frame, row, column), little-endian uint16.
+///
+/// Errors: those of `frame`; I/O; [`FormatError::Internal`] for a frame of another size.
+pub fn write_u16<E: From<FormatError>>(
+    path: &Path,
+    (count, height, width): (usize, usize, usize),
+    mut frame: impl FnMut(usize) -> Result<Array2<u16>, E>,
+) -> Result<(), E> {
+    let failed = |error| FormatError::io("write the npy file")(error);
+    let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
+    let mut writer = BufWriter::new(file);
+    let header = typed_header("<u2", &format!("({count}, {height}, {width})"));
+    writer.write_all(&header).map_err(failed)?;
+    for index in 0..count {
+        let frame = frame(index)?;
+        if frame.dim() != (height, width) {
+            let (rows, columns) = frame.dim();
+            let text = format!("a frame of {rows}x{columns} for a stack of {height}x{width}");
+            return Err(FormatError::Internal(text).into());
+        }
+        let bytes: Vec<u8> = frame.iter().flat_map(|value| value.to_le_bytes()).collect();
+        writer.write_all(&bytes).map_err(failed)?;
+    }
+    Ok(writer.flush().map_err(failed)?)
+}
+
 fn header(shape: &str) -> Vec<u8> {
-    let mut text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+    typed_header("<f4", shape)
+}
+
+/// A version 1.0 header, padded as NumPy does so that the data starts at a multiple of 64.
+fn typed_header(sample: &str, shape: &str) -> Vec<u8> {
+    let mut text = format!("{{'descr': '{sample}', 'fortran_order': False, 'shape': {shape}, }}");
     let prefix = MAGIC.len() + 4;
     while !(prefix + text.len() + 1).is_multiple_of(64) {
         text.push(' ');

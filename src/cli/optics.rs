@@ -1,0 +1,337 @@
+//! The file of optical parameters, and `sci-recon optics`, which prints and checks it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde::{Deserialize, Serialize};
+
+use super::CliError;
+use crate::optics::{ApertureGrid, Camera, Circle, Draw, Geometry, Method, Placement};
+
+/// The file of the defaults, with a comment for each number.
+const DEFAULTS: &str = include_str!("../../docs/optics.toml");
+
+/// Print the optical parameters of `simulate`: the defaults as a commented TOML file, or what
+/// follows from a file of your own.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Check this file and print, as JSON, all parameters and what follows from them.
+    #[arg(long, value_name = "FILE")]
+    check: Option<PathBuf>,
+}
+
+/// Everything that a file of optical parameters says.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct OpticsFile {
+    lcos: Lcos,
+    relay: Relay,
+    mask: Mask,
+    sensor: Sensor,
+    projection: Projection,
+    sub_apertures: SubApertures,
+    circle: CircleSection,
+    light: Light,
+    camera: CameraSection,
+}
+
+/// A section of the file, with the defaults of the type that it stands for.
+macro_rules! section {
+    ($name:ident = $defaults:expr => { $($field:ident: $type:ty),* $(,)? }) => {
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        struct $name { $($field: $type),* }
+
+        impl Default for $name {
+            fn default() -> Self {
+                let defaults = $defaults;
+                Self { $($field: defaults.$field),* }
+            }
+        }
+    };
+}
+
+section!(CircleSection = Circle::default() => { radius_pixels: f64, centre_pixels: f64 });
+section!(CameraSection = Camera::default() => {
+    bits: u32,
+    full_well_e: f64,
+    read_noise_e: f64,
+    black_level: f64,
+    background: f64,
+    calibration_exposure: f64,
+    measurement_exposure: f64,
+});
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Lcos {
+    rows: usize,
+    columns: usize,
+    pitch_um: f64,
+}
+
+impl Default for Lcos {
+    fn default() -> Self {
+        let paper = Geometry::default();
+        Self { rows: paper.lcos_rows, columns: paper.lcos_columns, pitch_um: paper.lcos_pitch_um }
+    }
+}
+
+section!(Relay = Geometry::default() => { focal_length_mm: f64, magnification: f64 });
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Mask {
+    pitch_um: f64,
+    distance_um: f64,
+}
+
+impl Default for Mask {
+    fn default() -> Self {
+        let paper = Geometry::default();
+        Self { pitch_um: paper.mask_pitch_um, distance_um: paper.mask_distance_um }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Sensor {
+    pitch_um: f64,
+}
+
+impl Default for Sensor {
+    fn default() -> Self {
+        Self { pitch_um: Geometry::default().sensor_pitch_um }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum PlacementName {
+    WholePixels,
+    Geometric,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum MethodName {
+    Shifts,
+    Convolution,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Projection {
+    placement: PlacementName,
+    method: MethodName,
+    phase_rows: f64,
+    phase_columns: f64,
+    blur_um: f64,
+}
+
+impl Default for Projection {
+    fn default() -> Self {
+        let (placement, method) = (PlacementName::WholePixels, MethodName::Shifts);
+        Self { placement, method, phase_rows: 0.0, phase_columns: 0.0, blur_um: 0.0 }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct SubApertures {
+    rows: Option<usize>,
+    columns: Option<usize>,
+    open_share: f64,
+    rank: Option<usize>,
+    tries: usize,
+}
+
+impl Default for SubApertures {
+    fn default() -> Self {
+        Self { rows: None, columns: None, open_share: 0.5, rank: None, tries: Draw::of(1).tries }
+    }
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Light {
+    vignetting: f64,
+}
+
+impl OpticsFile {
+    /// Reads and checks a file; without one these are the defaults.
+    pub(super) fn read(path: Option<&Path>) -> Result<Self, CliError> {
+        let Some(path) = path else { return Ok(Self::default()) };
+        let text = fs::read_to_string(path).map_err(|error| refused(path, &error))?;
+        let file: Self = toml::from_str(&text).map_err(|error| refused(path, &error))?;
+        file.geometry().check().map_err(|error| refused(path, &error))?;
+        file.camera().check().map_err(|error| refused(path, &error))?;
+        Ok(file)
+    }
+
+    pub(super) fn geometry(&self) -> Geometry {
+        Geometry {
+            lcos_rows: self.lcos.rows,
+            lcos_columns: self.lcos.columns,
+            lcos_pitch_um: self.lcos.pitch_um,
+            focal_length_mm: self.relay.focal_length_mm,
+            mask_distance_um: self.mask.distance_um,
+            mask_pitch_um: self.mask.pitch_um,
+            magnification: self.relay.magnification,
+            sensor_pitch_um: self.sensor.pitch_um,
+            blur_um: self.projection.blur_um,
+            phase_rows: self.projection.phase_rows,
+            phase_columns: self.projection.phase_columns,
+        }
+    }
+
+    pub(super) fn camera(&self) -> Camera {
+        let CameraSection {
+            bits,
+            full_well_e,
+            read_noise_e,
+            black_level,
+            background,
+            calibration_exposure,
+            measurement_exposure,
+        } = self.camera;
+        Camera {
+            bits,
+            full_well_e,
+            read_noise_e,
+            black_level,
+            background,
+            calibration_exposure,
+            measurement_exposure,
+        }
+    }
+
+    pub(super) fn circle(&self) -> Circle {
+        let CircleSection { radius_pixels, centre_pixels } = self.circle;
+        Circle { radius_pixels, centre_pixels }
+    }
+
+    pub(super) fn placement(&self) -> Placement {
+        match self.projection.placement {
+            PlacementName::WholePixels => Placement::WholePixels,
+            PlacementName::Geometric => Placement::Geometric,
+        }
+    }
+
+    pub(super) fn method(&self) -> Method {
+        match self.projection.method {
+            MethodName::Shifts => Method::Shifts,
+            MethodName::Convolution => Method::Convolution,
+        }
+    }
+
+    pub(super) fn vignetting(&self) -> f64 {
+        self.light.vignetting
+    }
+
+    /// The grid of sub-apertures for snapshots of `frames` frames.
+    pub(super) fn grid(&self, frames: usize) -> Result<ApertureGrid, CliError> {
+        let rule = ApertureGrid::for_frames(frames);
+        match (self.sub_apertures.rows, self.sub_apertures.columns) {
+            (None, None) => Ok(rule),
+            (Some(rows @ 1..), Some(columns @ 1..)) => Ok(ApertureGrid { rows, columns }),
+            _ => Err(CliError::Input(
+                "sub_apertures: state both rows and columns, at least 1, or neither".into(),
+            )),
+        }
+    }
+
+    /// How random squares are drawn on a grid.
+    pub(super) fn draw(&self, grid: ApertureGrid) -> Result<Draw, CliError> {
+        let SubApertures { open_share, rank, tries, .. } = self.sub_apertures;
+        if !(open_share > 0.0 && open_share <= 1.0) {
+            return Err(CliError::Input(format!(
+                "sub_apertures open_share is {open_share}; it must be above 0 and at most 1: no more \
+                 sub-apertures can be open than there are"
+            )));
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most the count
+        let open = (open_share * grid.count() as f64).round() as usize;
+        Ok(Draw { open, rank, tries })
+    }
+}
+
+fn refused(path: &Path, error: &dyn std::fmt::Display) -> CliError {
+    CliError::Input(format!("optics {}: {error}", path.display()))
+}
+
+/// What `--check` prints beside the parameters.
+#[derive(Debug, Serialize)]
+struct Derived {
+    /// By how much the mask's projection moves from the first to the last row of the LCoS.
+    shift_over_lcos_rows_mask_pixels: f64,
+    shift_over_lcos_columns_mask_pixels: f64,
+    shift_per_lcos_pixel_mask_pixels: f64,
+    sensor_pixels_per_mask_pixel: f64,
+    blur_mask_pixels: f64,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A file that can't be used.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let Some(path) = &arguments.check else {
+        print!("{DEFAULTS}");
+        return Ok(());
+    };
+    let file = OpticsFile::read(Some(path))?;
+    let geometry = file.geometry();
+    let shift = geometry.shift_per_lcos_pixel();
+    let derived = Derived {
+        shift_over_lcos_rows_mask_pixels: shift * geometry.lcos_rows as f64,
+        shift_over_lcos_columns_mask_pixels: shift * geometry.lcos_columns as f64,
+        shift_per_lcos_pixel_mask_pixels: shift,
+        sensor_pixels_per_mask_pixel: geometry.sensor_pixels_per_mask_pixel(),
+        blur_mask_pixels: geometry.blur_um / geometry.mask_pitch_um,
+    };
+    let value = serde_json::json!({ "optics": file, "derived": derived });
+    println!("{value:#}");
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{DEFAULTS, OpticsFile};
+
+    #[test]
+    fn the_printed_file_holds_the_defaults() {
+        let file: OpticsFile = toml::from_str(DEFAULTS).unwrap();
+        assert_eq!(file, OpticsFile::default());
+        // And it names every number that there is, also those that have no default.
+        let all = serde_json::to_value(&file).unwrap();
+        for (section, fields) in all.as_object().unwrap() {
+            assert!(DEFAULTS.contains(&format!("[{section}]")), "{section}");
+            for field in fields.as_object().unwrap().keys() {
+                assert!(DEFAULTS.contains(&format!("{field} = ")), "{section}.{field}");
+            }
+        }
+    }
+
+    #[test]
+    fn files_that_can_not_be_are_refused_with_their_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("optics.toml");
+        let read = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            OpticsFile::read(Some(&path))
+        };
+        let error = read("[mask]\ndistance_um = 0.0\n").unwrap_err().to_string();
+        assert!(error.contains("optics.toml") && error.contains("distance_um is 0"), "{error}");
+        let error = read("[mask]\ndistance = 3.0\n").unwrap_err().to_string();
+        assert!(error.contains("distance"), "{error}");
+        let file = read("[sub_apertures]\nopen_share = 1.5\n").unwrap();
+        let error = file.draw(file.grid(10).unwrap()).unwrap_err().to_string();
+        assert!(error.contains("open_share is 1.5"), "{error}");
+        let file = read("[sub_apertures]\nrows = 4\n").unwrap();
+        assert!(file.grid(10).is_err());
+        let file = read("[sub_apertures]\nrows = 4\ncolumns = 6\nopen_share = 0.25\n").unwrap();
+        assert_eq!(file.draw(file.grid(10).unwrap()).unwrap().open, 6);
+    }
+}

@@ -1,0 +1,165 @@
+//! The raw captures that a lab would take: 16-bit numbers and an index.
+
+use std::fs;
+use std::path::Path;
+
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
+use serde::Serialize;
+
+use crate::cli::CliError;
+use crate::formats::npy;
+use crate::optics::{Camera, generator, measure};
+
+/// Share of the background that the lithography mask lets through.
+const BACKGROUND_THROUGH_MASK: f64 = 0.5;
+
+/// `captures.json`: which files hold the repeats of which capture, and what their numbers mean.
+#[derive(Debug, Serialize)]
+struct Index {
+    schema: &'static str,
+    /// For each pattern, the files with captures of the white board through the mask.
+    masks: Vec<Vec<String>>,
+    /// The same with the LCoS all black.
+    black_with_mask: Vec<String>,
+    /// Without the mask, the LCoS all white.
+    white: Vec<String>,
+    /// Without the mask, the LCoS all black.
+    black: Vec<String>,
+    /// A pixel with this number is full.
+    saturation: u16,
+    measurement: Measurement,
+}
+
+#[derive(Debug, Serialize)]
+struct Measurement {
+    /// The snapshots.
+    data: String,
+    /// The LCoS all black, at the exposure of the measurement.
+    dark: Vec<String>,
+    /// The number that means 1 after the dark is subtracted, with masks whose largest value is 1.
+    full_scale: f32,
+    saturation: u16,
+}
+
+/// A lab with a camera.
+pub(super) struct Lab<'a> {
+    pub(super) camera: Camera,
+    /// Relative light \[H,W\] of the white board.
+    pub(super) illumination: ArrayView2<'a, f32>,
+    /// Masks \[B,H,W\].
+    pub(super) masks: ArrayView3<'a, f32>,
+    /// Share of the whole aperture's light where a mask is 1.
+    pub(super) scale: f32,
+    pub(super) repeats: usize,
+    pub(super) seed: u64,
+}
+
+impl Lab<'_> {
+    /// Writes all captures of a calibration, and the measurement of `scene` (its frames one snapshot
+    /// after the other, with the illumination in them). Gives the measurement's full scale.
+    pub(super) fn write(
+        &self,
+        folder: &Path,
+        snapshots: usize,
+        scene: ArrayView3<'_, f32>,
+    ) -> Result<f32, CliError> {
+        fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
+        let camera = self.camera;
+        let dim = self.illumination.dim();
+        let (exposure, closed) = (single(camera.calibration_exposure), Array2::zeros(dim));
+        let with_mask = camera.background * BACKGROUND_THROUGH_MASK;
+        let mut shots = Shots { lab: self, folder, stream: 2 };
+        let mut masks = Vec::new();
+        for (index, mask) in self.masks.outer_iter().enumerate() {
+            let light = (&mask * &self.illumination) * (exposure * self.scale);
+            masks.push(vec![shots.take(
+                &format!("mask_{:02}.npy", index + 1),
+                &light,
+                with_mask,
+            )?]);
+        }
+        let white = &self.illumination * exposure;
+        let index = Index {
+            schema: "sci-recon/captures/1",
+            masks,
+            black_with_mask: vec![shots.take("black_with_mask.npy", &closed, with_mask)?],
+            white: vec![shots.take("white.npy", &white, camera.background)?],
+            black: vec![shots.take("black.npy", &closed, camera.background)?],
+            saturation: camera.saturation(),
+            measurement: Measurement {
+                dark: vec![shots.take("scene_black.npy", &closed, with_mask)?],
+                data: self.snapshots(&mut shots, snapshots, scene, with_mask)?,
+                full_scale: self.full_scale(),
+                saturation: camera.saturation(),
+            },
+        };
+        let text = serde_json::to_string_pretty(&index)
+            .map_err(|error| CliError::Failure(format!("captures.json: {error}")))?;
+        let path = folder.join("captures.json");
+        fs::write(&path, text + "\n").map_err(|error| CliError::file("write", &path, &error))?;
+        Ok(index.measurement.full_scale)
+    }
+
+    fn full_scale(&self) -> f32 {
+        let white = single(self.camera.measurement_exposure) * self.scale;
+        white * f32::from(self.camera.saturation())
+    }
+
+    fn snapshots(
+        &self,
+        shots: &mut Shots<'_, '_>,
+        count: usize,
+        scene: ArrayView3<'_, f32>,
+        background: f64,
+    ) -> Result<String, CliError> {
+        let exposure = single(self.camera.measurement_exposure) * self.scale;
+        let mut lights = Vec::with_capacity(count);
+        for clip in scene.axis_chunks_iter(Axis(0), self.masks.dim().0) {
+            lights.push(measure(self.masks, clip)? * exposure);
+        }
+        shots.write("measurement.npy", count, |index| (&lights[index], background))
+    }
+}
+
+/// Takes captures, each with noise of its own.
+struct Shots<'s, 'a> {
+    lab: &'s Lab<'a>,
+    folder: &'s Path,
+    /// Of the random generator: 0 makes masks, 1 the noise of the float measurement.
+    stream: u64,
+}
+
+impl Shots<'_, '_> {
+    /// All repeats of one capture; gives the file's name.
+    fn take(
+        &mut self,
+        name: &str,
+        light: &Array2<f32>,
+        background: f64,
+    ) -> Result<String, CliError> {
+        self.write(name, self.lab.repeats, |_| (light, background))
+    }
+
+    fn write<'l>(
+        &mut self,
+        name: &str,
+        count: usize,
+        light: impl Fn(usize) -> (&'l Array2<f32>, f64),
+    ) -> Result<String, CliError> {
+        let mut rng = generator(self.lab.seed);
+        rng.set_stream(self.stream);
+        self.stream += 1;
+        let (height, width) = self.lab.illumination.dim();
+        npy::write_u16(&self.folder.join(name), (count, height, width), |index| {
+            let (light, background) = light(index);
+            let capture = self.lab.camera.capture(light.view(), background, &mut rng);
+            capture.map_err(CliError::from)
+        })?;
+        Ok(name.to_owned())
+    }
+}
+
+#[allow(clippy::cast_possible_truncation)] // to the precision of pictures
+fn single(value: f64) -> f32 {
+    value as f32
+}

@@ -1,0 +1,180 @@
+//! Which masks are simulated.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use ndarray::{Array2, Array3, Axis};
+use serde::Serialize;
+
+use crate::cli::CliError;
+use crate::cli::input::read_clip;
+use crate::cli::optics::OpticsFile;
+use crate::optics::{
+    HybridAperture, Method, Multiplexing, Normalisation, Placement, check_patterns, generator,
+    iid_masks, pattern_rank, single_apertures,
+};
+
+/// The masks that are asked for.
+#[derive(Debug, Args)]
+pub(super) struct MaskArguments {
+    /// Kind of the masks.
+    #[arg(long)]
+    pattern: Pattern,
+    /// Optical parameters as TOML (see `sci-recon optics`) [default: the paper's].
+    #[arg(long, value_name = "FILE")]
+    optics: Option<PathBuf>,
+    /// Aperture patterns, one for each frame, for --pattern images: what each part of the LCoS
+    /// transmits (a stack or a folder of PNGs, of any size up to the LCoS's).
+    #[arg(long, value_name = "FILE", required_if_eq("pattern", "images"))]
+    images: Option<PathBuf>,
+    /// The lithography mask, a picture of at least the sensor's size; its centre is used [default:
+    /// random, half of it open].
+    #[arg(long, value_name = "FILE")]
+    lithography: Option<PathBuf>,
+    /// What a mask value of 1 means.
+    #[arg(long, value_name = "HOW", default_value = "maximum")]
+    normalise: Normalise,
+}
+
+/// Kinds of masks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Pattern {
+    /// Independent binary pixels, half of them open, as in the public benchmark.
+    Iid,
+    /// The hybrid coded aperture: a lithography mask seen through random sub-apertures.
+    RandomSquares,
+    /// The same, seen through an open circle that turns from frame to frame.
+    RotatingCircle,
+    /// The same, seen through one sub-aperture in each frame: no multiplexing.
+    SingleApertures,
+    /// The same, seen through patterns of your own (--images).
+    Images,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Normalise {
+    /// The largest value of all masks, as after a calibration.
+    Maximum,
+    /// The light of the whole open aperture without a mask.
+    Throughput,
+}
+
+/// The aperture's patterns.
+#[derive(Debug, Serialize)]
+pub(super) struct Apertures {
+    rows: usize,
+    columns: usize,
+    rank: usize,
+    /// For each frame of a grid of sub-apertures, `1` for each open one and `0` for the others, row
+    /// by row; none for other patterns.
+    open: Option<Vec<String>>,
+}
+
+/// Masks, and where they come from.
+pub(super) struct SimulatedMasks {
+    /// \[B,H,W\] on \[0,1\].
+    pub(super) masks: Array3<f32>,
+    pub(super) throughput: f64,
+    pub(super) scale: f32,
+    /// None for masks without an aperture.
+    pub(super) apertures: Option<Apertures>,
+}
+
+impl MaskArguments {
+    /// The name of the kind.
+    pub(super) fn pattern(&self) -> &'static str {
+        match self.pattern {
+            Pattern::Iid => "iid",
+            Pattern::RandomSquares => "random-squares",
+            Pattern::RotatingCircle => "rotating-circle",
+            Pattern::SingleApertures => "single-apertures",
+            Pattern::Images => "images",
+        }
+    }
+
+    /// The optical parameters.
+    pub(super) fn optics(&self) -> Result<OpticsFile, CliError> {
+        OpticsFile::read(self.optics.as_deref())
+    }
+
+    /// Makes the masks of frames x rows x columns.
+    pub(super) fn make(
+        &self,
+        optics: &OpticsFile,
+        (frames, height, width): (usize, usize, usize),
+        seed: u64,
+    ) -> Result<SimulatedMasks, CliError> {
+        if self.pattern == Pattern::Iid {
+            let masks = iid_masks(frames, height, width, seed)?;
+            let throughput = f64::from(masks.mean().unwrap_or(0.0));
+            return Ok(SimulatedMasks { masks, throughput, scale: 1.0, apertures: None });
+        }
+        let mut rng = generator(seed);
+        let grid = optics.grid(frames)?;
+        let patterns = match self.pattern {
+            Pattern::RotatingCircle => optics.circle().patterns(frames, &optics.geometry())?,
+            Pattern::SingleApertures => single_apertures(frames, grid, &mut rng)?,
+            Pattern::Images => self.images(frames)?,
+            Pattern::RandomSquares | Pattern::Iid => {
+                let draw = optics.draw(grid)?;
+                Multiplexing::random(frames, grid.count(), draw, &mut rng)?.patterns(grid)
+            }
+        };
+        let made = self.aperture(optics)?.masks(patterns.view(), (height, width), &mut rng)?;
+        Ok(SimulatedMasks {
+            masks: made.masks,
+            throughput: made.throughput,
+            scale: made.scale,
+            apertures: Some(self.apertures(&patterns)),
+        })
+    }
+
+    fn on_grid(&self) -> bool {
+        matches!(self.pattern, Pattern::RandomSquares | Pattern::SingleApertures)
+    }
+
+    fn aperture(&self, optics: &OpticsFile) -> Result<HybridAperture, CliError> {
+        let (placement, method) = if self.on_grid() {
+            (optics.placement(), optics.method())
+        } else {
+            (Placement::Geometric, Method::Convolution)
+        };
+        Ok(HybridAperture {
+            geometry: optics.geometry(),
+            placement,
+            method,
+            lithography: self.lithography()?,
+            normalisation: match self.normalise {
+                Normalise::Maximum => Normalisation::Maximum,
+                Normalise::Throughput => Normalisation::Throughput,
+            },
+        })
+    }
+
+    fn images(&self, frames: usize) -> Result<Array3<f32>, CliError> {
+        let missing = || CliError::Input("--pattern images needs --images".into());
+        let patterns = read_clip(self.images.as_deref().ok_or_else(missing)?, None)?;
+        check_patterns(patterns.view(), frames)?;
+        Ok(patterns)
+    }
+
+    fn lithography(&self) -> Result<Option<Array2<f32>>, CliError> {
+        let Some(path) = &self.lithography else { return Ok(None) };
+        let stack = read_clip(path, None)?;
+        match stack.dim().0 {
+            1 => Ok(Some(stack.index_axis_move(Axis(0), 0))),
+            count => Err(CliError::Input(format!(
+                "the lithography mask {} is a stack of {count} pictures; it must be one",
+                path.display()
+            ))),
+        }
+    }
+
+    fn apertures(&self, patterns: &Array3<f32>) -> Apertures {
+        let (_, rows, columns) = patterns.dim();
+        let digit = |&open: &f32| if open > 0.0 { '1' } else { '0' };
+        let open = patterns.outer_iter().map(|pattern| pattern.iter().map(digit).collect());
+        let open = self.on_grid().then(|| open.collect());
+        Apertures { rows, columns, rank: pattern_rank(patterns.view()), open }
+    }
+}

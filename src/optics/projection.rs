@@ -1,0 +1,187 @@
+//! From aperture patterns to the masks that the sensor sees.
+
+use ndarray::{Array1, Array2, ArrayView2, s};
+use rayon::iter::{IndexedParallelIterator, ParallelIterator};
+use rayon::slice::ParallelSliceMut;
+
+use super::axis::{Axis, Cell};
+use super::{Geometry, OpticsError, check_size};
+
+/// Where the cells of a pattern shift the mask to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Placement {
+    /// By whole mask pixels, neighbours by what the geometry gives, rounded: the paper's simulation.
+    WholePixels,
+    /// Where the geometry puts them, the pattern centred on the axis.
+    Geometric,
+}
+
+/// How the light through a cell is taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// All through the cell's centre: a pattern's mask is a sum of shifted masks (Eq. 1).
+    Shifts,
+    /// Through its whole area: a convolution of the mask with the scaled pattern.
+    Convolution,
+}
+
+/// The way from a pattern of aperture cells to a mask on the sensor.
+///
+/// A ray that meets the image plane at x and came through the aperture at u crosses the mask, which
+/// stands a distance d before the image plane, at x + d u / f.
+#[derive(Debug)]
+pub struct Projector {
+    rows: Axis,
+    columns: Axis,
+    cells: (usize, usize),
+}
+
+impl Projector {
+    /// A projector of patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of
+    /// `sensor` (rows, columns).
+    ///
+    /// # Errors
+    /// A geometry or size that can't be; cells too close for whole pixels.
+    pub fn new(
+        geometry: &Geometry,
+        cells: (usize, usize),
+        placement: Placement,
+        method: Method,
+        sensor: (usize, usize),
+    ) -> Result<Self, OpticsError> {
+        geometry.check()?;
+        check_size(1, sensor.0, sensor.1)?;
+        let shift = geometry.shift_per_lcos_pixel();
+        let ratio = geometry.sensor_pixels_per_mask_pixel();
+        let axis = |lcos: usize, count: usize, pixels: usize, offset: f64| {
+            let pitch = lcos as f64 / count as f64 * shift;
+            let cells = place(pitch, count, placement, method)?;
+            Ok::<_, OpticsError>(Axis::new(&cells, pixels, ratio, offset, geometry.blur()))
+        };
+        for (name, count, pixels) in [
+            ("pattern rows", cells.0, geometry.lcos_rows),
+            ("pattern columns", cells.1, geometry.lcos_columns),
+        ] {
+            if !(1..=pixels).contains(&count) {
+                let range = "at least 1 and at most the LCoS's pixels";
+                return Err(OpticsError::Parameter { name, value: count.to_string(), range });
+            }
+        }
+        Ok(Self {
+            rows: axis(geometry.lcos_rows, cells.0, sensor.0, geometry.phase_rows)?,
+            columns: axis(geometry.lcos_columns, cells.1, sensor.1, geometry.phase_columns)?,
+            cells,
+        })
+    }
+
+    /// Rows and columns of the part of the lithography mask that the sensor can see.
+    pub fn mask_size(&self) -> (usize, usize) {
+        (self.rows.length, self.columns.length)
+    }
+
+    /// The mask \[H,W\] on the sensor: the sum, over the cells of `pattern`, of the cell's
+    /// transmission times the lithography mask as seen through it. All open and no mask gives the
+    /// number of cells.
+    ///
+    /// # Errors
+    /// Arrays that have not the sizes of [`Projector::new`] and [`Projector::mask_size`].
+    pub fn project(
+        &self,
+        lithography: ArrayView2<'_, f32>,
+        pattern: ArrayView2<'_, f32>,
+    ) -> Result<Array2<f32>, OpticsError> {
+        if pattern.dim() != self.cells || lithography.dim() != self.mask_size() {
+            let text = |(rows, columns): (usize, usize)| format!("{rows}x{columns}");
+            let (mask_rows, mask_columns) = self.mask_size();
+            return Err(OpticsError::Pattern(format!(
+                "a pattern of {} cells and a lithography mask of {} pixels were given to a projector \
+                 of {} cells and {mask_rows}x{mask_columns} pixels",
+                text(pattern.dim()),
+                text(lithography.dim()),
+                text(self.cells),
+            )));
+        }
+        let kernels = self.kernels(&pattern.mapv(f64::from));
+        let (height, width) = (self.rows.start.len(), self.columns.start.len());
+        let mut mask = vec![0.0; height * width];
+        mask.par_chunks_mut(width).enumerate().for_each(|(row, out)| {
+            let first = self.rows.start[row];
+            let kernels = &kernels[self.rows.phase[row]];
+            for (column, out) in out.iter_mut().enumerate() {
+                let start = self.columns.start[column];
+                for tap in &kernels[self.columns.phase[column]] {
+                    *out += tap.weight * lithography[[first + tap.row, start + tap.column]];
+                }
+            }
+        });
+        Array2::from_shape_vec((height, width), mask)
+            .map_err(|error| OpticsError::Pattern(error.to_string()))
+    }
+
+    /// The taps of the pattern's kernel, for each phase of the rows and of the columns.
+    fn kernels(&self, pattern: &Array2<f64>) -> Vec<Vec<Vec<Tap>>> {
+        let row_kernels = self.rows.weights.iter().map(|rows| {
+            let half = rows.t().dot(pattern);
+            let columns = self.columns.weights.iter();
+            columns.map(|columns| taps(&half.dot(columns))).collect()
+        });
+        row_kernels.collect()
+    }
+}
+
+/// A mask pixel that a sensor pixel sees, and how much light comes through it.
+#[derive(Debug, Clone, Copy)]
+struct Tap {
+    row: usize,
+    column: usize,
+    weight: f32,
+}
+
+#[allow(clippy::cast_possible_truncation)] // to the precision of the masks
+fn taps(kernel: &Array2<f64>) -> Vec<Tap> {
+    let taps = kernel.indexed_iter().filter(|(_, weight)| **weight > 0.0);
+    taps.map(|((row, column), &weight)| Tap { row, column, weight: weight as f32 }).collect()
+}
+
+/// The cells of an axis, as shifts in mask pixels; `pitch` of them from one cell to the next.
+fn place(
+    pitch: f64,
+    count: usize,
+    placement: Placement,
+    method: Method,
+) -> Result<Vec<Cell>, OpticsError> {
+    let half = match method {
+        Method::Shifts => 0.0,
+        Method::Convolution => pitch / 2.0,
+    };
+    let centre = match placement {
+        Placement::Geometric => Array1::from_iter((0..count).map(|cell| cell as f64 + 0.5))
+            .mapv(|cell| (cell - count as f64 / 2.0) * pitch),
+        Placement::WholePixels => {
+            let step = pitch.round();
+            if step < 1.0 && count > 1 {
+                return Err(OpticsError::Pattern(format!(
+                    "neighbouring sub-apertures shift the mask by {pitch:.3} mask pixels, which is 0 \
+                     whole pixels: use fewer sub-apertures, a greater mask distance, or the \
+                     placement geometric"
+                )));
+            }
+            let middle = ((count - 1) / 2) as f64;
+            Array1::from_iter((0..count).map(|cell| (cell as f64 - middle) * step))
+        }
+    };
+    let cell = |&at: &f64| Cell { from: at - half, to: at + half };
+    Ok(centre.iter().map(cell).collect())
+}
+
+/// The centre of an array, `(rows, columns)` of it.
+pub(super) fn centre(
+    array: ArrayView2<'_, f32>,
+    (rows, columns): (usize, usize),
+) -> ArrayView2<'_, f32> {
+    let [row, column] = [array.nrows() - rows, array.ncols() - columns].map(|rest| rest / 2);
+    array.slice_move(s![row..row + rows, column..column + columns])
+}
+
+#[cfg(test)]
+mod tests;
