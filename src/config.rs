@@ -76,6 +76,15 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_UPLOAD_HOURS", value_name = "HOURS", default_value_t = 72)]
     pub upload_hours: u64,
 
+    /// Days for which a job that has ended is kept, with its results [default: until it is deleted].
+    #[arg(long, env = "SCI_RECON_JOB_DAYS", value_name = "DAYS")]
+    pub job_days: Option<u32>,
+
+    /// Free bytes of the disk below which unused uploads and the oldest ended jobs go before their
+    /// time; those of the last hour stay. 0: never.
+    #[arg(long, env = "SCI_RECON_LOW_WATER_BYTES", value_name = "BYTES", default_value_t = 0)]
+    pub low_water_bytes: u64,
+
     /// How log lines look.
     #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,

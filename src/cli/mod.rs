@@ -2,11 +2,13 @@
 
 mod arguments;
 mod error;
+mod housekeeping;
 mod input;
 mod logging;
 mod progress;
 mod supervisor;
 
+pub mod backup;
 pub mod demo;
 pub mod optics;
 pub mod reconstruct;

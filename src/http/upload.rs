@@ -29,25 +29,42 @@ where
     let (sender, receiver) = mpsc::channel(CHUNKS);
     let store = app.store.clone();
     let writer = tokio::task::spawn_blocking(move || write(&store, receiver));
-    let mut size = 0;
-    while let Some(chunk) = next(app, &mut stream).await? {
-        size += chunk.len() as u64;
-        if size > app.max_upload_bytes {
-            return Err(admission::too_large(app));
-        }
-        room.take(app, chunk.len() as u64).await?;
-        // A writer that takes no more has failed, and says why below.
-        if sender.send(chunk).await.is_err() {
-            break;
-        }
-    }
-    drop(sender);
-    let staged = writer.await.map_err(|_| StoreError::Interrupted)??;
+    let received = pump(app, &mut room, &mut stream, sender).await;
+    // Waited for in any case: what is refused is gone from the disk when the user hears of it.
+    let staged = writer.await.map_err(|_| StoreError::Interrupted)?;
+    received?;
+    let staged = staged?;
     if staged.size() == 0 {
         return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
     }
     metrics::counter!("sci_recon_upload_bytes_total").increment(staged.size());
     Ok(staged)
+}
+
+/// Hands chunks on to the writer, for which there must be room.
+async fn pump<S, E>(
+    app: &App,
+    room: &mut Room,
+    stream: &mut S,
+    sender: mpsc::Sender<Bytes>,
+) -> Result<(), ApiError>
+where
+    S: Stream<Item = Result<Bytes, E>> + Unpin,
+    E: std::fmt::Display,
+{
+    let mut size = 0;
+    while let Some(chunk) = next(app, stream).await? {
+        size += chunk.len() as u64;
+        if size > app.max_upload_bytes {
+            return Err(admission::too_large(app));
+        }
+        room.take(app, chunk.len() as u64).await?;
+        // A writer that takes no more has failed, and says why itself.
+        if sender.send(chunk).await.is_err() {
+            break;
+        }
+    }
+    Ok(())
 }
 
 /// The next chunk, if there is one and it comes in time.

@@ -73,8 +73,12 @@ impl DataDir {
         self.results(job).join(format!("snapshot_{snapshot:04}"))
     }
 
+    pub(crate) fn partials(&self) -> PathBuf {
+        self.root.join("partial")
+    }
+
     pub(crate) fn partial(&self, id: PartialId) -> PathBuf {
-        self.root.join("partial").join(id.to_string())
+        self.partials().join(id.to_string())
     }
 
     pub(crate) fn tmp(&self) -> PathBuf {

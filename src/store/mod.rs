@@ -5,8 +5,11 @@
 //! processes work on the same content: the database is the one mutex of the service. No transaction
 //! is open while anything is computed or uploaded.
 
+mod acceptance;
+mod backup;
 mod blobs;
 mod calibrations;
+mod cleaning;
 mod dir;
 mod error;
 mod forecast;
@@ -34,11 +37,13 @@ use sqlx::sqlite::{
     Sqlite, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
 };
 
+pub use acceptance::{Inserted, NewJob};
+pub use backup::Backup;
 pub use blobs::{Blob, Origin};
 pub use calibrations::{Calibration, NewCalibration};
 pub use dir::DataDir;
 pub use error::StoreError;
-pub use jobs::{Inserted, Job, JobFilter, NewJob};
+pub use jobs::{Job, JobFilter};
 pub use losses::{MAX_FAILURES, MAX_LOSSES};
 pub use marks::JobMark;
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};

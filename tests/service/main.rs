@@ -6,6 +6,8 @@ mod access;
 mod app;
 mod cli;
 mod contract;
+mod crashes;
+mod damage;
 mod dashboard;
 mod deep;
 mod faults;
