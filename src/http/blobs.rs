@@ -23,7 +23,10 @@ pub(super) async fn create(
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let (_permit, room) = begin(&app, &access, &headers).await?;
+    let (_permit, room) = match begin(&app, &access, &headers).await {
+        Ok(begun) => begun,
+        Err(refusal) => return Err(refuse(refusal, &headers, request.into_body()).await),
+    };
     let staged = if is_form(&headers) {
         receive_form(&app, room, request).await?
     } else {
@@ -40,7 +43,10 @@ pub(super) async fn put(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    let (_permit, room) = begin(&app, &access, &headers).await?;
+    let (_permit, room) = match begin(&app, &access, &headers).await {
+        Ok(begun) => begun,
+        Err(refusal) => return Err(refuse(refusal, &headers, body).await),
+    };
     let staged = upload::receive(&app, room, body.into_data_stream()).await?;
     if staged.sha256() != sha256 {
         let detail = format!("the address says {sha256}, the bytes have {}", staged.sha256());
@@ -66,6 +72,15 @@ async fn begin(
 ) -> Result<(OwnedSemaphorePermit, Room), ApiError> {
     let permit = upload::place(app)?;
     Ok((permit, upload::admit(app, access, headers).await?))
+}
+
+/// Lets the client come to the end of a small body, so that it gets to see the refusal.
+async fn refuse(refusal: ApiError, headers: &HeaderMap, body: Body) -> ApiError {
+    // A client that waits for leave to send has none.
+    if !headers.contains_key(header::EXPECT) {
+        upload::drain(&mut body.into_data_stream()).await;
+    }
+    refusal
 }
 
 fn is_form(headers: &HeaderMap) -> bool {

@@ -1,6 +1,7 @@
 //! Receiving a file: from the network to the disk, hashed on the way, a few chunks in memory.
 
 use std::io::Write;
+use std::time::Duration;
 
 use axum::body::Bytes;
 use axum::http::{HeaderMap, header};
@@ -15,6 +16,10 @@ use crate::store::{StagedBlob, Store, StoreError};
 
 /// Chunks between the network and the disk.
 pub(super) const CHUNKS: usize = 4;
+
+/// What is read of a body that was refused.
+const DRAINED_BYTES: usize = 8 << 20;
+const DRAIN_TIME: Duration = Duration::from_secs(2);
 
 /// Receives a stream into a file that is not yet in the store. What is broken off leaves nothing.
 pub(super) async fn receive<S, E>(
@@ -32,6 +37,9 @@ where
     let received = pump(app, &mut room, &mut stream, sender).await;
     // Waited for in any case: what is refused is gone from the disk when the user hears of it.
     let staged = writer.await.map_err(|_| StoreError::Interrupted)?;
+    if received.is_err() || staged.is_err() {
+        drain(&mut stream).await;
+    }
     received?;
     let staged = staged?;
     if staged.size() == 0 {
@@ -39,6 +47,25 @@ where
     }
     metrics::counter!("sci_recon_upload_bytes_total").increment(staged.size());
     Ok(staged)
+}
+
+/// Reads on for a moment. A client that is still sending when the connection closes may not get to
+/// see why; a small file is soon through, and a large one is cut off.
+pub(super) async fn drain<S, E>(stream: &mut S)
+where
+    S: Stream<Item = Result<Bytes, E>> + Unpin,
+{
+    let read = async {
+        let mut size = 0;
+        while let Some(Ok(chunk)) = stream.next().await {
+            size += chunk.len();
+            if size > DRAINED_BYTES {
+                break;
+            }
+        }
+    };
+    // Late or not, the answer goes out.
+    let _ = tokio::time::timeout(DRAIN_TIME, read).await;
 }
 
 /// Hands chunks on to the writer, for which there must be room.

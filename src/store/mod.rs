@@ -48,7 +48,7 @@ pub use losses::{MAX_FAILURES, MAX_LOSSES};
 pub use marks::JobMark;
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
 pub use partials::{NewPartial, Partial, PartialFile};
-pub use progress::{JobProgress, ProgressStage, TaskCounts};
+pub use progress::{JobProgress, ProgressStage, TaskCounts, TaskTotals};
 pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};

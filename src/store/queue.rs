@@ -358,5 +358,14 @@ async fn finish(
     .bind(lease.attempt)
     .execute(&mut *connection)
     .await?;
+    sqlx::query(
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes)
+             SELECT kind, 1, coalesce(seconds, 0), iterations, passes FROM tasks WHERE id = ?
+         ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
+             iterations = iterations + excluded.iterations, passes = passes + excluded.passes",
+    )
+    .bind(lease.task.to_string())
+    .execute(&mut *connection)
+    .await?;
     losses::end_attempt(connection, lease.task, "done", None).await
 }

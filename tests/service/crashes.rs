@@ -57,7 +57,7 @@ async fn undisturbed() -> std::collections::BTreeMap<String, String> {
 
 /// Where faults happen: `make faults` says how many points.
 fn points() -> u64 {
-    std::env::var("SCI_RECON_FAULT_POINTS").map_or(4, |text| text.parse().unwrap())
+    std::env::var("SCI_RECON_FAULT_POINTS").map_or(2, |text| text.parse().unwrap())
 }
 
 /// The whole way of the data, again and again until each step has been taken.

@@ -14,6 +14,7 @@ mod faults;
 mod hangs;
 mod hostile;
 mod jobs;
+mod load;
 mod pipeline;
 mod resumable;
 mod samples;
