@@ -4,13 +4,16 @@ CARGO ?= cargo
 PYTHON ?= python3
 JUDGES := .venv/judges
 
-.PHONY: demo test runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny
+.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
 
 test: runtime judges ## all tests
 	SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --release
+
+e2e: runtime ## the dashboard in a real browser; ends with one line of JSON
+	@tests/e2e/run.sh
 
 serve: runtime ## the service on 127.0.0.1:8080, data in ./data
 	$(CARGO) run --release --quiet -- serve --data data
@@ -60,4 +63,4 @@ docs:
 
 clean:
 	$(CARGO) clean
-	rm -rf runtime .venv demo-output
+	rm -rf runtime .venv demo-output e2e-output tests/e2e/node_modules

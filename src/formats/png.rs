@@ -89,26 +89,53 @@ pub fn write_u16(
     encode_u16(BufWriter::new(file), frame, black, white)
 }
 
+/// An 8-bit grey PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
+/// outside; NaN becomes 0. `frame` has the axes (row, column).
+///
+/// # Errors
+/// [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without pixels.
+pub fn encode_u8(
+    frame: ArrayView2<'_, f32>,
+    black: f32,
+    white: f32,
+) -> Result<Vec<u8>, FormatError> {
+    let factor = 255.0 / (white - black);
+    let bytes: Vec<u8> = frame.iter().map(|v| ((v - black) * factor).round() as u8).collect();
+    let mut png = Vec::new();
+    encode(&mut png, frame.dim(), BitDepth::Eight, (black, white), &bytes)?;
+    Ok(png)
+}
+
 fn encode_u16(
     writer: impl Write,
     frame: ArrayView2<'_, f32>,
     black: f32,
     white: f32,
 ) -> Result<(), FormatError> {
-    if !(black.is_finite() && white.is_finite() && black < white) {
-        return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
-    }
-    let [height, width] = [frame.nrows(), frame.ncols()].map(|n| u32::try_from(n).unwrap_or(0));
-    let mut encoder = Encoder::new(writer, width, height);
-    encoder.set_color(ColorType::Grayscale);
-    encoder.set_depth(BitDepth::Sixteen);
-    // The low byte is noise: more effort buys little.
-    encoder.set_compression(Compression::Fast);
     let factor = 65535.0 / (white - black);
     let bytes: Vec<u8> =
         frame.iter().flat_map(|v| (((v - black) * factor).round() as u16).to_be_bytes()).collect();
+    encode(writer, frame.dim(), BitDepth::Sixteen, (black, white), &bytes)
+}
+
+fn encode(
+    writer: impl Write,
+    (height, width): (usize, usize),
+    depth: BitDepth,
+    (black, white): (f32, f32),
+    bytes: &[u8],
+) -> Result<(), FormatError> {
+    if !(black.is_finite() && white.is_finite() && black < white) {
+        return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
+    }
+    let [height, width] = [height, width].map(|n| u32::try_from(n).unwrap_or(0));
+    let mut encoder = Encoder::new(writer, width, height);
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(depth);
+    // The low bits are noise: more effort buys little.
+    encoder.set_compression(Compression::Fast);
     let mut png = encoder.write_header().map_err(encoding_error)?;
-    png.write_image_data(&bytes).map_err(encoding_error)?;
+    png.write_image_data(bytes).map_err(encoding_error)?;
     png.finish().map_err(encoding_error)
 }
 

@@ -9,6 +9,7 @@ use tokio_util::sync::CancellationToken;
 use super::admission::Promises;
 use super::events::Events;
 use super::metrics::Metrics;
+use super::pictures::Pictures;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
 use crate::job::Timestamp;
@@ -38,6 +39,7 @@ pub struct Shared {
     pub(super) intake: Arc<Semaphore>,
     pub(super) metrics: Metrics,
     pub(super) events: Events,
+    pub(super) pictures: Pictures,
     pub(super) about: About,
 }
 
@@ -74,6 +76,7 @@ impl App {
         let limits = Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() };
         Self(Arc::new(Shared {
             events: Events::start(store.clone(), closing),
+            pictures: Pictures::new(),
             about: About::new(settings),
             store,
             limits,

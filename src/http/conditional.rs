@@ -1,7 +1,10 @@
 //! Conditional and partial requests (RFC 9110): `If-None-Match`, `If-Range` and `Range`.
 
-use axum::http::{HeaderMap, HeaderName, header};
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
 
+use super::error::ApiError;
 use crate::job::Sha256;
 
 /// A strong ETag: the hash of the content.
@@ -16,6 +19,18 @@ pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     tags.flat_map(|list| list.split(','))
         .map(str::trim)
         .any(|tag| tag == "*" || tag.strip_prefix("W/").unwrap_or(tag) == etag)
+}
+
+/// A body with its ETag, or word that the client has it.
+pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
+    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
+    let etag = etag(&Sha256::of(&text));
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
+    if is_known(headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
+    }
+    let kind = [(header::CONTENT_TYPE, "application/json")];
+    Ok((tags, kind, text).into_response())
 }
 
 /// What part of a file is asked for.

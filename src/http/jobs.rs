@@ -187,19 +187,10 @@ pub(super) async fn list(
     let progress = app.store.progress_of(&page.items).await?;
     let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
     let page = Page { items: items.collect(), more: page.more };
-    tagged(&PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item), &headers)
-}
-
-/// A body with its ETag, or word that the client has it.
-fn tagged<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
-    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
-    let etag = conditional::etag(&Sha256::of(&text));
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
-    if conditional::is_known(headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
-    }
-    let kind = [(header::CONTENT_TYPE, "application/json")];
-    Ok((tags, kind, text).into_response())
+    conditional::json(
+        &PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item),
+        &headers,
+    )
 }
 
 /// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
@@ -209,7 +200,7 @@ pub(super) async fn show(
     Params(id): Params<JobId>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    tagged(&body(&app, &access.lab, id).await?, &headers)
+    conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }
 
 /// `POST /v1/jobs/{job}/cancel`

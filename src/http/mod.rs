@@ -21,9 +21,11 @@ mod layers;
 mod measurements;
 mod metrics;
 mod page;
+mod pictures;
 mod results;
 mod router;
 mod system;
+mod tiles;
 pub mod tus;
 mod upload;
 

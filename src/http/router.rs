@@ -11,7 +11,7 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, results, system, tus,
+    metrics, pictures, results, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -42,6 +42,17 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::stack),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::array),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::job_preview),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::job_spread),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::job_tile),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}").get(pictures::measurement_preview),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}/spread").get(pictures::measurement_spread),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::measurement_tile),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}").get(pictures::calibration_preview),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::calibration_spread),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::calibration_tile),
         R::at("/v1/events").get(events::listen).slow(),
         R::at("/v1/system").get(system::show).only(Rule::Admin),
         R::at("/").get(dashboard::page).only(Rule::Public),

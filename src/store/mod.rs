@@ -26,6 +26,7 @@ mod staging;
 mod tasks;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod tokens;
 mod workers;
 
@@ -53,6 +54,7 @@ pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use results::ResultFile;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use tasks::{TaskRecord, TileResult};
+pub use tiles::{TileHistory, TileState};
 pub use tokens::Token;
 pub use workers::{WorkerEnd, WorkerRow, WorkerTask};
 

@@ -122,7 +122,7 @@ impl Store {
         // 3. Claim: one statement finds the task, marks it and counts the attempt.
         let claimed = sqlx::query(
             "UPDATE tasks SET state = 'running', worker = ?1, lease_until = ?2, attempt = attempt + 1,
-                 stage = 'reading', iterations = 0, passes = 0, fraction = 0
+                 stage = 'reading', iterations = 0, passes = 0, fraction = 0, history = NULL
              WHERE id = (SELECT id FROM tasks WHERE state = 'ready'
                              -- A pause is seconds: what lies further ahead was noted before the
                              -- clock was set back.
@@ -199,10 +199,25 @@ impl Store {
         lease: &Lease,
         progress: TaskProgress,
     ) -> Result<Heartbeat, StoreError> {
+        self.heartbeat_with(lease, progress, None).await
+    }
+
+    /// As [`Store::heartbeat`], and notes how the solver went: JSON as
+    /// [`TileHistory::points`](super::TileHistory) has it. Without one, what was noted stays.
+    ///
+    /// # Errors
+    /// If the database fails; the lease is not renewed then.
+    pub async fn heartbeat_with(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+        history: Option<&str>,
+    ) -> Result<Heartbeat, StoreError> {
         let mut transaction = self.write().await?;
         workers::seen(&mut transaction, lease.worker).await?;
         let row = sqlx::query(
-            "UPDATE tasks SET lease_until = ?, stage = ?, iterations = ?, passes = ?, fraction = ?
+            "UPDATE tasks SET lease_until = ?, stage = ?, iterations = ?, passes = ?, fraction = ?,
+                 history = coalesce(?, history)
              WHERE id = ? AND attempt = ? AND state = 'running'
              RETURNING (SELECT state FROM jobs WHERE id = tasks.job) AS job_state",
         )
@@ -211,6 +226,7 @@ impl Store {
         .bind(progress.iterations)
         .bind(progress.passes)
         .bind(progress.fraction.clamp(0.0, 1.0))
+        .bind(history)
         .bind(lease.task.to_string())
         .bind(lease.attempt)
         .fetch_optional(&mut *transaction)

@@ -6,6 +6,7 @@
 
 mod assemble;
 mod finish;
+mod history;
 mod network;
 mod prepare;
 mod result;

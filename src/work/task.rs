@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use super::history::History;
 use super::network::{NetworkError, NetworkSource};
 use super::result::ResultError;
 use super::{assemble, finish, prepare, tile};
@@ -11,6 +12,7 @@ use crate::formats::FormatError;
 use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
 use crate::recon::ReconError;
 use crate::recon::denoise::fastdvdnet::FastDvdNet;
+use crate::recon::gap::Progress;
 use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};
 
 /// What the computing thread and the heartbeat tell each other.
@@ -18,13 +20,15 @@ use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileR
 pub(super) struct Shared {
     /// Where the task stands, and its last sign of life.
     progress: Mutex<(TaskProgress, Instant)>,
+    /// How the solver went, and whether there is more of it than was last told.
+    history: Mutex<(History, bool)>,
     stop: AtomicBool,
 }
 
 impl Shared {
     pub(super) fn new() -> Self {
         let progress = Mutex::new((TaskProgress::START, Instant::now()));
-        Self { progress, stop: AtomicBool::new(false) }
+        Self { progress, history: Mutex::default(), stop: AtomicBool::new(false) }
     }
 
     fn lock(&self) -> MutexGuard<'_, (TaskProgress, Instant)> {
@@ -44,6 +48,19 @@ impl Shared {
 
     pub(super) fn set_progress(&self, progress: TaskProgress) {
         *self.lock() = (progress, Instant::now());
+    }
+
+    /// Takes note of an iteration of the solver.
+    pub(super) fn note(&self, progress: &Progress) {
+        let mut history = self.history.lock().unwrap_or_else(PoisonError::into_inner);
+        history.0.note(progress);
+        history.1 = true;
+    }
+
+    /// How the solver went, as JSON; none if that was told before and nothing came after.
+    pub(super) fn news(&self) -> Option<String> {
+        let mut history = self.history.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::take(&mut history.1).then(|| history.0.to_json())
     }
 
     /// Asks the computing thread to stop at the next opportunity.

@@ -110,6 +110,7 @@ impl Observer for TaskObserver<'_> {
     fn iteration(&mut self, progress: &Progress) -> Control {
         let deep = progress.sigma.is_some();
         self.passes += u32::from(deep);
+        self.shared.note(progress);
         self.shared.set_progress(TaskProgress {
             stage: if deep { TaskStage::Deep } else { TaskStage::Tv },
             iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),

@@ -153,6 +153,9 @@ impl Worker {
         match watching.await {
             Ok(((engine, outcome), reason)) => {
                 self.engine = Some(engine);
+                if outcome.is_ok() && reason.is_none() {
+                    self.last_news(&lease, &shared).instrument(span.clone()).await;
+                }
                 self.end(&lease, outcome, reason).instrument(span).await;
                 Ok(())
             }
@@ -246,7 +249,7 @@ impl Worker {
                 }
                 () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
                 () = &mut too_late => return Err(WorkerError::Unfinished),
-                _ = tick.tick() => match self.store.heartbeat(lease, shared.progress()).await {
+                _ = tick.tick() => match self.beat(lease, shared).await {
                     Ok(Heartbeat::Continue) => {}
                     Ok(Heartbeat::Cancelled) => reason = Some(Reason::Cancelled),
                     Ok(Heartbeat::Lost) => reason = Some(Reason::Lost),
@@ -257,6 +260,20 @@ impl Worker {
             if reason.is_some() {
                 shared.stop();
             }
+        }
+    }
+
+    /// A heartbeat with all that there is to tell.
+    async fn beat(&self, lease: &Lease, shared: &Shared) -> Result<Heartbeat, StoreError> {
+        let news = shared.news();
+        self.store.heartbeat_with(lease, shared.progress(), news.as_deref()).await
+    }
+
+    /// Tells what the solver did after the last heartbeat.
+    async fn last_news(&self, lease: &Lease, shared: &Shared) {
+        if let Some(news) = shared.news() {
+            let told = self.store.heartbeat_with(lease, shared.progress(), Some(&news)).await;
+            said(told.map(|_| ()));
         }
     }
 

@@ -15,6 +15,7 @@ mod hangs;
 mod hostile;
 mod jobs;
 mod load;
+mod pictures;
 mod pipeline;
 mod resumable;
 mod samples;

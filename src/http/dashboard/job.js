@@ -1,10 +1,12 @@
 // One job: how far it is, what went in, what came out.
 
-import { announce, facts, h, put, say } from "./dom.js";
+import { announce, facts, h, put, say, trouble } from "./dom.js";
 import { bytes, duration, figure, momentInFull, nameOf, shapeOf, stageOf } from "./format.js";
 import { actions } from "./actions.js";
-import { get } from "./api.js";
+import { gaveUp, get } from "./api.js";
 import { left } from "./jobs.js";
+import { TileMap } from "./tilemap.js";
+import { Viewer } from "./viewer.js";
 import { watch } from "./live.js";
 
 export async function job(root, [id], signal) {
@@ -17,8 +19,10 @@ export async function job(root, [id], signal) {
   const snapshot = snapshotChoice(found);
   const files = card("Files", h("p", { class: "muted" }, "…"));
   const manifest = card("Manifest");
-  const cards = h("div", { class: "cards" }, details(found), files, manifest, repeat(found));
-  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, cards);
+  const viewer = new Viewer(found, signal);
+  const tiles = new TileMap(found, signal);
+  const cards = h("div", { class: "cards" }, tiles.plotCard, tiles.tilesCard, files, manifest, details(found), repeat(found));
+  root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, viewer.element, cards);
 
   let shown = null;
   let ready = null;
@@ -34,7 +38,9 @@ export async function job(root, [id], signal) {
       if (shown) announce(`The job is ${now.state}`);
     }
     put(progress, line(now));
-    const done = `${now.progress.snapshots_done} ${now.state}`;
+    await tiles.renew(snapshot.value());
+    const done = `${now.progress.tiles_done} ${now.progress.snapshots_done} ${now.state}`;
+    if (shown && done !== ready) await viewer.renew();
     if (done !== ready) await results(now);
     ready = done;
     shown = now;
@@ -43,7 +49,13 @@ export async function job(root, [id], signal) {
     await showFiles(files, id, snapshot.value(), signal);
     await showManifest(manifest, now, snapshot.value(), signal);
   };
-  snapshot.listen(() => results(shown ?? found));
+  const open = async () => {
+    await viewer.open(snapshot.value());
+    await tiles.renew(snapshot.value());
+    await results(shown ?? found);
+  };
+  snapshot.listen(() => open().catch((error) => gaveUp(error) || put(problem, trouble(error))));
+  await viewer.open(snapshot.value());
   watch(refresh, signal);
 }
 
@@ -80,7 +92,7 @@ function details(found) {
     ["Schedule", schedule(found.schedule)],
     ["Tiles", `${found.tile.size} pixels, ${found.tile.overlap} shared`],
     ["Priority", found.priority],
-    ["Calibration", h("code", null, found.calibration)],
+    ["Calibration", h("a", { href: `#/calibrations/${found.calibration}` }, h("code", null, found.calibration))],
     ["Measurement", h("code", null, found.measurement)],
     ["Identifier", h("code", null, found.id)],
     ["Created", momentInFull(found.created_at)],

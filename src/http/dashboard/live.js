@@ -127,7 +127,7 @@ function seen(signal) {
 }
 
 /** Shows whether the service answers. */
-function link(good) {
+export function link(good) {
   const element = document.getElementById("link");
   say(element, good ? "live" : "no connection, trying again");
   element.classList.toggle("lost", !good);

@@ -4,11 +4,15 @@
 import { h, put, trouble } from "./dom.js";
 import { gaveUp } from "./api.js";
 import { jobs } from "./jobs.js";
+import { link } from "./live.js";
 
 const ID = "([0-9a-f-]{36})";
 const VIEWS = [
   [/^\/jobs$/, "Jobs", async () => jobs],
   [new RegExp(`^/jobs/${ID}$`), "Job", async () => (await import("./job.js")).job],
+  [new RegExp(`^/compare/${ID}/${ID}$`), "Two jobs", async () => (await import("./compare.js")).compare],
+  [/^\/calibrations$/, "Calibrations", async () => (await import("./calibrations.js")).calibrations],
+  [new RegExp(`^/calibrations/${ID}$`), "Calibration", async () => (await import("./calibrations.js")).calibration],
   [/^\/new$/, "New job", async () => (await import("./submit.js")).submit],
   [/^\/system$/, "System", async () => (await import("./system.js")).system],
 ];
@@ -35,6 +39,7 @@ async function show() {
     root.className = "";
     put(root);
     await view(root, [...found.match.slice(1), new URLSearchParams(query)], signal);
+    link(true);
   } catch (error) {
     if (!gaveUp(error) && !signal.aborted) root.append(trouble(error));
   }

@@ -1,0 +1,203 @@
+// A canvas that shows a picture of any size by the tiles that are in sight.
+
+import { h, say } from "./dom.js";
+import { gaveUp, picture } from "./api.js";
+import { steer } from "./view.js";
+
+const HELD = 500;
+const tiles = new Map();
+let waiting = [];
+let busy = 0;
+
+/** A tile's bitmap if it is here; else it is asked for, and `ready` is called when it has come. */
+function tile(url, generation, ready) {
+  const key = `${generation} ${url}`;
+  const found = tiles.get(key);
+  if (found) {
+    tiles.delete(key);
+    tiles.set(key, found);
+    if (!found.bitmap && ready) found.ready.add(ready);
+    return found.bitmap;
+  }
+  if (!ready) return null;
+  const entry = { bitmap: null, ready: new Set([ready]) };
+  tiles.set(key, entry);
+  waiting.push(() => fetchTile(url, key, entry));
+  pump();
+  return null;
+}
+
+/** A few at a time, the latest first: who has scrolled on does not wait for what is out of sight. */
+function pump() {
+  while (busy < 6 && waiting.length > 0) {
+    busy += 1;
+    waiting.pop()().finally(() => {
+      busy -= 1;
+      pump();
+    });
+  }
+  if (waiting.length > 200) waiting = waiting.slice(-200);
+}
+
+async function fetchTile(url, key, entry) {
+  try {
+    entry.bitmap = await picture(url);
+  } catch (error) {
+    // Asked for again at the next drawing, if it is still in sight.
+    tiles.delete(key);
+    if (!gaveUp(error) && error.status !== 404) console.warn(error.message);
+    return;
+  }
+  for (const [oldest, held] of tiles) {
+    if (tiles.size <= HELD) break;
+    tiles.delete(oldest);
+    held.bitmap?.close();
+  }
+  entry.ready.forEach((call) => call());
+}
+
+export class Pane {
+  /** A pane with a title; `view` is where it looks. */
+  constructor(title, view, signal) {
+    this.view = view;
+    this.title = h("span", null, title);
+    this.tools = h("span", { class: "row" });
+    this.canvas = h("canvas", { tabindex: 0, role: "img", "aria-label": title });
+    this.note = h("p", { class: "note", hidden: true });
+    this.element = h("figure", { class: "pane" }, h("figcaption", null, this.title, this.tools), h("div", { class: "sight" }, this.canvas, this.note));
+    this.generation = 0;
+    this.source = null;
+    this.marks = [];
+    this.redraw = this.redraw.bind(this);
+    view.listen(() => {
+      this.moved = true;
+      this.redraw();
+    }, signal);
+    const observer = new ResizeObserver(() => this.size());
+    observer.observe(this.canvas);
+    signal.addEventListener("abort", () => observer.disconnect(), { once: true });
+    steer(this.canvas, view, this, signal);
+  }
+
+  /** Shows `{base, levels, tile, label}` with a window of contrast. */
+  show(source, black, white) {
+    this.source = source && { ...source, black, white };
+    if (source) this.canvas.setAttribute("aria-label", source.label);
+    this.redraw();
+  }
+
+  /** Says why there is nothing to see. */
+  tell(text) {
+    this.note.hidden = !text;
+    say(this.note, text);
+  }
+
+  /** What was shown has changed on the service. */
+  renew() {
+    this.generation += 1;
+    this.redraw();
+  }
+
+  size() {
+    const scale = devicePixelRatio || 1;
+    const [width, height] = [Math.round(this.canvas.clientWidth * scale), Math.round(this.canvas.clientHeight * scale)];
+    if (this.canvas.width === width && this.canvas.height === height) return;
+    this.canvas.width = width;
+    this.canvas.height = height;
+    this.moved = true;
+    this.redraw();
+  }
+
+  /** Zoom, and the picture's coordinates at the left and upper border. */
+  place() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const { view } = this;
+    const zoom = view.zoom ?? Math.min(width / view.width, height / view.height);
+    return { zoom: zoom || 1, left: view.x - width / zoom / 2, top: view.y - height / zoom / 2 };
+  }
+
+  redraw() {
+    if (this.due) return;
+    this.due = requestAnimationFrame(() => {
+      this.due = 0;
+      this.draw();
+    });
+  }
+
+  draw() {
+    const context = this.canvas.getContext("2d");
+    const scale = this.canvas.width / (this.canvas.clientWidth || 1);
+    if (this.moved || !this.source) context.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    this.moved = false;
+    if (!this.source || this.canvas.width === 0) return;
+    const { zoom, left, top } = this.place();
+    const by = zoom * scale;
+    context.imageSmoothingEnabled = by < 2;
+    const target = (x, y, width, height) => {
+      // Rounded to whole pixels, so that neighbours touch.
+      const [x0, y0] = [Math.round((x - left) * by), Math.round((y - top) * by)];
+      return [x0, y0, Math.round((x + width - left) * by) - x0, Math.round((y + height - top) * by) - y0];
+    };
+    for (const at of this.inSight()) {
+      const bitmap = tile(this.url(at), this.generation, this.redraw);
+      const span = this.source.tile * 2 ** at.level;
+      const [x, y] = [at.column * span, at.row * span];
+      if (bitmap) {
+        const unit = 2 ** at.level;
+        const [width, height] = [Math.min(bitmap.width * unit, this.view.width - x), Math.min(bitmap.height * unit, this.view.height - y)];
+        context.drawImage(bitmap, ...target(x, y, width, height));
+      } else {
+        this.coarser(context, at, target);
+      }
+    }
+    this.marks.forEach((mark) => mark(context, target, scale));
+  }
+
+  /** What is known of a missing tile from a coarser level. */
+  coarser(context, at, target) {
+    const size = this.source.tile;
+    for (let up = 1; at.level + up <= this.source.levels; up += 1) {
+      const above = { level: at.level + up, row: at.row >> up, column: at.column >> up };
+      const bitmap = tile(this.url(above), this.generation, null);
+      if (!bitmap) continue;
+      const part = size / 2 ** up;
+      const [sx, sy] = [(at.column % 2 ** up) * part, (at.row % 2 ** up) * part];
+      const [width, height] = [Math.min(part, bitmap.width - sx), Math.min(part, bitmap.height - sy)];
+      if (width <= 0 || height <= 0) return;
+      const unit = 2 ** above.level;
+      const [x, y] = [at.column * size * 2 ** at.level, at.row * size * 2 ** at.level];
+      context.drawImage(bitmap, sx, sy, width, height, ...target(x, y, width * unit, height * unit));
+      return;
+    }
+  }
+
+  url({ level, row, column }) {
+    const { base, black, white } = this.source;
+    return `${base}/tiles/${level}/${row}/${column}?black=${black}&white=${white}`;
+  }
+
+  /** The tiles that the pane needs at its zoom. */
+  inSight() {
+    const { zoom, left, top } = this.place();
+    const scale = this.canvas.width / (this.canvas.clientWidth || 1);
+    const level = Math.max(0, Math.min(this.source.levels, Math.floor(-Math.log2(zoom * scale) + 0.01)));
+    const span = this.source.tile * 2 ** level;
+    const range = (from, length, end) => [Math.max(0, Math.floor(from / span)), Math.min(Math.ceil(end / span), Math.ceil((from + length) / span))];
+    const [row0, row1] = range(top, this.canvas.clientHeight / zoom, this.view.height);
+    const [column0, column1] = range(left, this.canvas.clientWidth / zoom, this.view.width);
+    const found = [];
+    for (let row = row0; row < row1; row += 1) {
+      for (let column = column0; column < column1; column += 1) found.push({ level, row, column });
+    }
+    return found;
+  }
+
+  /** Asks for the tiles in sight of another picture before it is shown; says whether all are here. */
+  prepare(source, black, white) {
+    const before = this.source;
+    this.source = { ...source, black, white };
+    const missing = this.inSight().filter((at) => !tile(this.url(at), this.generation, () => {}));
+    this.source = before;
+    return missing.length === 0;
+  }
+}

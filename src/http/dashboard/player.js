@@ -1,0 +1,90 @@
+// Which frame is shown: slider, play at any rate, keys.
+
+import { h, put, say } from "./dom.js";
+
+/** A player of `count` frames; `show(frame)` is called with 1 to `count`. */
+export class Player {
+  constructor(count, signal, show) {
+    Object.assign(this, { count, show, frame: 1, playing: false, ahead: () => true });
+    this.slider = h("input", { type: "range", id: "frame", min: 1, max: count, value: 1, "aria-label": "Frame" });
+    this.slider.addEventListener("input", () => this.go(Number(this.slider.value)));
+    this.button = h("button", { type: "button", id: "play", "aria-pressed": "false", onclick: () => this.toggle() }, "Play");
+    this.rate = h("input", { type: "number", id: "rate", min: 0.1, max: 240, step: "any", value: Math.min(12, Math.max(4, count)) });
+    this.text = h("output", { for: "frame", class: "count" });
+    this.element = h("div", { class: "row player" }, this.button,
+      this.step(-1, "Frame before", "‹"), this.slider, this.step(1, "Next frame", "›"), this.text,
+      h("label", { for: "rate", class: "row muted" }, this.rate, "frames/s"));
+    signal.addEventListener("abort", () => this.stop(), { once: true });
+    this.tell();
+  }
+
+  step(by, label, sign) {
+    return h("button", { type: "button", class: "small", "aria-label": label, onclick: () => this.go(this.frame + by) }, sign);
+  }
+
+  go(frame) {
+    this.frame = ((frame - 1 + this.count) % this.count) + 1;
+    this.tell();
+    this.show(this.frame);
+  }
+
+  tell() {
+    this.slider.value = this.frame;
+    this.slider.setAttribute("aria-valuetext", `frame ${this.frame} of ${this.count}`);
+    say(this.text, `${this.frame} / ${this.count}`);
+  }
+
+  toggle() {
+    if (this.playing) this.stop();
+    else this.play();
+  }
+
+  play() {
+    this.playing = true;
+    this.mark();
+    let before = performance.now();
+    let shown = 0;
+    this.fps = 0;
+    const turn = (now) => {
+      if (!this.playing) return;
+      const period = 1000 / Math.min(240, Math.max(0.1, Number(this.rate.value) || 1));
+      const steps = Math.floor((now - before) / period);
+      if (steps >= 1) {
+        // What is asked for faster than the screen is skipped; what has not come yet is waited for.
+        const next = ((this.frame - 1 + steps) % this.count) + 1;
+        if (this.ahead(next)) {
+          before += steps * period;
+          this.go(next);
+          shown += 1;
+        } else {
+          before = now - period;
+        }
+      }
+      this.shown = shown;
+      requestAnimationFrame(turn);
+    };
+    requestAnimationFrame(turn);
+  }
+
+  stop() {
+    this.playing = false;
+    this.mark();
+  }
+
+  mark() {
+    put(this.button, this.playing ? "Pause" : "Play");
+    this.button.setAttribute("aria-pressed", String(this.playing));
+  }
+
+  /** Keys that work anywhere in the viewer. */
+  keys(element) {
+    element.addEventListener("keydown", (event) => {
+      if (event.target.matches("input, select, button, a, summary") && event.key !== "k") return;
+      if (event.ctrlKey || event.metaKey || event.altKey || event.shiftKey) return;
+      const act = { " ": () => this.toggle(), k: () => this.toggle(), ArrowLeft: () => this.go(this.frame - 1), ArrowRight: () => this.go(this.frame + 1), Home: () => this.go(1), End: () => this.go(this.count) }[event.key];
+      if (!act || event.target.matches("input[type=number]")) return;
+      event.preventDefault();
+      act();
+    });
+  }
+}

@@ -1,0 +1,74 @@
+// The tiles of a snapshot: which are done, which run; one of them is chosen for the plot.
+
+import { convergence } from "./convergence.js";
+import { figure } from "./format.js";
+import { get } from "./api.js";
+import { h, put, s } from "./dom.js";
+
+export class TileMap {
+  constructor(job, signal) {
+    Object.assign(this, { job, signal, chosen: null, tiles: [] });
+    this.map = h("div");
+    this.select = h("select", { id: "tile" });
+    this.select.addEventListener("change", () => this.choose(this.select.value === "" ? null : Number(this.select.value)));
+    this.note = h("p", { class: "muted" });
+    this.plot = h("div");
+    this.tilesCard = h("section", { class: "card", "aria-label": "Tiles" }, h("h2", null, "Tiles"), this.map, this.note);
+    this.plotCard = h("section", { class: "card", "aria-label": "Convergence" },
+      h("h2", { class: "row" }, "Convergence", h("span", { class: "grow" }), h("label", { for: "tile", class: "row muted" }, "of tile", this.select)), this.plot);
+  }
+
+  async renew(snapshot) {
+    this.snapshot = snapshot;
+    const found = await get(`/v1/jobs/${this.job.id}/snapshots/${snapshot}/tiles`, this.signal);
+    if (found.items !== this.tiles) {
+      this.tiles = found.items;
+      this.draw();
+      this.options();
+    }
+    await this.history();
+  }
+
+  choose(tile) {
+    this.chosen = tile;
+    this.draw();
+    this.history();
+  }
+
+  /** The chosen tile, or else the one that runs, or that ended last. */
+  current() {
+    if (this.chosen !== null) return this.chosen;
+    const runs = this.tiles.find((tile) => tile.state === "running" && tile.iterations > 0);
+    return (runs ?? this.tiles.filter((tile) => tile.state === "done").at(-1) ?? this.tiles[0])?.tile ?? 0;
+  }
+
+  async history() {
+    const { points } = await get(`/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/tiles/${this.current()}/history`, this.signal);
+    if (points === this.points) return;
+    this.points = points;
+    convergence(this.plot, points);
+  }
+
+  options() {
+    const state = (tile) => `${tile.tile + 1} (${tile.state})`;
+    put(this.select, h("option", { value: "" }, "that runs or ended last"), this.tiles.map((tile) => h("option", { value: tile.tile, selected: tile.tile === this.chosen }, state(tile))));
+  }
+
+  draw() {
+    const { height, width } = this.job.shape;
+    const done = this.tiles.filter((tile) => tile.state === "done");
+    const worst = Math.max(...done.map((tile) => tile.residual ?? 0));
+    const text = `${done.length} of ${this.tiles.length} tiles are done`;
+    const unit = Math.max(width, height) / 100;
+    const rectangle = (tile) => s("rect", {
+      x: tile.column + unit / 2, y: tile.row + unit / 2, width: tile.width - unit, height: tile.height - unit, rx: unit,
+      class: `tile ${tile.state}${tile.tile === this.chosen ? " chosen" : ""}`, "stroke-width": unit / 2,
+      onclick: () => {
+        this.select.value = tile.tile;
+        this.choose(tile.tile);
+      },
+    }, s("title", null, `tile ${tile.tile + 1}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
+    put(this.map, s("svg", { viewBox: `0 0 ${width} ${height}`, class: "tiles", role: "img", "aria-label": text }, this.tiles.map(rectangle)));
+    put(this.note, `${text}${done.length ? `; the largest residual is ${figure(worst)}` : ""}.`);
+  }
+}

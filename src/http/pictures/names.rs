@@ -1,0 +1,219 @@
+//! What pictures are called, and which values that means.
+
+use std::sync::Arc;
+
+use serde::Deserialize;
+
+use super::render::Picture;
+use super::source::{Files, Stack};
+use crate::http::app::App;
+use crate::http::error::{ApiError, Code};
+use crate::http::jobs::with_snapshot;
+use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
+use crate::store::{Calibration, Job, Measurement, StoreError};
+
+/// A picture of a job's snapshot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub(in crate::http) enum JobPicture {
+    /// `frame-1` and so on.
+    Frame(usize),
+    /// `difference-2`: frame 2 without frame 1.
+    Difference(usize),
+    /// `residual`
+    Residual,
+    /// `slice-0`: all frames at row 0.
+    Slice(usize),
+}
+
+/// A picture of a measurement: `snapshot-0` and so on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub(in crate::http) struct MeasurementPicture(usize);
+
+/// A picture of a calibration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub(in crate::http) enum CalibrationPicture {
+    /// `mask-1` and so on.
+    Mask(usize),
+    /// `mean` of the masks.
+    Mean,
+    /// `gram`: sum of their squares.
+    Gram,
+    /// `dead`: 1 where all are dark.
+    Dead,
+}
+
+/// The number after a name, in the one form that it is written in.
+fn numbered(text: &str, name: &str) -> Option<usize> {
+    let digits = text.strip_prefix(name)?.strip_prefix('-')?;
+    digits.parse().ok().filter(|number: &usize| number.to_string() == digits)
+}
+
+impl TryFrom<String> for JobPicture {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let number = |name| numbered(&text, name);
+        let found = match text.as_str() {
+            "residual" => Some(Self::Residual),
+            _ => (number("frame").map(Self::Frame))
+                .or_else(|| number("difference").map(Self::Difference))
+                .or_else(|| number("slice").map(Self::Slice)),
+        };
+        found.ok_or_else(|| "pictures are frame-N, difference-N, slice-ROW and residual".into())
+    }
+}
+
+impl TryFrom<String> for MeasurementPicture {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        numbered(&text, "snapshot").map(Self).ok_or_else(|| "pictures are snapshot-N".into())
+    }
+}
+
+impl TryFrom<String> for CalibrationPicture {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        match text.as_str() {
+            "mean" => Ok(Self::Mean),
+            "gram" => Ok(Self::Gram),
+            "dead" => Ok(Self::Dead),
+            _ => numbered(&text, "mask")
+                .map(Self::Mask)
+                .ok_or_else(|| "pictures are mask-N, mean, gram and dead".into()),
+        }
+    }
+}
+
+/// The picture of a job.
+pub(super) async fn of_job(
+    app: &App,
+    lab: &Lab,
+    (id, snapshot, name): (JobId, u32, JobPicture),
+) -> Result<Picture, ApiError> {
+    let job = with_snapshot(app, lab, id, snapshot).await?;
+    let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
+    let stack = frames_of(app, &job, snapshot).await?;
+    match name {
+        JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
+        JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
+        JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
+        JobPicture::Residual => {
+            let masks = masks_of(app, &app.store.calibration(lab, job.spec.calibration).await?);
+            let measurement = app.store.measurement(lab, job.spec.measurement).await?;
+            Ok(stack.residual(&masks, &snapshots_of(app, &measurement), snapshot as usize))
+        }
+        _ => Err(outside(format!(
+            "frames are counted from 1 to {frames}, differences from 2, rows from 0 to {}",
+            height.saturating_sub(1)
+        ))),
+    }
+}
+
+/// The picture of a measurement.
+pub(super) async fn of_measurement(
+    app: &App,
+    lab: &Lab,
+    (id, MeasurementPicture(snapshot)): (MeasurementId, MeasurementPicture),
+) -> Result<Picture, ApiError> {
+    let stack = snapshots_of(app, &app.store.measurement(lab, id).await?);
+    let count = stack.shape.0;
+    if snapshot < count {
+        return Ok(stack.frame(snapshot));
+    }
+    Err(outside(format!("snapshots are counted from 0 to {}", count.saturating_sub(1))))
+}
+
+/// The picture of a calibration.
+pub(super) async fn of_calibration(
+    app: &App,
+    lab: &Lab,
+    (id, name): (CalibrationId, CalibrationPicture),
+) -> Result<Picture, ApiError> {
+    let stack = masks_of(app, &app.store.calibration(lab, id).await?);
+    let count = stack.shape.0;
+    match name {
+        CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
+        CalibrationPicture::Mask(_) => Err(outside(format!("masks are counted from 1 to {count}"))),
+        CalibrationPicture::Mean => Ok(stack.mean()),
+        CalibrationPicture::Gram => Ok(stack.gram()),
+        CalibrationPicture::Dead => Ok(stack.dead()),
+    }
+}
+
+fn outside(detail: String) -> ApiError {
+    ApiError::new(Code::NotFound, detail)
+}
+
+fn masks_of(app: &App, calibration: &Calibration) -> Stack {
+    let facts = &calibration.facts;
+    prepared(app, calibration.prepared, (facts.frames, facts.height, facts.width))
+}
+
+fn snapshots_of(app: &App, measurement: &Measurement) -> Stack {
+    let facts = &measurement.facts;
+    prepared(app, measurement.prepared, (facts.snapshots as usize, facts.height, facts.width))
+}
+
+fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Stack {
+    let files = Files::Prepared(app.store.dir().blob(&sha256));
+    Stack { shape, identity: sha256.to_string(), files }
+}
+
+/// The frames of a snapshot: those of the result, or of the tiles that are done.
+async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiError> {
+    let spec = &job.spec;
+    let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
+    match app.store.result_file(job, Some(snapshot), "frames.npy").await {
+        Ok((file, path)) => {
+            return Ok(Stack {
+                shape,
+                identity: file.sha256.to_string(),
+                files: Files::Frames(path),
+            });
+        }
+        Err(StoreError::NotFound { .. }) => {}
+        Err(error) => return Err(error.into()),
+    }
+    let done = app.store.tile_results(job.id, snapshot).await?;
+    if done.is_empty() {
+        let detail = "no tile of this snapshot is done yet; the job's state says how far it is";
+        return Err(ApiError::new(Code::NotReady, detail));
+    }
+    let hashes: String = done.iter().map(|tile| tile.sha256.to_string()).collect();
+    let plan = spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
+    let place = |tile: crate::store::TileResult| Some((plan.tile(tile.tile as usize)?, tile.path));
+    let tiles = Arc::new(done.into_iter().filter_map(place).collect());
+    let identity = Sha256::of(hashes.as_bytes()).to_string();
+    Ok(Stack { shape, identity, files: Files::Tiles(tiles) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{CalibrationPicture, JobPicture, MeasurementPicture};
+
+    #[test]
+    fn every_picture_has_one_name() {
+        let job = |text: &str| JobPicture::try_from(text.to_owned());
+        assert_eq!(job("frame-12"), Ok(JobPicture::Frame(12)));
+        assert_eq!(job("difference-2"), Ok(JobPicture::Difference(2)));
+        assert_eq!(job("slice-0"), Ok(JobPicture::Slice(0)));
+        assert_eq!(job("residual"), Ok(JobPicture::Residual));
+        for bad in ["frame-01", "frame-+1", "frame", "frame-", "../x", "residual-1", "slice--1", ""]
+        {
+            assert!(job(bad).is_err(), "{bad}");
+        }
+        let long = "frame-99999999999999999999999";
+        assert!(job(long).is_err());
+        assert!(MeasurementPicture::try_from("snapshot-3".to_owned()).is_ok());
+        assert_eq!(
+            CalibrationPicture::try_from("mask-1".to_owned()),
+            Ok(CalibrationPicture::Mask(1))
+        );
+        assert!(CalibrationPicture::try_from("masks".to_owned()).is_err());
+    }
+}

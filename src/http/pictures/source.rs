@@ -1,0 +1,249 @@
+//! Where pictures come from: prepared arrays, result files, and tiles that are done while others
+//! are not.
+
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use ndarray::{Array2, Array3, Axis, s};
+
+use super::render::Picture;
+use crate::formats::{FormatError, Limits, npy, planar};
+use crate::recon::tile::Tile;
+
+/// A stack of f32 \[frames, rows, columns\] of which windows are read.
+#[derive(Debug, Clone)]
+pub(super) struct Stack {
+    /// Frames, rows and columns.
+    pub(super) shape: (usize, usize, usize),
+    /// Names the content.
+    pub(super) identity: String,
+    pub(super) files: Files,
+}
+
+/// The files of a stack.
+#[derive(Debug, Clone)]
+pub(super) enum Files {
+    /// A prepared array.
+    Prepared(PathBuf),
+    /// The frames of a result.
+    Frames(PathBuf),
+    /// Tiles of an unfinished result; NaN where none is done.
+    Tiles(Arc<Vec<(Tile, PathBuf)>>),
+}
+
+type Window = Result<Array3<f32>, FormatError>;
+
+impl Stack {
+    fn window(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
+        let limits = Limits::default();
+        match &self.files {
+            Files::Prepared(path) => {
+                planar::Reader::open(path, &limits)?.read_window(frames, rows, columns)
+            }
+            Files::Frames(path) => {
+                npy::open_windows(path, &limits)?.read_window(frames, rows, columns)
+            }
+            Files::Tiles(tiles) => mosaic(tiles, frames, rows, columns),
+        }
+    }
+
+    fn settled(&self) -> bool {
+        !matches!(self.files, Files::Tiles(_))
+    }
+
+    fn picture<F>(&self, name: &str, depth: usize, read: F) -> Picture
+    where
+        F: Fn(&Self, Range<usize>, Range<usize>) -> Result<Array2<f32>, FormatError>
+            + Send
+            + Sync
+            + 'static,
+    {
+        let (_, height, width) = self.shape;
+        let stack = self.clone();
+        Picture {
+            height,
+            width,
+            identity: format!("{} {name}", self.identity),
+            settled: self.settled(),
+            depth,
+            read: Box::new(move |rows, columns| read(&stack, rows, columns)),
+        }
+    }
+
+    /// One frame.
+    pub(super) fn frame(&self, k: usize) -> Picture {
+        self.picture(&format!("frame {k}"), 1, move |stack, rows, columns| {
+            Ok(first(stack.window(k..k + 1, rows, columns)?))
+        })
+    }
+
+    /// Frame `k` without the one before it.
+    pub(super) fn difference(&self, k: usize) -> Picture {
+        self.picture(&format!("difference {k}"), 2, move |stack, rows, columns| {
+            let pair = stack.window(k - 1..k + 1, rows, columns)?;
+            Ok(&pair.index_axis(Axis(0), 1) - &pair.index_axis(Axis(0), 0))
+        })
+    }
+
+    /// All frames at one row: \[frames, columns\].
+    pub(super) fn slice(&self, row: usize) -> Picture {
+        let frames = self.shape.0;
+        let picture = self.picture(&format!("slice {row}"), 1, move |stack, rows, columns| {
+            Ok(stack.window(rows, row..row + 1, columns)?.index_axis_move(Axis(1), 0))
+        });
+        Picture { height: frames, ..picture }
+    }
+
+    /// The mean of all frames.
+    pub(super) fn mean(&self) -> Picture {
+        let frames = self.shape.0;
+        self.picture("mean", frames, move |stack, rows, columns| {
+            let window = stack.window(0..frames, rows, columns)?;
+            Ok(window.sum_axis(Axis(0)) / frames as f32)
+        })
+    }
+
+    /// The sum of the squares of all frames: of masks, the gram diagonal.
+    pub(super) fn gram(&self) -> Picture {
+        let frames = self.shape.0;
+        self.picture("gram", frames, move |stack, rows, columns| {
+            let window = stack.window(0..frames, rows, columns)?;
+            Ok(window.map_axis(Axis(0), |line| line.iter().map(|c| c * c).sum()))
+        })
+    }
+
+    /// 1 where all frames are 0, else 0.
+    pub(super) fn dead(&self) -> Picture {
+        let frames = self.shape.0;
+        self.picture("dead", frames, move |stack, rows, columns| {
+            let window = stack.window(0..frames, rows, columns)?;
+            Ok(window.map_axis(Axis(0), |line| f32::from(line.iter().all(|&c| c == 0.0))))
+        })
+    }
+
+    /// `|y - Hx|` of these frames `x`, with the masks of `H` and frame `snapshot` of `y`.
+    pub(super) fn residual(&self, masks: &Self, measurement: &Self, snapshot: usize) -> Picture {
+        let frames = self.shape.0;
+        let name = format!("{} {} {snapshot} residual", masks.identity, measurement.identity);
+        let (masks, measurement) = (masks.clone(), measurement.clone());
+        self.picture(&name, 2 * frames, move |stack, rows, columns| {
+            let y = measurement.window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
+            let mut rest = first(y);
+            let masks = masks.window(0..frames, rows.clone(), columns.clone())?;
+            let x = stack.window(0..frames, rows, columns)?;
+            for (mask, frame) in masks.outer_iter().zip(x.outer_iter()) {
+                ndarray::azip!((rest in &mut rest, &c in &mask, &x in &frame) *rest -= c * x);
+            }
+            rest.mapv_inplace(f32::abs);
+            Ok(rest)
+        })
+    }
+}
+
+fn first(window: Array3<f32>) -> Array2<f32> {
+    window.index_axis_move(Axis(0), 0)
+}
+
+/// A window of a picture of which only some tiles are there. Where they overlap the later one
+/// counts: they are blended when all are done.
+fn mosaic(
+    tiles: &[(Tile, PathBuf)],
+    frames: Range<usize>,
+    rows: Range<usize>,
+    columns: Range<usize>,
+) -> Window {
+    let mut whole = Array3::from_elem((frames.len(), rows.len(), columns.len()), f32::NAN);
+    for (tile, path) in tiles {
+        let (down, across) =
+            (common(&rows, tile.row, tile.height), common(&columns, tile.column, tile.width));
+        if down.is_empty() || across.is_empty() {
+            continue;
+        }
+        let part = planar::Reader::open(path, &Limits::default())?.read_window(
+            frames.clone(),
+            down.start - tile.row..down.end - tile.row,
+            across.start - tile.column..across.end - tile.column,
+        )?;
+        let place = s![
+            ..,
+            down.start - rows.start..down.end - rows.start,
+            across.start - columns.start..across.end - columns.start
+        ];
+        whole.slice_mut(place).assign(&part);
+    }
+    Ok(whole)
+}
+
+/// The part of a range that a tile of this start and length covers.
+fn common(range: &Range<usize>, start: usize, length: usize) -> Range<usize> {
+    let (from, to) = (range.start.max(start), range.end.min(start + length));
+    from..to.max(from)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::{Files, Stack};
+    use crate::formats::planar::Writer;
+    use crate::recon::tile::Tile;
+    use ndarray::{Array3, s};
+
+    fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
+        let (frames, height, width) = stack.dim();
+        let path = folder.join(name);
+        let mut writer =
+            Writer::new(std::fs::File::create(&path).unwrap(), frames, height, width).unwrap();
+        stack.outer_iter().for_each(|frame| writer.write_frame(frame).unwrap());
+        writer.finish().unwrap();
+        path
+    }
+
+    fn stack(shape: (usize, usize, usize), files: Files) -> Stack {
+        Stack { shape, identity: "x".into(), files }
+    }
+
+    #[test]
+    fn the_residual_is_what_the_frames_leave_of_the_measurement() {
+        let folder = tempfile::tempdir().unwrap();
+        let value = |k: usize, i: usize, j: usize| ((k * 31 + i * 7 + j * 3) % 11) as f32 / 10.0;
+        let x = Array3::from_shape_fn((3, 20, 24), |(k, i, j)| value(k, i, j));
+        let masks = Array3::from_shape_fn((3, 20, 24), |(k, i, j)| value(j, k, i));
+        let mut y = (&x * &masks).sum_axis(ndarray::Axis(0));
+        y[[4, 5]] -= 0.25;
+        let y = y.insert_axis(ndarray::Axis(0));
+        let files = |name, of: &Array3<f32>| Files::Prepared(prepared(folder.path(), name, of));
+        let frames = stack((3, 20, 24), files("x", &x));
+        let masks = stack((3, 20, 24), files("masks", &masks));
+        let picture = frames.residual(&masks, &stack((1, 20, 24), files("y", &y)), 0);
+        let found = picture.reduce(&picture.whole(0)).unwrap();
+        for ((i, j), &rest) in found.indexed_iter() {
+            let expected = if (i, j) == (4, 5) { 0.25 } else { 0.0 };
+            assert!((rest - expected).abs() < 1e-5, "{i} {j} {rest}");
+        }
+        let slice = frames.slice(7);
+        let found = slice.reduce(&slice.whole(0)).unwrap();
+        assert_eq!(found, x.slice(s![.., 7, ..]));
+        let change = frames.difference(2);
+        let found = change.reduce(&change.whole(0)).unwrap();
+        assert_eq!(found, &x.slice(s![2, .., ..]) - &x.slice(s![1, .., ..]));
+    }
+
+    #[test]
+    fn tiles_that_are_done_stand_in_their_place() {
+        let folder = tempfile::tempdir().unwrap();
+        let x = Array3::from_shape_fn((2, 40, 40), |(k, i, j)| (k * 1600 + i * 40 + j) as f32);
+        let tile = Tile { index: 3, row: 16, column: 20, height: 24, width: 20 };
+        let part = x.slice(s![.., 16..40, 20..40]).to_owned();
+        let path = prepared(folder.path(), "tile", &part);
+        let stack = stack((2, 40, 40), Files::Tiles(Arc::new(vec![(tile, path)])));
+        let picture = stack.frame(1);
+        assert!(!picture.settled);
+        let found = picture.reduce(&picture.whole(0)).unwrap();
+        for ((i, j), &value) in found.indexed_iter() {
+            let expected = (i >= 16 && j >= 20).then_some(x[[1, i, j]]);
+            assert_eq!(value.is_finite().then_some(value), expected, "{i} {j}");
+        }
+    }
+}

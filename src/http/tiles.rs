@@ -1,0 +1,65 @@
+//! Tiles of a job as they are worked on, and how the solver converges on each.
+
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::response::Response;
+use serde::Serialize;
+
+use super::access::Access;
+use super::app::App;
+use super::conditional;
+use super::error::{ApiError, Code};
+use super::extract::Params;
+use super::jobs::with_snapshot;
+use crate::job::JobId;
+use crate::store::{TileHistory, TileState};
+
+/// The tiles of a snapshot as they are shown.
+#[derive(Debug, Serialize)]
+struct TilesBody {
+    snapshot: u32,
+    items: Vec<TileBody>,
+}
+
+/// A tile as it is shown.
+#[derive(Debug, Serialize)]
+struct TileBody {
+    row: usize,
+    column: usize,
+    height: usize,
+    width: usize,
+    #[serde(flatten)]
+    state: TileState,
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles`
+pub(super) async fn list(
+    State(app): State<App>,
+    access: Access,
+    Params((id, snapshot)): Params<(JobId, u32)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
+    let plan = job.spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
+    let states = app.store.tile_states(id, snapshot).await?;
+    let show = |state: TileState| {
+        let tile = plan.tile(state.tile as usize)?;
+        let (row, column, height, width) = (tile.row, tile.column, tile.height, tile.width);
+        Some(TileBody { row, column, height, width, state })
+    };
+    let body = TilesBody { snapshot, items: states.into_iter().filter_map(show).collect() };
+    conditional::json(&body, &headers)
+}
+
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history`
+pub(super) async fn history(
+    State(app): State<App>,
+    access: Access,
+    Params((id, snapshot, tile)): Params<(JobId, u32, u32)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    with_snapshot(&app, &access.lab, id, snapshot).await?;
+    let history: Option<TileHistory> = app.store.tile_history(id, snapshot, tile).await?;
+    let none = || ApiError::new(Code::NotFound, format!("the job has no tile {tile}"));
+    conditional::json(&history.ok_or_else(none)?, &headers)
+}

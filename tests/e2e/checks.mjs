@@ -1,0 +1,72 @@
+// What is checked and kept of every view: accessibility, and how it looks.
+
+import { mkdirSync, readFileSync, rmSync } from "node:fs";
+import { createRequire } from "node:module";
+import { join } from "node:path";
+
+const AXE = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
+const SIZES = [[1400, 900], [390, 844]];
+
+export class Checks {
+  constructor(folder) {
+    rmSync(folder, { recursive: true, force: true });
+    mkdirSync(folder, { recursive: true });
+    Object.assign(this, { folder, count: 0, screenshots: 0, views: new Set(), minor: new Set(), errors: [], times: {} });
+  }
+
+  /** Something that must be so. */
+  that(condition, text) {
+    this.count += 1;
+    if (!condition) throw new Error(`check failed: ${text}`);
+  }
+
+  /** Times a step. */
+  async step(name, run) {
+    const start = performance.now();
+    const value = await run();
+    this.times[name] = Math.round(performance.now() - start);
+    return value;
+  }
+
+  /** A page on which no script error and no dialog may appear. */
+  async page(context) {
+    const page = await context.newPage();
+    page.on("pageerror", (error) => this.errors.push(`script: ${error.message}`));
+    page.on("dialog", (dialog) => {
+      this.errors.push(`dialog: ${dialog.message()}`);
+      dialog.dismiss();
+    });
+    page.on("console", (message) => {
+      // Answers with a status of 400 and above are some of what is tested.
+      if (message.type() === "error" && !message.text().startsWith("Failed to load resource")) this.errors.push(`console: ${message.text()}`);
+    });
+    return page;
+  }
+
+  /** A view at both sizes, dark and light: no serious finding of axe, and a picture of each. */
+  async look(page, name) {
+    this.views.add(name);
+    for (const [width, height] of SIZES) {
+      await page.setViewportSize({ width, height });
+      for (const colorScheme of ["dark", "light"]) {
+        await page.emulateMedia({ colorScheme });
+        await page.waitForTimeout(250);
+        await this.accessible(page, `${name} (${width}, ${colorScheme})`);
+        await page.screenshot({ path: join(this.folder, `${name}-${width}-${colorScheme}.png`) });
+        this.screenshots += 1;
+      }
+      const wider = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+      this.that(wider <= 0, `${name} is ${wider} pixels wider than a screen of ${width}`);
+    }
+    await page.setViewportSize({ width: SIZES[0][0], height: SIZES[0][1] });
+  }
+
+  async accessible(page, name) {
+    // By the debugger and not by a script element, which the page's policy forbids.
+    await page.evaluate(AXE);
+    const { violations } = await page.evaluate(() => globalThis.axe.run());
+    const grave = violations.filter((found) => ["serious", "critical"].includes(found.impact));
+    violations.filter((found) => !grave.includes(found)).forEach((found) => this.minor.add(found.id));
+    this.that(grave.length === 0, `${name}: ${JSON.stringify(grave.map((found) => [found.id, found.nodes.map((node) => node.html).slice(0, 3)]))}`);
+  }
+}

@@ -1,0 +1,107 @@
+// Drives the dashboard of a real service in a real Chromium; ends with one line of JSON.
+//
+//     node run.mjs PROGRAM
+//
+// CHROMIUM names the browser. Pictures of every view are kept in e2e-output/.
+
+import { fileURLToPath } from "node:url";
+import { chromium } from "playwright-core";
+import { Checks } from "./checks.mjs";
+import { HOSTILE, compare, manage, submit, view, watch } from "./drive.mjs";
+import { Service } from "./service.mjs";
+import { fill, scroll, visit } from "./measure.mjs";
+import { scene } from "./scene.mjs";
+
+const FRAMES = 8;
+const LIMITS = { bytes: 150_000, paint: 1000 };
+const program = process.argv[2];
+const checks = new Checks(fileURLToPath(new URL("../../e2e-output", import.meta.url)));
+const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium" });
+const services = [];
+
+/** A job that keeps a worker busy for minutes. */
+const long = (measurement, label) => ({
+  measurement, algorithm: "gap-tv", label, tile: { size: 128, overlap: 16 },
+  schedule: { stages: [{ prior: "tv", iterations: 10000, tv_weight: 0.05, tv_updates: 40, tolerance: 0 }] },
+});
+
+async function everything() {
+  const service = await Service.start(program, "--workers", "2");
+  services.push(service);
+  const page = await checks.page(await browser.newContext({ viewport: { width: 1400, height: 900 } }));
+  await page.goto(service.url);
+  await page.waitForSelector("text=There are no jobs yet.");
+  const shown = scene(FRAMES, 720, 960);
+  const id = await checks.step("submit", () => submit(page, checks, shown));
+  await checks.step("watch", () => watch(page, checks));
+  await checks.look(page, "job");
+  await checks.step("view", () => view(page, checks, FRAMES));
+  const { measurement } = await service.call("GET", `/v1/jobs/${id}`);
+  const other = await service.submit({ measurement, algorithm: "gap-tv", label: "ten iterations", schedule: { stages: [{ prior: "tv", iterations: 10, tv_weight: 0.05 }] } });
+  await service.when(other.id, (job) => job.state === "succeeded");
+  await checks.step("compare", () => compare(page, checks, ["ten iterations", HOSTILE]));
+  await service.submit(long(measurement, "long job"));
+  await checks.step("manage", () => manage(page, checks, "long job"));
+  checks.that((await page.textContent(`.list a >> text=${HOSTILE}`)) === HOSTILE, "the list shows the name as text");
+  await views(page, service);
+  const busy = await checks.step("visit", () => loaded(service, measurement));
+  const list = await checks.step("list", thousands);
+  checks.that(checks.errors.length === 0, `no script fails and no dialog opens: ${checks.errors}`);
+  return { ...busy, list };
+}
+
+/** The views that nothing was done in. */
+async function views(page, service) {
+  await checks.look(page, "jobs");
+  for (const name of ["calibrations", "system"]) {
+    await page.goto(`${service.url}/#/${name}`);
+    await page.waitForSelector("table");
+    await page.waitForTimeout(600);
+    await checks.look(page, name);
+  }
+  await page.goto(`${service.url}/#/calibrations`);
+  await page.click("table a");
+  await page.waitForSelector(".viewer");
+  await page.waitForTimeout(800);
+  await checks.look(page, "calibration");
+}
+
+/** A visit while both workers compute. */
+async function loaded(service, measurement) {
+  const jobs = [await service.submit(long(measurement, "busy"))];
+  await service.when(jobs[0].id, (job) => job.progress.tiles_running === 2);
+  const found = await visit(browser, checks, service.url);
+  const still = await service.call("GET", `/v1/jobs/${jobs[0].id}`);
+  checks.that(still.progress.tiles_running === 2, "both workers computed meanwhile");
+  checks.that(found.bytes < LIMITS.bytes, `the dashboard weighs ${found.bytes} bytes`);
+  checks.that(found.paint < LIMITS.paint, `the first paint took ${found.paint} ms`);
+  await service.call("POST", `/v1/jobs/${jobs[0].id}/cancel`);
+  return { page_bytes: found.bytes, page_files: found.files, first_paint_ms: found.paint };
+}
+
+/** A list of thousands of jobs. */
+async function thousands() {
+  const service = await Service.start(program, "--workers", "0");
+  services.push(service);
+  const { measurement } = await service.take(scene(2, 32, 32));
+  await checks.step("fill", () => fill(service, measurement));
+  const page = await checks.page(await browser.newContext({ viewport: { width: 1400, height: 900 } }));
+  return scroll(page, checks, service.url);
+}
+
+let result;
+let failed = 0;
+try {
+  result = await everything();
+} catch (error) {
+  failed = 1;
+  console.error(error);
+  if (checks.errors.length > 0) console.error(checks.errors);
+}
+await browser.close();
+await Promise.allSettled(services.map((service) => service.stop()));
+console.log(JSON.stringify({
+  e2e: failed ? "failed" : "passed", checks: checks.count, views: checks.views.size, screenshots: checks.screenshots,
+  axe_minor: [...checks.minor], ms: checks.times, ...result,
+}));
+process.exitCode = failed;

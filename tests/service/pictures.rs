@@ -1,0 +1,137 @@
+//! Pictures to look at, and how the solver went.
+
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use crate::app::{Answer, TestApp};
+use crate::pipeline::values;
+use crate::samples::Scene;
+
+/// Rows, columns and values of an 8-bit grey PNG.
+fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
+    assert_eq!(answer.header("content-type"), "image/png");
+    let mut reader = png::Decoder::new(std::io::Cursor::new(&answer.bytes)).read_info().unwrap();
+    let mut values = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut values).unwrap();
+    assert_eq!(
+        (info.color_type, info.bit_depth),
+        (png::ColorType::Grayscale, png::BitDepth::Eight)
+    );
+    (info.height as usize, info.width as usize, values)
+}
+
+async fn job(app: &TestApp, schedule: Value) -> String {
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 1,
+        "tile": {"size": 32, "overlap": 8}, "schedule": schedule});
+    app.submit(&body).await
+}
+
+fn tv(iterations: u32, updates: u32) -> Value {
+    json!({"stages": [{"prior": "tv", "iterations": iterations, "tv_weight": 0.1,
+        "tv_updates": updates, "tolerance": 0.0}]})
+}
+
+#[tokio::test]
+async fn frames_are_shown_as_they_are() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let job = job(&app, tv(200, 4)).await;
+    let done = app.ended(&job).await;
+    let base = format!("/v1/jobs/{job}/snapshots/1");
+    let frames = values(&app.get(&format!("{base}/frames.npy")).await.expect(200).bytes);
+    let (height, width) = (Scene::SMALL.height, Scene::SMALL.width);
+    let plane = height * width;
+    let pictures = format!("{base}/pictures");
+
+    // A tile at full resolution has every pixel, on the window's scale.
+    let address = format!("{pictures}/frame-2/tiles/0/0/0?black=0.1&white=0.9");
+    let tile = app.get(&address).await.expect(200);
+    let (rows, columns, shown) = decode(&tile);
+    assert_eq!((rows, columns), (height, width));
+    for (&shown, &value) in shown.iter().zip(&frames[plane..2 * plane]) {
+        let expected = ((value - 0.1) / 0.8 * 255.0).clamp(0.0, 255.0);
+        assert!((f32::from(shown) - expected).abs() <= 0.51, "{shown} {expected}");
+    }
+    assert!(tile.header("cache-control").contains("immutable"));
+    let known = app.request(Method::GET, &address).header("if-none-match", tile.header("etag"));
+    app.send(known).await.expect(304);
+
+    // A preview is reduced by a power of two; a slice has a row of every frame.
+    let small = app.get(&format!("{pictures}/frame-1?size=32&black=0&white=1")).await.expect(200);
+    let (rows, columns, shown) = decode(&small);
+    assert_eq!((rows, columns), (height / 2, width / 2));
+    let mean = (frames[0] + frames[1] + frames[width] + frames[width + 1]) / 4.0;
+    assert!((f32::from(shown[0]) - mean * 255.0).abs() <= 0.51);
+    let slice = app.get(&format!("{pictures}/slice-5/tiles/0/0/0?black=0&white=1")).await;
+    let (rows, columns, shown) = decode(&slice.expect(200));
+    assert_eq!((rows, columns), (Scene::SMALL.frames, width));
+    let value = frames[3 * plane + 5 * width + 7] * 255.0;
+    assert!((f32::from(shown[3 * width + 7]) - value).abs() <= 0.51);
+
+    // The spread tells what window makes sense; the residual is small.
+    let spread = app.get(&format!("{pictures}/frame-1/spread")).await.expect(200).json();
+    assert_eq!((&spread["height"], &spread["levels"]), (&json!(height), &json!(0)));
+    assert!(spread["low"].as_f64().unwrap() < spread["high"].as_f64().unwrap());
+    let rest = app.get(&format!("{pictures}/residual/spread")).await.expect(200).json();
+    assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
+    app.get(&format!("{pictures}/difference-2")).await.expect(200);
+
+    // Masks and measurement.
+    let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
+    let masks = format!("/v1/calibrations/{}/pictures", calibration.as_str().unwrap());
+    for name in ["mask-4", "mean", "gram", "dead"] {
+        decode(&app.get(&format!("{masks}/{name}")).await.expect(200));
+    }
+    let measured = format!("/v1/measurements/{}/pictures", measurement.as_str().unwrap());
+    decode(&app.get(&format!("{measured}/snapshot-1")).await.expect(200));
+
+    for (path, status, code) in [
+        (format!("{pictures}/frame-0"), 404, "not_found"),
+        (format!("{pictures}/frame-5"), 404, "not_found"),
+        (format!("{pictures}/difference-1"), 404, "not_found"),
+        (format!("{pictures}/slice-48"), 404, "not_found"),
+        (format!("{pictures}/secret"), 404, "not_found"),
+        (format!("{masks}/mask-5"), 404, "not_found"),
+        (format!("{measured}/snapshot-2"), 404, "not_found"),
+        (format!("{pictures}/frame-1/tiles/0/1/0?black=0&white=1"), 404, "not_found"),
+        (format!("{pictures}/frame-1/tiles/1/0/0?black=0&white=1"), 404, "not_found"),
+        (format!("{pictures}/frame-1/tiles/0/0/0"), 400, "invalid_query"),
+        (format!("{pictures}/frame-1/tiles/0/0/0?black=1&white=1"), 400, "invalid_query"),
+        (format!("{pictures}/frame-1/tiles/0/0/0?black=NaN&white=1"), 400, "invalid_query"),
+        (format!("{pictures}/frame-1?size=5000"), 400, "invalid_query"),
+        (format!("{pictures}/frame-1?black=0"), 400, "invalid_query"),
+    ] {
+        app.get(&path).await.problem(status, code);
+    }
+}
+
+#[tokio::test]
+async fn tiles_show_while_others_run_and_tell_how_the_solver_goes() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let job = job(&app, tv(5_000, 8)).await;
+    let base = format!("/v1/jobs/{job}/snapshots/1");
+    app.get(&format!("{base}/pictures/frame-1")).await.problem(404, "not_ready");
+    app.when(&job, |job| {
+        job["progress"]["tiles_done"].as_u64() >= Some(1)
+            && job["progress"]["tiles_running"] == 1
+            && job["progress"]["percent"].as_f64() < Some(90.0)
+    })
+    .await;
+    let part = app.get(&format!("{base}/pictures/frame-1")).await.expect(200);
+    assert_eq!(part.header("cache-control"), "no-cache");
+    let tiles = app.get(&format!("{base}/tiles")).await.expect(200).json();
+    let tiles = tiles["items"].as_array().unwrap();
+    assert_eq!(tiles.len(), 6);
+    assert_eq!(tiles[0]["state"], "done");
+    assert!(tiles[0]["residual"].as_f64().unwrap() < 1.0);
+    assert_eq!(tiles[5]["residual"], Value::Null);
+    let history = app.get(&format!("{base}/tiles/0/history")).await.expect(200).json();
+    let points = history["points"].as_array().unwrap();
+    assert!((64..=129).contains(&points.len()), "{}", points.len());
+    assert_eq!((&points[0][0], &points[0][3]), (&json!(1), &Value::Null));
+    assert_eq!(points.last().unwrap()[0], 5_000);
+    assert!(points[0][1].as_f64() > points.last().unwrap()[1].as_f64(), "the residual falls");
+    app.get(&format!("{base}/tiles/6/history")).await.problem(404, "not_found");
+    app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
+    app.ended(&job).await;
+}
