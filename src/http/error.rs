@@ -234,6 +234,11 @@ impl IntoResponse for ApiError {
     }
 }
 
+fn disk_full(cause: &(dyn std::error::Error + 'static)) -> ApiError {
+    tracing::error!(error = cause, "the disk is full");
+    ApiError::new(Code::InsufficientStorage, "the disk of the service is full")
+}
+
 impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         let code = match &error {
@@ -244,10 +249,7 @@ impl From<StoreError> for ApiError {
             StoreError::HashMismatch { .. } => Code::HashMismatch,
             StoreError::QueueFull { .. } => Code::QueueFull,
             StoreError::Interrupted => Code::Unavailable,
-            full if full.is_disk_full() => {
-                tracing::error!(error = full as &dyn std::error::Error, "the disk is full");
-                return Self::new(Code::InsufficientStorage, "the disk of the service is full");
-            }
+            full if full.is_disk_full() => return disk_full(full),
             StoreError::Database(_)
             | StoreError::Migrate(_)
             | StoreError::Io { .. }
@@ -259,6 +261,9 @@ impl From<StoreError> for ApiError {
 
 impl From<FormatError> for ApiError {
     fn from(error: FormatError) -> Self {
+        if error.is_disk_full() {
+            return disk_full(&error);
+        }
         if !error.is_callers_fault() {
             return Self::internal(&error);
         }

@@ -100,7 +100,9 @@ def run(schemathesis, service, examples, token, ids, seed):
         command += ["--request-timeout", "30", "--suppress-health-check", "all", "--no-color"]
         if token:
             command += ["--header", f"Authorization: Bearer {token}"]
-        ended = subprocess.run(command, capture_output=True, text=True, cwd=pathlib.Path.cwd())
+        hooks = {"PYTHONPATH": "tests/judges", "SCHEMATHESIS_HOOKS": "schemathesis_hooks"}
+        environment = {**os.environ, **hooks}
+        ended = subprocess.run(command, capture_output=True, text=True, env=environment)
         if ended.returncode:
             print(ended.stdout[-12000:], ended.stderr[-2000:], file=sys.stderr)
         entries = json.loads(har.read_text())["log"]["entries"]
