@@ -33,10 +33,10 @@ mod workers;
 use std::path::Path;
 use std::time::Duration;
 
-use sqlx::SqlitePool;
 use sqlx::sqlite::{
     Sqlite, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
 };
+use sqlx::{Connection, SqlitePool};
 
 pub use acceptance::{Inserted, NewJob};
 pub use backup::Backup;
@@ -102,6 +102,9 @@ impl Store {
             .max_connections(1)
             .idle_timeout(None)
             .max_lifetime(None)
+            // After some errors, such as a full disk, SQLite has rolled back by itself; sqlx then
+            // fails to roll back again and holds the transaction to be open for ever.
+            .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         // Two processes that start together must not both make the tables.
         let lock = dir.lock_blocking("migrate.lock").await?;
