@@ -85,7 +85,8 @@ pub(super) fn checked(spec: &ScheduleSpec) -> Result<Schedule, CliError> {
     })
 }
 
-fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
+/// Names of algorithms.
+pub(super) fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
     PossibleValuesParser::new(Algorithm::ALL.map(Algorithm::name)).try_map(|name: String| {
         let named = Algorithm::ALL.into_iter().find(|algorithm| algorithm.name() == name);
         named.ok_or("no such algorithm")

@@ -9,6 +9,8 @@ mod progress;
 mod supervisor;
 
 pub mod backup;
+pub mod bench;
+pub mod calibrate;
 pub mod demo;
 pub mod optics;
 pub mod reconstruct;

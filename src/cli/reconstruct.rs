@@ -312,6 +312,7 @@ impl Solution {
             tile_plan: (&setup.plan).into(),
             summary: Summary::of(&tiles),
             tiles,
+            warnings: Vec::new(),
             camera: None,
             files: Vec::new(),
         };

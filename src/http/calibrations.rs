@@ -4,27 +4,29 @@ use axum::Json;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::access::Access;
 use super::app::App;
-use super::error::ApiError;
+use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf};
 use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody};
 use crate::formats::validate::MaskStatistics;
-use crate::job::{CalibrationId, Label, Sha256};
-use crate::store::{Calibration, NewCalibration};
+use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
+use crate::store::{Calibration, NewCalibration, Page, Unready};
 
-/// The body of `POST /v1/calibrations`.
+/// The body of `POST /v1/calibrations`: masks, or the captures to make them of.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CalibrationRequest {
     name: Option<Label>,
     /// The upload with the masks.
-    masks: Sha256,
+    masks: Option<Sha256>,
     /// The stored number that means 1.
     full_scale: Option<f32>,
+    /// Raw captures.
+    captures: Option<Captures>,
 }
 
 /// The query of the list.
@@ -36,31 +38,164 @@ pub(super) struct ListQuery {
     cursor: Option<CalibrationId>,
 }
 
+/// Where a calibration stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum CalibrationState {
+    /// Masks are made of captures.
+    Preparing,
+    /// The masks are there.
+    Ready,
+    /// There will be none; `error` says why.
+    Failed,
+}
+
+/// A calibration as it is shown. What is known of masks is null until they are there.
+#[derive(Debug, Serialize)]
+pub(super) struct CalibrationBody {
+    id: CalibrationId,
+    state: CalibrationState,
+    /// How much of the work is done, in percent.
+    percent: f64,
+    error: Option<String>,
+    created_at: Timestamp,
+    name: Option<Label>,
+    masks: Option<Sha256>,
+    format: Option<String>,
+    sample: Option<String>,
+    frames: usize,
+    height: Option<usize>,
+    width: Option<usize>,
+    full_scale: Option<f32>,
+    mask_mean: Option<f64>,
+    dead_pixels: Option<u64>,
+    clipped_negatives: Option<u64>,
+}
+
+impl From<Calibration> for CalibrationBody {
+    fn from(calibration: Calibration) -> Self {
+        let Calibration { id, created_at, facts, .. } = calibration;
+        Self {
+            id,
+            state: CalibrationState::Ready,
+            percent: 100.0,
+            error: None,
+            created_at,
+            name: facts.name,
+            masks: Some(facts.masks),
+            format: Some(facts.format),
+            sample: Some(facts.sample),
+            frames: facts.frames,
+            height: Some(facts.height),
+            width: Some(facts.width),
+            full_scale: Some(facts.full_scale),
+            mask_mean: Some(facts.mask_mean),
+            dead_pixels: Some(facts.dead_pixels),
+            clipped_negatives: Some(facts.clipped_negatives),
+        }
+    }
+}
+
+impl From<Unready> for CalibrationBody {
+    fn from(unready: Unready) -> Self {
+        let Unready { id, name, frames, fraction, error, created_at } = unready;
+        let failed = error.is_some();
+        Self {
+            id,
+            state: if failed { CalibrationState::Failed } else { CalibrationState::Preparing },
+            percent: (fraction * 1000.0).round() / 10.0,
+            error,
+            created_at,
+            name,
+            masks: None,
+            format: None,
+            sample: None,
+            frames,
+            height: None,
+            width: None,
+            full_scale: None,
+            mask_mean: None,
+            dead_pixels: None,
+            clipped_negatives: None,
+        }
+    }
+}
+
 /// `POST /v1/calibrations`
 pub(super) async fn create(
     State(app): State<App>,
     access: Access,
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response, ApiError> {
-    let (masks, full_scale) = (request.masks, request.full_scale);
-    app.store.upload(&access.lab, masks).await.map_err(|error| missing("/masks", error))?;
+    let CalibrationRequest { name, masks, full_scale, captures } = request;
+    let (status, body) = match (masks, captures) {
+        (Some(masks), None) => {
+            (StatusCode::CREATED, of_masks(&app, &access.lab, name, masks, full_scale).await?)
+        }
+        (None, Some(captures)) if full_scale.is_none() => {
+            (StatusCode::ACCEPTED, of_captures(&app, &access.lab, name, captures).await?)
+        }
+        (None, Some(_)) => {
+            let detail = "captures have no full scale: white and black give their masks' scale";
+            return Err(ApiError::field("/full_scale", detail));
+        }
+        _ => return Err(ApiError::field("", "name either masks or captures, not both or none")),
+    };
+    let location = [(header::LOCATION, format!("/v1/calibrations/{}", body.id))];
+    Ok((status, location, Json(body)).into_response())
+}
+
+async fn of_masks(
+    app: &App,
+    lab: &Lab,
+    name: Option<Label>,
+    masks: Sha256,
+    full_scale: Option<f32>,
+) -> Result<CalibrationBody, ApiError> {
+    app.store.upload(lab, masks).await.map_err(|error| missing("/masks", error))?;
     let prepared =
-        intake::run(&app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
+        intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
     let Prepared { info, statistics, file } = prepared.await?;
-    let facts = facts(request, &info, &statistics);
-    let calibration = app.store.add_calibration(&access.lab, facts, file).await?;
-    let location = [(header::LOCATION, format!("/v1/calibrations/{}", calibration.id))];
-    Ok((StatusCode::CREATED, location, Json(calibration)).into_response())
+    let facts = facts(name, masks, &info, &statistics);
+    Ok(app.store.add_calibration(lab, facts, file).await?.into())
+}
+
+/// Puts captures in the queue, once they look as if they could be calibrated with.
+async fn of_captures(
+    app: &App,
+    lab: &Lab,
+    name: Option<Label>,
+    captures: Captures,
+) -> Result<CalibrationBody, ApiError> {
+    captures.check().map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
+    for (place, upload) in captures.uploads() {
+        app.store.upload(lab, upload).await.map_err(|error| missing(&place, error))?;
+    }
+    let captures = intake::run(app, move |store, limits| {
+        intake::captures(store, limits, &captures)?;
+        Ok(captures)
+    })
+    .await?;
+    let id = app.store.add_captures(lab, name.as_ref(), &captures).await?;
+    body(app, lab, id).await
+}
+
+async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody, ApiError> {
+    match app.store.unready(lab, id).await? {
+        Some(unready) => Ok(unready.into()),
+        None => Ok(app.store.calibration(lab, id).await?.into()),
+    }
 }
 
 fn facts(
-    request: CalibrationRequest,
+    name: Option<Label>,
+    masks: Sha256,
     info: &crate::formats::StackInfo,
     statistics: &MaskStatistics,
 ) -> NewCalibration {
     NewCalibration {
-        name: request.name,
-        masks: request.masks,
+        name,
+        masks,
         format: info.format.name().to_owned(),
         sample: info.sample.name().to_owned(),
         frames: statistics.frames,
@@ -86,9 +221,17 @@ pub(super) async fn list(
     State(app): State<App>,
     access: Access,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<Calibration>>, ApiError> {
-    let page = app.store.calibrations(&access.lab, query.cursor, query.limit.get()).await?;
-    Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
+) -> Result<Json<PageBody<CalibrationBody>>, ApiError> {
+    let limit = query.limit.get();
+    let ready = app.store.calibrations(&access.lab, query.cursor, limit).await?;
+    let unready = app.store.all_unready(&access.lab, query.cursor, limit).await?;
+    let mut items: Vec<CalibrationBody> = ready.items.into_iter().map(Into::into).collect();
+    items.extend(unready.items.into_iter().map(CalibrationBody::from));
+    items.sort_by_key(|item| std::cmp::Reverse(item.id));
+    let most = usize::try_from(limit).unwrap_or(usize::MAX);
+    let more = ready.more || unready.more || items.len() > most;
+    items.truncate(most);
+    Ok(Json(PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item)))
 }
 
 /// `GET /v1/calibrations/{calibration}`
@@ -96,8 +239,8 @@ pub(super) async fn show(
     State(app): State<App>,
     access: Access,
     Params(id): Params<CalibrationId>,
-) -> Result<Json<Calibration>, ApiError> {
-    Ok(Json(app.store.calibration(&access.lab, id).await?))
+) -> Result<Json<CalibrationBody>, ApiError> {
+    Ok(Json(body(&app, &access.lab, id).await?))
 }
 
 /// `DELETE /v1/calibrations/{calibration}`

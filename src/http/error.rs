@@ -23,6 +23,7 @@ pub enum Code {
     Forbidden,
     NotFound,
     NotReady,
+    CalibrationNotReady,
     MethodNotAllowed,
     UploadStalled,
     OffsetMismatch,
@@ -72,6 +73,9 @@ impl Code {
             Self::Forbidden => (S::FORBIDDEN, "forbidden", "The token does not allow it", false),
             Self::NotFound => (S::NOT_FOUND, "not_found", "There is no such thing", false),
             Self::NotReady => (S::NOT_FOUND, "not_ready", "It is not there yet", true),
+            Self::CalibrationNotReady => {
+                (S::CONFLICT, "calibration_not_ready", "The masks are not there", true)
+            }
             Self::MethodNotAllowed => {
                 (S::METHOD_NOT_ALLOWED, "method_not_allowed", "Not with this method", false)
             }
@@ -243,6 +247,7 @@ impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
+            StoreError::Unready { .. } => Code::CalibrationNotReady,
             StoreError::InUse { .. } => Code::InUse,
             StoreError::State(_) | StoreError::NotFinal(_) => Code::IllegalState,
             StoreError::KeyReused { .. } => Code::IdempotencyKeyReused,

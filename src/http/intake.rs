@@ -6,13 +6,31 @@ use std::path::Path;
 
 use super::app::App;
 use super::error::{ApiError, Code};
+use super::intake_check::{Exposed, average_dark, check};
 use crate::formats::mat::{self, SceneArray};
 use crate::formats::validate::{
     MaskCheck, MaskStatistics, MeasurementCheck, MeasurementStatistics,
 };
 use crate::formats::{self, FormatError, FrameReader, FullScale, Limits, StackInfo, planar};
-use crate::job::Sha256;
+use crate::job::{Captures, Finding, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
+
+/// What is asked of a measurement beyond its data.
+#[derive(Debug)]
+pub(super) struct Exposure {
+    /// The stored number that means 1.
+    pub(super) full_scale: Option<f32>,
+    /// Captures of the dark, to be averaged and subtracted.
+    pub(super) dark: Vec<Sha256>,
+    /// The stored number from which on a pixel is full.
+    pub(super) saturation: Option<u32>,
+}
+
+/// A measurement that was taken in, and what was found in it.
+pub(super) struct Measured {
+    pub(super) prepared: Prepared<MeasurementStatistics>,
+    pub(super) findings: Vec<Finding>,
+}
 
 /// What an upload turned out to be.
 pub(super) struct Prepared<T> {
@@ -54,16 +72,43 @@ pub(super) fn masks(
     Ok(Prepared { info, statistics, file: finish(writer)? })
 }
 
-/// Checks a measurement against its calibration and writes it with its full scale divided out.
+/// Looks at the headers of captures: they must be stacks of one size, before a worker averages them.
+pub(super) fn captures(
+    store: &Store,
+    limits: &Limits,
+    captures: &Captures,
+) -> Result<(), ApiError> {
+    let mut first = None;
+    for (place, uploads) in captures.lists() {
+        for (index, upload) in uploads.iter().enumerate() {
+            let place = format!("{place}/{index}");
+            let opened = formats::open_stack(&store.dir().blob(upload), limits);
+            let info = *opened.map_err(|error| ApiError::from(error).at(&place))?.info();
+            let size = (info.height, info.width);
+            let (height, width) = *first.get_or_insert(size);
+            if size != (height, width) {
+                let detail = format!(
+                    "this capture is {}x{} (rows x columns), but those before it are {height}x{width}",
+                    info.height, info.width
+                );
+                return Err(ApiError::new(Code::SizeMismatch, detail).at(&place));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Writes a measurement with its dark subtracted and its full scale divided out, and checks it
+/// against the masks of its calibration.
 pub(super) fn measurement(
     store: &Store,
     limits: &Limits,
     upload: &Sha256,
-    full_scale: Option<f32>,
+    exposure: &Exposure,
     calibration: &Calibration,
-) -> Result<Prepared<MeasurementStatistics>, ApiError> {
+) -> Result<Measured, ApiError> {
     let path = store.dir().blob(upload);
-    let (mut reader, scale) = open(&path, limits, SceneArray::Measurements, full_scale)?;
+    let (reader, scale) = open(&path, limits, SceneArray::Measurements, exposure.full_scale)?;
     let info = *reader.info();
     let masks = &calibration.facts;
     if (info.height, info.width) != (masks.height, masks.width) {
@@ -73,11 +118,17 @@ pub(super) fn measurement(
         );
         return Err(ApiError::new(Code::SizeMismatch, detail).at("/data"));
     }
+    let dark = average_dark(store, limits, &exposure.dark, (info.height, info.width))?;
+    let mut reader = Exposed::new(reader, dark, exposure.saturation);
     let mut writer = writer(store, &info)?;
     let statistics =
-        MeasurementCheck::run(&mut *reader, scale, |snapshot| writer.write_frame(snapshot))
+        MeasurementCheck::run(&mut reader, scale, |snapshot| writer.write_frame(snapshot))
             .map_err(refused)?;
-    Ok(Prepared { info, statistics, file: finish(writer)? })
+    let file = finish(writer)?;
+    let masks = planar::Reader::open(&store.dir().blob(&calibration.prepared), limits)?;
+    let snapshots = planar::Reader::open(file.path(), limits)?;
+    let findings = check(&masks, &snapshots, reader.saturated().as_deref())?;
+    Ok(Measured { prepared: Prepared { info, statistics, file }, findings })
 }
 
 fn open(

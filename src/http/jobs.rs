@@ -15,8 +15,8 @@ use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
-    Algorithm, CalibrationId, JobId, JobRequest, JobSpec, JobState, Lab, Label, MeasurementId,
-    SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
+    Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
+    MeasurementId, SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
 };
 use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
 
@@ -34,6 +34,8 @@ pub(super) struct JobBody {
     schedule: ScheduleSpec,
     tile: TileSpec,
     priority: i32,
+    /// What the check of the measurement found.
+    warnings: Vec<Finding>,
     error: Option<String>,
     created_at: Timestamp,
     started_at: Option<Timestamp>,
@@ -53,6 +55,7 @@ impl JobBody {
             tile,
             priority,
             label,
+            warnings,
         } = job.spec;
         let Job { id, state, error, created_at, started_at, finished_at, .. } = job;
         Self {
@@ -67,6 +70,7 @@ impl JobBody {
             schedule,
             tile,
             priority,
+            warnings,
             error,
             created_at,
             started_at,
@@ -143,9 +147,17 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, A
         snapshots: measurement.snapshots,
     };
     let resolved = request.resolve(calibration.id, shape);
-    let spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
+    let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
+    spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
     check_memory(app, &spec)?;
     Ok(spec)
+}
+
+/// The warnings about the snapshots of a job.
+fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding> {
+    let concerns =
+        |warning: &Finding| warning.snapshot.is_none_or(|snapshot| snapshots.contains(snapshot));
+    warnings.into_iter().filter(concerns).collect()
 }
 
 /// Refuses a job that no worker could do.

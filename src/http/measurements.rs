@@ -11,10 +11,10 @@ use super::app::App;
 use super::calibrations::missing;
 use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf};
-use super::intake::{self, Prepared};
+use super::intake::{self, Exposure, Measured, Prepared};
 use super::page::{Limit, PageBody};
 use crate::formats::StackInfo;
-use crate::job::{CalibrationId, InvalidField, Label, MeasurementId, Sha256};
+use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
 use crate::store::{Measurement, MeasurementFilter, NewMeasurement};
 
 /// The body of `POST /v1/measurements`.
@@ -26,6 +26,12 @@ pub(super) struct MeasurementRequest {
     calibration: CalibrationId,
     /// The upload with the snapshots.
     data: Sha256,
+    /// Captures of the dark, the LCoS all black, at the measurement's exposure: their average is
+    /// subtracted.
+    #[serde(default)]
+    dark: Vec<Sha256>,
+    /// The stored number from which on a pixel is full.
+    saturation: Option<u32>,
     /// The stored number that means 1.
     full_scale: Option<f32>,
     /// Snapshots in a second.
@@ -51,18 +57,27 @@ pub(super) async fn create(
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response, ApiError> {
     check_times(&request)?;
-    let (data, full_scale) = (request.data, request.full_scale);
+    let (data, exposure) = (request.data, exposure(&request));
     let calibration = app.store.calibration(&access.lab, request.calibration).await;
     let calibration = calibration.map_err(|error| missing("/calibration", error))?;
     app.store.upload(&access.lab, data).await.map_err(|error| missing("/data", error))?;
-    let prepared = intake::run(&app, move |store, limits| {
-        intake::measurement(store, limits, &data, full_scale, &calibration)
+    for (index, dark) in request.dark.iter().enumerate() {
+        let there = app.store.upload(&access.lab, *dark).await;
+        there.map_err(|error| missing(&format!("/dark/{index}"), error))?;
+    }
+    let measured = intake::run(&app, move |store, limits| {
+        intake::measurement(store, limits, &data, &exposure, &calibration)
     });
-    let Prepared { info, statistics, file } = prepared.await?;
-    let facts = facts(request, &info, statistics.full_scale.value());
+    let Measured { prepared: Prepared { info, statistics, file }, findings } = measured.await?;
+    let facts = facts(request, &info, statistics.full_scale.value(), findings);
     let measurement = app.store.add_measurement(&access.lab, facts, file).await?;
     let location = [(header::LOCATION, format!("/v1/measurements/{}", measurement.id))];
     Ok((StatusCode::CREATED, location, Json(measurement)).into_response())
+}
+
+fn exposure(request: &MeasurementRequest) -> Exposure {
+    let MeasurementRequest { full_scale, saturation, .. } = *request;
+    Exposure { full_scale, dark: request.dark.clone(), saturation }
 }
 
 /// Refuses times that can't be: they become the times of frames.
@@ -83,7 +98,12 @@ fn check_times(request: &MeasurementRequest) -> Result<(), ApiError> {
     if errors.is_empty() { Ok(()) } else { Err(ApiError::fields(Code::InvalidRequest, errors)) }
 }
 
-fn facts(request: MeasurementRequest, info: &StackInfo, full_scale: f32) -> NewMeasurement {
+fn facts(
+    request: MeasurementRequest,
+    info: &StackInfo,
+    full_scale: f32,
+    warnings: Vec<Finding>,
+) -> NewMeasurement {
     NewMeasurement {
         name: request.name,
         calibration: request.calibration,
@@ -97,6 +117,8 @@ fn facts(request: MeasurementRequest, info: &StackInfo, full_scale: f32) -> NewM
         full_scale,
         camera_fps: request.camera_fps,
         exposure_s: request.exposure_s,
+        dark: request.dark,
+        warnings,
     }
 }
 

@@ -11,7 +11,7 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, pictures, results, system, tiles, tus,
+    metrics, pictures, reports, results, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -29,6 +29,9 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
         R::at("/v1/calibrations/{calibration}").get(calibrations::show).delete(calibrations::delete),
+        R::at("/v1/calibrations/{calibration}/report.json").get(reports::json),
+        R::at("/v1/calibrations/{calibration}/report.html").get(reports::html),
+        R::at("/v1/calibrations/{calibration}/maps/{map}").get(reports::map),
         R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
         R::at("/v1/measurements/{measurement}").get(measurements::show).delete(measurements::delete),
         R::at("/v1/algorithms").get(algorithms::list),

@@ -46,6 +46,7 @@ mod tests {
             tile: TileSpec { size: side, overlap: 0 },
             priority: 0,
             label: None,
+            warnings: Vec::new(),
         };
         spec.worker_bytes() >> 20
     }

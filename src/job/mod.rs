@@ -1,10 +1,13 @@
 //! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
 
 mod access;
+mod captures;
 mod disk;
+mod finding;
 mod ids;
 mod memory;
 mod reason;
+mod report;
 mod request;
 mod schedule;
 mod state;
@@ -12,10 +15,13 @@ mod task;
 mod text;
 
 pub use access::{Lab, Role, Secret};
+pub use captures::Captures;
+pub use finding::{Finding, Grade, Severity};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, PartialId, TaskId, TokenId, WorkerId,
 };
 pub use reason::without_paths;
+pub use report::{CalibrationReport, CaptureReport, MaskReport, PatternReport};
 pub use request::{
     Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,
     SnapshotSelection, TileSpec,

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Finding;
 use super::ids::{CalibrationId, MeasurementId};
 use super::schedule::ScheduleSpec;
 use super::text::Label;
@@ -214,6 +215,9 @@ pub struct JobSpec {
     pub priority: i32,
     /// The label.
     pub label: Option<Label>,
+    /// What the check of the measurement found.
+    #[serde(default)]
+    pub warnings: Vec<Finding>,
 }
 
 impl JobRequest {
@@ -268,6 +272,7 @@ impl JobRequest {
             tile,
             priority,
             label,
+            warnings: Vec::new(),
         })
     }
 }

@@ -122,6 +122,7 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM calibration_captures WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)",
         )
         .bind(sha256.to_string())
@@ -144,7 +145,8 @@ impl Store {
         sqlx::query(
             "DELETE FROM holdings AS h WHERE touched_at < ?
                  AND NOT EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = sha256)
-                 AND NOT EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = sha256)",
+                 AND NOT EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = sha256)
+                 AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c WHERE c.sha256 = h.sha256)",
         )
         .bind(before.0)
         .execute(&mut *transaction)
@@ -154,6 +156,7 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
+                 AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c WHERE c.sha256 = blobs.sha256)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
              RETURNING sha256",
         )

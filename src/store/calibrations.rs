@@ -1,13 +1,13 @@
 //! Table `calibrations`.
 
 use serde::Serialize;
-use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
 
 use super::blobs::Origin;
 use super::error::StoreError;
 use super::rows::{integer, number, parsed, parsed_if, single};
-use super::{Page, StagedBlob, Store};
+use super::{Page, StagedBlob, Store, calibrating};
 use crate::job::{CalibrationId, Lab, Label, Sha256, Timestamp};
 
 /// What is known of a calibration when its masks have been checked.
@@ -69,32 +69,12 @@ impl Store {
             created_at: Timestamp::now(),
             facts,
         };
-        let facts = &calibration.facts;
         let mut transaction = self.write().await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
-        sqlx::query(
-            "INSERT INTO calibrations (lab, id, name, masks, prepared, format, sample, frames, height,
-                 width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        )
-        .bind(lab.as_str())
-        .bind(calibration.id.to_string())
-        .bind(facts.name.as_ref().map(Label::as_str))
-        .bind(facts.masks.to_string())
-        .bind(calibration.prepared.to_string())
-        .bind(&facts.format)
-        .bind(&facts.sample)
-        .bind(integer(facts.frames))
-        .bind(integer(facts.height))
-        .bind(integer(facts.width))
-        .bind(f64::from(facts.full_scale))
-        .bind(facts.mask_mean)
-        .bind(integer(facts.dead_pixels))
-        .bind(integer(facts.clipped_negatives))
-        .bind(calibration.created_at.0)
-        .execute(&mut *transaction)
-        .await
-        .map_err(|error| gone_if_foreign_key(error, "blob", facts.masks.to_string()))?;
+        insert(&mut transaction, lab, &calibration).await?;
+        // Its report is made by a worker.
+        let name = calibration.facts.name.as_ref();
+        calibrating::insert(&mut transaction, lab, calibration.id, name, None).await?;
         transaction.commit().await?;
         Ok(calibration)
     }
@@ -102,13 +82,19 @@ impl Store {
     /// The lab's calibration with this identifier.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`].
+    /// [`StoreError::NotFound`]; [`StoreError::Unready`] if its masks are not there.
     pub async fn calibration(
         &self,
         lab: &Lab,
         id: CalibrationId,
     ) -> Result<Calibration, StoreError> {
-        self.find_calibration(Some(lab), id).await
+        match self.find_calibration(Some(lab), id).await {
+            Err(missing @ StoreError::NotFound { .. }) => match self.unready(lab, id).await {
+                Ok(Some(unready)) => Err(unready.into()),
+                _ => Err(missing),
+            },
+            found => found,
+        }
     }
 
     /// As [`Self::calibration`]; without a lab, for those who work for all of them.
@@ -153,7 +139,7 @@ impl Store {
     /// # Errors
     /// [`StoreError::NotFound`], [`StoreError::InUse`].
     pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
-        self.calibration(lab, id).await?;
+        let unready = self.unready(lab, id).await?.is_some();
         let mut transaction = self.write().await?;
         let row = sqlx::query("SELECT count(*) AS users FROM measurements WHERE calibration = ?")
             .bind(id.to_string())
@@ -166,12 +152,53 @@ impl Store {
         let row = sqlx::query("DELETE FROM calibrations WHERE id = ? RETURNING prepared")
             .bind(id.to_string())
             .fetch_optional(&mut *transaction)
-            .await?
-            .ok_or_else(|| not_found(id))?;
-        self.release(&mut transaction, parsed(&row, "prepared")?).await?;
+            .await?;
+        sqlx::query("DELETE FROM calibration_tasks WHERE calibration = ?")
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await?;
+        match row {
+            Some(row) => self.release(&mut transaction, parsed(&row, "prepared")?).await?,
+            // A worker that has its captures in hand finds that nobody wants them any more.
+            None if unready => {}
+            None => return Err(not_found(id)),
+        }
         transaction.commit().await?;
         Ok(())
     }
+}
+
+/// Writes the row of a calibration whose masks are there.
+pub(super) async fn insert(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+    calibration: &Calibration,
+) -> Result<(), StoreError> {
+    let facts = &calibration.facts;
+    sqlx::query(
+        "INSERT INTO calibrations (lab, id, name, masks, prepared, format, sample, frames, height,
+             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+    )
+    .bind(lab.as_str())
+    .bind(calibration.id.to_string())
+    .bind(facts.name.as_ref().map(Label::as_str))
+    .bind(facts.masks.to_string())
+    .bind(calibration.prepared.to_string())
+    .bind(&facts.format)
+    .bind(&facts.sample)
+    .bind(integer(facts.frames))
+    .bind(integer(facts.height))
+    .bind(integer(facts.width))
+    .bind(f64::from(facts.full_scale))
+    .bind(facts.mask_mean)
+    .bind(integer(facts.dead_pixels))
+    .bind(integer(facts.clipped_negatives))
+    .bind(calibration.created_at.0)
+    .execute(connection)
+    .await
+    .map_err(|error| gone_if_foreign_key(error, "blob", facts.masks.to_string()))?;
+    Ok(())
 }
 
 impl<T> Page<T> {

@@ -39,6 +39,14 @@ pub enum StoreError {
         /// Its identifier.
         id: String,
     },
+    /// The masks of a calibration are not there.
+    #[error("{}", unready(*.id, .error.as_deref()))]
+    Unready {
+        /// The calibration.
+        id: crate::job::CalibrationId,
+        /// Why there will be none; none while they are made.
+        error: Option<String>,
+    },
     /// It can't be deleted, because something else needs it.
     #[error("the {what} is used by {users} {by}; delete those first")]
     InUse {
@@ -82,6 +90,21 @@ pub enum StoreError {
     /// A task that blocks was broken off, as at shutdown.
     #[error("the work was broken off")]
     Interrupted,
+}
+
+fn unready(id: crate::job::CalibrationId, error: Option<&str>) -> String {
+    match error {
+        None => {
+            format!("the masks of calibration {id} are still being made; ask again in a moment")
+        }
+        Some(error) => format!("calibration {id} has failed: {error}"),
+    }
+}
+
+impl From<super::Unready> for StoreError {
+    fn from(unready: super::Unready) -> Self {
+        Self::Unready { id: unready.id, error: unready.error }
+    }
 }
 
 impl StoreError {

@@ -7,9 +7,9 @@ use sqlx::sqlite::SqliteRow;
 use super::blobs::Origin;
 use super::calibrations::{gone_if_foreign_key, label};
 use super::error::StoreError;
-use super::rows::{integer, number, parsed, single};
+use super::rows::{integer, json_if, number, parsed, single};
 use super::{Page, StagedBlob, Store};
-use crate::job::{CalibrationId, Lab, Label, MeasurementId, Sha256, Timestamp};
+use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -36,6 +36,10 @@ pub struct NewMeasurement {
     pub camera_fps: Option<f64>,
     /// Exposure of one snapshot in seconds.
     pub exposure_s: Option<f64>,
+    /// The uploads whose average was subtracted.
+    pub dark: Vec<Sha256>,
+    /// What the check against the calibration found.
+    pub warnings: Vec<Finding>,
 }
 
 /// A measurement on record.
@@ -85,8 +89,8 @@ impl Store {
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         sqlx::query(
             "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
-                 snapshots, height, width, full_scale, camera_fps, exposure_s, created_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                 snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings, created_at)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         )
         .bind(lab.as_str())
         .bind(measurement.id.to_string())
@@ -102,6 +106,8 @@ impl Store {
         .bind(f64::from(facts.full_scale))
         .bind(facts.camera_fps)
         .bind(facts.exposure_s)
+        .bind(serde_json::json!(facts.dark).to_string())
+        .bind(serde_json::json!(facts.warnings).to_string())
         .bind(measurement.created_at.0)
         .execute(&mut *transaction)
         .await
@@ -207,6 +213,8 @@ fn measurement(row: &SqliteRow) -> Result<Measurement, StoreError> {
             full_scale: single(row, "full_scale")?,
             camera_fps: row.try_get("camera_fps")?,
             exposure_s: row.try_get("exposure_s")?,
+            dark: json_if(row, "dark")?.unwrap_or_default(),
+            warnings: json_if(row, "warnings")?.unwrap_or_default(),
         },
     })
 }

@@ -58,6 +58,15 @@ pub(super) fn json<T: DeserializeOwned>(
     serde_json::from_str(&value).map_err(|_| StoreError::Corrupt { column, value })
 }
 
+/// As [`json`], for a column that may be empty.
+pub(super) fn json_if<T: DeserializeOwned>(
+    row: &SqliteRow,
+    column: &'static str,
+) -> Result<Option<T>, StoreError> {
+    let value: Option<String> = row.try_get(column)?;
+    value.map(|_| json(row, column)).transpose()
+}
+
 fn corrupt(column: &'static str, value: impl Display) -> StoreError {
     StoreError::Corrupt { column, value: value.to_string() }
 }

@@ -174,6 +174,12 @@ impl StagedBlob {
         self.size
     }
 
+    /// Where it lies until it is stored.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.temporary.path
+    }
+
     /// Moves the file to its place. The writer's lock of the database must be held.
     pub(super) fn put(mut self, place: &Path) -> Result<(), StoreError> {
         if let Some(folder) = place.parent() {

@@ -64,6 +64,8 @@ impl Lab {
             full_scale: 1.0,
             camera_fps: Some(30.0),
             exposure_s: None,
+            dark: Vec::new(),
+            warnings: Vec::new(),
         };
         let measurement =
             store.add_measurement(&local, facts, upload(b"prepared data")).await.unwrap();

@@ -5,10 +5,10 @@ use std::time::Duration;
 use serde::Serialize;
 use sqlx::{Row, SqliteConnection};
 
-use super::Store;
 use super::error::StoreError;
 use super::losses::{self, Loss};
 use super::rows::{number, number_if, parsed, parsed_if};
+use super::{Store, calibrating};
 use crate::job::{JobId, Timestamp, WorkerId};
 
 /// A worker process on record.
@@ -101,6 +101,7 @@ impl Store {
         for row in &tasks {
             losses::lose(&mut transaction, parsed(row, "id")?, &loss).await?;
         }
+        calibrating::worker_ended(&mut transaction, id, &loss).await?;
         sqlx::query("DELETE FROM workers WHERE id = ?")
             .bind(id.to_string())
             .execute(&mut *transaction)

@@ -15,7 +15,7 @@ use super::task::{Engine, Shared, TaskError};
 use super::tile::TileTaskRecord;
 use crate::formats::Limits;
 use crate::formats::planar::Reader;
-use crate::job::{ScheduleSpec, TaskProgress, TaskStage, Timestamp};
+use crate::job::{Finding, ScheduleSpec, TaskProgress, TaskStage, Timestamp};
 use crate::recon::tile::TilePlan;
 use crate::store::{ClaimedTask, Completion, Product, Store, TileResult, hash_file};
 
@@ -142,6 +142,7 @@ fn manifest(
         tile_plan: plan.into(),
         summary: Summary::of(&tiles),
         tiles,
+        warnings: warnings(&spec.warnings, snapshot),
         camera: CameraRecord::new(measurement.camera_fps, measurement.exposure_s, snapshot, frames),
         files: Vec::new(),
     };
@@ -156,4 +157,11 @@ fn manifest(
         finished_at: Timestamp::now().to_string(),
     };
     Ok(Manifest { schema: SCHEMA.into(), content, run })
+}
+
+/// The warnings about a snapshot.
+fn warnings(all: &[Finding], snapshot: usize) -> Vec<Finding> {
+    let concerns =
+        |warning: &&Finding| warning.snapshot.is_none_or(|number| number as usize == snapshot);
+    all.iter().filter(concerns).cloned().collect()
 }

@@ -11,7 +11,7 @@ use super::prepare::{Prepared, to_record};
 use super::result::ResultFile;
 use super::task::{Engine, TaskError};
 use crate::job::{
-    Algorithm, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp,
+    Algorithm, Finding, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp,
 };
 use crate::store::{ClaimedTask, Completion, Product, Store, TaskRecord};
 
@@ -37,6 +37,9 @@ struct JobContent {
     model: Option<ModelRecord>,
     scale: ScaleRecord,
     tile_plan: TilePlanRecord,
+    /// What the check of the measurement against its calibration found.
+    #[serde(default)]
+    warnings: Vec<Finding>,
     snapshots: Vec<SnapshotEntry>,
 }
 
@@ -121,6 +124,7 @@ fn content(
             white: Prepared::of(task)?.white,
         },
         tile_plan: (&spec.tile_plan()?).into(),
+        warnings: spec.warnings.clone(),
         snapshots: snapshots.into_iter().map(entry).collect(),
     })
 }

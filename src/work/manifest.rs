@@ -10,7 +10,7 @@ use sha2::{Digest, Sha256};
 
 use super::result::ResultFile;
 use crate::formats::exr::Attributes;
-use crate::job::{Algorithm, ScheduleSpec, TileSpec};
+use crate::job::{Algorithm, Finding, ScheduleSpec, TileSpec};
 use crate::models::TwoStageModel;
 use crate::recon::tile::TilePlan;
 
@@ -68,6 +68,9 @@ pub struct Content {
     pub tiles: Vec<TileRecord>,
     /// Sum over the snapshot: see [`Summary`].
     pub summary: Summary,
+    /// What the check of the measurement against its calibration found.
+    #[serde(default)]
+    pub warnings: Vec<Finding>,
     /// Times of the camera, if it told them.
     pub camera: Option<CameraRecord>,
     /// The files that came out, without this one.
@@ -295,6 +298,7 @@ pub(super) fn sample() -> Manifest {
         tile_plan: (&plan).into(),
         tiles: Vec::new(),
         summary: Summary::of(&[]),
+        warnings: Vec::new(),
         camera: CameraRecord::new(Some(50.0), Some(0.012), 1, 3),
         files: Vec::new(),
     };

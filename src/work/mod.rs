@@ -5,6 +5,8 @@
 //! the same frames whichever way it came.
 
 mod assemble;
+pub mod calibrate;
+mod calibration_task;
 mod finish;
 mod history;
 mod network;

@@ -20,9 +20,9 @@ use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError}
 
 /// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
 /// against a lab's patience.
-const LEASE: Duration = Duration::from_secs(20);
+pub(super) const LEASE: Duration = Duration::from_secs(20);
 /// Time between heartbeats, and so the longest time until a cancel is heard of.
-const HEARTBEAT: Duration = Duration::from_secs(1);
+pub(super) const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Time between looks for a task.
 const POLL: Duration = Duration::from_millis(200);
 /// Looks without a task between two signs of life.
@@ -100,6 +100,10 @@ impl Worker {
         tracing::info!(worker = %self.id, "waiting for tasks");
         let mut looks = 0;
         while !self.stop.is_cancelled() {
+            // Calibrations come first: people wait for them before they measure.
+            if self.calibrate().await? {
+                continue;
+            }
             match self.store.claim(self.id, LEASE).await {
                 Ok(Some(task)) => {
                     self.work(task).await?;
@@ -119,6 +123,19 @@ impl Worker {
             }
         }
         Ok(())
+    }
+
+    pub(super) fn store(&self) -> &Store {
+        &self.store
+    }
+
+    pub(super) fn id(&self) -> WorkerId {
+        self.id
+    }
+
+    /// Waits until the worker is told to stop.
+    pub(super) async fn stopped(&self) {
+        self.stop.cancelled().await;
     }
 
     async fn sign_of_life(&self) {
@@ -310,7 +327,7 @@ impl Worker {
 }
 
 /// Logs that the store could not be told; the lease runs out then.
-fn said(told: Result<(), StoreError>) {
+pub(super) fn said(told: Result<(), StoreError>) {
     if let Err(error) = told {
         tracing::error!(%error, "the end of the task is not recorded");
     }

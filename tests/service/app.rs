@@ -132,6 +132,12 @@ impl TestApp {
     }
 
     /// Kills the server as a power cut would, and starts another one on the same folder.
+    pub fn restart_with(&mut self, arguments: &[&str]) {
+        self.arguments = arguments.iter().map(|&text| text.to_owned()).collect();
+        self.restart();
+    }
+
+    /// Kills the server as a power cut would, and starts another one on the same folder.
     pub fn restart(&mut self) {
         self.kill();
         let begun = spawn(&self.data, &self.arguments, &[], Stdio::inherit());

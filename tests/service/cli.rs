@@ -158,6 +158,27 @@ fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
 }
 
 #[test]
+fn multiplexing_loses_without_noise_and_wins_with_it() {
+    let files = Files::new();
+    let (clip, out) = (concat!(env!("CARGO_MANIFEST_DIR"), "/demo/clip"), files.text("bench"));
+    let line = ["bench", "noise", "--clips", clip, "--cr", "8", "--scale", "128", "--out", &out];
+    let output = sci_recon(&[&line[..], &["--sigmas", "0,20"]].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let record: Value =
+        serde_json::from_slice(&bytes(&files.path("bench").join("noise.json"))).unwrap();
+    let psnr =
+        |curve: usize, level: usize| record["curves"][curve]["psnr_db"][level].as_f64().unwrap();
+    assert!(psnr(0, 0) < psnr(1, 0), "single apertures win without noise: {record:#}");
+    assert!(psnr(0, 1) > psnr(1, 1), "multiplexed masks win with noise: {record:#}");
+    let sigma = record["crossing_sigma"].as_f64().unwrap();
+    assert!((0.0..20.0).contains(&sigma));
+    let shares = [0, 1].map(|curve| record["curves"][curve]["light_throughput"].as_f64().unwrap());
+    assert!((shares[0] / shares[1] - 6.0).abs() < 0.3, "{shares:?}");
+    let chart = String::from_utf8(bytes(&files.path("bench").join("noise.svg"))).unwrap();
+    assert!(chart.starts_with("<svg") && chart.matches("<polyline").count() == 2);
+}
+
+#[test]
 fn optics_that_can_not_be_are_refused_at_once() {
     let files = Files::new();
     let optics = files.text("optics.toml");

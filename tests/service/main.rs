@@ -4,6 +4,7 @@
 
 mod access;
 mod app;
+mod calibration;
 mod cli;
 mod contract;
 mod crashes;

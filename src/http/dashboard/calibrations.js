@@ -28,8 +28,13 @@ export async function calibrations(root, _, signal) {
 }
 
 function line(item) {
+  const name = h("th", { scope: "row" }, h("a", { href: `#/calibrations/${item.id}` }, nameOf(item)));
+  if (item.state !== "ready") {
+    return h("tr", null, name, h("td", { colspan: 4 }, ...unready(item)),
+      h("td", { title: momentInFull(item.created_at) }, moment(item.created_at)));
+  }
   return h("tr", null,
-    h("th", { scope: "row" }, h("a", { href: `#/calibrations/${item.id}` }, nameOf(item))),
+    name,
     h("td", null, `${item.frames} × ${item.height} × ${item.width}`),
     h("td", null, figure(item.mask_mean)),
     h("td", null, item.dead_pixels),
@@ -37,14 +42,25 @@ function line(item) {
     h("td", { title: momentInFull(item.created_at) }, moment(item.created_at)));
 }
 
+/** What is to be said of a calibration whose masks are not there. */
+function unready(item) {
+  if (item.state === "failed") return [h("span", { class: "warn" }, `No masks: ${item.error}`)];
+  return [`Masks are being made of ${item.frames} patterns: ${item.percent} %`];
+}
+
 export async function calibration(root, [id], signal) {
   const item = await get(`/v1/calibrations/${id}`, signal);
   document.title = `${nameOf(item)} – sci-recon`;
   const remove = h("button", { type: "button", class: "delete" }, "Delete");
   remove.addEventListener("click", () => erase(item));
+  if (item.state !== "ready") {
+    root.append(h("div", { class: "row head" }, h("h1", null, nameOf(item)), h("span", { class: "grow" }), remove), h("p", null, ...unready(item)));
+    return;
+  }
   const masks = new Masks(item, signal);
   root.append(
     h("div", { class: "row head" }, h("h1", null, nameOf(item)), h("span", { class: "grow" }),
+      h("a", { class: "button", href: `/v1/calibrations/${id}/report.html` }, "Report"),
       h("a", { class: "button", href: `#/new?calibration=${id}` }, "Use for a new job"), remove),
     masks.element, h("div", { class: "cards" }, about(item)));
   await masks.show();

@@ -17,7 +17,7 @@ export async function submit(root, [query], signal) {
     ready();
   };
   const measurement = measurementStep(form, ready, reset, signal);
-  const calibration = calibrationStep(form, known.items, measurement.wake, reset, query.get("calibration"), signal);
+  const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, reset, query.get("calibration"), signal);
   const job = jobStep(algorithms.items);
   const element = h("form", { class: "steps" }, calibration, measurement.element, job.element, h("div", { class: "row" }, button), result);
   element.addEventListener("submit", async (event) => {
@@ -191,6 +191,7 @@ function calibrationVerdict(item) {
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): nothing is known there`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
+      ["Report", h("a", { href: `/v1/calibrations/${item.id}/report.html` }, "what is known of the masks")],
       ...more(item),
     ]),
   ];

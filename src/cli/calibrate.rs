@@ -1,0 +1,153 @@
+//! `sci-recon calibrate`: masks and a report from raw captures, without a server.
+
+use std::fs::{self, File};
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde::Deserialize;
+
+use super::{CliError, progress};
+use crate::formats::npy::F32StackWriter;
+use crate::formats::planar::{self, Reader};
+use crate::formats::{Limits, StackInfo};
+use crate::http::report_page;
+use crate::work::calibrate::{
+    CalibrateError, CaptureFiles, Progress, Report, average_masks, read_patterns, report,
+    scale_masks,
+};
+
+/// Make masks and a report from raw captures, without a server.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// The index of the captures, JSON as `simulate --captures` writes it: `masks` (a list of files for
+    /// each pattern), `white`, `black`, and perhaps `black_with_mask`, `patterns` and `saturation`.
+    /// Files are named relative to it; each holds one frame or several repeats.
+    #[arg(long, value_name = "FILE")]
+    captures: PathBuf,
+    /// Folder for masks.npy, report.json, report.html and maps/.
+    #[arg(long, value_name = "FOLDER")]
+    out: PathBuf,
+    /// Print the report as one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// The index of the captures. What belongs to a measurement is not looked at.
+#[derive(Debug, Deserialize)]
+struct Index {
+    masks: Vec<Vec<PathBuf>>,
+    white: Vec<PathBuf>,
+    black: Vec<PathBuf>,
+    #[serde(default)]
+    black_with_mask: Vec<PathBuf>,
+    patterns: Option<PathBuf>,
+    saturation: Option<u32>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// Captures that can't be used, or files that can't be written.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let files = read_index(&arguments.captures)?;
+    let out = &arguments.out;
+    fs::create_dir_all(out.join("maps")).map_err(|error| CliError::file("make", out, &error))?;
+    let bar = progress::bar("calibrating");
+    let mut share = |share: f64| {
+        progress::show(&bar, share);
+        true
+    };
+    let limits = Limits::default();
+    let patterns = read_patterns(files.patterns.as_ref(), &limits)?;
+    // Beside the result, where there is room for it.
+    let temporary = || {
+        let file = tempfile::Builder::new().prefix(".making-").tempfile_in(out);
+        file.map_err(|error| CliError::file("write", out, &error))
+    };
+    let (raw, scaled) = (temporary()?, temporary()?);
+    let made = average_masks(&files, &limits, raw.as_file(), &mut share)?;
+    let raw = Reader::open(raw.path(), &limits)?;
+    write_masks(out, &raw, made.scale, scaled.as_file(), &mut share)?;
+    let scaled = Reader::open(scaled.path(), &limits)?;
+    let report = report(&scaled, Some(&made), patterns.as_ref(), &mut share)?;
+    bar.finish_and_clear();
+    write_report(arguments, &report)
+}
+
+/// Writes masks.npy, and the same masks for the report to look at.
+fn write_masks(
+    out: &Path,
+    raw: &Reader,
+    scale: f32,
+    copy: &File,
+    share: &mut Progress<'_>,
+) -> Result<(), CliError> {
+    let path = out.join("masks.npy");
+    let file = File::create(&path).map_err(|error| CliError::file("write", &path, &error))?;
+    let StackInfo { frames, height, width, .. } = *raw.info();
+    let mut masks = F32StackWriter::new(BufWriter::new(file), frames, height, width)?;
+    let mut copy = planar::Writer::new(BufWriter::new(copy), frames, height, width)?;
+    scale_masks(
+        raw,
+        scale,
+        |mask| masks.write_frame(mask).and_then(|()| copy.write_frame(mask)),
+        share,
+    )?;
+    masks.finish()?;
+    copy.finish()?;
+    Ok(())
+}
+
+fn write_report(arguments: &Arguments, made: &Report) -> Result<(), CliError> {
+    let out = &arguments.out;
+    let failed = |error| CliError::file("write", out, &error);
+    let text = serde_json::to_string_pretty(&made.report)
+        .map_err(|error| CliError::Failure(format!("the report: {error}")))?;
+    let name = arguments.captures.display().to_string();
+    fs::write(out.join("report.html"), report_page(&name, &made.report)).map_err(failed)?;
+    for (name, png) in &made.maps {
+        fs::write(out.join("maps").join(format!("{name}.png")), png).map_err(failed)?;
+    }
+    if arguments.json {
+        println!("{text}");
+    } else {
+        println!("grade: {}", made.report.grade.name());
+        for finding in &made.report.findings {
+            println!("{}: {}. What to do: {}.", finding.code, finding.detail, finding.remedy);
+        }
+        println!("masks.npy and report.html are in {}", out.display());
+    }
+    fs::write(out.join("report.json"), text + "\n").map_err(failed)
+}
+
+impl From<CalibrateError> for CliError {
+    fn from(error: CalibrateError) -> Self {
+        let text = error.to_string();
+        if error.is_retryable() { Self::Failure(text) } else { Self::Input(text) }
+    }
+}
+
+fn read_index(path: &Path) -> Result<CaptureFiles, CliError> {
+    let refused = |error: &dyn std::fmt::Display| {
+        CliError::Input(format!("captures {}: {error}", path.display()))
+    };
+    let text = fs::read_to_string(path).map_err(|error| refused(&error))?;
+    let index: Index = serde_json::from_str(&text).map_err(|error| refused(&error))?;
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let list = |files: Vec<PathBuf>| files.iter().map(|file| folder.join(file)).collect::<Vec<_>>();
+    if let Some(missing) = index.masks.iter().position(Vec::is_empty) {
+        return Err(refused(&format!("pattern {missing} (counted from 0) has no captures")));
+    }
+    if index.masks.is_empty() || index.white.is_empty() || index.black.is_empty() {
+        return Err(refused(&"masks, white and black each need captures"));
+    }
+    Ok(CaptureFiles {
+        masks: index.masks.into_iter().map(list).collect(),
+        white: list(index.white),
+        black: list(index.black),
+        black_with_mask: list(index.black_with_mask),
+        patterns: index.patterns.map(|file| folder.join(file)),
+        saturation: index.saturation,
+    })
+}

@@ -1,0 +1,86 @@
+//! `/v1/calibrations/{calibration}/report.json`, `report.html` and `maps/{name}.png`.
+
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+
+use super::access::Access;
+use super::app::App;
+use super::conditional;
+use super::error::{ApiError, Code};
+use super::extract::Params;
+use super::report_page::report_page;
+use crate::job::{CalibrationId, CalibrationReport, Lab, Sha256};
+use crate::store::StoreError;
+
+/// What the browser may load: our own style and pictures, and no script at all.
+const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
+     form-action 'none'; frame-ancestors 'none'";
+
+/// `GET /v1/calibrations/{calibration}/report.json`
+pub(super) async fn json(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<CalibrationId>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let report = report(&app, &access.lab, id).await?;
+    let text = serde_json::to_vec(&report).map_err(|error| ApiError::internal(&error))?;
+    Ok(known(&headers, "application/json", text))
+}
+
+/// `GET /v1/calibrations/{calibration}/report.html`
+pub(super) async fn html(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<CalibrationId>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let report = report(&app, &access.lab, id).await?;
+    let name = app.store.calibration(&access.lab, id).await?.facts.name;
+    let title = name.map_or_else(|| id.to_string(), |name| name.as_str().to_owned());
+    let text = report_page(&title, &report).into_bytes();
+    let mut response = known(&headers, "text/html; charset=utf-8", text);
+    let policy = header::HeaderValue::from_static(POLICY);
+    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
+    Ok(response)
+}
+
+/// `GET /v1/calibrations/{calibration}/maps/{name}`
+pub(super) async fn map(
+    State(app): State<App>,
+    access: Access,
+    Params((id, name)): Params<(CalibrationId, String)>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let report = report(&app, &access.lab, id).await?;
+    let plain = name.strip_suffix(".png");
+    let plain = plain.filter(|name| report.maps.iter().any(|map| map == name));
+    let missing = || {
+        let names: Vec<String> = report.maps.iter().map(|map| format!("{map}.png")).collect();
+        ApiError::new(Code::NotFound, format!("there is no such map; the maps are {names:?}"))
+    };
+    let png = app.store.map(id, plain.ok_or_else(missing)?).await?;
+    Ok(known(&headers, "image/png", png.ok_or_else(missing)?))
+}
+
+/// The report, if it is made.
+async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport, ApiError> {
+    // Whose it is, before what it holds.
+    if let Some(unready) = app.store.unready(lab, id).await? {
+        return Err(StoreError::from(unready).into());
+    }
+    let not_yet =
+        || ApiError::new(Code::NotReady, "the report is not made yet; ask again in a moment");
+    app.store.report(id).await?.ok_or_else(not_yet)
+}
+
+/// Content with its ETag, or 304 for who has it.
+fn known(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -> Response {
+    let etag = conditional::etag(&Sha256::of(&bytes));
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
+    if conditional::is_known(headers, &etag) {
+        return (StatusCode::NOT_MODIFIED, tags).into_response();
+    }
+    (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response()
+}

@@ -1,0 +1,78 @@
+//! The captures that a calibration is made of.
+
+use serde::{Deserialize, Serialize};
+
+use super::{InvalidField, Sha256};
+
+/// The most patterns, and the most uploads for each.
+const MOST: usize = 4096;
+
+/// Uploads by what they show. Each upload has one frame or several: all are repeats of the same.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Captures {
+    /// For each pattern, in order: the white board through the lithography mask.
+    pub masks: Vec<Vec<Sha256>>,
+    /// The lithography mask taken out, the LCoS all white.
+    pub white: Vec<Sha256>,
+    /// The lithography mask taken out, the LCoS all black.
+    pub black: Vec<Sha256>,
+    /// With the lithography mask, the LCoS all black. Without these, `black` serves for it: Eq. 7 of
+    /// the paper.
+    #[serde(default)]
+    pub black_with_mask: Vec<Sha256>,
+    /// The aperture patterns that were shown, one frame each, to tell whether the order is right.
+    #[serde(default)]
+    pub patterns: Option<Sha256>,
+    /// The stored number from which on a pixel is full; by default the largest of its type.
+    #[serde(default)]
+    pub saturation: Option<u32>,
+}
+
+impl Captures {
+    /// Each list of repeats with its place in the request.
+    pub fn lists(&self) -> impl Iterator<Item = (String, &[Sha256])> {
+        let masks = self.masks.iter().enumerate();
+        let masks = masks.map(|(index, list)| (format!("/captures/masks/{index}"), &list[..]));
+        masks.chain([
+            ("/captures/white".to_owned(), &self.white[..]),
+            ("/captures/black".to_owned(), &self.black[..]),
+            ("/captures/black_with_mask".to_owned(), &self.black_with_mask[..]),
+        ])
+    }
+
+    /// Each upload with its place in the request.
+    pub fn uploads(&self) -> impl Iterator<Item = (String, Sha256)> {
+        let lists = self.lists().flat_map(|(place, list)| {
+            let uploads = list.iter().enumerate();
+            uploads.map(|(index, upload)| (format!("{place}/{index}"), *upload)).collect::<Vec<_>>()
+        });
+        lists.chain(self.patterns.map(|upload| ("/captures/patterns".to_owned(), upload)))
+    }
+
+    /// Refuses lists that are empty or too long.
+    ///
+    /// # Errors
+    /// All that is wrong, each with its place.
+    pub fn check(&self) -> Result<(), Vec<InvalidField>> {
+        let mut errors = Vec::new();
+        if self.masks.is_empty() || self.masks.len() > MOST {
+            let detail = format!("{} patterns; it must be 1 to {MOST}", self.masks.len());
+            errors.push(InvalidField::new("/captures/masks", detail));
+        }
+        for (place, list) in self.lists() {
+            let may_be_empty = place == "/captures/black_with_mask";
+            if (list.is_empty() && !may_be_empty) || list.len() > MOST {
+                let detail = format!(
+                    "{} uploads; each capture needs 1 to {MOST}: a pattern without one is missing",
+                    list.len()
+                );
+                errors.push(InvalidField::new(&place, detail));
+            }
+        }
+        if self.saturation == Some(0) {
+            errors.push(InvalidField::new("/captures/saturation", "0; it must be at least 1"));
+        }
+        if errors.is_empty() { Ok(()) } else { Err(errors) }
+    }
+}

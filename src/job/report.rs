@@ -1,0 +1,197 @@
+//! The report of a calibration, as it is stored and shown.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Finding, Grade};
+use crate::optics::{CaptureFigures, MaskFigures};
+
+/// What is known of the masks of a calibration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CalibrationReport {
+    /// Name and version of this form.
+    pub schema: String,
+    /// The verdict.
+    pub grade: Grade,
+    /// Why it is not better, and what to do.
+    pub findings: Vec<Finding>,
+    /// Masks (B).
+    pub frames: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// Figures of the masks.
+    pub masks: MaskReport,
+    /// Figures of the captures that they were made of; none for masks that were sent.
+    pub captures: Option<CaptureReport>,
+    /// Names of the pictures.
+    pub maps: Vec<String>,
+}
+
+/// Figures of masks on \[0,1\].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MaskReport {
+    /// Mean of all values.
+    pub mean: f64,
+    /// Mean over the pixels of the standard deviation over the frames.
+    pub deviation: f64,
+    /// 1 % of all values lie below this.
+    pub percentile_1: f64,
+    /// 99 % of all values lie below this.
+    pub percentile_99: f64,
+    /// Mean of each mask.
+    pub frame_means: Vec<f64>,
+    /// Correlation of each mask with each other.
+    pub correlation: Vec<Vec<f64>>,
+    /// Mean over all pairs; none for one mask.
+    pub correlation_mean: Option<f64>,
+    /// Largest of all pairs; none for one mask.
+    pub correlation_largest: Option<f64>,
+    /// Smallest, mean and largest sum of squares of a pixel: the gram diagonal.
+    pub gram: [f64; 3],
+    /// Pixels that are dark in all masks.
+    pub dead_pixels: u64,
+    /// Pixels that are open in all masks.
+    pub stuck_pixels: u64,
+    /// Values that are 0 (or were below and set to 0).
+    pub values_at_zero: u64,
+}
+
+/// Figures of captures. Levels are numbers as stored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CaptureReport {
+    /// Share of the light of the open aperture without a mask that passes, in the mean.
+    pub light_throughput: f64,
+    /// The share where a mask is 1: masks were divided by it.
+    pub mask_scale: f64,
+    /// Standard deviation that noise gives a mask value in the mean; none without repeats.
+    pub noise: Option<f64>,
+    /// Mean deviation over the frames over that noise, in decibels: what is left of the dynamic range.
+    pub dynamic_range_db: Option<f64>,
+    /// Mean of the white.
+    pub white_level: f64,
+    /// Mean of the black.
+    pub black_level: f64,
+    /// Mean of the black with mask; none for Eq. 7.
+    pub black_with_mask_level: Option<f64>,
+    /// Darkest over brightest part of the illumination.
+    pub illumination_flatness: Option<f64>,
+    /// Share of full pixels of the white.
+    pub white_saturated: Option<f64>,
+    /// Share of pixels whose white is not above their black.
+    pub denominator_not_positive: f64,
+    /// Share of further pixels whose white is hardly above their black.
+    pub denominator_too_dark: f64,
+    /// Of each pattern.
+    pub patterns: Vec<PatternReport>,
+}
+
+/// Figures of the captures of one pattern.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PatternReport {
+    /// Mean share of the white's light.
+    pub light: f64,
+    /// Share of pixels at or below 0.
+    pub not_positive: f64,
+    /// Share of pixels too far below 0 for noise.
+    pub negative: f64,
+    /// Standard deviation that noise gives a mask value.
+    pub noise: Option<f64>,
+    /// Share of full pixels.
+    pub saturated: Option<f64>,
+    /// Change of the light during the repeats, as a share.
+    pub drift: f64,
+}
+
+/// Name and version of this form of report.
+const SCHEMA: &str = "sci-recon/calibration-report/1";
+
+impl CalibrationReport {
+    /// Of figures and what was found in them. `captures` come with the scale of the masks.
+    #[must_use]
+    pub fn new(
+        figures: &MaskFigures,
+        captures: Option<(&CaptureFigures, f32)>,
+        findings: Vec<Finding>,
+        maps: Vec<String>,
+    ) -> Self {
+        let (height, width) = figures.gram.dim();
+        let masks = MaskReport::new(figures);
+        Self {
+            schema: SCHEMA.into(),
+            grade: Grade::of(&findings),
+            findings,
+            frames: masks.frame_means.len(),
+            height,
+            width,
+            captures: captures
+                .map(|(captures, scale)| CaptureReport::new(captures, scale.into(), &masks)),
+            masks,
+            maps,
+        }
+    }
+}
+
+impl MaskReport {
+    fn new(figures: &MaskFigures) -> Self {
+        let correlations = figures.correlations();
+        let gram = || figures.gram.iter().map(|&value| f64::from(value));
+        let pixels = figures.gram.len().max(1) as f64;
+        Self {
+            mean: figures.overall_mean(),
+            deviation: figures.mean_deviation(),
+            percentile_1: figures.percentiles.0.into(),
+            percentile_99: figures.percentiles.1.into(),
+            frame_means: figures.frame_means.clone(),
+            correlation: figures.correlation.outer_iter().map(|row| row.to_vec()).collect(),
+            correlation_mean: correlations.map(|(mean, _)| mean),
+            correlation_largest: correlations.map(|(_, largest)| largest),
+            gram: [
+                gram().fold(f64::INFINITY, f64::min),
+                gram().sum::<f64>() / pixels,
+                gram().fold(0.0, f64::max),
+            ],
+            dead_pixels: figures.dead,
+            stuck_pixels: figures.stuck_open,
+            values_at_zero: figures.zeros,
+        }
+    }
+}
+
+impl CaptureReport {
+    fn new(figures: &CaptureFigures, scale: f64, masks: &MaskReport) -> Self {
+        let noise: Option<Vec<f64>> =
+            figures.patterns.iter().map(|pattern| pattern.noise).collect();
+        let count = figures.patterns.len().max(1) as f64;
+        // Of the masks as they are: divided by their scale.
+        let noise = noise.map(|noise| noise.iter().sum::<f64>() / count / scale);
+        let range = noise.filter(|noise| *noise > 0.0 && masks.deviation > 0.0);
+        Self {
+            light_throughput: figures.patterns.iter().map(|p| p.mean).sum::<f64>() / count,
+            mask_scale: scale,
+            noise,
+            dynamic_range_db: range.map(|noise| 20.0 * (masks.deviation / noise).log10()),
+            white_level: figures.levels.0,
+            black_level: figures.levels.1,
+            black_with_mask_level: figures.levels.2,
+            illumination_flatness: figures.flatness,
+            white_saturated: figures.white_saturated,
+            denominator_not_positive: figures.denominator_not_positive,
+            denominator_too_dark: figures.denominator_too_dark,
+            patterns: figures.patterns.iter().map(|p| PatternReport::new(p, scale)).collect(),
+        }
+    }
+}
+
+impl PatternReport {
+    fn new(figures: &crate::optics::PatternFigures, scale: f64) -> Self {
+        Self {
+            light: figures.mean,
+            not_positive: figures.not_positive,
+            negative: figures.negative,
+            noise: figures.noise.map(|noise| noise / scale),
+            saturated: figures.saturated,
+            drift: figures.drift,
+        }
+    }
+}

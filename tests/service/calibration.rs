@@ -1,0 +1,440 @@
+//! From raw captures to masks, over HTTP: a lab simulated with noise, and what can go wrong in it.
+
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use crate::app::{TestApp, id};
+use crate::pipeline::values;
+use crate::samples::npy;
+
+const FRAMES: usize = 8;
+const SIDE: usize = 96;
+
+/// The files of a simulated lab.
+struct Lab {
+    folder: tempfile::TempDir,
+}
+
+impl Lab {
+    /// A lab with these optics (TOML) and random squares.
+    fn new(optics: &str) -> Self {
+        Self::with("random-squares", optics)
+    }
+
+    fn with(pattern: &str, optics: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        // A disc that moves over a ground with some texture.
+        let pixel = |k: usize, i: usize, j: usize| {
+            let texture = 0.4 + 0.1 * ((i as f32 / 5.0).sin() + (j as f32 / 7.0).cos());
+            let away = (i as f32 - 40.0 - 2.0 * k as f32).hypot(j as f32 - 50.0);
+            if away < 15.0 { 0.9 } else { texture }
+        };
+        let pixels = (0..FRAMES * SIDE * SIDE)
+            .map(|at| pixel(at / (SIDE * SIDE), at / SIDE % SIDE, at % SIDE));
+        let clip = folder.path().join("clip.npy");
+        std::fs::write(&clip, npy(&[FRAMES, SIDE, SIDE], pixels)).unwrap();
+        let toml = folder.path().join("optics.toml");
+        std::fs::write(&toml, optics).unwrap();
+        let made = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+            .args([
+                "simulate",
+                "--compression-ratio",
+                "8",
+                "--captures",
+                "12",
+                "--pattern",
+                pattern,
+            ])
+            .args(["--frames".as_ref(), clip.as_os_str(), "--optics".as_ref(), toml.as_os_str()])
+            .args(["--out".as_ref(), folder.path().join("sim").as_os_str()])
+            .output()
+            .unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        Self { folder }
+    }
+
+    fn file(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.folder.path().join("sim").join(name)).unwrap()
+    }
+
+    fn json(&self, name: &str) -> Value {
+        serde_json::from_slice(&self.file(name)).unwrap()
+    }
+
+    /// The patterns that the LCoS showed, as .npy.
+    fn patterns(&self) -> Vec<u8> {
+        let record = self.json("simulation.json");
+        let (rows, columns) = (&record["apertures"]["rows"], &record["apertures"]["columns"]);
+        let shape = [rows, columns].map(|side| side.as_u64().unwrap() as usize);
+        let open: String = record["apertures"]["open"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|row| row.as_str().unwrap())
+            .collect();
+        let values: Vec<f32> = open.bytes().map(|digit| f32::from(digit - b'0')).collect();
+        npy(&[FRAMES, shape[0], shape[1]], values.into_iter())
+    }
+
+    /// Sends all captures; gives the `captures` of a request.
+    async fn send(&self, app: &TestApp) -> Value {
+        let index = self.json("captures/captures.json");
+        let mut captures = json!({"saturation": index["saturation"]});
+        for role in ["white", "black", "black_with_mask"] {
+            captures[role] = json!([self.upload(app, &index[role][0]).await]);
+        }
+        let mut masks = Vec::new();
+        for list in index["masks"].as_array().unwrap() {
+            masks.push(json!([self.upload(app, &list[0]).await]));
+        }
+        captures["masks"] = Value::from(masks);
+        captures["patterns"] = json!(app.upload(self.patterns()).await);
+        captures
+    }
+
+    async fn upload(&self, app: &TestApp, name: &Value) -> String {
+        app.upload(self.file(&format!("captures/{}", name.as_str().unwrap()))).await
+    }
+}
+
+impl TestApp {
+    /// Makes a calibration of captures, waits until it has come to its end, and gives it.
+    async fn calibrate_captures(&self, captures: &Value) -> Value {
+        let answer =
+            self.post("/v1/calibrations", &json!({"captures": captures})).await.expect(202);
+        assert_eq!(answer.json()["state"], "preparing");
+        self.calibrated(&id(&answer)).await
+    }
+
+    async fn calibrated(&self, calibration: &str) -> Value {
+        let start = Instant::now();
+        loop {
+            let body =
+                self.get(&format!("/v1/calibrations/{calibration}")).await.expect(200).json();
+            if body["state"] != "preparing" {
+                return body;
+            }
+            assert!(start.elapsed() < Duration::from_secs(120), "{body:#}");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    }
+
+    async fn report(&self, calibration: &Value) -> Value {
+        let id = calibration["id"].as_str().unwrap();
+        let start = Instant::now();
+        loop {
+            let answer = self.get(&format!("/v1/calibrations/{id}/report.json")).await;
+            if answer.status == 200 {
+                return answer.json();
+            }
+            answer.problem(404, "not_ready");
+            assert!(start.elapsed() < Duration::from_secs(120));
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    }
+}
+
+/// The codes of findings, and the frames that each is about.
+fn found(findings: &Value) -> Vec<(String, Vec<u64>)> {
+    let finding = |finding: &Value| {
+        let frames = finding["frames"].as_array().unwrap();
+        let frames = frames.iter().map(|frame| frame.as_u64().unwrap()).collect();
+        (finding["code"].as_str().unwrap().to_owned(), frames)
+    };
+    findings.as_array().unwrap().iter().map(finding).collect()
+}
+
+/// The prepared masks of a calibration, from the store's folder.
+fn masks(app: &TestApp, calibration: &Value) -> Vec<f32> {
+    let sha256 = calibration["masks"].as_str().unwrap();
+    let file = find(&app.data().join("blobs"), sha256).expect("the masks are stored");
+    let bytes = std::fs::read(file).unwrap();
+    bytes[32..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+}
+
+fn find(folder: &Path, name: &str) -> Option<std::path::PathBuf> {
+    std::fs::read_dir(folder).unwrap().find_map(|entry| {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            return find(&path, name);
+        }
+        path.to_string_lossy().replace('/', "").ends_with(name).then_some(path)
+    })
+}
+
+#[tokio::test]
+async fn captures_give_masks_within_their_statistical_error() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new("[light]\nvignetting = 0.3\n");
+    let mut captures = lab.send(&app).await;
+    for black_with_mask in [true, false] {
+        let calibration = app.calibrate_captures(&captures).await;
+        assert_eq!(calibration["state"], "ready", "{calibration:#}");
+        let report = app.report(&calibration).await;
+        let figures = &report["captures"];
+        let scale = figures["mask_scale"].as_f64().unwrap();
+        let truth = values(&lab.file("masks.npy"));
+        let true_scale = lab.json("simulation.json")["mask_scale"].as_f64().unwrap();
+        let made = masks(&app, &calibration);
+        assert_eq!(made.len(), truth.len());
+        let errors = made.iter().zip(&truth);
+        let errors: Vec<f64> = errors
+            .map(|(made, truth)| f64::from(*made) * scale - f64::from(*truth) * true_scale)
+            .collect();
+        let rms = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
+        let expected = figures["noise"].as_f64().unwrap() * scale;
+        if black_with_mask {
+            // Values below 0 are set to 0, which takes a little of the error away.
+            assert!((0.85..1.15).contains(&(rms / expected)), "{rms} and {expected} expected");
+            let bias = errors.iter().sum::<f64>() / errors.len() as f64;
+            assert!(bias.abs() < 0.2 * expected, "{bias}");
+            assert_eq!(report["grade"], "good", "{report:#}");
+            let flat = figures["illumination_flatness"].as_f64().unwrap();
+            assert!((0.7..0.8).contains(&flat), "{flat}");
+            let share = figures["light_throughput"].as_f64().unwrap();
+            let true_share = lab.json("simulation.json")["light_throughput"].as_f64().unwrap();
+            assert!((share / true_share - 1.0).abs() < 0.01, "{share} and {true_share}");
+        } else {
+            // Eq. 7 takes the background for that without the mask, which is brighter.
+            assert!(rms > expected && rms < 0.01, "{rms} and {expected}");
+        }
+        captures["black_with_mask"] = json!([]);
+    }
+}
+
+#[test]
+fn the_command_line_calibrates_as_the_service_does() {
+    let lab = Lab::new("");
+    let index = lab.folder.path().join("sim/captures/captures.json");
+    let out = lab.folder.path().join("calibration");
+    let run = |index: &Path| {
+        let line =
+            ["calibrate".as_ref(), "--json".as_ref(), "--captures".as_ref(), index.as_os_str()];
+        Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+            .args(line)
+            .args(["--out".as_ref(), out.as_os_str()])
+            .output()
+            .unwrap()
+    };
+    let made = run(&index);
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let report: Value = serde_json::from_slice(&made.stdout).unwrap();
+    assert_eq!(report["grade"], "good", "{report:#}");
+    let masks = values(&std::fs::read(out.join("masks.npy")).unwrap());
+    assert_eq!(masks.len(), FRAMES * SIDE * SIDE);
+    assert_eq!(masks.iter().copied().fold(0.0, f32::max), 1.0);
+    for file in ["report.json", "report.html", "maps/gram.png"] {
+        assert!(out.join(file).is_file(), "{file}");
+    }
+    let bad = lab.folder.path().join("sim/captures/bad.json");
+    std::fs::write(
+        &bad,
+        r#"{"masks": [["mask_01.npy"], []], "white": ["white.npy"], "black": []}"#,
+    )
+    .unwrap();
+    let refused = run(&bad);
+    assert_eq!(refused.status.code(), Some(2));
+    let text = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(text.contains("pattern 1") && text.contains("no captures"), "{text}");
+}
+
+#[tokio::test]
+async fn the_report_can_be_looked_at() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new("");
+    let captures = lab.send(&app).await;
+    let calibration = app.calibrate_captures(&captures).await;
+    let report = app.report(&calibration).await;
+    let base = format!("/v1/calibrations/{}", calibration["id"].as_str().unwrap());
+    assert_eq!(report["maps"], json!(["mean", "deviation", "gram", "illumination"]));
+    for map in report["maps"].as_array().unwrap() {
+        let answer =
+            app.get(&format!("{base}/maps/{}.png", map.as_str().unwrap())).await.expect(200);
+        assert_eq!(answer.header("content-type"), "image/png");
+        let picture = image::load_from_memory(&answer.bytes).unwrap();
+        assert_eq!((picture.width(), picture.height()), (SIDE as u32, SIDE as u32));
+    }
+    app.get(&format!("{base}/maps/nothing.png")).await.problem(404, "not_found");
+    let page = app.get(&format!("{base}/report.html")).await.expect(200);
+    assert!(page.header("content-security-policy").contains("default-src 'none'"));
+    let text = String::from_utf8(page.bytes).unwrap();
+    assert!(text.contains("maps/gram.png") && !text.contains("<script"), "{text}");
+    // Masks that were sent get a report of what can be known of them.
+    let sent = app.calibrate(lab.file("masks.npy")).await.expect(201).json();
+    let report = app.report(&sent).await;
+    assert_eq!(report["captures"], Value::Null);
+    assert_eq!(report["maps"], json!(["mean", "deviation", "gram"]));
+    let mean = report["masks"]["correlation_mean"].as_f64().unwrap();
+    assert!((0.4..0.6).contains(&mean), "{mean}");
+}
+
+#[tokio::test]
+async fn what_went_wrong_in_the_lab_is_named_by_the_report() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let lab = Lab::new("");
+    let good = lab.send(&app).await;
+    let codes = async |captures: &Value| {
+        let calibration = app.calibrate_captures(captures).await;
+        found(&app.report(&calibration).await["findings"])
+    };
+    assert_eq!(codes(&good).await, []);
+    let mut wrong = good.clone();
+    wrong["black_with_mask"] = good["masks"][0].clone();
+    let seen = codes(&wrong).await;
+    assert!(seen.iter().any(|(code, _)| code == "wrong_dark"), "{seen:?}");
+    let mut missing = good.clone();
+    missing["masks"][3] = good["black_with_mask"].clone();
+    let seen = codes(&missing).await;
+    assert!(seen.contains(&("missing_pattern".into(), vec![3])), "{seen:?}");
+    let mut twice = good.clone();
+    twice["masks"][3] = good["masks"][2].clone();
+    let seen = codes(&twice).await;
+    assert!(seen.contains(&("repeated_pattern".into(), vec![2, 3])), "{seen:?}");
+    let mut swapped = good.clone();
+    swapped["masks"][1] = good["masks"][5].clone();
+    swapped["masks"][5] = good["masks"][1].clone();
+    let seen = codes(&swapped).await;
+    assert_eq!(seen, [("swapped_order".into(), vec![1, 5])]);
+    let bright = Lab::new("[camera]\ncalibration_exposure = 1.2\n").send(&app).await;
+    let seen = codes(&bright).await;
+    assert!(seen.iter().any(|(code, _)| code == "saturated_white"), "{seen:?}");
+}
+
+#[tokio::test]
+async fn captures_that_can_not_be_are_refused() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new("");
+    let good = lab.send(&app).await;
+    let post = async |change: &dyn Fn(&mut Value)| {
+        let mut captures = good.clone();
+        change(&mut captures);
+        app.post("/v1/calibrations", &json!({"captures": captures})).await
+    };
+    let answer = post(&|captures| captures["masks"][2] = json!([])).await;
+    let detail = answer.problem(422, "invalid_request");
+    assert!(detail.contains("missing"), "{detail}");
+    assert_eq!(answer.json()["pointer"], "/captures/masks/2");
+    let small = app.upload(npy(&[20, 30], (0..600).map(|_| 1.0))).await;
+    let answer = post(&|captures| captures["masks"][1] = json!([small])).await;
+    let detail = answer.problem(422, "size_mismatch");
+    assert!(detail.contains("20x30") && detail.contains("96x96"), "{detail}");
+    assert_eq!(answer.json()["pointer"], "/captures/masks/1/0");
+    let nowhere = "0".repeat(64);
+    let answer = post(&|captures| captures["white"] = json!([nowhere])).await;
+    assert_eq!(answer.json()["pointer"], "/captures/white/0");
+    let both = json!({"captures": good, "masks": small});
+    app.post("/v1/calibrations", &both).await.problem(422, "invalid_request");
+    // What only shows on the way ends as a failure with its reason.
+    let mut confused = good.clone();
+    confused["white"] = good["black"].clone();
+    let failed = app.calibrate_captures(&confused).await;
+    assert_eq!(failed["state"], "failed");
+    let error = failed["error"].as_str().unwrap();
+    assert!(error.contains("nowhere brighter"), "{error}");
+    let body = json!({"calibration": failed["id"], "data": small});
+    let detail = app.post("/v1/measurements", &body).await.problem(409, "calibration_not_ready");
+    assert!(detail.contains("nowhere brighter"), "{detail}");
+    let listed = app.get("/v1/calibrations").await.expect(200).json();
+    assert_eq!(listed["items"][0]["state"], "failed");
+    let path = format!("/v1/calibrations/{}", failed["id"].as_str().unwrap());
+    app.delete(&path).await.expect(204);
+    app.get(&path).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn a_calibration_waits_for_a_worker_and_says_so() {
+    let mut app = TestApp::start().await;
+    let captures = Lab::new("").send(&app).await;
+    let answer = app.post("/v1/calibrations", &json!({"captures": captures})).await.expect(202);
+    let calibration = id(&answer);
+    let body = json!({"calibration": calibration, "data": captures["white"][0]});
+    app.post("/v1/measurements", &body).await.problem(409, "calibration_not_ready");
+    let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await;
+    report.problem(409, "calibration_not_ready");
+    app.restart_with(&["--workers", "1"]);
+    assert_eq!(app.calibrated(&calibration).await["state"], "ready");
+}
+
+impl Lab {
+    /// Sends the measurement; gives the body of a request.
+    async fn measurement(&self, app: &TestApp, calibration: &Value) -> Value {
+        let index = &self.json("captures/captures.json")["measurement"];
+        json!({
+            "calibration": calibration["id"],
+            "data": self.upload(app, &index["data"]).await,
+            "dark": [self.upload(app, &index["dark"][0]).await],
+            "full_scale": index["full_scale"],
+            "saturation": index["saturation"],
+        })
+    }
+
+    /// The measurement moved by some rows and columns, round the edges.
+    fn moved(&self, rows: usize, columns: usize) -> Vec<u8> {
+        let mut file = self.file("captures/measurement.npy");
+        let start = file.len() - 2 * SIDE * SIDE;
+        let pixels = file.split_off(start);
+        for at in 0..SIDE * SIDE {
+            let (row, column) = ((at / SIDE + rows) % SIDE, (at % SIDE + columns) % SIDE);
+            let from = 2 * (row * SIDE + column);
+            file.extend(&pixels[from..from + 2]);
+        }
+        file
+    }
+}
+
+#[tokio::test]
+async fn a_measurement_is_checked_against_its_calibration() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new("[camera]\nbackground = 0.1\nmeasurement_exposure = 0.15\n");
+    let captures = lab.send(&app).await;
+    let calibration = app.calibrate_captures(&captures).await;
+    let good = lab.measurement(&app, &calibration).await;
+    let post = async |change: &dyn Fn(&mut Value)| {
+        let mut body = good.clone();
+        change(&mut body);
+        app.post("/v1/measurements", &body).await.expect(201).json()
+    };
+    let codes = |measurement: &Value| {
+        found(&measurement["warnings"]).into_iter().map(|(code, _)| code).collect::<Vec<_>>()
+    };
+    let fine = post(&|_| ()).await;
+    assert_eq!(codes(&fine), Vec::<String>::new(), "{fine:#}");
+    let undarkened = post(&|body| body["dark"] = json!([])).await;
+    assert_eq!(codes(&undarkened), ["wrong_dark"]);
+    let too_dark = post(&|body| body["dark"] = captures["white"].clone()).await;
+    assert!(codes(&too_dark).contains(&"negative".to_owned()), "{too_dark:#}");
+    let data = app.upload(lab.moved(2, 1)).await;
+    let moved = post(&|body| body["data"] = json!(data)).await;
+    assert_eq!(codes(&moved), ["shifted_masks"]);
+    assert!(moved["warnings"][0]["detail"].as_str().unwrap().contains("-2 rows and -1 columns"));
+    let full = post(&|body| body["saturation"] = json!(900)).await;
+    assert!(codes(&full).contains(&"saturated".to_owned()), "{full:#}");
+    // A measurement that lacks a pattern of its calibration.
+    let mut lacking = captures.clone();
+    let other = Lab::new("[camera]\nbackground = 0.1\n[sub_apertures]\nopen_share = 0.25\n");
+    lacking["masks"][4] = other.send(&app).await["masks"][4].clone();
+    lacking.as_object_mut().unwrap().remove("patterns");
+    let wrong = app.calibrate_captures(&lacking).await;
+    let lost = post(&|body| body["calibration"] = wrong["id"].clone()).await;
+    let seen = found(&lost["warnings"]);
+    assert!(seen.contains(&("missing_pattern".into(), vec![4])), "{lost:#}");
+    // Warnings go with the job and stand in its manifest.
+    let body = json!({"measurement": moved["id"], "algorithm": "gap-tv"});
+    let job = app.submit(&body).await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    assert_eq!(codes(&done), ["shifted_masks"]);
+    for path in ["manifest.json", "snapshots/0/manifest.json"] {
+        let manifest = app.get(&format!("/v1/jobs/{job}/{path}")).await.expect(200).json();
+        assert_eq!(codes(&manifest["content"]), ["shifted_masks"], "{path}");
+    }
+    let small = app.upload(npy(&[20, 30], (0..600).map(|_| 1.0))).await;
+    let mut body = good.clone();
+    body["dark"] = json!([small]);
+    let answer = app.post("/v1/measurements", &body).await;
+    answer.problem(422, "size_mismatch");
+    assert_eq!(answer.json()["pointer"], "/dark/0");
+}
