@@ -4,7 +4,7 @@ CARGO ?= cargo
 PYTHON ?= python3
 JUDGES := .venv/judges
 
-.PHONY: demo test e2e runtime judges fmt lint docs serve clean
+.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
@@ -26,6 +26,31 @@ $(JUDGES)/.stamp: tests/judges/requirements.txt
 	$(PYTHON) -m venv $(JUDGES)
 	$(JUDGES)/bin/python -m pip install --quiet --requirement $<
 	touch $@
+
+faults: runtime ## 200 random kills, faults at many file operations, damaged data, hanging tasks
+	SCI_RECON_KILLS=200 SCI_RECON_FAULT_POINTS=25 $(PYTHON) scripts/figures.py faults \
+		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs::
+
+load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once (12 GB of disk)
+	$(PYTHON) scripts/figures.py load \
+		$(CARGO) test --release --test service -- --nocapture --ignored --test-threads 1 load::
+
+fuzz: ## every decoder for SECONDS seconds; needs cargo install cargo-fuzz
+	$(PYTHON) scripts/fuzz.py $(SECONDS)
+SECONDS ?= 60
+
+SCHEMATHESIS := .venv/schemathesis
+schemathesis: $(SCHEMATHESIS)/.stamp ## the API against its contract, with and without a token
+	$(CARGO) build --release
+	$(PYTHON) tests/judges/schemathesis_runs.py $(SCHEMATHESIS)/bin/schemathesis \
+		$${CARGO_TARGET_DIR:-target}/release/sci-recon
+$(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
+	$(PYTHON) -m venv $(SCHEMATHESIS)
+	$(SCHEMATHESIS)/bin/python -m pip install --quiet --requirement $<
+	touch $@
+
+deny: ## licences, bans and sources of all crates; needs cargo install cargo-deny
+	$(CARGO) deny check licenses bans sources
 
 fmt:
 	$(CARGO) fmt --check

@@ -68,9 +68,22 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
     pub request_seconds: u64,
 
-    /// Hours for which an upload that nothing refers to is kept.
+    /// Jobs that may wait and run; more are told to come back later.
+    #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
+    pub max_jobs: u64,
+
+    /// Hours for which an upload that nothing refers to, or that is not complete, is kept.
     #[arg(long, env = "SCI_RECON_UPLOAD_HOURS", value_name = "HOURS", default_value_t = 72)]
     pub upload_hours: u64,
+
+    /// Days for which a job that has ended is kept, with its results [default: until it is deleted].
+    #[arg(long, env = "SCI_RECON_JOB_DAYS", value_name = "DAYS")]
+    pub job_days: Option<u32>,
+
+    /// Free bytes of the disk below which unused uploads and the oldest ended jobs go before their
+    /// time; those of the last hour stay. 0: never.
+    #[arg(long, env = "SCI_RECON_LOW_WATER_BYTES", value_name = "BYTES", default_value_t = 0)]
+    pub low_water_bytes: u64,
 
     /// How log lines look.
     #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
@@ -168,6 +181,12 @@ impl ServeArguments {
     #[must_use]
     pub fn upload_idle(&self) -> Duration {
         Duration::from_secs(self.upload_idle_seconds)
+    }
+
+    /// How long an upload is kept that nothing refers to, or that is not complete.
+    #[must_use]
+    pub fn upload_age(&self) -> Duration {
+        Duration::from_secs(self.upload_hours.saturating_mul(3600))
     }
 
     /// The longest time for an answer.

@@ -25,6 +25,7 @@ enum Command {
     Bench(cli::bench::Arguments),
     Demo(cli::demo::Arguments),
     Token(cli::token::Arguments),
+    Backup(cli::backup::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -38,6 +39,7 @@ fn main() -> ExitCode {
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
         Command::Demo(arguments) => cli::demo::run(&arguments),
         Command::Token(arguments) => cli::token::run(&arguments),
+        Command::Backup(arguments) => cli::backup::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

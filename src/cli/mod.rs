@@ -2,12 +2,14 @@
 
 mod arguments;
 mod error;
+mod housekeeping;
 mod input;
 mod logging;
 mod npz;
 mod progress;
 mod supervisor;
 
+pub mod backup;
 pub mod bench;
 pub mod calibrate;
 pub mod demo;

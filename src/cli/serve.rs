@@ -10,11 +10,11 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use super::housekeeping::keep_house;
 use super::logging;
 use super::supervisor::Supervisor;
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, router};
-use crate::job::Timestamp;
 use crate::store::{Store, StoreError};
 
 /// How long open requests may take to end at a shutdown.
@@ -91,8 +91,9 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
-    tokio::spawn(keep_house(store.clone(), metrics.clone(), settings.upload_hours));
     let closing = CancellationToken::new();
+    let house = keep_house(store.clone(), metrics.clone(), settings.clone());
+    tokio::spawn(closing.clone().run_until_cancelled_owned(house));
     let closer = closing.clone();
     tokio::spawn(async move {
         signal.await;
@@ -138,24 +139,6 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
         log_format: settings.log_format,
         id: None,
         supervised: true,
-    }
-}
-
-/// Every few seconds: figures; every hour: uploads that nobody came back for.
-async fn keep_house(store: Store, metrics: Metrics, upload_hours: u64) {
-    let mut tick = tokio::time::interval(Duration::from_secs(5));
-    for count in 0u64.. {
-        tick.tick().await;
-        metrics.upkeep();
-        if count % 720 != 0 {
-            continue;
-        }
-        let age = i64::try_from(upload_hours.saturating_mul(3_600_000)).unwrap_or(i64::MAX);
-        match store.collect(Timestamp(Timestamp::now().0.saturating_sub(age))).await {
-            Ok(0) => {}
-            Ok(files) => tracing::info!(files, "removed uploads that nothing refers to"),
-            Err(error) => tracing::error!(%error, "old uploads can't be removed"),
-        }
     }
 }
 

@@ -173,6 +173,12 @@ impl FormatError {
         !matches!(self, Self::Io { .. } | Self::Internal(_))
     }
 
+    /// True if the disk is full or a quota is used up.
+    pub fn is_disk_full(&self) -> bool {
+        use io::ErrorKind::{QuotaExceeded, StorageFull};
+        matches!(self, Self::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
+    }
+
     pub(super) fn malformed(format: Format, problem: impl Into<String>) -> Self {
         Self::Malformed { format, problem: problem.into() }
     }

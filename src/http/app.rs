@@ -3,9 +3,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::Semaphore;
+use tokio::sync::{Mutex, Semaphore};
 use tokio_util::sync::CancellationToken;
 
+use super::admission::Promises;
 use super::events::Events;
 use super::metrics::Metrics;
 use super::pictures::Pictures;
@@ -29,7 +30,11 @@ pub struct Shared {
     pub(super) worker_memory_bytes: u64,
     pub(super) upload_idle: Duration,
     pub(super) request_time: Duration,
+    pub(super) upload_age: Duration,
+    pub(super) max_jobs: u64,
     pub(super) uploads: Arc<Semaphore>,
+    pub(super) promises: Promises,
+    pub(super) finishing: Mutex<()>,
     /// One file is checked at a time: each takes a core and a frame of memory.
     pub(super) intake: Arc<Semaphore>,
     pub(super) metrics: Metrics,
@@ -80,7 +85,11 @@ impl App {
             worker_memory_bytes: settings.worker_memory_bytes,
             upload_idle: settings.upload_idle(),
             request_time: settings.request_time(),
+            upload_age: settings.upload_age(),
+            max_jobs: settings.max_jobs,
             uploads: Arc::new(Semaphore::new(settings.max_uploads)),
+            promises: Promises::default(),
+            finishing: Mutex::new(()),
             intake: Arc::new(Semaphore::new(1)),
             metrics,
         }))

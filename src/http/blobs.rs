@@ -8,6 +8,7 @@ use axum::response::{IntoResponse, Response};
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::access::Access;
+use super::admission::{self, Room};
 use super::app::App;
 use super::error::{ApiError, Code};
 use super::extract::Params;
@@ -22,11 +23,14 @@ pub(super) async fn create(
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let _permit = begin(&app, &access, &headers).await?;
+    let (_permit, room) = match begin(&app, &access, &headers).await {
+        Ok(begun) => begun,
+        Err(refusal) => return Err(refuse(refusal, &headers, request.into_body()).await),
+    };
     let staged = if is_form(&headers) {
-        receive_form(&app, request).await?
+        receive_form(&app, room, request).await?
     } else {
-        upload::receive(&app, request.into_body().into_data_stream()).await?
+        upload::receive(&app, room, request.into_body().into_data_stream()).await?
     };
     store(&app, &access, staged).await
 }
@@ -39,8 +43,11 @@ pub(super) async fn put(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    let _permit = begin(&app, &access, &headers).await?;
-    let staged = upload::receive(&app, body.into_data_stream()).await?;
+    let (_permit, room) = match begin(&app, &access, &headers).await {
+        Ok(begun) => begun,
+        Err(refusal) => return Err(refuse(refusal, &headers, body).await),
+    };
+    let staged = upload::receive(&app, room, body.into_data_stream()).await?;
     if staged.sha256() != sha256 {
         let detail = format!("the address says {sha256}, the bytes have {}", staged.sha256());
         return Err(ApiError::new(Code::HashMismatch, detail));
@@ -57,16 +64,23 @@ pub(super) async fn show(
     Ok(Json(app.store.upload(&access.lab, sha256).await?))
 }
 
-/// Takes one of the places for uploads and refuses what is too large.
+/// Takes one of the places for uploads, and room on the disk.
 async fn begin(
     app: &App,
     access: &Access,
     headers: &HeaderMap,
-) -> Result<OwnedSemaphorePermit, ApiError> {
-    upload::admit(app, access, headers).await?;
-    app.uploads.clone().try_acquire_owned().map_err(|_| {
-        ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
-    })
+) -> Result<(OwnedSemaphorePermit, Room), ApiError> {
+    let permit = upload::place(app)?;
+    Ok((permit, upload::admit(app, access, headers).await?))
+}
+
+/// Lets the client come to the end of a small body, so that it gets to see the refusal.
+async fn refuse(refusal: ApiError, headers: &HeaderMap, body: Body) -> ApiError {
+    // A client that waits for leave to send has none.
+    if !headers.contains_key(header::EXPECT) {
+        upload::drain(&mut body.into_data_stream()).await;
+    }
+    refusal
 }
 
 fn is_form(headers: &HeaderMap) -> bool {
@@ -74,14 +88,14 @@ fn is_form(headers: &HeaderMap) -> bool {
     kind.is_some_and(|kind| kind.trim_start().to_ascii_lowercase().starts_with("multipart/"))
 }
 
-async fn receive_form(app: &App, request: Request) -> Result<StagedBlob, ApiError> {
+async fn receive_form(app: &App, room: Room, request: Request) -> Result<StagedBlob, ApiError> {
     let malformed = |text: String| ApiError::new(Code::MalformedRequest, text);
     let mut form = Multipart::from_request(request, app)
         .await
         .map_err(|error| malformed(error.body_text()))?;
     while let Some(field) = form.next_field().await.map_err(|error| malformed(error.body_text()))? {
         if field.name() == Some("file") {
-            return upload::receive(app, field).await;
+            return upload::receive(app, room, field).await;
         }
     }
     Err(malformed("the form has no field named file".into()))
@@ -89,7 +103,7 @@ async fn receive_form(app: &App, request: Request) -> Result<StagedBlob, ApiErro
 
 async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response, ApiError> {
     // Again, for an upload that did not say its length before.
-    upload::check_quota(app, access, staged.size()).await?;
+    admission::check_length(app, access, staged.size()).await?;
     let (blob, new) = app.store.store_upload(&access.lab, access.token, staged).await?;
     let status = if new { StatusCode::CREATED } else { StatusCode::OK };
     let location = [(header::LOCATION, format!("/v1/blobs/{}", blob.sha256))];

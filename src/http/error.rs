@@ -1,5 +1,7 @@
 //! Errors as the user sees them: problem+json (RFC 9457).
 
+use std::sync::LazyLock;
+
 use axum::Json;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -24,6 +26,10 @@ pub enum Code {
     CalibrationNotReady,
     MethodNotAllowed,
     UploadStalled,
+    OffsetMismatch,
+    TusVersion,
+    UploadBusy,
+    ChecksumMismatch,
     InUse,
     IllegalState,
     TooLarge,
@@ -35,12 +41,17 @@ pub enum Code {
     HashMismatch,
     IdempotencyKeyReused,
     TooManyUploads,
+    QueueFull,
     Internal,
     Unavailable,
     TimedOut,
     InsufficientStorage,
     QuotaExceeded,
 }
+
+/// tus 1.0 has a status of its own for this.
+static CHECKSUM_STATUS: LazyLock<StatusCode> =
+    LazyLock::new(|| StatusCode::from_u16(460).unwrap_or(StatusCode::BAD_REQUEST));
 
 impl Code {
     /// The table: status, stable name, title, and whether the same request may succeed later.
@@ -70,6 +81,16 @@ impl Code {
             }
             Self::UploadStalled => {
                 (S::REQUEST_TIMEOUT, "upload_stalled", "The upload came to a halt", true)
+            }
+            Self::OffsetMismatch => {
+                (S::CONFLICT, "offset_mismatch", "The piece does not follow", false)
+            }
+            Self::TusVersion => {
+                (S::PRECONDITION_FAILED, "tus_version", "Not in this version of tus", false)
+            }
+            Self::UploadBusy => (S::LOCKED, "upload_busy", "Another request is at it", true),
+            Self::ChecksumMismatch => {
+                (*CHECKSUM_STATUS, "checksum_mismatch", "The piece has come damaged", true)
             }
             Self::InUse => (S::CONFLICT, "in_use", "Something else needs it", false),
             Self::IllegalState => (S::CONFLICT, "illegal_state", "Not in this state", false),
@@ -104,6 +125,7 @@ impl Code {
             Self::TooManyUploads => {
                 (S::TOO_MANY_REQUESTS, "too_many_uploads", "Too many uploads at once", true)
             }
+            Self::QueueFull => (S::TOO_MANY_REQUESTS, "queue_full", "Enough jobs wait", true),
             Self::Internal => {
                 (S::INTERNAL_SERVER_ERROR, "internal", "The service has failed", true)
             }
@@ -216,6 +238,11 @@ impl IntoResponse for ApiError {
     }
 }
 
+fn disk_full(cause: &(dyn std::error::Error + 'static)) -> ApiError {
+    tracing::error!(error = cause, "the disk is full");
+    ApiError::new(Code::InsufficientStorage, "the disk of the service is full")
+}
+
 impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         let code = match &error {
@@ -224,11 +251,10 @@ impl From<StoreError> for ApiError {
             StoreError::InUse { .. } => Code::InUse,
             StoreError::State(_) | StoreError::NotFinal(_) => Code::IllegalState,
             StoreError::KeyReused { .. } => Code::IdempotencyKeyReused,
+            StoreError::HashMismatch { .. } => Code::HashMismatch,
+            StoreError::QueueFull { .. } => Code::QueueFull,
             StoreError::Interrupted => Code::Unavailable,
-            full if full.is_disk_full() => {
-                tracing::error!(error = full as &dyn std::error::Error, "the disk is full");
-                return Self::new(Code::InsufficientStorage, "the disk of the service is full");
-            }
+            full if full.is_disk_full() => return disk_full(full),
             StoreError::Database(_)
             | StoreError::Migrate(_)
             | StoreError::Io { .. }
@@ -240,6 +266,9 @@ impl From<StoreError> for ApiError {
 
 impl From<FormatError> for ApiError {
     fn from(error: FormatError) -> Self {
+        if error.is_disk_full() {
+            return disk_full(&error);
+        }
         if !error.is_callers_fault() {
             return Self::internal(&error);
         }

@@ -7,6 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::access::Access;
+use super::admission;
 use super::app::App;
 use super::calibrations::missing;
 use super::conditional;
@@ -104,14 +105,33 @@ pub(super) async fn create(
     let idempotency_key = idempotency_key(&headers)?;
     // Hashed as it was understood, so that white space and the order of fields do not matter.
     let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
-    let spec = resolve(&app, &access.lab, request).await?;
-    let new = NewJob { lab: access.lab.clone(), spec, request: Sha256::of(&text), idempotency_key };
-    let (id, status) = match app.store.add_job(new).await? {
+    let inserted = insert(&app, access.lab.clone(), request, Sha256::of(&text), idempotency_key);
+    let (id, status) = match inserted.await? {
         Inserted::New(id) => (id, StatusCode::CREATED),
         Inserted::Before(id) => (id, StatusCode::OK),
     };
     let location = [(header::LOCATION, format!("/v1/jobs/{id}"))];
     Ok((status, location, Json(body(&app, &access.lab, id).await?)).into_response())
+}
+
+/// Accepts a job, unless it was accepted before, if there is room for it.
+async fn insert(
+    app: &App,
+    lab: Lab,
+    request: JobRequest,
+    hash: Sha256,
+    idempotency_key: Option<String>,
+) -> Result<Inserted, ApiError> {
+    if let Some(key) = &idempotency_key
+        && let Some(job) = app.store.job_with_key(&lab, key, hash).await?
+    {
+        return Ok(Inserted::Before(job));
+    }
+    let spec = resolve(app, &lab, request).await?;
+    admission::check_room(app, "the job", spec.disk_bytes()).await?;
+    let most_jobs = app.max_jobs;
+    let new = NewJob { most_jobs, lab, spec, request: hash, idempotency_key };
+    Ok(app.store.add_job(new).await?)
 }
 
 /// Checks a request against the measurement that it names.

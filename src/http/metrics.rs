@@ -53,6 +53,15 @@ fn describe() {
     describe_counter!("sci_recon_worker_exits_total", "Worker processes that ended, by reason.");
     describe_gauge!("sci_recon_jobs", "Jobs on record, by state.");
     describe_gauge!("sci_recon_tasks", "Tasks on record, by kind and state.");
+    describe_counter!("sci_recon_tasks_done_total", "Tasks done, by kind.");
+    describe_counter!("sci_recon_task_seconds_total", Unit::Seconds, "Seconds of tasks done.");
+    describe_counter!("sci_recon_solver_iterations_total", "Solver iterations done.");
+    describe_counter!("sci_recon_denoiser_passes_total", "Passes of the deep denoiser done.");
+    describe_gauge!(
+        "sci_recon_disk_promised_bytes",
+        Unit::Bytes,
+        "Bytes promised to jobs and uploads."
+    );
     describe_gauge!("sci_recon_workers", "Worker processes alive.");
     describe_gauge!("sci_recon_blobs", "Files in the content-addressed store.");
     describe_gauge!("sci_recon_blob_bytes", Unit::Bytes, "Bytes of files in that store.");
@@ -80,6 +89,17 @@ pub(super) async fn show(State(app): State<App>) -> Result<Response, ApiError> {
     for ((kind, state), count) in app.store.task_counts().await? {
         gauge!("sci_recon_tasks", "kind" => kind, "state" => state).set(count as f64);
     }
+    for done in app.store.totals().await? {
+        let kind = || done.kind.clone();
+        counter!("sci_recon_tasks_done_total", "kind" => kind()).absolute(done.tasks);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // whole seconds will do
+        counter!("sci_recon_task_seconds_total", "kind" => kind()).absolute(done.seconds as u64);
+        if done.kind == "tile" {
+            counter!("sci_recon_solver_iterations_total").absolute(done.iterations);
+            counter!("sci_recon_denoiser_passes_total").absolute(done.passes);
+        }
+    }
+    gauge!("sci_recon_disk_promised_bytes").set(app.store.promised_bytes().await? as f64);
     let workers = app.store.live_workers(Duration::from_secs(15)).await?.len();
     gauge!("sci_recon_workers").set(workers as f64);
     let (files, bytes) = app.store.blob_totals().await?;

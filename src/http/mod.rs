@@ -4,6 +4,7 @@
 //! problem+json (RFC 9457); [`error`] has the only table of status codes.
 
 mod access;
+mod admission;
 mod algorithms;
 mod app;
 mod blobs;
@@ -29,6 +30,7 @@ mod results;
 mod router;
 mod system;
 mod tiles;
+pub mod tus;
 mod upload;
 
 pub use app::App;

@@ -11,7 +11,7 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, pictures, quality, reports, results, system, tiles,
+    metrics, pictures, quality, reports, results, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -25,6 +25,8 @@ pub fn routes() -> Vec<Route> {
     vec![
         R::at("/v1/blobs").post(blobs::create).uploads(),
         R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).uploads(),
+        R::at("/v1/uploads").post(tus::create).options(tus::options).tus(),
+        R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
         R::at("/v1/calibrations/{calibration}").get(calibrations::show).delete(calibrations::delete),
         R::at("/v1/calibrations/{calibration}/report.json").get(reports::json),
@@ -136,6 +138,19 @@ impl Route {
         self.method("put", MethodFilter::PUT, handler)
     }
 
+    fn patch<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("patch", MethodFilter::PATCH, handler)
+    }
+
+    /// HEAD where there is no GET.
+    fn head<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("head", MethodFilter::HEAD, handler)
+    }
+
+    fn options<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
+        self.method("options", MethodFilter::OPTIONS, handler)
+    }
+
     fn delete<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
         self.method("delete", MethodFilter::DELETE, handler)
     }
@@ -151,6 +166,12 @@ impl Route {
     fn slow(mut self) -> Self {
         self.slow = true;
         self
+    }
+
+    /// As [`Self::uploads`], in the version of tus that we speak.
+    fn tus(mut self) -> Self {
+        self.handlers = self.handlers.route_layer(from_fn(tus::version));
+        self.uploads()
     }
 
     /// As [`Self::slow`], and with uploads' own limits instead of that of JSON bodies.
@@ -176,7 +197,8 @@ mod tests {
             for (key, _) in item.as_mapping().unwrap() {
                 let (path, key) = (path.as_str().unwrap(), key.as_str().unwrap());
                 // A route for GET also answers HEAD.
-                if key != "parameters" && key != "summary" && key != "head" {
+                let with_get = key == "head" && item.get("get").is_some();
+                if key != "parameters" && key != "summary" && !with_get {
                     documented.insert(format!("{key} {path}"));
                 }
             }

@@ -82,6 +82,10 @@ identifier!(
     TaskId
 );
 identifier!(
+    /// An upload that comes in pieces.
+    PartialId
+);
+identifier!(
     /// A token; not its secret.
     TokenId
 );

@@ -2,6 +2,7 @@
 
 mod access;
 mod captures;
+mod disk;
 mod finding;
 mod ids;
 mod memory;
@@ -16,7 +17,9 @@ mod text;
 pub use access::{Lab, Role, Secret};
 pub use captures::Captures;
 pub use finding::{Finding, Grade, Severity};
-pub use ids::{CalibrationId, InvalidId, JobId, MeasurementId, TaskId, TokenId, WorkerId};
+pub use ids::{
+    CalibrationId, InvalidId, JobId, MeasurementId, PartialId, TaskId, TokenId, WorkerId,
+};
 pub use reason::without_paths;
 pub use report::{CalibrationReport, CaptureReport, MaskReport, PatternReport};
 pub use request::{

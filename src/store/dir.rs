@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::error::StoreError;
-use crate::job::{JobId, Sha256};
+use crate::job::{JobId, PartialId, Sha256};
 
 /// The folder with all that the service keeps.
 ///
@@ -15,6 +15,7 @@ use crate::job::{JobId, Sha256};
 /// sci-recon.db          records
 /// blobs/ab/cdef...      files by the SHA-256 of their bytes
 /// results/JOB/          manifest.json and one folder for each snapshot
+/// partial/ID            uploads that come in pieces
 /// tmp/                  files that are being written, locked by their writers
 /// ```
 #[derive(Debug, Clone)]
@@ -27,7 +28,7 @@ impl DataDir {
     pub(crate) fn create(root: &Path) -> Result<Self, StoreError> {
         fs::create_dir_all(root).map_err(StoreError::io("make the folder", root))?;
         let root = root.canonicalize().map_err(StoreError::io("find", root))?;
-        for name in ["blobs", "results", "tmp"] {
+        for name in ["blobs", "results", "partial", "tmp"] {
             let path = root.join(name);
             fs::create_dir_all(&path).map_err(StoreError::io("make the folder", &path))?;
         }
@@ -70,6 +71,14 @@ impl DataDir {
     #[must_use]
     pub fn snapshot_results(&self, job: JobId, snapshot: u32) -> PathBuf {
         self.results(job).join(format!("snapshot_{snapshot:04}"))
+    }
+
+    pub(crate) fn partials(&self) -> PathBuf {
+        self.root.join("partial")
+    }
+
+    pub(crate) fn partial(&self, id: PartialId) -> PathBuf {
+        self.partials().join(id.to_string())
     }
 
     pub(crate) fn tmp(&self) -> PathBuf {

@@ -63,6 +63,22 @@ pub enum StoreError {
     /// The job still runs.
     #[error("the job is {0}; cancel it before it is deleted")]
     NotFinal(crate::job::JobState),
+    /// The bytes are not those that were named.
+    #[error("the hash should be {expected}, the bytes have {found}")]
+    HashMismatch {
+        /// What was named.
+        expected: crate::job::Sha256,
+        /// What came.
+        found: crate::job::Sha256,
+    },
+    /// No more jobs are taken before some have ended.
+    #[error("{jobs} jobs wait or run, and no more than {most} may")]
+    QueueFull {
+        /// Jobs that have not ended.
+        jobs: u64,
+        /// How many there may be.
+        most: u64,
+    },
     /// The key was used for another request.
     #[error("the Idempotency-Key {key:?} was used for another request, which made job {job}")]
     KeyReused {

@@ -7,30 +7,8 @@ use super::error::StoreError;
 use super::rows::{json, number, parsed};
 use super::{Page, Store, dir, on_files, tasks};
 use crate::job::{
-    CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, TaskKind, Timestamp,
+    CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, TaskKind, Timestamp,
 };
-
-/// A job to be accepted.
-#[derive(Debug, Clone)]
-pub struct NewJob {
-    /// Whose it is.
-    pub lab: Lab,
-    /// What is to be done.
-    pub spec: JobSpec,
-    /// The hash of the request as it was sent.
-    pub request: Sha256,
-    /// The user's key against double submission.
-    pub idempotency_key: Option<String>,
-}
-
-/// What became of a [`NewJob`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Inserted {
-    /// It was accepted.
-    New(JobId),
-    /// The same request with the same key was accepted before.
-    Before(JobId),
-}
 
 /// A job on record.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,46 +49,6 @@ pub struct JobFilter {
 }
 
 impl Store {
-    /// Accepts a job: the job and its tasks, or nothing.
-    ///
-    /// # Errors
-    /// [`StoreError::KeyReused`]; [`StoreError::NotFound`] if the measurement is gone.
-    pub async fn add_job(&self, new: NewJob) -> Result<Inserted, StoreError> {
-        let mut transaction = self.write().await?;
-        if let Some(key) = &new.idempotency_key
-            && let Some(job) = with_key(&mut transaction, &new.lab, key, new.request).await?
-        {
-            return Ok(Inserted::Before(job));
-        }
-        let id = JobId::new();
-        let spec = serde_json::to_string(&new.spec)
-            .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
-        sqlx::query(
-            "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-                 idempotency_key, request, created_at, lab)
-             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?)",
-        )
-        .bind(id.to_string())
-        .bind(new.spec.calibration.to_string())
-        .bind(new.spec.measurement.to_string())
-        .bind(new.spec.label.as_ref().map(Label::as_str))
-        .bind(spec)
-        .bind(new.spec.priority)
-        .bind(new.idempotency_key.as_ref().map(|key| key_of(&new.lab, key)))
-        .bind(new.request.to_string())
-        .bind(Timestamp::now().0)
-        .bind(new.lab.as_str())
-        .execute(&mut *transaction)
-        .await
-        .map_err(|error| {
-            let id = new.spec.measurement.to_string();
-            super::calibrations::gone_if_foreign_key(error, "measurement", id)
-        })?;
-        tasks::insert(&mut transaction, id, &new.spec).await?;
-        transaction.commit().await?;
-        Ok(Inserted::New(id))
-    }
-
     /// The lab's job with this identifier.
     ///
     /// # Errors
@@ -210,6 +148,11 @@ impl Store {
     /// [`StoreError::NotFound`]; [`StoreError::NotFinal`] if it still runs or waits.
     pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
         self.job(lab, id).await?;
+        self.remove_job(id).await
+    }
+
+    /// As [`Self::delete_job`], whosever it is.
+    pub(super) async fn remove_job(&self, id: JobId) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
         let state = state(&mut transaction, id).await?;
         if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
@@ -330,31 +273,6 @@ async fn snapshots(connection: &mut SqliteConnection, id: JobId) -> Result<Vec<u
     .fetch_all(connection)
     .await?;
     rows.iter().map(|row| number(row, "snapshot")).collect()
-}
-
-/// A key as it is stored: good for one job of a lab.
-fn key_of(lab: &Lab, key: &str) -> String {
-    format!("{lab} {key}")
-}
-
-/// The job that the lab made with this key; an error if its request was another one.
-async fn with_key(
-    connection: &mut SqliteConnection,
-    lab: &Lab,
-    key: &str,
-    request: Sha256,
-) -> Result<Option<JobId>, StoreError> {
-    let row = sqlx::query("SELECT id, request FROM jobs WHERE idempotency_key = ?")
-        .bind(key_of(lab, key))
-        .fetch_optional(connection)
-        .await?;
-    let Some(row) = row else { return Ok(None) };
-    let job = parsed(&row, "id")?;
-    if parsed::<Sha256>(&row, "request")? == request {
-        Ok(Some(job))
-    } else {
-        Err(StoreError::KeyReused { key: key.to_owned(), job })
-    }
 }
 
 fn job(row: &SqliteRow) -> Result<Job, StoreError> {

@@ -5,9 +5,12 @@
 //! processes work on the same content: the database is the one mutex of the service. No transaction
 //! is open while anything is computed or uploaded.
 
+mod acceptance;
+mod backup;
 mod blobs;
 mod calibrating;
 mod calibrations;
+mod cleaning;
 mod dir;
 mod error;
 mod forecast;
@@ -15,6 +18,7 @@ mod jobs;
 mod losses;
 mod marks;
 mod measurements;
+mod partials;
 mod progress;
 mod queue;
 mod reports;
@@ -31,21 +35,24 @@ mod workers;
 use std::path::Path;
 use std::time::Duration;
 
-use sqlx::SqlitePool;
 use sqlx::sqlite::{
     Sqlite, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
 };
+use sqlx::{Connection, SqlitePool};
 
+pub use acceptance::{Inserted, NewJob};
+pub use backup::Backup;
 pub use blobs::{Blob, Origin};
 pub use calibrating::{CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration};
 pub use calibrations::{Calibration, NewCalibration};
 pub use dir::DataDir;
 pub use error::StoreError;
-pub use jobs::{Inserted, Job, JobFilter, NewJob};
+pub use jobs::{Job, JobFilter};
 pub use losses::{MAX_FAILURES, MAX_LOSSES};
 pub use marks::JobMark;
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
-pub use progress::{JobProgress, ProgressStage, TaskCounts};
+pub use partials::{NewPartial, Partial, PartialFile};
+pub use progress::{JobProgress, ProgressStage, TaskCounts, TaskTotals};
 pub use queue::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use reports::Unready;
 pub use results::ResultFile;
@@ -99,6 +106,9 @@ impl Store {
             .max_connections(1)
             .idle_timeout(None)
             .max_lifetime(None)
+            // After some errors, such as a full disk, SQLite has rolled back by itself; sqlx then
+            // fails to roll back again and holds the transaction to be open for ever.
+            .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         // Two processes that start together must not both make the tables.
         let lock = dir.lock_blocking("migrate.lock").await?;

@@ -63,6 +63,21 @@ pub struct JobProgress {
     pub passes_done: u64,
 }
 
+/// What has been done in all by tasks of a kind, those of deleted jobs with them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TaskTotals {
+    /// The kind of task.
+    pub kind: String,
+    /// Tasks done.
+    pub tasks: u64,
+    /// Seconds of their successful attempts.
+    pub seconds: f64,
+    /// Solver iterations.
+    pub iterations: u64,
+    /// Passes of the deep denoiser.
+    pub passes: u64,
+}
+
 /// Numbers of tasks by kind and state.
 pub type TaskCounts = BTreeMap<(String, String), u64>;
 
@@ -111,6 +126,25 @@ impl Store {
                 progress(job, row, forecast.as_ref())
             })
             .collect()
+    }
+
+    /// What has been done in all, by kind of task.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn totals(&self) -> Result<Vec<TaskTotals>, StoreError> {
+        let rows =
+            sqlx::query("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await?;
+        let read = |row: &SqliteRow| {
+            Ok(TaskTotals {
+                kind: row.try_get("kind")?,
+                tasks: number(row, "tasks")?,
+                seconds: row.try_get("seconds")?,
+                iterations: number(row, "iterations")?,
+                passes: number(row, "passes")?,
+            })
+        };
+        rows.iter().map(read).collect()
     }
 
     /// The number of tasks by kind and state, with zeros for what there is none of.

@@ -105,8 +105,10 @@ impl Store {
         let now = Timestamp::now().0;
         // 1. Look without the lock: most of the time there is nothing to do.
         let work = sqlx::query(
-            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = 'ready' AND ready_at <= ?1)
-                OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running' AND lease_until < ?1)",
+            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = 'ready'
+                               AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + 60000)
+                OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
+                              AND lease_until NOT BETWEEN ?1 AND ?1 + 600000)",
         )
         .bind(now)
         .fetch_optional(&self.readers)
@@ -121,7 +123,10 @@ impl Store {
         let claimed = sqlx::query(
             "UPDATE tasks SET state = 'running', worker = ?1, lease_until = ?2, attempt = attempt + 1,
                  stage = 'reading', iterations = 0, passes = 0, fraction = 0, history = NULL
-             WHERE id = (SELECT id FROM tasks WHERE state = 'ready' AND ready_at <= ?3
+             WHERE id = (SELECT id FROM tasks WHERE state = 'ready'
+                             -- A pause is seconds: what lies further ahead was noted before the
+                             -- clock was set back.
+                             AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + 60000
                          ORDER BY priority DESC, job, ordinal LIMIT 1)
              RETURNING id, job, kind, snapshot, tile, attempt, cost",
         )
@@ -367,6 +372,15 @@ async fn finish(
     .bind(now)
     .bind(lease.task.to_string())
     .bind(lease.attempt)
+    .execute(&mut *connection)
+    .await?;
+    sqlx::query(
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes)
+             SELECT kind, 1, coalesce(seconds, 0), iterations, passes FROM tasks WHERE id = ?
+         ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
+             iterations = iterations + excluded.iterations, passes = passes + excluded.passes",
+    )
+    .bind(lease.task.to_string())
     .execute(&mut *connection)
     .await?;
     losses::end_attempt(connection, lease.task, "done", None).await

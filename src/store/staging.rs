@@ -69,6 +69,17 @@ impl Store {
         Ok(StagedPath(Temporary::new(path, lock)?))
     }
 
+    /// A second name for a file that is there, on its way into the store. Blocks on the disk.
+    ///
+    /// # Errors
+    /// If the file can't be linked.
+    pub(super) fn staged_link(&self, original: &Path) -> Result<StagedPath, StoreError> {
+        let path = self.temporary_path();
+        fs::hard_link(original, &path).map_err(StoreError::io("link", &path))?;
+        let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
+        Ok(StagedPath(Temporary::new(path, lock)?))
+    }
+
     /// A new empty folder for the results of a task. Blocks on the disk.
     ///
     /// # Errors

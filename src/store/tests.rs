@@ -106,6 +106,7 @@ impl Lab {
         };
         let spec = job.resolve(measurement.calibration, shape).unwrap();
         let new = NewJob {
+            most_jobs: 1000,
             lab: crate::job::Lab::local(),
             spec,
             request: Sha256::of(request),

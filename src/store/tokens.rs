@@ -68,7 +68,9 @@ impl Store {
     pub async fn tokens(&self) -> Result<Vec<(Token, u64)>, StoreError> {
         let rows = sqlx::query(
             "SELECT *, (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                        WHERE token = tokens.id) AS bytes
+                        WHERE token = tokens.id)
+                    + (SELECT coalesce(sum(length), 0) FROM partials
+                       WHERE token = tokens.id AND result IS NULL) AS bytes
              FROM tokens ORDER BY id",
         )
         .fetch_all(&self.readers)
@@ -103,14 +105,16 @@ impl Store {
         Ok(row.is_none())
     }
 
-    /// Bytes of uploads that a token keeps here.
+    /// Bytes of uploads that a token keeps here, or has begun.
     ///
     /// # Errors
     /// If the database fails.
     pub async fn token_bytes(&self, id: TokenId) -> Result<u64, StoreError> {
         let row = sqlx::query(
-            "SELECT coalesce(sum(size), 0) AS bytes FROM holdings JOIN blobs USING (sha256)
-             WHERE token = ?",
+            "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
+                     WHERE token = ?1)
+                  + (SELECT coalesce(sum(length), 0) FROM partials
+                     WHERE token = ?1 AND result IS NULL) AS bytes",
         )
         .bind(id.to_string())
         .fetch_one(&self.readers)

@@ -1,14 +1,16 @@
 //! The first task of a job: the white level that all its tiles share.
 
+use std::path::Path;
+
 use serde::{Deserialize, Serialize};
 
 use super::solve::typical_white;
 use super::task::{Shared, TaskError};
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
-use crate::job::{TaskProgress, TaskStage};
+use crate::job::{Sha256, TaskProgress, TaskStage};
 use crate::recon::scale::ScaleEstimator;
-use crate::store::{ClaimedTask, Completion, Product};
+use crate::store::{ClaimedTask, Completion, Product, hash_file};
 
 /// What the other tasks of the job learn from this one.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
@@ -29,6 +31,9 @@ impl Prepared {
 
 /// Estimates the white level; memory holds a few planes, whatever the number of frames.
 pub(super) fn run(task: &ClaimedTask, shared: &Shared) -> Result<Completion, TaskError> {
+    check("masks", &task.masks, task.calibration.prepared)?;
+    check("snapshots", &task.snapshots, task.measurement.prepared)?;
+    shared.check()?;
     let limits = Limits::default();
     let masks = Reader::open(&task.masks, &limits)?;
     let snapshots = Reader::open(&task.snapshots, &limits)?;
@@ -49,6 +54,14 @@ pub(super) fn run(task: &ClaimedTask, shared: &Shared) -> Result<Completion, Tas
     let prepared = Prepared { white: typical_white(whites).ok_or_else(none)? };
     let progress = TaskProgress { stage: TaskStage::Reading, fraction: 1.0, ..shared.progress() };
     Ok(Completion { progress, record: to_record(&prepared)?, product: Product::Record })
+}
+
+/// Refuses an array whose bytes are not those that were stored, once a job.
+fn check(what: &'static str, path: &Path, sha256: Sha256) -> Result<(), TaskError> {
+    if path.exists() && hash_file(path)? == sha256 {
+        return Ok(());
+    }
+    Err(TaskError::Corrupt { what, sha256 })
 }
 
 /// One frame \[H,W\] of a prepared array.

@@ -9,7 +9,7 @@ use super::network::{NetworkError, WarmNetworks};
 use super::result::ResultError;
 use super::{assemble, finish, prepare, tile};
 use crate::formats::FormatError;
-use crate::job::{InvalidField, TaskKind, TaskProgress};
+use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
 use crate::recon::ReconError;
 use crate::recon::gap::Progress;
 use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};
@@ -102,6 +102,17 @@ pub(super) enum TaskError {
     /// Stored tiles are not what was stored.
     #[error("the stored results of tiles {0:?} are damaged")]
     Damaged(Vec<u32>),
+    /// A prepared array is not what was stored.
+    #[error(
+        "the stored {what} (blob {sha256}) are damaged: send the files again, and make the \
+         calibration and the measurement anew"
+    )]
+    Corrupt {
+        /// Masks or snapshots.
+        what: &'static str,
+        /// The hash that it should have.
+        sha256: Sha256,
+    },
     /// A snapshot without light.
     #[error("snapshot {snapshot}: {source}")]
     Snapshot {
@@ -126,7 +137,7 @@ impl TaskError {
         match self {
             Self::Recon(error) => matches!(error, ReconError::Runtime(_)),
             Self::Format(error) => !error.is_callers_fault(),
-            Self::Snapshot { .. } | Self::Record { .. } => false,
+            Self::Snapshot { .. } | Self::Record { .. } | Self::Corrupt { .. } => false,
             _ => true,
         }
     }

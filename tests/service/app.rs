@@ -12,7 +12,8 @@ use crate::samples;
 
 /// A running service; it is killed when this is dropped.
 pub struct TestApp {
-    folder: TempDir,
+    _folder: TempDir,
+    data: std::path::PathBuf,
     process: Child,
     url: String,
     client: Client,
@@ -75,20 +76,59 @@ impl TestApp {
     /// A service with one worker that writes all there is to say to this file.
     pub async fn logging(log: &Path) -> Self {
         let log = std::fs::File::create(log).unwrap();
-        Self::spawned(&["--workers", "1"], "trace", log.into()).await
+        let folder = tempfile::tempdir().unwrap();
+        let environment = [("RUST_LOG", "trace")];
+        let begun = spawn(folder.path(), &owned(&["--workers", "1"]), &environment, log.into());
+        Self::begun(folder, "", &["--workers", "1"], begun.expect("the server starts"))
     }
 
     pub async fn with(arguments: &[&str]) -> Self {
-        let level = std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into());
-        Self::spawned(arguments, &level, Stdio::inherit()).await
+        Self::in_environment(arguments, &[]).await
     }
 
-    async fn spawned(arguments: &[&str], level: &str, log: Stdio) -> Self {
+    /// With these variables in its environment; a restart is without them.
+    pub async fn in_environment(arguments: &[&str], environment: &[(&str, &str)]) -> Self {
+        Self::try_in_environment(arguments, environment).await.expect("the server starts")
+    }
+
+    /// None if the server does not start.
+    pub async fn try_in_environment(
+        arguments: &[&str],
+        environment: &[(&str, &str)],
+    ) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
-        let arguments: Vec<String> = arguments.iter().map(|&text| text.to_owned()).collect();
-        let (process, url) = spawn(folder.path(), &arguments, level, log);
-        let token = std::sync::RwLock::default();
-        Self { folder, process, url, client: Client::new(), arguments, token }
+        let begun = spawn(folder.path(), &owned(arguments), environment, Stdio::inherit())?;
+        Some(Self::begun(folder, "", arguments, begun))
+    }
+
+    /// A service on data that are there, in a subfolder.
+    pub async fn on(folder: TempDir, subfolder: &str, arguments: &[&str]) -> Self {
+        let data = folder.path().join(subfolder);
+        let begun = spawn(&data, &owned(arguments), &[], Stdio::inherit());
+        Self::begun(folder, subfolder, arguments, begun.expect("the server starts"))
+    }
+
+    fn begun(
+        folder: TempDir,
+        subfolder: &str,
+        arguments: &[&str],
+        (process, url): (Child, String),
+    ) -> Self {
+        let data = folder.path().join(subfolder);
+        let (arguments, token) = (owned(arguments), std::sync::RwLock::default());
+        Self { _folder: folder, data, process, url, client: Client::new(), arguments, token }
+    }
+
+    /// The same data, served with other arguments.
+    pub async fn again(mut self, arguments: &[&str]) -> Self {
+        self.arguments = owned(arguments);
+        self.restart();
+        self
+    }
+
+    /// True if the server's process has not ended.
+    pub fn lives(&mut self) -> bool {
+        self.process.try_wait().unwrap().is_none()
     }
 
     /// Kills the server as a power cut would, and starts another one on the same folder.
@@ -100,14 +140,14 @@ impl TestApp {
     /// Kills the server as a power cut would, and starts another one on the same folder.
     pub fn restart(&mut self) {
         self.kill();
-        let level = std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into());
-        (self.process, self.url) =
-            spawn(self.folder.path(), &self.arguments, &level, Stdio::inherit());
+        let begun = spawn(&self.data, &self.arguments, &[], Stdio::inherit());
+        (self.process, self.url) = begun.expect("the server starts");
     }
 
     /// SIGKILL.
     pub fn kill(&mut self) {
-        self.process.kill().unwrap();
+        // It may be dead already.
+        let _ = self.process.kill();
         self.process.wait().unwrap();
     }
 
@@ -119,7 +159,7 @@ impl TestApp {
     }
 
     pub fn data(&self) -> &Path {
-        self.folder.path()
+        &self.data
     }
 
     pub fn pid(&self) -> u32 {
@@ -210,12 +250,23 @@ impl Drop for TestApp {
     }
 }
 
-fn spawn(data: &Path, arguments: &[String], level: &str, log: Stdio) -> (Child, String) {
+fn owned(arguments: &[&str]) -> Vec<String> {
+    arguments.iter().map(|&text| text.to_owned()).collect()
+}
+
+/// The server and its address; none if it ends before it says one.
+fn spawn(
+    data: &Path,
+    arguments: &[String],
+    environment: &[(&str, &str)],
+    log: Stdio,
+) -> Option<(Child, String)> {
     let mut process = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
         .args(["serve", "--listen", "127.0.0.1:0", "--min-free-bytes", "1000000", "--data"])
         .arg(data)
         .args(arguments)
-        .env("RUST_LOG", level)
+        .env("RUST_LOG", std::env::var("RUST_LOG").unwrap_or_else(|_| "error".into()))
+        .envs(environment.iter().copied())
         .stderr(log)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -223,8 +274,11 @@ fn spawn(data: &Path, arguments: &[String], level: &str, log: Stdio) -> (Child, 
         .unwrap();
     let mut line = String::new();
     BufReader::new(process.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let announced: Value = serde_json::from_str(&line).expect("the server starts");
-    (process, announced["url"].as_str().unwrap().to_owned())
+    let Ok(announced) = serde_json::from_str::<Value>(&line) else {
+        process.wait().unwrap();
+        return None;
+    };
+    Some((process, announced["url"].as_str().unwrap().to_owned()))
 }
 
 impl TestApp {

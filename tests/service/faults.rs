@@ -1,4 +1,4 @@
-//! Issue 2: killing worker and server at ten random moments of a job changes nothing in the result.
+//! Killing workers and servers at random moments loses no job and changes no result.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -22,7 +22,7 @@ fn job(measurement: &str) -> Value {
 }
 
 /// The hashes of all result files but the manifests, which tell times and attempts.
-async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
+pub async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
     let mut hashes = BTreeMap::new();
     for snapshot in 0..Scene::SMALL.snapshots {
         let listed =
@@ -62,9 +62,14 @@ impl TestApp {
     }
 }
 
+/// How often to kill: `make faults` says 200.
+fn kills() -> u32 {
+    std::env::var("SCI_RECON_KILLS").map_or(10, |text| text.parse().unwrap())
+}
+
 #[tokio::test]
-async fn kills_at_ten_random_moments_change_nothing_in_the_result() {
-    const KILLS: u32 = 10;
+async fn kills_at_random_moments_change_nothing_in_any_result() {
+    let kills = kills();
     let mut app = TestApp::with(&["--workers", "2"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let undisturbed = app.submit(&job(&measurement)).await;
@@ -75,32 +80,89 @@ async fn kills_at_ten_random_moments_change_nothing_in_the_result() {
     let seed: u64 = rand::random();
     eprintln!("seed of the kills: {seed}");
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    let disturbed = app.submit(&job(&measurement)).await;
-    let mut while_running = 0;
-    for kill in 0..KILLS {
-        tokio::time::sleep(Duration::from_millis(random.random_range(50..900))).await;
-        let state = app.get(&format!("/v1/jobs/{disturbed}")).await.json()["state"].clone();
-        while_running += u32::from(state == "running" || state == "queued");
+    let mut jobs = vec![app.submit(&job(&measurement)).await];
+    let (mut servers, mut while_running) = (0, 0);
+    for kill in 0..kills {
+        tokio::time::sleep(Duration::from_millis(random.random_range(20..900))).await;
+        let last = jobs.last().unwrap();
+        let state = app.get(&format!("/v1/jobs/{last}")).await.json()["state"].clone();
+        if state == "running" || state == "queued" {
+            while_running += 1;
+        } else {
+            jobs.push(app.submit(&job(&measurement)).await);
+        }
         if kill % 2 == 0 {
             app.kill_worker(random.random_range(0..2));
         } else {
+            servers += 1;
             app.restart();
         }
     }
-    let done = app.ended(&disturbed).await;
-    assert_eq!(done["state"], "succeeded", "{done:#}");
-    eprintln!("{while_running} of {KILLS} kills fell into the job");
-    assert!(while_running >= 5, "{while_running} kills fell into the job; it is too short");
-    assert_eq!(results(&app, &disturbed).await, expected);
-    for snapshot in 0..2 {
-        let path = format!("/v1/jobs/{disturbed}/snapshots/{snapshot}/frames.npy");
+    let (mut lost, mut wrong) = (0, 0);
+    for job in &jobs {
+        let done = app.ended(job).await;
+        if done["state"] != "succeeded" {
+            eprintln!("{done:#}");
+            lost += 1;
+        } else if results(&app, job).await != expected || !downloads(&app, job, &expected).await {
+            wrong += 1;
+        }
+    }
+    let orphans = orphans(&mut app).await;
+    let jobs = jobs.len();
+    let ok = lost + wrong + orphans == 0 && while_running >= kills / 2;
+    println!(
+        "{}",
+        json!({"target": "faults", "ok": ok, "kills": kills, "of_servers": servers,
+               "while_a_job_ran": while_running, "jobs": jobs, "lost_jobs": lost,
+               "wrong_results": wrong, "orphans": orphans, "seed": seed})
+    );
+    assert!(ok);
+}
+
+/// True if the bytes that are downloaded are those on record.
+async fn downloads(app: &TestApp, job: &str, expected: &BTreeMap<String, String>) -> bool {
+    for snapshot in 0..Scene::SMALL.snapshots {
+        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy");
         let bytes = app.get(&path).await.expect(200).bytes;
-        let hash = sha256(&bytes);
-        assert_eq!(
-            hash,
-            expected[&format!("{snapshot}/frames.npy")],
-            "the bytes are those on record"
-        );
+        if sha256(&bytes) != expected[&format!("{snapshot}/frames.npy")] {
+            return false;
+        }
+    }
+    true
+}
+
+/// Files that nothing knows of, after the cleaning at the start of a server: temporary ones, blobs
+/// beyond the number on record, results without a job.
+pub async fn orphans(app: &mut TestApp) -> usize {
+    // What is younger than ten seconds may still be somebody's, so the sweep lets it be.
+    tokio::time::sleep(Duration::from_secs(11)).await;
+    app.restart();
+    let app = &*app;
+    let count = |folder: &str| {
+        let mut folders = vec![app.data().join(folder)];
+        let mut files = 0usize;
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() { folders.push(path) } else { files += 1 }
+            }
+        }
+        files
+    };
+    let start = std::time::Instant::now();
+    loop {
+        let text = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
+        let line = text.lines().find_map(|line| line.strip_prefix("sci_recon_blobs ")).unwrap();
+        let known: usize = line.parse().unwrap();
+        let jobs = app.get("/v1/jobs?limit=200").await.json()["items"].as_array().unwrap().len();
+        let results = std::fs::read_dir(app.data().join("results")).unwrap().count();
+        let results = results.saturating_sub(jobs);
+        let left = count("blobs").abs_diff(known) + results + count("partial") + count("tmp");
+        if left == 0 || start.elapsed().as_secs() > 10 {
+            return left;
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
     }
 }
 

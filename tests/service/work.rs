@@ -91,3 +91,26 @@ async fn a_missing_runtime_fails_the_job_with_its_reason() {
     let error = ended["error"].as_str().unwrap();
     assert!(error.contains("libonnxruntime") && error.contains("scripts/fetch"), "{error}");
 }
+
+/// The linter of Prometheus itself, where it is installed (Debian: `prometheus`).
+#[tokio::test]
+async fn figures_please_the_linter_of_prometheus() {
+    use std::io::Write;
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    assert_eq!(app.ended(&app.submit(&tv(&measurement)).await).await["state"], "succeeded");
+    let text = app.get("/metrics").await.expect(200).bytes;
+    let lines = String::from_utf8(text.clone()).unwrap();
+    for name in ["sci_recon_tasks_done_total{kind=\"tile\"}", "sci_recon_solver_iterations_total"] {
+        let line = lines.lines().find(|line| line.starts_with(name)).unwrap();
+        assert!(line.rsplit(' ').next().unwrap().parse::<u64>().unwrap() > 0, "{line}");
+    }
+    let mut linter = std::process::Command::new("promtool");
+    linter.args(["check", "metrics"]).stdin(std::process::Stdio::piped());
+    let Ok(mut linter) = linter.spawn() else {
+        eprintln!("SKIPPED: there is no promtool");
+        return;
+    };
+    linter.stdin.take().unwrap().write_all(&text).unwrap();
+    assert!(linter.wait().unwrap().success());
+}

@@ -1,0 +1,31 @@
+//! Bytes as a file, for decoders that want a path.
+
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use sci_recon::formats::{FrameReader, Limits};
+
+/// In memory where there is such a folder: a file a run.
+static PLACE: LazyLock<PathBuf> = LazyLock::new(|| {
+    let folder = Path::new("/dev/shm");
+    let folder = if folder.is_dir() { folder.to_owned() } else { std::env::temp_dir() };
+    folder.join(format!("sci-recon-fuzz-{}", std::process::id()))
+});
+
+/// Small, so that memory which follows a header's claim instead of the limits shows.
+pub const LIMITS: Limits =
+    Limits { max_file_bytes: 1 << 20, max_frames: 64, max_side: 512, max_voxels: 1 << 20 };
+
+pub fn with_file(bytes: &[u8], run: impl FnOnce(&Path)) {
+    std::fs::write(&*PLACE, bytes).expect("the fuzzer can write");
+    run(&PLACE);
+}
+
+/// Reads all frames, as a check of an upload does.
+pub fn drain(reader: &mut dyn FrameReader) {
+    let info = *reader.info();
+    assert!(info.frames <= LIMITS.max_frames && info.voxels() <= LIMITS.max_voxels);
+    while let Ok(Some(frame)) = reader.next_frame() {
+        assert_eq!(frame.dim(), (info.height, info.width));
+    }
+}

@@ -1,0 +1,14 @@
+#![no_main]
+
+mod file;
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    // The first bytes choose the decoder; here it is always this one.
+    let magic = b"\x89PNG\r\n\x1a\n".as_slice();
+    let whole = if bytes.starts_with(magic) { bytes.to_vec() } else { [magic, bytes].concat() };
+    file::with_file(&whole, |path| {
+        if let Ok(mut reader) = sci_recon::formats::open_stack(path, &file::LIMITS) {
+            file::drain(&mut *reader);
+        }
+    });
+});

@@ -1,0 +1,222 @@
+//! `/v1/uploads`: uploads in pieces, by tus 1.0 (core, creation, checksum, expiration, termination).
+//! `docs/uploads.md` says why this is a module of our own.
+
+mod append;
+pub mod headers;
+
+use std::time::{Duration, UNIX_EPOCH};
+
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+
+use super::access::Access;
+use super::admission;
+use super::app::App;
+use super::error::{ApiError, Code};
+use super::extract::Params;
+use crate::job::{PartialId, Sha256};
+use crate::store::{NewPartial, Partial, StoreError};
+
+const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
+const LENGTH: HeaderName = HeaderName::from_static("upload-length");
+const OFFSET: HeaderName = HeaderName::from_static("upload-offset");
+const METADATA: HeaderName = HeaderName::from_static("upload-metadata");
+const CHECKSUM: HeaderName = HeaderName::from_static("upload-checksum");
+const EXPIRES: HeaderName = HeaderName::from_static("upload-expires");
+const VERSION: HeaderValue = HeaderValue::from_static("1.0.0");
+
+/// Speaks version 1.0.0 alone, and says so in every answer.
+pub(super) async fn version(request: Request, next: Next) -> Response {
+    let spoken = request.headers().get(&RESUMABLE);
+    let mut response = if spoken == Some(&VERSION) || request.method() == Method::OPTIONS {
+        next.run(request).await
+    } else {
+        let detail = "the header Tus-Resumable must be 1.0.0";
+        ApiError::new(Code::TusVersion, detail)
+            .with_header(HeaderName::from_static("tus-version"), VERSION)
+            .into_response()
+    };
+    response.headers_mut().insert(RESUMABLE, VERSION);
+    response
+}
+
+/// `OPTIONS /v1/uploads`: what this service can do.
+pub(super) async fn options(State(app): State<App>) -> Response {
+    let fields = [
+        ("tus-version", "1.0.0".to_owned()),
+        ("tus-extension", "creation,checksum,expiration,termination".to_owned()),
+        ("tus-checksum-algorithm", headers::ALGORITHMS.to_owned()),
+        ("tus-max-size", app.max_upload_bytes.to_string()),
+    ];
+    (StatusCode::NO_CONTENT, fields).into_response()
+}
+
+/// `POST /v1/uploads`: begins an upload.
+pub(super) async fn create(
+    State(app): State<App>,
+    access: Access,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let length = number(&headers, &LENGTH)?;
+    if length == 0 {
+        return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
+    }
+    let metadata = text(&headers, &METADATA)?.unwrap_or_default();
+    let expected = expected(metadata).map_err(malformed)?;
+    admission::check_length(&app, &access, length).await?;
+    admission::check_room(&app, "the upload", length).await?;
+    let Access { lab, token, .. } = access;
+    let facts = NewPartial { lab, token, length, metadata: metadata.to_owned(), expected };
+    let upload = app.store.begin_partial(facts, app.upload_age).await?;
+    let location = [(header::LOCATION, format!("/v1/uploads/{}", upload.id))];
+    Ok((StatusCode::CREATED, location, state(&upload)).into_response())
+}
+
+/// The hash of the whole file, if the metadata name it.
+fn expected(metadata: &str) -> Result<Option<Sha256>, String> {
+    let pairs = headers::metadata(metadata)?;
+    let Some((_, value)) = pairs.into_iter().find(|(name, _)| *name == "sha256") else {
+        return Ok(None);
+    };
+    let text = String::from_utf8(value).map_err(|_| "the metadata's sha256 is no text")?;
+    text.parse().map(Some).map_err(|error: crate::job::InvalidText| error.to_string())
+}
+
+/// `HEAD /v1/uploads/{upload}`: how far it is.
+pub(super) async fn show(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<PartialId>,
+) -> Result<Response, ApiError> {
+    let mut upload = app.store.partial(&access.lab, id).await?;
+    if upload.received == upload.facts.length && upload.result.is_none() {
+        // The last piece came, but not the end of its request.
+        finish(&app, &mut upload).await?;
+    }
+    let length = upload.facts.length.to_string();
+    let about = [(LENGTH, length), (METADATA, upload.facts.metadata.clone())];
+    let about = about.into_iter().filter(|(_, value)| !value.is_empty());
+    let cache = [(header::CACHE_CONTROL, "no-store")];
+    Ok((cache, state(&upload), axum::response::AppendHeaders(about.collect::<Vec<_>>()))
+        .into_response())
+}
+
+/// `PATCH /v1/uploads/{upload}`: the next piece.
+pub(super) async fn patch(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<PartialId>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    let permit = super::upload::place(&app)?;
+    let upload = app.store.partial(&access.lab, id).await?;
+    // A task of its own: what has come is recorded also when the connection, and with it this
+    // request, is gone.
+    let piece = tokio::spawn(async move {
+        let _permit = permit;
+        piece(&app, upload, &headers, body).await
+    });
+    let upload = piece.await.map_err(|error| ApiError::internal(&error))??;
+    Ok((StatusCode::NO_CONTENT, state(&upload)).into_response())
+}
+
+async fn piece(
+    app: &App,
+    mut upload: Partial,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<Partial, ApiError> {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok());
+    if kind != Some("application/offset+octet-stream") {
+        let detail = "a piece must be sent as Content-Type: application/offset+octet-stream";
+        return Err(ApiError::new(Code::UnsupportedMediaType, detail));
+    }
+    let offset = number(headers, &OFFSET)?;
+    let checksum = text(headers, &CHECKSUM)?.map(headers::Checksum::parse).transpose();
+    let checksum = checksum.map_err(malformed)?;
+    if offset != upload.received {
+        let detail = format!("{} bytes are here; the piece begins at {offset}", upload.received);
+        return Err(ApiError::new(Code::OffsetMismatch, detail));
+    }
+    if upload.result.is_some() {
+        return Ok(upload);
+    }
+    let file = app.store.open_partial(&upload).await?.ok_or_else(busy)?;
+    append::append(app, &mut upload, file, checksum, body).await?;
+    if upload.received == upload.facts.length {
+        finish(app, &mut upload).await?;
+    }
+    Ok(upload)
+}
+
+/// Stores a file of which all is there.
+async fn finish(app: &App, upload: &mut Partial) -> Result<(), ApiError> {
+    // One at a time: of two requests that see the last piece, the second finds the first one's work.
+    let _turn = app.finishing.lock().await;
+    *upload = app.store.partial(&upload.facts.lab, upload.id).await?;
+    if upload.result.is_none() {
+        app.store.finish_partial(upload).await?;
+    }
+    Ok(())
+}
+
+/// `DELETE /v1/uploads/{upload}`: ends it; what has come goes.
+pub(super) async fn delete(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<PartialId>,
+) -> Result<StatusCode, ApiError> {
+    let upload = app.store.partial(&access.lab, id).await?;
+    if upload.result.is_none() {
+        match app.store.open_partial(&upload).await {
+            Ok(None) => return Err(busy()),
+            Ok(Some(_)) | Err(StoreError::NotFound { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
+    app.store.end_partial(id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// How far the upload is, until when it is kept, and, once it is stored, as what.
+fn state(upload: &Partial) -> HeaderMap {
+    let expires = u64::try_from(upload.expires_at.0).unwrap_or_default();
+    let expires = UNIX_EPOCH + Duration::from_millis(expires);
+    let mut fields = HeaderMap::new();
+    fields.insert(OFFSET, upload.received.into());
+    if let Ok(expires) = HeaderValue::try_from(httpdate::fmt_http_date(expires)) {
+        fields.insert(EXPIRES, expires);
+    }
+    if let Some(Ok(place)) =
+        upload.result.map(|sha256| HeaderValue::try_from(format!("/v1/blobs/{sha256}")))
+    {
+        fields.insert(header::CONTENT_LOCATION, place);
+    }
+    fields
+}
+
+fn text<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Result<Option<&'a str>, ApiError> {
+    let value = headers.get(name).map(HeaderValue::to_str).transpose();
+    value.map_err(|_| malformed(format!("{name} is not printable ASCII")))
+}
+
+fn number(headers: &HeaderMap, name: &HeaderName) -> Result<u64, ApiError> {
+    let digits = |text: &&str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let number = text(headers, name)?.filter(digits).and_then(|text| text.parse().ok());
+    // SQLite keeps signed numbers.
+    number
+        .filter(|number| i64::try_from(*number).is_ok())
+        .ok_or_else(|| malformed(format!("the header {name} must be a number of bytes")))
+}
+
+fn malformed(detail: String) -> ApiError {
+    ApiError::new(Code::MalformedRequest, detail)
+}
+
+fn busy() -> ApiError {
+    ApiError::new(Code::UploadBusy, "another request is writing to this upload")
+}

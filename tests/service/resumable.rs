@@ -1,0 +1,274 @@
+//! Uploads in pieces: the protocol by hand, and a client by others over connections that are cut.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use reqwest::{Method, RequestBuilder};
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+
+use crate::app::{Answer, TestApp};
+
+const ABC: &str = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+const ABC_BASE64: &str =
+    "YmE3ODE2YmY4ZjAxY2ZlYTQxNDE0MGRlNWRhZTIyMjNiMDAzNjFhMzk2MTc3YTljYjQxMGZmNjFmMjAwMTVhZA==";
+
+fn tus(app: &TestApp, method: Method, path: &str) -> RequestBuilder {
+    app.request(method, path).header("tus-resumable", "1.0.0")
+}
+
+async fn begin(app: &TestApp, length: usize, metadata: &str) -> String {
+    let request = tus(app, Method::POST, "/v1/uploads").header("upload-length", length);
+    let answer = app.send(request.header("upload-metadata", metadata)).await.expect(201);
+    assert_eq!(answer.header("upload-offset"), "0");
+    assert!(answer.header("upload-expires").ends_with(" GMT"));
+    answer.header("location").to_owned()
+}
+
+fn piece(app: &TestApp, path: &str, offset: usize, bytes: &'static [u8]) -> RequestBuilder {
+    tus(app, Method::PATCH, path)
+        .header("upload-offset", offset)
+        .header("content-type", "application/offset+octet-stream")
+        .body(bytes)
+}
+
+async fn offset(app: &TestApp, path: &str) -> String {
+    let answer = app.send(tus(app, Method::HEAD, path)).await.expect(200);
+    assert_eq!(answer.header("cache-control"), "no-store");
+    assert_eq!(answer.header("tus-resumable"), "1.0.0");
+    answer.header("upload-offset").to_owned()
+}
+
+#[tokio::test]
+async fn pieces_become_a_blob() {
+    let mut app = TestApp::start().await;
+    let options = app.send(app.request(Method::OPTIONS, "/v1/uploads")).await.expect(204);
+    assert_eq!(options.header("tus-version"), "1.0.0");
+    assert_eq!(options.header("tus-extension"), "creation,checksum,expiration,termination");
+    assert_eq!(options.header("tus-checksum-algorithm"), "sha1,sha256");
+    let path = begin(&app, 3, &format!("filename YQ==,sha256 {ABC_BASE64}")).await;
+    assert_eq!(
+        app.send(piece(&app, &path, 0, b"a")).await.expect(204).header("upload-offset"),
+        "1"
+    );
+    app.restart();
+    assert_eq!(offset(&app, &path).await, "1");
+    app.send(piece(&app, &path, 0, b"a")).await.problem(409, "offset_mismatch");
+    app.send(piece(&app, &path, 1, b"bcd")).await.problem(413, "too_large");
+    let last = app.send(piece(&app, &path, 1, b"bc")).await.expect(204);
+    assert_eq!(last.header("content-location"), format!("/v1/blobs/{ABC}"));
+    let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
+    assert_eq!(known.header("upload-length"), "3");
+    assert!(known.header("upload-metadata").starts_with("filename YQ==,"));
+    assert_eq!(known.header("content-location"), format!("/v1/blobs/{ABC}"));
+    assert_eq!(app.get(&format!("/v1/blobs/{ABC}")).await.expect(200).json()["size"], 3);
+    // The same file is stored once, and ending the upload does not touch it.
+    app.send(tus(&app, Method::DELETE, &path)).await.expect(204);
+    app.send(tus(&app, Method::HEAD, &path)).await.expect(404);
+    app.get(&format!("/v1/blobs/{ABC}")).await.expect(200);
+    assert_eq!(std::fs::read_dir(app.data().join("partial")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn damaged_pieces_and_files_do_not_count() {
+    let app = TestApp::start().await;
+    let path = begin(&app, 3, &format!("sha256 {ABC_BASE64}")).await;
+    let sum = |request: RequestBuilder, sum: &str| request.header("upload-checksum", sum);
+    // SHA-1 of "abc".
+    let good = "sha1 qZk+NkcGgWq6PiVxeFDCbJzQ2J0=";
+    app.send(sum(piece(&app, &path, 0, b"abd"), good)).await.problem(460, "checksum_mismatch");
+    assert_eq!(offset(&app, &path).await, "0");
+    app.send(sum(piece(&app, &path, 0, b"abc"), "md5 x")).await.problem(400, "malformed_request");
+    app.send(sum(piece(&app, &path, 0, b"abc"), good)).await.expect(204);
+    // The whole file against the hash that was named at the start.
+    let path = begin(&app, 3, &format!("sha256 {ABC_BASE64}")).await;
+    let wrong = app.send(piece(&app, &path, 0, b"abd")).await;
+    assert!(wrong.problem(422, "hash_mismatch").contains(ABC));
+    app.send(tus(&app, Method::HEAD, &path)).await.expect(404);
+}
+
+#[tokio::test]
+async fn requests_that_are_no_tus_are_refused() {
+    let app = TestApp::start().await;
+    let plain = app.request(Method::POST, "/v1/uploads").header("upload-length", 3);
+    let answer = app.send(plain).await;
+    answer.problem(412, "tus_version");
+    assert_eq!(answer.header("tus-version"), "1.0.0");
+    for (name, value) in [
+        ("upload-length", "-1"),
+        ("upload-length", "1e3"),
+        ("upload-length", "99999999999999999999"),
+        ("upload-length", "0"),
+        ("upload-defer-length", "1"),
+    ] {
+        let request = tus(&app, Method::POST, "/v1/uploads").header(name, value);
+        assert_eq!(app.send(request).await.status, 400, "{name}: {value}");
+    }
+    for metadata in ["a ***", "sha256 YWJj", "a YQ==,a YQ=="] {
+        let request = tus(&app, Method::POST, "/v1/uploads").header("upload-length", 3);
+        let answer = app.send(request.header("upload-metadata", metadata)).await;
+        answer.problem(400, "malformed_request");
+    }
+    let path = begin(&app, 3, "").await;
+    let typed = tus(&app, Method::PATCH, &path).header("upload-offset", 0).body("abc");
+    app.send(typed).await.problem(415, "unsupported_media_type");
+    let large = tus(&app, Method::POST, "/v1/uploads").header("upload-length", 1u64 << 40);
+    app.send(large).await.problem(413, "too_large");
+}
+
+#[tokio::test]
+async fn an_upload_is_its_labs_alone() {
+    let app = TestApp::start().await;
+    let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
+    app.sign_in(&a);
+    let path = begin(&app, 3, "").await;
+    app.sign_in(&b);
+    app.send(tus(&app, Method::HEAD, &path)).await.expect(404);
+    app.send(piece(&app, &path, 0, b"abc")).await.problem(404, "not_found");
+    app.send(tus(&app, Method::DELETE, &path)).await.problem(404, "not_found");
+    app.sign_in(&a);
+    assert_eq!(offset(&app, &path).await, "0");
+}
+
+#[tokio::test]
+async fn the_disk_is_promised_once_and_the_queue_has_an_end() {
+    let app = TestApp::with(&["--workers", "0", "--max-jobs", "2"]).await;
+    let free = rustix::fs::statvfs(app.data()).unwrap();
+    let free = free.f_bavail * free.f_frsize;
+    // Each is allowed by itself (uploads have at most 8 GiB), but together they are too many.
+    let (mut promised, mut refused) = (0, None);
+    let length = 8u64 << 30;
+    for _ in 0..free / length + 1 {
+        let request = tus(&app, Method::POST, "/v1/uploads").header("upload-length", length);
+        let answer = app.send(request).await;
+        if answer.status != 201 {
+            refused = Some(answer);
+            break;
+        }
+        promised += length;
+    }
+    let detail = refused.expect("the disk has an end").problem(507, "insufficient_storage");
+    assert!(detail.contains(&promised.to_string()), "{detail}");
+    // The queue: full is no fault, and a job that was accepted is found again by its key.
+    let list = app.data().join("partial");
+    for entry in std::fs::read_dir(list).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        let path = format!("/v1/uploads/{name}");
+        app.send(tus(&app, Method::DELETE, &path)).await.expect(204);
+    }
+    let (_, measurement) = app.scene(&crate::samples::Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let keyed = || {
+        let request = app.request(Method::POST, "/v1/jobs").header("idempotency-key", "k");
+        app.send(request.json(&body))
+    };
+    keyed().await.expect(201);
+    app.post("/v1/jobs", &body).await.expect(201);
+    let full = app.post("/v1/jobs", &body).await;
+    assert!(full.problem(429, "queue_full").contains('2'));
+    assert!(!full.header("retry-after").is_empty());
+    keyed().await.expect(200);
+    let ready = app.get("/readyz").await.json();
+    assert_eq!((&ready["database"], &ready["disk"]), (&json!("ok"), &json!("ok")));
+}
+
+/// Hands connections on to the service and cuts each of them after some bytes, ever later.
+async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let cuts = Arc::new(AtomicU64::new(0));
+    let counter = cuts.clone();
+    tokio::spawn(async move {
+        for number in 0u64.. {
+            let (mut client, _) = listener.accept().await.unwrap();
+            let (service, cuts) = (service.clone(), counter.clone());
+            let mut left = 1_000 + (number * 7_919_000) % 900_000;
+            tokio::spawn(async move {
+                let mut server = TcpStream::connect(&service).await.unwrap();
+                let (mut from_client, mut to_client) = client.split();
+                let (mut from_server, mut to_server) = server.split();
+                let up = async {
+                    let mut buffer = vec![0; 16 * 1024];
+                    while let Ok(count @ 1..) = from_client.read(&mut buffer).await {
+                        let count = (count as u64).min(left) as usize;
+                        if to_server.write_all(&buffer[..count]).await.is_err() {
+                            return;
+                        }
+                        left -= count as u64;
+                        if left == 0 {
+                            cuts.fetch_add(1, Ordering::Relaxed);
+                            return;
+                        }
+                    }
+                };
+                let down = tokio::io::copy(&mut from_server, &mut to_client);
+                tokio::select! {
+                    () = up => {}
+                    _ = down => {}
+                }
+            });
+        }
+    });
+    (address, cuts)
+}
+
+#[tokio::test]
+async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
+    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
+        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
+        return;
+    };
+    let app = TestApp::start().await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("masks.npy");
+    let bytes: Vec<u8> = (0u32..3_000_000).flat_map(u32::to_le_bytes).collect();
+    std::fs::write(&file, &bytes).unwrap();
+    let hash: String = {
+        use sha2::Digest;
+        sha2::Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+    };
+    let (proxy, cuts) = cutting(app.address()).await;
+    let mut command = tokio::process::Command::new(&python);
+    command.arg("tests/judges/tus_upload.py").arg(format!("http://{proxy}/v1/uploads"));
+    command.arg(&file).arg(&hash).arg(&token);
+    let output = command.output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(told["offset"], bytes.len());
+    let cut = cuts.load(Ordering::Relaxed);
+    eprintln!("{cut} connections were cut");
+    assert!(cut >= 5, "{cut} connections were cut");
+    let stored = app.get(&format!("/v1/blobs/{hash}")).await.expect(200);
+    assert_eq!(stored.json()["size"], bytes.len());
+    let blob = app.data().join("blobs").join(&hash[..2]).join(&hash[2..]);
+    assert!(std::fs::read(blob).unwrap() == bytes, "the bytes are those that were sent");
+}
+
+/// A client that is gone in the middle of a piece: what came is kept.
+#[tokio::test]
+async fn what_came_before_a_cut_is_kept() {
+    let app = TestApp::start().await;
+    let path = begin(&app, 1_000_000, "").await;
+    let address = app.address();
+    let mut socket = TcpStream::connect(&address).await.unwrap();
+    let head = format!(
+        "PATCH {path} HTTP/1.1\r\nHost: {address}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n\
+         Content-Type: application/offset+octet-stream\r\nContent-Length: 1000000\r\n\r\n"
+    );
+    socket.write_all(head.as_bytes()).await.unwrap();
+    socket.write_all(&[7; 300_000]).await.unwrap();
+    tokio::time::sleep(std::time::Duration::from_millis(300)).await;
+    // Another request does not write into the same file.
+    let busy: Answer = app.send(piece(&app, &path, 0, b"x")).await;
+    busy.problem(423, "upload_busy");
+    drop(socket);
+    let start = std::time::Instant::now();
+    while offset(&app, &path).await != "300000" {
+        assert!(start.elapsed().as_secs() < 10, "{}", offset(&app, &path).await);
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+}

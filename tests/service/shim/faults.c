@@ -1,0 +1,120 @@
+/* Stands between a program and the kernel (LD_PRELOAD) and lets things go wrong when a test says so.
+ *
+ * FAULT_PROGRAM  the first argument of the programs that are meant: serve or worker
+ * FAULT_AT       the number of the file operation that goes wrong, from 1
+ * FAULT_KIND     kill: the process dies before the operation; full: it and the next writes of the
+ *                process fail for want of space
+ * FAULT_TOKEN    a file; the process that removes it has the fault, so that there is one
+ * FAULT_FULL     a file; as long as it is there, nothing can be written
+ * FAULT_CLOCK    a file of 8 bytes, seconds that the wall clock is off
+ */
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdatomic.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <sys/types.h>
+#include <time.h>
+#include <unistd.h>
+
+static long at = -1;
+static int kind_full, failing;
+static atomic_long count;
+static const char *token, *full;
+static volatile long long *skew;
+
+static int meant(const char *program) {
+    char line[256] = {0};
+    int file = open("/proc/self/cmdline", O_RDONLY);
+    if (file < 0) return 0;
+    ssize_t length = pread(file, line, sizeof line - 1, 0);
+    close(file);
+    size_t first = strlen(line) + 1;
+    return length > (ssize_t)first && strcmp(line + first, program) == 0;
+}
+
+__attribute__((constructor)) static void begin(void) {
+    const char *program = getenv("FAULT_PROGRAM"), *number = getenv("FAULT_AT");
+    const char *kind = getenv("FAULT_KIND"), *clock = getenv("FAULT_CLOCK");
+    token = getenv("FAULT_TOKEN");
+    full = getenv("FAULT_FULL");
+    kind_full = kind && strcmp(kind, "full") == 0;
+    if (number && program && meant(program)) at = atol(number);
+    if (clock) {
+        int file = open(clock, O_RDONLY);
+        void *page = mmap(NULL, 8, PROT_READ, MAP_SHARED, file, 0);
+        if (page != MAP_FAILED) skew = page;
+        close(file);
+    }
+}
+
+static int regular(int file) {
+    struct stat about;
+    return fstat(file, &about) == 0 && S_ISREG(about.st_mode);
+}
+
+/* True if this operation must fail for want of space. */
+static int fault(int writes) {
+    if (writes && full && access(full, F_OK) == 0) return 1;
+    if (at < 0) return 0;
+    long now = atomic_fetch_add(&count, 1) + 1;
+    if (now == at && unlink(token) == 0) {
+        if (!kind_full) kill(getpid(), SIGKILL);
+        failing = 1;
+    }
+    return failing && now < at + 8 && writes;
+}
+
+#define REAL(name) __typeof__(&name) real = (__typeof__(&name))dlsym(RTLD_NEXT, #name)
+#define FAIL do { errno = ENOSPC; return -1; } while (0)
+
+ssize_t write(int file, const void *bytes, size_t size) {
+    REAL(write);
+    if (regular(file) && fault(1)) FAIL;
+    return real(file, bytes, size);
+}
+ssize_t pwrite64(int file, const void *bytes, size_t size, off64_t offset) {
+    REAL(pwrite64);
+    if (regular(file) && fault(1)) FAIL;
+    return real(file, bytes, size, offset);
+}
+ssize_t pwrite(int file, const void *bytes, size_t size, off_t offset) {
+    return pwrite64(file, bytes, size, offset);
+}
+int fsync(int file) {
+    REAL(fsync);
+    if (fault(1)) FAIL;
+    return real(file);
+}
+int fdatasync(int file) {
+    REAL(fdatasync);
+    if (fault(1)) FAIL;
+    return real(file);
+}
+int rename(const char *from, const char *to) {
+    REAL(rename);
+    if (fault(1)) FAIL;
+    return real(from, to);
+}
+int mkdir(const char *path, mode_t mode) {
+    REAL(mkdir);
+    if (fault(1)) FAIL;
+    return real(path, mode);
+}
+int unlink(const char *path) {
+    REAL(unlink);
+    if (!token || strcmp(path, token) != 0) fault(0);
+    return real(path);
+}
+int clock_gettime(clockid_t clock, struct timespec *now) {
+    REAL(clock_gettime);
+    int result = real(clock, now);
+    if (clock == CLOCK_REALTIME && skew) now->tv_sec += *skew;
+    return result;
+}
