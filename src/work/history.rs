@@ -82,7 +82,15 @@ mod tests {
         for done in 1..=iterations {
             let (residual, change) = (1.0 / done as f32, f32::INFINITY);
             let sigma = (done % 2 == 0).then(|| Sigma::new(0.1).unwrap());
-            history.note(&Progress { stage: 0, done, planned: 9, residual, change, sigma, deep: false });
+            history.note(&Progress {
+                stage: 0,
+                done,
+                planned: 9,
+                residual,
+                change,
+                sigma,
+                deep: false,
+            });
         }
         serde_json::from_str(&history.to_json()).unwrap()
     }

@@ -232,6 +232,7 @@ impl Default for Filter {
 /// lane: the same as `Y - tau^2 (G^2 + tau^2)^-1 (Y - mean)`.
 // With AVX-512 the compiler gathers across groups instead of using a register a group: 4 times slower.
 #[multiversion(targets("x86_64+avx2+fma"))]
+#[allow(clippy::needless_range_loop)] // the indices of the algebra
 fn low_rank(filter: &mut Filter, tau: f32) {
     let Filter { patches, gram, factor, solved } = filter;
     for (row, centred) in patches.iter().zip(solved.iter_mut()) {
