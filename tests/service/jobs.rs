@@ -28,7 +28,9 @@ async fn a_job_is_accepted_with_all_that_was_left_open_filled_in() {
     assert_eq!(job["progress"]["stage"], "waiting");
     assert_eq!(job["progress"]["eta_seconds"], Value::Null, "no worker lives");
     let algorithms = app.get("/v1/algorithms").await.expect(200).json();
-    assert_eq!(job["schedule"], algorithms["items"][1]["schedule"]);
+    let items = algorithms["items"].as_array().unwrap();
+    let named = items.iter().find(|item| item["name"] == job["algorithm"]).unwrap();
+    assert_eq!(job["schedule"], named["schedule"]);
     let snapshot = format!("/v1/jobs/{}/snapshots/1", id(&created));
     assert_eq!(app.get(&snapshot).await.expect(200).json()["ready"], false);
     for file in ["frames/1.exr", "frames/4.png", "stack.exr", "frames.npy", "manifest.json"] {
