@@ -81,7 +81,7 @@ async function loaded(service, measurement) {
 
 /** A list of thousands of jobs. */
 async function thousands() {
-  const service = await Service.start(program, "--workers", "0");
+  const service = await Service.start(program, "--workers", "0", "--max-jobs", "6000");
   services.push(service);
   const { measurement } = await service.take(scene(2, 32, 32));
   await checks.step("fill", () => fill(service, measurement));
