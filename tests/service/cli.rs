@@ -277,3 +277,16 @@ fn what_does_not_fit_is_refused_with_the_reason() {
     assert!(few.contains("6 frames") && few.contains("need 7"), "{few}");
     refused(&["reconstruct", "--json"]);
 }
+
+#[test]
+fn the_demo_shows_what_the_service_is_for() {
+    let files = Files::new();
+    let output = sci_recon(&["demo", "--json", "--out", &files.text("demo")]);
+    let report = json(&output);
+    let (tv, pnp) = (&report["gap_tv"], &report["pnp_tv_fastdvdnet"]);
+    let gain = pnp["psnr_db"].as_f64().unwrap() - tv["psnr_db"].as_f64().unwrap();
+    assert!(gain >= 1.0, "{report:#}");
+    assert!(pnp["ssim"].as_f64() > tv["ssim"].as_f64(), "{report:#}");
+    let frames = files.path("demo/frames/pnp-tv-fastdvdnet");
+    assert_eq!(std::fs::read_dir(frames).unwrap().count(), 8);
+}
