@@ -12,9 +12,10 @@ use serde::Serialize;
 use super::CliError;
 use super::arguments::{EngineArguments, ScheduleArguments, checked};
 use super::input::{Scaled, Source};
+use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
-use crate::job::{Algorithm, ScheduleSpec, TileSpec, Timestamp};
+use crate::job::{Algorithm, ScheduleSpec, Timestamp};
 use crate::recon::metrics;
 use crate::recon::scale::ScaleEstimator;
 use crate::recon::tile::TilePlan;
@@ -23,8 +24,8 @@ use crate::work::manifest::{
     frame_attributes,
 };
 use crate::work::{
-    NetworkSource, ResultSpec, SnapshotInput, TileOutcome, Usage, blended_frame, check_output,
-    peak_rss_bytes, replace_result, solve, write_result,
+    NetworkSource, ResultSpec, SnapshotInput, Solver, TileOutcome, Usage, blended_frame,
+    check_output, peak_rss_bytes, replace_result, solve, write_result,
 };
 
 /// Reconstruct the frames of one snapshot from files, without a server.
@@ -58,17 +59,23 @@ pub struct Arguments {
     truth_full_scale: Option<f32>,
     #[command(flatten)]
     schedule: ScheduleArguments,
+    /// The network of --algorithm learned: an ONNX file with inputs `measurement` [1,1,H,W] and
+    /// `masks` [1,B,H,W] and output `frames` [1,B,H,W], all float32. The measurement is sum C x with
+    /// frames x from 0 to 1.
+    #[arg(long, value_name = "FILE", required_if_eq("algorithm", Algorithm::Learned.name()))]
+    model: Option<PathBuf>,
     #[command(flatten)]
     engine: EngineArguments,
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels.
-    #[arg(long, value_name = "PIXELS", default_value_t = TileSpec::default().size)]
-    tile: usize,
-    /// Least overlap of neighbouring tiles, in pixels.
-    #[arg(long, value_name = "PIXELS", default_value_t = TileSpec::default().overlap)]
-    overlap: usize,
+    /// Largest side of a tile, in pixels [default: 256; the whole picture for a network that takes
+    /// no other].
+    #[arg(long, value_name = "PIXELS")]
+    tile: Option<usize>,
+    /// Least overlap of neighbouring tiles, in pixels [default: 32, or 0 for the whole picture].
+    #[arg(long, value_name = "PIXELS")]
+    overlap: Option<usize>,
     /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
@@ -102,7 +109,27 @@ struct Setup {
     schedule: ScheduleSpec,
     plan: TilePlan,
     network: NetworkSource,
+    model: Option<Learned>,
     threads: usize,
+}
+
+impl Setup {
+    fn needs_network(&self) -> bool {
+        self.model.is_some() || self.schedule.needs_network()
+    }
+
+    /// The schedule with all defaults filled in.
+    fn full_schedule(&self) -> Result<ScheduleSpec, CliError> {
+        match self.model {
+            None => Ok(ScheduleSpec::from(&checked(&self.schedule)?)),
+            Some(_) => Ok(self.schedule.clone()),
+        }
+    }
+
+    fn models(&self) -> Vec<ModelRecord> {
+        let learned = self.model.as_ref().map(Learned::record);
+        ModelRecord::of(&self.schedule).into_iter().chain(learned).collect()
+    }
 }
 
 /// Runs the command.
@@ -116,13 +143,14 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     if let Some(out) = &arguments.out {
         check_output(out)?;
     }
-    let (_, height, width) = input.masks.array.dim();
+    let model = learned(arguments, &network)?;
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let setup = Setup {
         algorithm: arguments.schedule.algorithm,
         schedule,
-        plan: TilePlan::new(height, width, arguments.tile, arguments.overlap)?,
+        plan: plan((arguments.tile, arguments.overlap), model.as_ref(), input.masks.array.dim())?,
         network,
+        model,
         threads: arguments.threads.map_or(cores, usize::from),
     };
 
@@ -138,6 +166,18 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         solution.write(out, &setup, manifest)?;
     }
     solution.report(&input, &setup, spent)?.print(arguments)
+}
+
+/// The network of `--model`.
+fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Learned>, CliError> {
+    let Some(path) = &arguments.model else { return Ok(None) };
+    match arguments.schedule.algorithm {
+        Algorithm::Learned => Learned::open(path, network).map(Some),
+        other => Err(CliError::Input(format!(
+            "{} takes no --model; ask for --algorithm learned",
+            other.name()
+        ))),
+    }
 }
 
 /// What the computing took.
@@ -211,11 +251,19 @@ impl<'a> Input<'a> {
         let mut estimator = ScaleEstimator::new(height, width);
         self.masks.array.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
         let white = estimator.white(self.measurement.array.view())?;
+        let schedule;
+        let solver = match &setup.model {
+            Some(model) => Solver::Network(&model.file),
+            None => {
+                schedule = checked(&setup.schedule)?;
+                Solver::Schedule(&schedule)
+            }
+        };
         let input = SnapshotInput {
             masks: self.masks.array.view(),
             measurement: self.measurement.array.view(),
             white,
-            schedule: &checked(&setup.schedule)?,
+            solver,
             plan: &setup.plan,
         };
         let bar = SnapshotBar::new(&setup.schedule, setup.plan.len());
@@ -253,7 +301,7 @@ impl Solution {
             tv_iterations: summary.tv_iterations,
             cpu_seconds: spent.cpu_seconds,
             peak_rss_bytes: peak_rss_bytes(),
-            provider: setup.schedule.needs_network().then(|| setup.network.provider()),
+            provider: setup.needs_network().then(|| setup.network.provider()),
             stop_reason: summary.stop_reason,
         })
     }
@@ -289,12 +337,12 @@ impl Solution {
         spent: Spent,
     ) -> Result<Manifest, CliError> {
         let (frames, height, width) = input.masks.array.dim();
-        let deep = setup.schedule.needs_network();
+        let deep = setup.needs_network();
         let tiles = self.records();
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
             algorithm: setup.algorithm,
-            schedule: ScheduleSpec::from(&checked(&setup.schedule)?),
+            schedule: setup.full_schedule()?,
             frames,
             height,
             width,
@@ -303,7 +351,7 @@ impl Solution {
                 masks_sha256: input.sources.masks.sha256()?,
                 measurement_sha256: input.sources.measurement.sha256()?,
             },
-            models: ModelRecord::of(&setup.schedule),
+            models: setup.models(),
             scale: ScaleRecord {
                 masks_full_scale: input.masks.full_scale,
                 measurement_full_scale: input.measurement.full_scale,

@@ -6,6 +6,7 @@ mod disk;
 mod finding;
 mod ids;
 mod memory;
+mod model;
 mod reason;
 mod report;
 mod request;
@@ -18,8 +19,9 @@ pub use access::{Lab, Role, Secret};
 pub use captures::Captures;
 pub use finding::{Finding, Grade, Severity};
 pub use ids::{
-    CalibrationId, InvalidId, JobId, MeasurementId, PartialId, TaskId, TokenId, WorkerId,
+    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };
+pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use reason::without_paths;
 pub use report::{CalibrationReport, CaptureReport, MaskReport, PatternReport};
 pub use request::{

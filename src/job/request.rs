@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::Finding;
-use super::ids::{CalibrationId, MeasurementId};
+use super::ids::{CalibrationId, MeasurementId, ModelId};
+use super::model::{JobModel, ModelChoice};
 use super::schedule::{PriorSpec, ScheduleSpec};
 use super::text::Label;
 use crate::recon::schedule::Schedule;
@@ -31,17 +32,20 @@ pub enum Algorithm {
     /// GAP with total variation, with FastDVDNet, then with the nonlocal prior.
     #[serde(rename = "pnp-tv-fastdvdnet")]
     PnpTvFastDvdNet,
+    /// A network from measurement and masks to frames, trained for one calibration.
+    Learned,
 }
 
 impl Algorithm {
     /// All algorithms.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::GapTv,
         Self::AdmmTv,
         Self::PnpNonlocal,
         Self::PnpFfdNet,
         Self::PnpFastDvdNet,
         Self::PnpTvFastDvdNet,
+        Self::Learned,
     ];
 
     /// The name in JSON, on the command line and in the database.
@@ -54,6 +58,7 @@ impl Algorithm {
             Self::PnpFfdNet => "pnp-ffdnet",
             Self::PnpFastDvdNet => "pnp-fastdvdnet",
             Self::PnpTvFastDvdNet => "pnp-tv-fastdvdnet",
+            Self::Learned => "learned",
         }
     }
 
@@ -79,10 +84,14 @@ impl Algorithm {
                 "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best \
                  on all masks measured."
             }
+            Self::Learned => {
+                "A network of your own from measurement and masks to frames, registered for a \
+                 calibration as a model: one run, no schedule."
+            }
         }
     }
 
-    /// The schedule of a job that names none.
+    /// The schedule of a job that names none; without stages for [`Self::Learned`], which has none.
     #[must_use]
     pub fn default_schedule(self) -> ScheduleSpec {
         ScheduleSpec::from(&match self {
@@ -92,6 +101,7 @@ impl Algorithm {
             Self::PnpFfdNet => Schedule::pnp_ffdnet(),
             Self::PnpFastDvdNet => Schedule::pnp_fastdvdnet(),
             Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
+            Self::Learned => return ScheduleSpec::without_stages(),
         })
     }
 
@@ -105,6 +115,7 @@ impl Algorithm {
             Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
             Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNet],
             Self::PnpTvFastDvdNet => vec![P::Tv, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal],
+            Self::Learned => Vec::new(),
         }
     }
 
@@ -229,6 +240,14 @@ impl Default for TileSpec {
     }
 }
 
+impl TileSpec {
+    /// One tile for the whole of a picture.
+    #[must_use]
+    pub fn whole(height: usize, width: usize) -> Self {
+        Self { size: height.max(width).max(16), overlap: 0 }
+    }
+}
+
 /// The sizes of a measurement and its calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneShape {
@@ -256,10 +275,14 @@ pub struct JobRequest {
     pub snapshots: SnapshotSelection,
     /// The algorithm.
     pub algorithm: Algorithm,
+    /// The network of [`Algorithm::Learned`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub model: Option<ModelId>,
     /// The schedule; the algorithm's own where it is left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub schedule: Option<ScheduleSpec>,
-    /// The tiles; 256 with 32 shared where it is left out.
+    /// The tiles; 256 with 32 shared where it is left out, or the whole picture for a network that
+    /// takes no other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
     /// Jobs of higher priority are served first; from -100 to 100.
@@ -283,7 +306,10 @@ pub struct JobSpec {
     pub snapshots: SnapshotRange,
     /// The algorithm.
     pub algorithm: Algorithm,
-    /// The schedule.
+    /// The network of [`Algorithm::Learned`]; none for all others.
+    #[serde(default)]
+    pub model: Option<JobModel>,
+    /// The schedule; without stages for [`Algorithm::Learned`].
     pub schedule: ScheduleSpec,
     /// The tiles.
     pub tile: TileSpec,
@@ -297,7 +323,8 @@ pub struct JobSpec {
 }
 
 impl JobRequest {
-    /// Checks the request against the measurement and fills in the defaults.
+    /// Checks the request against the measurement and the model that it names, and fills in the
+    /// defaults.
     ///
     /// # Errors
     /// All that is wrong, each with its place in the request.
@@ -305,6 +332,7 @@ impl JobRequest {
         self,
         calibration: CalibrationId,
         shape: SceneShape,
+        model: Option<JobModel>,
     ) -> Result<JobSpec, Vec<InvalidField>> {
         let mut errors = Vec::new();
         if self.calibration.is_some_and(|given| given != calibration) {
@@ -315,15 +343,23 @@ impl JobRequest {
             errors.push(error);
             SnapshotRange { first: 0, count: 1 }
         });
+        let choice = ModelChoice {
+            algorithm: self.algorithm,
+            model: model.as_ref(),
+            schedule: self.schedule.as_ref(),
+            tile: self.tile,
+        };
+        errors.extend(choice.errors(calibration, shape));
+        let tile = choice.tile(shape);
         let schedule = self.schedule.unwrap_or_else(|| self.algorithm.default_schedule());
         match schedule.to_schedule() {
+            _ if self.algorithm == Algorithm::Learned => {}
             Err(wrong) => errors.extend(wrong.into_iter().map(|error| error.under("/schedule"))),
             Ok(_) => {
                 let misfit = self.algorithm.misfit(&schedule);
                 errors.extend(misfit.map(|detail| InvalidField::new("/algorithm", detail)));
             }
         }
-        let tile = self.tile.unwrap_or_default();
         match TilePlan::new(shape.height, shape.width, tile.size, tile.overlap) {
             Ok(plan) => errors.extend(too_many(plan.len(), snapshots)),
             Err(error) => errors.push(InvalidField::new("/tile", error.to_string())),
@@ -343,6 +379,7 @@ impl JobRequest {
             shape,
             snapshots,
             algorithm,
+            model,
             schedule,
             tile,
             priority,
@@ -408,14 +445,15 @@ mod tests {
     }
 
     fn pointers(fields: Value) -> Vec<String> {
-        let errors = request(fields).unwrap().resolve(CalibrationId::new(), SHAPE).unwrap_err();
+        let errors =
+            request(fields).unwrap().resolve(CalibrationId::new(), SHAPE, None).unwrap_err();
         errors.into_iter().map(|error| error.pointer).collect()
     }
 
     #[test]
     fn defaults_are_filled_in() {
         let calibration = CalibrationId::new();
-        let spec = request(json!({})).unwrap().resolve(calibration, SHAPE).unwrap();
+        let spec = request(json!({})).unwrap().resolve(calibration, SHAPE, None).unwrap();
         assert_eq!(spec.snapshots, SnapshotRange { first: 0, count: 6 });
         assert_eq!(spec.calibration, calibration);
         assert_eq!(spec.tile_plan().unwrap().len(), 2);
@@ -427,7 +465,7 @@ mod tests {
         for (json, first, count) in [(json!(2), 2, 1), (json!([1, 3]), 1, 3), (json!("all"), 0, 6)]
         {
             let request = request(json!({ "snapshots": json })).unwrap();
-            let spec = request.resolve(CalibrationId::new(), SHAPE).unwrap();
+            let spec = request.resolve(CalibrationId::new(), SHAPE, None).unwrap();
             assert_eq!(spec.snapshots, SnapshotRange { first, count });
         }
         assert!(request(json!({"snapshots": "some"})).is_err());

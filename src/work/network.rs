@@ -4,11 +4,13 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
+use super::learned::ModelFile;
+use crate::job::Sha256;
 use crate::models;
 use crate::recon::ReconError;
 use crate::recon::denoise::fastdvdnet::FastDvdNet;
 use crate::recon::denoise::ffdnet::FfdNet;
-use crate::recon::denoise::onnx::{Device, Runtime};
+use crate::recon::denoise::onnx::{Device, EndToEndNetwork, Runtime};
 use crate::recon::denoise::{Denoiser, Networks};
 use crate::recon::schedule::Network;
 
@@ -24,6 +26,9 @@ pub enum NetworkError {
          scripts/fetch-onnxruntime.sh"
     )]
     Missing(String),
+    /// The file of an end-to-end network can't be read, or is not what it was.
+    #[error("{0}")]
+    File(String),
     /// It was found, but the network does not run on it.
     #[error(transparent)]
     Runtime(#[from] ReconError),
@@ -74,6 +79,14 @@ impl NetworkSource {
         })
     }
 
+    /// An end-to-end network with a session of its own, for one thread.
+    ///
+    /// # Errors
+    /// No library; a file that can't be read, or holds no network that can be run.
+    pub fn end_to_end(&self, file: &ModelFile) -> Result<EndToEndNetwork, NetworkError> {
+        Ok(EndToEndNetwork::load(&self.runtime()?, &file.read()?)?)
+    }
+
     fn runtime(&self) -> Result<Runtime, NetworkError> {
         Ok(Runtime::open(&self.path()?, self.device)?)
     }
@@ -97,12 +110,27 @@ impl NetworkSource {
 pub struct WarmNetworks {
     source: NetworkSource,
     loaded: Vec<(Network, Box<dyn Denoiser + Send>)>,
+    /// The last end-to-end network.
+    end_to_end: Option<(Sha256, EndToEndNetwork)>,
 }
 
 impl WarmNetworks {
     /// Networks from `source`, none of them loaded yet.
     pub fn new(source: NetworkSource) -> Self {
-        Self { source, loaded: Vec::new() }
+        Self { source, loaded: Vec::new(), end_to_end: None }
+    }
+
+    /// The end-to-end network in this file, which is kept until another one is asked for.
+    ///
+    /// # Errors
+    /// As [`NetworkSource::end_to_end`].
+    pub fn end_to_end(&mut self, file: &ModelFile) -> Result<&mut EndToEndNetwork, NetworkError> {
+        let warm = self.end_to_end.take().filter(|(sha256, _)| *sha256 == file.sha256());
+        let network = match warm {
+            Some((_, network)) => network,
+            None => self.source.end_to_end(file)?,
+        };
+        Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
 
     /// Where they come from.
