@@ -1,5 +1,7 @@
 //! `sci-recon reconstruct`: one snapshot, without a server.
 
+mod report;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::thread;
@@ -7,7 +9,6 @@ use std::time::Instant;
 
 use clap::Args;
 use ndarray::{Array2, Array3, s};
-use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{EngineArguments, ScheduleArguments, checked};
@@ -27,6 +28,7 @@ use crate::work::{
     NetworkSource, ResultSpec, SnapshotInput, Solver, TileOutcome, Usage, blended_frame,
     check_output, peak_rss_bytes, replace_result, solve, write_result,
 };
+use report::Report;
 
 /// Reconstruct the frames of one snapshot from files, without a server.
 #[derive(Debug, Args)]
@@ -59,8 +61,8 @@ pub struct Arguments {
     truth_full_scale: Option<f32>,
     #[command(flatten)]
     schedule: ScheduleArguments,
-    /// The network of --algorithm learned: an ONNX file with inputs `measurement` [1,1,H,W] and
-    /// `masks` [1,B,H,W] and output `frames` [1,B,H,W], all float32. The measurement is sum C x with
+    /// The network of --algorithm learned: an ONNX file with inputs `measurement [1,1,H,W]` and
+    /// `masks [1,B,H,W]` and output `frames [1,B,H,W]`, all float32. The measurement is sum C x with
     /// frames x from 0 to 1.
     #[arg(long, value_name = "FILE", required_if_eq("algorithm", Algorithm::Learned.name()))]
     model: Option<PathBuf>,
@@ -82,25 +84,6 @@ pub struct Arguments {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
-}
-
-/// What `--json` prints.
-#[derive(Debug, Serialize)]
-struct Report {
-    algorithm: &'static str,
-    frames: usize,
-    height: usize,
-    width: usize,
-    psnr_db: Option<f64>,
-    ssim: Option<f64>,
-    seconds: f64,
-    denoiser_passes: usize,
-    tv_iterations: usize,
-    cpu_seconds: f64,
-    peak_rss_bytes: u64,
-    /// None for a schedule without a network.
-    provider: Option<&'static str>,
-    stop_reason: String,
 }
 
 /// What is to be done with the input.
@@ -388,37 +371,5 @@ impl Solution {
         let frame = |k| Ok::<_, CliError>(blended_frame(plan, &self.tiles, k));
         write_result(made.path(), &spec, frame, |files| manifest.with_files(files))?;
         Ok(replace_result(made.path(), out)?)
-    }
-}
-
-impl Report {
-    fn print(&self, arguments: &Arguments) -> Result<(), CliError> {
-        if arguments.json {
-            let text = serde_json::to_string(self)
-                .map_err(|error| CliError::Failure(format!("the report: {error}")))?;
-            println!("{text}");
-            return Ok(());
-        }
-        println!(
-            "{}: {} frames of {}x{} in {:.1} s ({:.1} CPU-seconds), {} TV iterations, {} denoiser \
-             passes, {}",
-            self.algorithm,
-            self.frames,
-            self.height,
-            self.width,
-            self.seconds,
-            self.cpu_seconds,
-            self.tv_iterations,
-            self.denoiser_passes,
-            self.stop_reason
-        );
-        if let Some(psnr) = self.psnr_db {
-            let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
-            println!("PSNR {psnr:.2} dB{ssim}");
-        }
-        if let Some(out) = &arguments.out {
-            println!("frames are in {}", out.display());
-        }
-        Ok(())
     }
 }

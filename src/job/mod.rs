@@ -1,6 +1,7 @@
 //! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
 
 mod access;
+mod algorithm;
 mod captures;
 mod disk;
 mod finding;
@@ -16,6 +17,7 @@ mod task;
 mod text;
 
 pub use access::{Lab, Role, Secret};
+pub use algorithm::Algorithm;
 pub use captures::Captures;
 pub use finding::{Finding, Grade, Severity};
 pub use ids::{
@@ -25,8 +27,8 @@ pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use reason::without_paths;
 pub use report::{CalibrationReport, CaptureReport, MaskReport, PatternReport};
 pub use request::{
-    Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,
-    SnapshotSelection, TileSpec,
+    InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange, SnapshotSelection,
+    TileSpec,
 };
 pub use schedule::{MethodSpec, PriorSpec, ScheduleSpec, StageSpec};
 pub use state::{IllegalTransition, JobState};
