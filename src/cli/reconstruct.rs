@@ -68,6 +68,11 @@ pub struct Arguments {
     model: Option<PathBuf>,
     #[command(flatten)]
     engine: EngineArguments,
+    /// Networks of your own instead of those in the program: a folder with
+    /// fastdvdnet-gray/stage1.onnx and stage2.onnx, or ffdnet-gray/model.onnx. The manifest names
+    /// them by their hash.
+    #[arg(long, value_name = "FOLDER")]
+    models: Option<PathBuf>,
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
@@ -109,9 +114,10 @@ impl Setup {
         }
     }
 
-    fn models(&self) -> Vec<ModelRecord> {
-        let learned = self.model.as_ref().map(Learned::record);
-        ModelRecord::of(&self.schedule).into_iter().chain(learned).collect()
+    fn models(&self) -> Result<Vec<ModelRecord>, CliError> {
+        let mut models = self.network.records(&self.schedule)?;
+        models.extend(self.model.as_ref().map(Learned::record));
+        Ok(models)
     }
 }
 
@@ -121,7 +127,7 @@ impl Setup {
 /// Input that can't be used, or a failure on the way.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let schedule = arguments.schedule.resolve()?;
-    let network = arguments.engine.network()?;
+    let network = arguments.engine.network()?.with_models(arguments.models.clone());
     let input = Input::read(arguments)?;
     if let Some(out) = &arguments.out {
         check_output(out)?;
@@ -334,7 +340,7 @@ impl Solution {
                 masks_sha256: input.sources.masks.sha256()?,
                 measurement_sha256: input.sources.measurement.sha256()?,
             },
-            models: setup.models(),
+            models: setup.models()?,
             scale: ScaleRecord {
                 masks_full_scale: input.masks.full_scale,
                 measurement_full_scale: input.measurement.full_scale,

@@ -31,7 +31,7 @@ impl ModelFile {
     /// # Errors
     /// A file that can't be read.
     pub fn open(path: &Path) -> Result<Self, NetworkError> {
-        let bytes = fs::read(path).map_err(|error| unreadable(path, &error))?;
+        let bytes = read(path)?;
         Ok(Self { path: path.to_owned(), sha256: Sha256::of(&bytes) })
     }
 
@@ -42,20 +42,17 @@ impl ModelFile {
 
     /// The content.
     pub(super) fn read(&self) -> Result<Vec<u8>, NetworkError> {
-        let bytes = fs::read(&self.path).map_err(|error| unreadable(&self.path, &error))?;
+        let bytes = read(&self.path)?;
         let found = Sha256::of(&bytes);
         if found == self.sha256 {
             return Ok(bytes);
         }
-        Err(NetworkError::File(format!(
-            "the file of the network is damaged: its hash should be {}, but is {found}",
-            self.sha256
-        )))
+        Err(NetworkError::Damaged { expected: self.sha256, found })
     }
 }
 
-fn unreadable(path: &Path, error: &std::io::Error) -> NetworkError {
-    NetworkError::File(format!("the network {} can't be read: {error}", path.display()))
+fn read(path: &Path) -> Result<Vec<u8>, NetworkError> {
+    fs::read(path).map_err(|reason| NetworkError::Model { path: path.to_owned(), reason })
 }
 
 /// Reconstructs one tile in one run of a network: divides the measurement by the white level, so
