@@ -1,13 +1,15 @@
 //! Isotropic total variation, frame by frame (Chambolle, "An algorithm for total variation
 //! minimization and applications", 2004).
 
-use std::ops::Range;
+use std::ops::{Deref, DerefMut, Range};
 
 use multiversion::multiversion;
 use ndarray::{Array3, Axis};
 
 /// Step of the dual ascent: 1 / (2 * dimensions).
 const TAU: f32 = 0.25;
+/// Values of a cache line.
+const LINE: usize = 16;
 
 /// The dual fields of a few rows of every frame, kept so that the loop allocates nothing.
 ///
@@ -27,17 +29,48 @@ pub struct TotalVariation {
 #[derive(Debug)]
 struct Level {
     /// Dual field along rows (downwards).
-    down: [Vec<f32>; 2],
+    down: [Row; 2],
     /// Dual field along columns, after a 0.
-    right: [Vec<f32>; 2],
+    right: [Row; 2],
     /// `u = x + div p`, and its last value once more.
-    primal: [Vec<f32>; 2],
+    primal: [Row; 2],
 }
 
 impl Level {
     fn new(width: usize) -> Self {
-        let rows = |length: usize| [vec![0.0; length], vec![0.0; length]];
-        Self { down: rows(width), right: rows(width + 1), primal: rows(width + 1) }
+        let rows = |length, aligned| [Row::new(length, aligned), Row::new(length, aligned)];
+        Self { down: rows(width, 0), right: rows(width + 1, 1), primal: rows(width + 1, 0) }
+    }
+}
+
+/// Values of which one lies where a cache line begins: a register of them is then one access.
+#[derive(Debug)]
+struct Row {
+    values: Vec<f32>,
+    start: usize,
+}
+
+impl Row {
+    fn new(length: usize, aligned: usize) -> Self {
+        let mut values = vec![0.0; length + LINE];
+        let address = values.as_ptr().addr() / size_of::<f32>() + aligned;
+        let start = (LINE - address % LINE) % LINE;
+        values.truncate(start + length);
+        Self { values, start }
+    }
+}
+
+impl Deref for Row {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        &self.values[self.start..]
+    }
+}
+
+impl DerefMut for Row {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut self.values[self.start..]
     }
 }
 
@@ -123,7 +156,7 @@ fn sweep_rows<const FMA: bool>(
             let (before, after) = levels.split_at_mut(level);
             let (old, new) = (&before[level - 1], &mut after[0]);
             let [even, odd] = &mut new.down;
-            let (down, above) = if i.is_multiple_of(2) { (even, &*odd) } else { (odd, &*even) };
+            let (down, above) = if i.is_multiple_of(2) { (even, &**odd) } else { (odd, &**even) };
             let right = &mut new.right[i % 2];
             let here = &old.primal[i % 2];
             let below = if i + 1 < height { &old.primal[(i + 1) % 2] } else { here };
