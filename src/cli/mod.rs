@@ -5,6 +5,7 @@ mod error;
 mod housekeeping;
 mod input;
 mod logging;
+mod masks;
 mod npz;
 mod progress;
 mod supervisor;

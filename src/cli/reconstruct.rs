@@ -19,7 +19,7 @@ use crate::recon::metrics;
 use crate::recon::scale::ScaleEstimator;
 use crate::recon::tile::TilePlan;
 use crate::work::manifest::{
-    Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
+    Content, Inputs, Manifest, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
     frame_attributes,
 };
 use crate::work::{
@@ -60,6 +60,11 @@ pub struct Arguments {
     schedule: ScheduleArguments,
     #[command(flatten)]
     engine: EngineArguments,
+    /// Networks of your own instead of those in the program: a folder with
+    /// fastdvdnet-gray/stage1.onnx and stage2.onnx, or ffdnet-gray/model.onnx. The manifest names
+    /// them by their hash.
+    #[arg(long, value_name = "FOLDER")]
+    models: Option<PathBuf>,
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
@@ -111,7 +116,7 @@ struct Setup {
 /// Input that can't be used, or a failure on the way.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let schedule = arguments.schedule.resolve()?;
-    let network = arguments.engine.network()?;
+    let network = arguments.engine.network()?.with_models(arguments.models.clone());
     let input = Input::read(arguments)?;
     if let Some(out) = &arguments.out {
         check_output(out)?;
@@ -303,7 +308,7 @@ impl Solution {
                 masks_sha256: input.sources.masks.sha256()?,
                 measurement_sha256: input.sources.measurement.sha256()?,
             },
-            models: ModelRecord::of(&setup.schedule),
+            models: setup.network.records(&setup.schedule)?,
             scale: ScaleRecord {
                 masks_full_scale: input.masks.full_scale,
                 measurement_full_scale: input.measurement.full_scale,

@@ -1,7 +1,6 @@
 //! `sci-recon simulate`: masks and a measurement of a known scene.
 
 mod captures;
-mod masks;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,10 +11,10 @@ use serde::Serialize;
 
 use super::CliError;
 use super::input::read_clip;
+use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
 use crate::formats::npy;
 use crate::optics::{OpticsError, illumination, measure, noisy};
-use masks::{Apertures, MaskArguments, SimulatedMasks};
 
 /// Simulate a snapshot: make masks and measure known frames through them.
 #[derive(Debug, Args)]

@@ -96,15 +96,18 @@ pub struct ModelRecord {
 }
 
 impl ModelRecord {
-    /// Those of a schedule, in a fixed order.
+    /// Those of a schedule that the program carries, in a fixed order.
     pub fn of(schedule: &ScheduleSpec) -> Vec<Self> {
-        schedule.networks().into_iter().map(|network| Self::from(&models::of(network))).collect()
+        let record = |network| {
+            let model = models::of(network);
+            Self::new(&model, model.files.iter().map(|(_, content)| *content))
+        };
+        schedule.networks().into_iter().map(record).collect()
     }
-}
 
-impl From<&Model> for ModelRecord {
-    fn from(model: &Model) -> Self {
-        let digest = model.files.iter().fold(Sha256::new(), |hash, file| hash.chain_update(file));
+    /// That of a model with these contents of its files.
+    pub(super) fn new<'a>(model: &Model, contents: impl Iterator<Item = &'a [u8]>) -> Self {
+        let digest = contents.fold(Sha256::new(), |hash, content| hash.chain_update(content));
         let sha256 = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
         Self { name: model.name.into(), sha256 }
     }

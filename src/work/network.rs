@@ -1,9 +1,12 @@
-//! Where the denoiser comes from: libonnxruntime and the network that the program carries.
+//! Where the denoiser comes from: libonnxruntime, and the network that the program carries or a
+//! folder holds.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
+use super::manifest::ModelRecord;
+use crate::job::ScheduleSpec;
 use crate::models;
 use crate::recon::ReconError;
 use crate::recon::denoise::fastdvdnet::FastDvdNet;
@@ -24,6 +27,14 @@ pub enum NetworkError {
          scripts/fetch-onnxruntime.sh"
     )]
     Missing(String),
+    /// A network in a folder of one's own.
+    #[error("model {}: {reason}", path.display())]
+    Model {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: std::io::Error,
+    },
     /// It was found, but the network does not run on it.
     #[error(transparent)]
     Runtime(#[from] ReconError),
@@ -33,6 +44,7 @@ pub enum NetworkError {
 #[derive(Debug, Clone)]
 pub struct NetworkSource {
     library: Option<PathBuf>,
+    models: Option<PathBuf>,
     device: Device,
     version: Arc<OnceLock<String>>,
 }
@@ -40,7 +52,31 @@ pub struct NetworkSource {
 impl NetworkSource {
     /// `library` is a libonnxruntime, or none for the one beside the executable.
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
-        Self { library, device, version: Arc::default() }
+        Self { library, models: None, device, version: Arc::default() }
+    }
+
+    /// The same with the networks in `folder`, one folder of ONNX files each as in `models/`,
+    /// instead of those that the program carries.
+    #[must_use]
+    pub fn with_models(self, folder: Option<PathBuf>) -> Self {
+        Self { models: folder, ..self }
+    }
+
+    /// The networks of a schedule, for records.
+    ///
+    /// # Errors
+    /// A file of the folder of models can't be read.
+    pub fn records(&self, schedule: &ScheduleSpec) -> Result<Vec<ModelRecord>, NetworkError> {
+        let record = |network| {
+            let contents = self.contents(network)?;
+            Ok(ModelRecord::new(&models::of(network), contents.iter().map(AsRef::as_ref)))
+        };
+        schedule.networks().into_iter().map(record).collect()
+    }
+
+    fn contents(&self, which: Network) -> Result<Vec<models::Content>, NetworkError> {
+        let contents = models::of(which).contents(self.models.as_deref());
+        contents.map_err(|(path, reason)| NetworkError::Model { path, reason })
     }
 
     /// Name of the execution provider, for records.
@@ -64,8 +100,8 @@ impl NetworkSource {
 
     /// A network with sessions of its own, for one thread.
     fn load(&self, which: Network) -> Result<Box<dyn Denoiser + Send>, NetworkError> {
-        let (runtime, files) = (self.runtime()?, models::of(which).files);
-        Ok(match (which, files) {
+        let (runtime, files) = (self.runtime()?, self.contents(which)?);
+        Ok(match (which, files.as_slice()) {
             (Network::FastDvdNet, [first, second]) => {
                 Box::new(FastDvdNet::load(&runtime, first, second)?)
             }
@@ -144,6 +180,7 @@ fn version_in(library: &[u8]) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::{NetworkSource, version_in};
+    use crate::job::Algorithm;
     use crate::recon::denoise::onnx::Device;
     use crate::recon::schedule::Network;
 
@@ -161,5 +198,24 @@ mod tests {
         let error = source.load(Network::FfdNet).err().unwrap().to_string();
         assert!(error.contains("/nowhere/libonnxruntime.so"), "{error}");
         assert!(error.contains("--onnxruntime"), "{error}");
+    }
+    #[test]
+    fn networks_of_a_folder_replace_the_carried_ones_and_are_recorded() {
+        let carried = NetworkSource::new(None, Device::Cpu);
+        let folder = tempfile::tempdir().unwrap();
+        let own = carried.clone().with_models(Some(folder.path().into()));
+        let schedule = Algorithm::PnpFfdNet.default_schedule();
+        let error = own.records(&schedule).unwrap_err().to_string();
+        assert!(error.contains("ffdnet-gray/model.onnx"), "{error}");
+
+        let file = folder.path().join("ffdnet-gray/model.onnx");
+        std::fs::create_dir(file.parent().unwrap()).unwrap();
+        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/models/ffdnet-gray/model.onnx");
+        let mut content = std::fs::read(shipped).unwrap();
+        std::fs::write(&file, &content).unwrap();
+        assert_eq!(own.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
+        content.push(0);
+        std::fs::write(&file, &content).unwrap();
+        assert_ne!(own.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
     }
 }

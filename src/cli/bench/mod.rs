@@ -3,6 +3,7 @@
 mod clips;
 mod noise;
 mod noise_chart;
+mod tables;
 
 use clap::{Args, Subcommand};
 
@@ -18,6 +19,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Experiment {
     Noise(noise::Arguments),
+    Tables(Box<tables::Arguments>),
 }
 
 /// Runs the experiment.
@@ -27,5 +29,6 @@ enum Experiment {
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     match &arguments.experiment {
         Experiment::Noise(arguments) => noise::run(arguments),
+        Experiment::Tables(arguments) => tables::run(arguments),
     }
 }

@@ -133,7 +133,9 @@ mod tests {
             return None;
         };
         let runtime = Runtime::open(&library, Device::Cpu).unwrap();
-        let [stage1, stage2] = models::of(Network::FastDvdNet).files else { unreachable!() };
+        let [(_, stage1), (_, stage2)] = models::of(Network::FastDvdNet).files else {
+            unreachable!()
+        };
         Some(FastDvdNet::load(&runtime, stage1, stage2).unwrap())
     }
 

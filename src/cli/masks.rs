@@ -1,4 +1,4 @@
-//! Which masks are simulated.
+//! Which masks are simulated, for all commands that simulate.
 
 use std::path::PathBuf;
 
@@ -18,7 +18,7 @@ use crate::optics::{
 #[derive(Debug, Args)]
 pub(super) struct MaskArguments {
     /// Kind of the masks.
-    #[arg(long)]
+    #[arg(long, default_value = "random-squares")]
     pattern: Pattern,
     /// Optical parameters as TOML (see `sci-recon optics`) [default: the paper's].
     #[arg(long, value_name = "FILE")]

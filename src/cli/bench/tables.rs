@@ -1,0 +1,126 @@
+//! `sci-recon bench tables`: the paper's Tables 1 and 2, algorithms compared on clips of your own.
+
+mod markdown;
+mod record;
+mod trial;
+mod zones;
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::clips::read_clips;
+use crate::cli::CliError;
+use crate::cli::arguments::{EngineArguments, algorithms};
+use crate::cli::masks::MaskArguments;
+use crate::job::Algorithm;
+use markdown::Layout;
+use record::{Records, Setting};
+use trial::Bench;
+
+/// Compare algorithms as the paper's Tables 1 and 2 do: PSNR and SSIM of each clip at each scale
+/// and compression ratio, with processor seconds and deep passes. Each clip is measured through
+/// simulated masks and reconstructed as `reconstruct` does. Rows are written as they are made; the
+/// same command goes on where it was interrupted.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// A folder of clips: folders of PNGs, .npy, .npz, .mat or TIFF files. A folder of PNGs is one clip.
+    #[arg(long, value_name = "FOLDER")]
+    clips: PathBuf,
+    /// Sides of the squares that are cut from the middle of each frame, in pixels.
+    #[arg(long, value_name = "PIXELS,...", value_delimiter = ',', default_values_t = [256],
+          value_parser = clap::value_parser!(u16).range(16..))]
+    scales: Vec<u16>,
+    /// Compression ratios: the first N frames of each clip make one snapshot.
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [10, 20],
+          value_parser = clap::value_parser!(u16).range(1..=1000))]
+    cr: Vec<u16>,
+    /// The algorithms, in the order of the tables' rows.
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = algorithms(),
+          default_values = PAPER.map(Algorithm::name))]
+    algorithms: Vec<Algorithm>,
+    #[command(flatten)]
+    masks: MaskArguments,
+    /// Noise of the measurements on the scale of 255 grey values: S/255 is the standard deviation
+    /// added to y = sum C x, with x and C from 0 to 1.
+    #[arg(long, value_name = "S", default_value_t = 0.0)]
+    noise_sigma: f32,
+    /// Also show the PSNR of each frame.
+    #[arg(long)]
+    by_frame: bool,
+    /// Also show the PSNR of rings from the centre to the rim.
+    #[arg(long)]
+    by_zone: bool,
+    #[command(flatten)]
+    engine: EngineArguments,
+    /// Seed of masks and noise.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Folder for tables.md, the rows of this command, and tables.json, all rows ever made there.
+    #[arg(long, value_name = "FOLDER")]
+    out: PathBuf,
+}
+
+/// The algorithms of the paper's tables that need no network of their own for each set of masks.
+const PAPER: [Algorithm; 3] = [Algorithm::GapTv, Algorithm::PnpFfdNet, Algorithm::PnpTvFastDvdNet];
+
+/// Runs the comparison.
+///
+/// # Errors
+/// Clips that can't be used at the largest scale and ratio, told before anything is computed; a
+/// tables.json that is none; a failure on the way.
+pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let (ratios, scales) = (distinct(&arguments.cr), distinct(&arguments.scales));
+    let most = |values: &[u16]| values.iter().copied().max().map(usize::from);
+    let clips = read_clips(&arguments.clips, most(&ratios).unwrap_or(1), most(&scales))?;
+    let layout = Layout {
+        clips: clips.iter().map(|clip| clip.name.clone()).collect(),
+        algorithms: distinct(&arguments.algorithms),
+        by_frame: arguments.by_frame,
+        by_zone: arguments.by_zone,
+    };
+    let mut records = Records::open(&arguments.out)?;
+    let setting = Setting {
+        pattern: arguments.masks.pattern().to_owned(),
+        noise_sigma: arguments.noise_sigma,
+        seed: arguments.seed,
+    };
+    let bench = Bench::new(arguments.engine.network()?, setting);
+    // Patterns that can't be are told now, not hours later.
+    let smallest = usize::from(scales.iter().copied().min().unwrap_or(1));
+    for &ratio in &ratios {
+        bench.masks(&arguments.masks, ratio.into(), smallest)?;
+    }
+    let mut rows = Vec::new();
+    for ratio in ratios {
+        for &scale in &scales {
+            let masks = bench.masks(&arguments.masks, ratio.into(), scale.into())?;
+            for clip in &clips {
+                let snapshot = bench.snapshot(&masks, clip)?;
+                for &algorithm in &layout.algorithms {
+                    let key = bench.key(&snapshot, algorithm);
+                    let row = match records.find(&key) {
+                        Some(row) => row.clone(),
+                        None => records.add(bench.run(&snapshot, key)?)?,
+                    };
+                    eprintln!("{}", layout.line(&row));
+                    rows.push(row);
+                    records.write("tables.md", &layout.markdown(&rows))?;
+                }
+            }
+        }
+    }
+    print!("{}", layout.markdown(&rows));
+    Ok(())
+}
+
+/// The values without repetitions, in their order.
+fn distinct<T: PartialEq + Copy>(values: &[T]) -> Vec<T> {
+    let mut distinct = Vec::with_capacity(values.len());
+    for value in values {
+        if !distinct.contains(value) {
+            distinct.push(*value);
+        }
+    }
+    distinct
+}
