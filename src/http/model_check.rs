@@ -6,6 +6,7 @@ use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
 use tokio::process::Command;
+use tokio::sync::Semaphore;
 
 use super::app::App;
 use super::error::{ApiError, Code};
@@ -23,6 +24,8 @@ pub(super) struct Checker {
     program: Option<PathBuf>,
     engine: EngineArguments,
     memory_bytes: u64,
+    /// One check at a time; not that of other files, which would wait for minutes.
+    turn: Semaphore,
 }
 
 impl Checker {
@@ -31,6 +34,7 @@ impl Checker {
             program: std::env::current_exe().ok(),
             engine: settings.engine.clone(),
             memory_bytes: settings.worker_memory_bytes,
+            turn: Semaphore::new(1),
         }
     }
 
@@ -66,7 +70,7 @@ pub(super) async fn check(
 ) -> Result<ModelFacts, ApiError> {
     let unavailable = |why: &str| ApiError::new(Code::Unavailable, why);
     let stopped = |_| unavailable("the service is shutting down");
-    let _permit = app.intake.acquire().await.map_err(stopped)?;
+    let _permit = app.checker.turn.acquire().await.map_err(stopped)?;
     let mut command = app
         .checker
         .command(app, file, masks)

@@ -1,8 +1,9 @@
 """Fits a tiny end-to-end network to masks and writes it as ONNX.
 
-    train_network.py MASKS.npy OUT.onnx {fixed|free|outside}
+    train_network.py MASKS.npy OUT.onnx {fixed|free|outside|greedy}
 
-Of a fixed or free size, or of a fixed one with its weights in another file, masks.npy beside it.
+Of a fixed or free size, or of a fixed one with its weights in another file, masks.npy beside it, or
+with an intermediate result of many gigabytes.
 
 The network is one convolution over the measurement divided by the masks' sum, and over that and the
 measurement times each mask. Its weights are the least-squares solution over random scenes of squares
@@ -58,6 +59,17 @@ def fit(masks, clips=40):
     return weights.astype(np.float32), solution[-1].astype(np.float32)
 
 
+def greedy(model, frames, height, width):
+    """The same frames, but by way of so many copies of them that no machine should hold them."""
+    copies = 2**36 // (frames * height * width)
+    graph, node = model.graph, helper.make_node
+    graph.node[-1].output[0] = "once"
+    shape = np.array([copies, frames, height, width])
+    graph.initializer.append(numpy_helper.from_array(shape, "copies"))
+    graph.node.append(node("Expand", ["once", "copies"], ["often"]))
+    graph.node.append(node("ReduceMax", ["often"], ["frames"], axes=[0], keepdims=1))
+
+
 def network(weights, bias, size):
     frames = len(bias)
     value = lambda name, planes: helper.make_tensor_value_info(
@@ -100,6 +112,8 @@ def main():
         stored.data_location = TensorProto.EXTERNAL
         for key, value in [("location", "masks.npy"), ("offset", 0), ("length", length)]:
             stored.external_data.add(key=key, value=str(value))
+    if size == "greedy":
+        greedy(model, *masks.shape)
     with open(out, "wb") as file:
         file.write(model.SerializeToString())
 

@@ -117,6 +117,9 @@ async fn what_is_no_network_for_these_masks_is_refused() {
     let outside = train(&python, folder.path(), scene, "outside");
     let detail = register(&app, &calibration, &outside).await.problem(422, "invalid_content");
     assert!(detail.contains("weights"), "{detail}");
+    let greedy = train(&python, folder.path(), scene, "greedy");
+    let detail = register(&app, &calibration, &greedy).await.problem(422, "invalid_content");
+    assert!(detail.contains("memory"), "{detail}");
     let body = json!({"calibration": calibration, "file": "0".repeat(64)});
     assert_eq!(app.post("/v1/models", &body).await.json()["pointer"], "/file");
     app.get("/livez").await.expect(200);
