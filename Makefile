@@ -5,7 +5,7 @@ PYTHON ?= python3
 JUDGES := .venv/judges
 
 .PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny \
-	eval-models eval-loop evaluation-data
+	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
@@ -48,6 +48,27 @@ schemathesis: $(SCHEMATHESIS)/.stamp ## the API against its contract, with and w
 $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	$(PYTHON) -m venv $(SCHEMATHESIS)
 	$(SCHEMATHESIS)/bin/python -m pip install --quiet --requirement $<
+	touch $@
+
+PEERS := .venv/peers
+bench-peers: runtime $(PEERS)/.stamp ## CPU seconds beside numpy, scikit-image and PyTorch, side by side; ends with one line of JSON
+	@$(CARGO) build --release --quiet
+	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(PEERS)/bin/python benches/peers/peers.py $${CARGO_TARGET_DIR:-target}/release/sci-recon
+# SIZE, FRAMES, ALGORITHM, DEVICE (cuda:0) and the image are yours to set.
+IMAGE ?= ../shared/scenes/still_6720x4480.jpg
+SIZE ?= 3200
+FRAMES ?= 10
+ALGORITHM ?= gap-tv
+bench-scale: runtime $(PEERS)/.stamp ## ten megapixels through the service: time by stage, memory, disk; ends with one line of JSON
+	@test -f $(IMAGE) || { echo "no image at IMAGE=$(IMAGE): any photograph will do, best of 3400x3400 or more" >&2; exit 2; }
+	@$(CARGO) build --release --quiet
+	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(PEERS)/bin/python benches/scale/scale.py $${CARGO_TARGET_DIR:-target}/release/sci-recon $(IMAGE) \
+		--size $(SIZE) --frames $(FRAMES) --algorithm $(ALGORITHM) $(if $(DEVICE),--device $(DEVICE) --workers 1)
+$(PEERS)/.stamp: benches/peers/requirements.txt
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
 TRAINING := .venv/training

@@ -27,7 +27,7 @@ fn kernels(criterion: &mut Criterion) {
 
     group.throughput(Throughput::Elements(voxels));
     for updates in [1, 4, 20] {
-        let mut tv = TotalVariation::new(DIM.1, DIM.2);
+        let mut tv = TotalVariation::new(DIM);
         let mut frames = random(1);
         group.bench_function(format!("tv, {updates} dual updates"), |bencher| {
             bencher.iter(|| tv.denoise(black_box(&mut frames), 0.1, updates));

@@ -26,6 +26,7 @@ enum Command {
     Demo(cli::demo::Arguments),
     Token(cli::token::Arguments),
     Backup(cli::backup::Arguments),
+    CheckModel(cli::check_model::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -40,6 +41,7 @@ fn main() -> ExitCode {
         Command::Demo(arguments) => cli::demo::run(&arguments),
         Command::Token(arguments) => cli::token::run(&arguments),
         Command::Backup(arguments) => cli::backup::run(&arguments),
+        Command::CheckModel(arguments) => cli::check_model::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

@@ -17,7 +17,7 @@ use crate::work::NetworkSource;
 pub(super) struct ScheduleArguments {
     /// The algorithm.
     #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastDvdNet.name(),
-          value_parser = algorithms())]
+          value_parser = named(&Algorithm::ALL))]
     pub(super) algorithm: Algorithm,
     /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
     #[arg(long, value_name = "FILE")]
@@ -40,8 +40,15 @@ pub(super) struct EngineArguments {
 }
 
 impl ScheduleArguments {
-    /// The schedule, checked.
+    /// The schedule, checked; without stages for an algorithm that has none.
     pub(super) fn resolve(&self) -> Result<ScheduleSpec, CliError> {
+        if self.algorithm == Algorithm::Learned {
+            if self.schedule.is_some() || self.iterations.is_some() {
+                let text = "learned runs one network once: it takes no --schedule or --iterations";
+                return Err(CliError::Input(text.into()));
+            }
+            return Ok(self.algorithm.default_schedule());
+        }
         let spec = match &self.schedule {
             None => self.algorithm.default_schedule(),
             Some(path) => {
@@ -81,9 +88,15 @@ pub(super) fn checked(spec: &ScheduleSpec) -> Result<Schedule, CliError> {
     })
 }
 
-/// Names of algorithms.
+/// Names of algorithms that need no network of the user's.
 pub(super) fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
-    PossibleValuesParser::new(Algorithm::ALL.map(Algorithm::name)).try_map(|name: String| {
+    let [own @ .., _] = &Algorithm::ALL;
+    named(own)
+}
+
+fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {
+    let names: Vec<&str> = algorithms.iter().map(|algorithm| algorithm.name()).collect();
+    PossibleValuesParser::new(names).try_map(|name: String| {
         let named = Algorithm::ALL.into_iter().find(|algorithm| algorithm.name() == name);
         named.ok_or("no such algorithm")
     })

@@ -1,5 +1,7 @@
 //! `sci-recon reconstruct`: one snapshot, without a server.
 
+mod report;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::thread;
@@ -7,25 +9,26 @@ use std::time::Instant;
 
 use clap::Args;
 use ndarray::{Array2, Array3, s};
-use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{EngineArguments, ScheduleArguments, checked};
 use super::input::{Scaled, Source};
+use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
-use crate::job::{Algorithm, ScheduleSpec, TileSpec, Timestamp};
+use crate::job::{Algorithm, ScheduleSpec, Timestamp};
 use crate::recon::metrics;
 use crate::recon::scale::ScaleEstimator;
 use crate::recon::tile::TilePlan;
 use crate::work::manifest::{
-    Content, Inputs, Manifest, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
+    Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
     frame_attributes,
 };
 use crate::work::{
-    NetworkSource, ResultSpec, SnapshotInput, TileOutcome, Usage, blended_frame, check_output,
-    peak_rss_bytes, replace_result, solve, write_result,
+    NetworkSource, ResultSpec, SnapshotInput, Solver, TileOutcome, Usage, blended_frame,
+    check_output, peak_rss_bytes, replace_result, solve, write_result,
 };
+use report::Report;
 
 /// Reconstruct the frames of one snapshot from files, without a server.
 #[derive(Debug, Args)]
@@ -58,6 +61,11 @@ pub struct Arguments {
     truth_full_scale: Option<f32>,
     #[command(flatten)]
     schedule: ScheduleArguments,
+    /// The network of --algorithm learned: an ONNX file with inputs `measurement [1,1,H,W]` and
+    /// `masks [1,B,H,W]` and output `frames [1,B,H,W]`, all float32. The measurement is sum C x with
+    /// frames x from 0 to 1.
+    #[arg(long, value_name = "FILE", required_if_eq("algorithm", Algorithm::Learned.name()))]
+    model: Option<PathBuf>,
     #[command(flatten)]
     engine: EngineArguments,
     /// Networks of your own instead of those in the program: a folder with
@@ -68,12 +76,13 @@ pub struct Arguments {
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels.
-    #[arg(long, value_name = "PIXELS", default_value_t = TileSpec::default().size)]
-    tile: usize,
-    /// Least overlap of neighbouring tiles, in pixels.
-    #[arg(long, value_name = "PIXELS", default_value_t = TileSpec::default().overlap)]
-    overlap: usize,
+    /// Largest side of a tile, in pixels [default: 256; the whole picture for a network that takes
+    /// no other].
+    #[arg(long, value_name = "PIXELS")]
+    tile: Option<usize>,
+    /// Least overlap of neighbouring tiles, in pixels [default: 32, or 0 for the whole picture].
+    #[arg(long, value_name = "PIXELS")]
+    overlap: Option<usize>,
     /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
@@ -82,32 +91,34 @@ pub struct Arguments {
     json: bool,
 }
 
-/// What `--json` prints.
-#[derive(Debug, Serialize)]
-struct Report {
-    algorithm: &'static str,
-    frames: usize,
-    height: usize,
-    width: usize,
-    psnr_db: Option<f64>,
-    ssim: Option<f64>,
-    seconds: f64,
-    denoiser_passes: usize,
-    tv_iterations: usize,
-    cpu_seconds: f64,
-    peak_rss_bytes: u64,
-    /// None for a schedule without a network.
-    provider: Option<&'static str>,
-    stop_reason: String,
-}
-
 /// What is to be done with the input.
 struct Setup {
     algorithm: Algorithm,
     schedule: ScheduleSpec,
     plan: TilePlan,
     network: NetworkSource,
+    model: Option<Learned>,
     threads: usize,
+}
+
+impl Setup {
+    fn needs_network(&self) -> bool {
+        self.model.is_some() || self.schedule.needs_network()
+    }
+
+    /// The schedule with all defaults filled in.
+    fn full_schedule(&self) -> Result<ScheduleSpec, CliError> {
+        match self.model {
+            None => Ok(ScheduleSpec::from(&checked(&self.schedule)?)),
+            Some(_) => Ok(self.schedule.clone()),
+        }
+    }
+
+    fn models(&self) -> Result<Vec<ModelRecord>, CliError> {
+        let mut models = self.network.records(&self.schedule)?;
+        models.extend(self.model.as_ref().map(Learned::record));
+        Ok(models)
+    }
 }
 
 /// Runs the command.
@@ -121,13 +132,14 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     if let Some(out) = &arguments.out {
         check_output(out)?;
     }
-    let (_, height, width) = input.masks.array.dim();
+    let model = learned(arguments, &network)?;
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let setup = Setup {
         algorithm: arguments.schedule.algorithm,
         schedule,
-        plan: TilePlan::new(height, width, arguments.tile, arguments.overlap)?,
+        plan: plan((arguments.tile, arguments.overlap), model.as_ref(), input.masks.array.dim())?,
         network,
+        model,
         threads: arguments.threads.map_or(cores, usize::from),
     };
 
@@ -143,6 +155,18 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         solution.write(out, &setup, manifest)?;
     }
     solution.report(&input, &setup, spent)?.print(arguments)
+}
+
+/// The network of `--model`.
+fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Learned>, CliError> {
+    let Some(path) = &arguments.model else { return Ok(None) };
+    match arguments.schedule.algorithm {
+        Algorithm::Learned => Learned::open(path, network).map(Some),
+        other => Err(CliError::Input(format!(
+            "{} takes no --model; ask for --algorithm learned",
+            other.name()
+        ))),
+    }
 }
 
 /// What the computing took.
@@ -216,11 +240,19 @@ impl<'a> Input<'a> {
         let mut estimator = ScaleEstimator::new(height, width);
         self.masks.array.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
         let white = estimator.white(self.measurement.array.view())?;
+        let schedule;
+        let solver = match &setup.model {
+            Some(model) => Solver::Network(&model.file),
+            None => {
+                schedule = checked(&setup.schedule)?;
+                Solver::Schedule(&schedule)
+            }
+        };
         let input = SnapshotInput {
             masks: self.masks.array.view(),
             measurement: self.measurement.array.view(),
             white,
-            schedule: &checked(&setup.schedule)?,
+            solver,
             plan: &setup.plan,
         };
         let bar = SnapshotBar::new(&setup.schedule, setup.plan.len());
@@ -258,7 +290,7 @@ impl Solution {
             tv_iterations: summary.tv_iterations,
             cpu_seconds: spent.cpu_seconds,
             peak_rss_bytes: peak_rss_bytes(),
-            provider: setup.schedule.needs_network().then(|| setup.network.provider()),
+            provider: setup.needs_network().then(|| setup.network.provider()),
             stop_reason: summary.stop_reason,
         })
     }
@@ -294,12 +326,12 @@ impl Solution {
         spent: Spent,
     ) -> Result<Manifest, CliError> {
         let (frames, height, width) = input.masks.array.dim();
-        let deep = setup.schedule.needs_network();
+        let deep = setup.needs_network();
         let tiles = self.records();
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
             algorithm: setup.algorithm,
-            schedule: ScheduleSpec::from(&checked(&setup.schedule)?),
+            schedule: setup.full_schedule()?,
             frames,
             height,
             width,
@@ -308,7 +340,7 @@ impl Solution {
                 masks_sha256: input.sources.masks.sha256()?,
                 measurement_sha256: input.sources.measurement.sha256()?,
             },
-            models: setup.network.records(&setup.schedule)?,
+            models: setup.models()?,
             scale: ScaleRecord {
                 masks_full_scale: input.masks.full_scale,
                 measurement_full_scale: input.measurement.full_scale,
@@ -345,37 +377,5 @@ impl Solution {
         let frame = |k| Ok::<_, CliError>(blended_frame(plan, &self.tiles, k));
         write_result(made.path(), &spec, frame, |files| manifest.with_files(files))?;
         Ok(replace_result(made.path(), out)?)
-    }
-}
-
-impl Report {
-    fn print(&self, arguments: &Arguments) -> Result<(), CliError> {
-        if arguments.json {
-            let text = serde_json::to_string(self)
-                .map_err(|error| CliError::Failure(format!("the report: {error}")))?;
-            println!("{text}");
-            return Ok(());
-        }
-        println!(
-            "{}: {} frames of {}x{} in {:.1} s ({:.1} CPU-seconds), {} TV iterations, {} denoiser \
-             passes, {}",
-            self.algorithm,
-            self.frames,
-            self.height,
-            self.width,
-            self.seconds,
-            self.cpu_seconds,
-            self.tv_iterations,
-            self.denoiser_passes,
-            self.stop_reason
-        );
-        if let Some(psnr) = self.psnr_db {
-            let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
-            println!("PSNR {psnr:.2} dB{ssim}");
-        }
-        if let Some(out) = &arguments.out {
-            println!("frames are in {}", out.display());
-        }
-        Ok(())
     }
 }

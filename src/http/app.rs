@@ -9,6 +9,7 @@ use tokio_util::sync::CancellationToken;
 use super::admission::Promises;
 use super::events::Events;
 use super::metrics::Metrics;
+use super::model_check::Checker;
 use super::pictures::Pictures;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
@@ -37,6 +38,7 @@ pub struct Shared {
     pub(super) finishing: Mutex<()>,
     /// One file is checked at a time: each takes a core and a frame of memory.
     pub(super) intake: Arc<Semaphore>,
+    pub(super) checker: Checker,
     pub(super) metrics: Metrics,
     pub(super) events: Events,
     pub(super) pictures: Pictures,
@@ -91,6 +93,7 @@ impl App {
             promises: Promises::default(),
             finishing: Mutex::new(()),
             intake: Arc::new(Semaphore::new(1)),
+            checker: Checker::new(settings),
             metrics,
         }))
     }

@@ -16,7 +16,7 @@ use super::extract::{Body, Params, QueryOf, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
     Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
-    MeasurementId, SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
+    MeasurementId, ModelId, SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
 };
 use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
 
@@ -31,6 +31,8 @@ pub(super) struct JobBody {
     shape: SceneShape,
     snapshots: SnapshotRange,
     algorithm: Algorithm,
+    /// The network of `learned`; null for all others.
+    model: Option<ModelId>,
     schedule: ScheduleSpec,
     tile: TileSpec,
     priority: i32,
@@ -51,6 +53,7 @@ impl JobBody {
             shape,
             snapshots,
             algorithm,
+            model,
             schedule,
             tile,
             priority,
@@ -67,6 +70,7 @@ impl JobBody {
             shape,
             snapshots,
             algorithm,
+            model: model.map(|model| model.id),
             schedule,
             tile,
             priority,
@@ -146,7 +150,14 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, A
         width: measurement.width,
         snapshots: measurement.snapshots,
     };
-    let resolved = request.resolve(calibration.id, shape);
+    let model = match request.model {
+        None => None,
+        Some(id) => {
+            let model = app.store.model(lab, id).await;
+            Some(model.map_err(|error| missing("/model", error))?.into())
+        }
+    };
+    let resolved = request.resolve(calibration.id, shape, model);
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
     check_memory(app, &spec)?;

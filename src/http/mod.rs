@@ -21,6 +21,8 @@ mod jobs;
 mod layers;
 mod measurements;
 mod metrics;
+mod model_check;
+mod models;
 mod page;
 mod pictures;
 mod quality;

@@ -11,7 +11,7 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::{
     algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, pictures, quality, reports, results, system, tiles, tus,
+    metrics, models, pictures, quality, reports, results, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -34,6 +34,8 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/calibrations/{calibration}/maps/{map}").get(reports::map),
         R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
         R::at("/v1/measurements/{measurement}").get(measurements::show).delete(measurements::delete),
+        R::at("/v1/models").get(models::list).post(models::create).slow(),
+        R::at("/v1/models/{model}").get(models::show).delete(models::delete),
         R::at("/v1/algorithms").get(algorithms::list),
         R::at("/v1/jobs").get(jobs::list).post(jobs::create),
         R::at("/v1/jobs/{job}").get(jobs::show).delete(jobs::delete),

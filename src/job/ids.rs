@@ -74,6 +74,10 @@ identifier!(
     MeasurementId
 );
 identifier!(
+    /// A model: an end-to-end network that is registered for a calibration.
+    ModelId
+);
+identifier!(
     /// A job: the reconstruction of some snapshots of one measurement.
     JobId
 );

@@ -1,7 +1,7 @@
 //! How much memory a worker needs for a job: planned when the job is asked for, not hoped for.
 
-use super::JobSpec;
 use super::schedule::{MethodSpec, PriorSpec};
+use super::{JobModel, JobSpec};
 
 /// The program, its thread stacks and, with the deep denoiser, ONNX Runtime and the network.
 const BASE_BYTES: u64 = 128 << 20;
@@ -20,12 +20,32 @@ const NETWORK_BYTES_PER_PIXEL: u64 = 2600;
 const NETWORK_PIXELS: u64 = 1 << 18;
 
 impl JobSpec {
+    /// The planned cost of a tile in CPU-nanoseconds per voxel: of the schedule, or of a network as
+    /// its trial took it.
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)] // counts far below 2^53
+    pub fn planned_ns_per_voxel(&self) -> f64 {
+        match &self.model {
+            None => self.schedule.planned_ns_per_voxel(),
+            Some(JobModel { trial, .. }) => {
+                let voxels = (trial.pixels() * self.shape.frames).max(1);
+                trial.cpu_seconds * 1e9 / voxels as f64
+            }
+        }
+    }
+
     /// An upper bound of the resident memory, in bytes, of a worker that does a tile of this job.
     #[must_use]
     pub fn worker_bytes(&self) -> u64 {
         let side = |length: usize| length.min(self.tile.size) as u64;
         let pixels = side(self.shape.height) * side(self.shape.width);
         let voxels = pixels * self.shape.frames as u64;
+        if let Some(model) = &self.model {
+            // What the trial took grows with the picture at most.
+            let trial = (model.trial.pixels() as u64).max(1);
+            let network = model.trial.peak_rss_bytes.saturating_mul(pixels.div_ceil(trial).max(1));
+            return BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL + network;
+        }
         let mut per_voxel = SOLVER_BYTES_PER_VOXEL;
         if self.schedule.method == MethodSpec::Admm {
             per_voxel += START_BYTES_PER_VOXEL;
@@ -58,6 +78,7 @@ mod tests {
             shape: SceneShape { frames, height: side, width: side, snapshots: 1 },
             snapshots: SnapshotRange { first: 0, count: 1 },
             algorithm,
+            model: None,
             schedule: algorithm.default_schedule(),
             tile: TileSpec { size: side, overlap: 0 },
             priority: 0,

@@ -1,11 +1,13 @@
 //! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
 
 mod access;
+mod algorithm;
 mod captures;
 mod disk;
 mod finding;
 mod ids;
 mod memory;
+mod model;
 mod reason;
 mod report;
 mod request;
@@ -15,16 +17,18 @@ mod task;
 mod text;
 
 pub use access::{Lab, Role, Secret};
+pub use algorithm::Algorithm;
 pub use captures::Captures;
 pub use finding::{Finding, Grade, Severity};
 pub use ids::{
-    CalibrationId, InvalidId, JobId, MeasurementId, PartialId, TaskId, TokenId, WorkerId,
+    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };
+pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use reason::without_paths;
 pub use report::{CalibrationReport, CaptureReport, MaskReport, PatternReport};
 pub use request::{
-    Algorithm, InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange,
-    SnapshotSelection, TileSpec,
+    InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange, SnapshotSelection,
+    TileSpec,
 };
 pub use schedule::{MethodSpec, PriorSpec, ScheduleSpec, StageSpec};
 pub use state::{IllegalTransition, JobState};

@@ -3,124 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use super::Finding;
-use super::ids::{CalibrationId, MeasurementId};
-use super::schedule::{PriorSpec, ScheduleSpec};
+use super::algorithm::Algorithm;
+use super::ids::{CalibrationId, MeasurementId, ModelId};
+use super::model::{JobModel, ModelChoice};
+use super::schedule::ScheduleSpec;
 use super::text::Label;
-use crate::recon::schedule::Schedule;
 use crate::recon::tile::TilePlan;
 
 /// The most tasks of one job; a larger one should be sent as several ranges of snapshots.
 pub const MAX_TASKS: usize = 50_000;
-
-/// The algorithms.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Algorithm {
-    /// GAP with total variation.
-    GapTv,
-    /// ADMM with total variation.
-    AdmmTv,
-    /// GAP with total variation, then with the nonlocal prior.
-    PnpNonlocal,
-    /// GAP with total variation, then with FFDNet.
-    #[serde(rename = "pnp-ffdnet")]
-    PnpFfdNet,
-    /// GAP with total variation, then with FastDVDNet.
-    #[serde(rename = "pnp-fastdvdnet")]
-    PnpFastDvdNet,
-    /// GAP with total variation, with FastDVDNet, then with the nonlocal prior.
-    #[serde(rename = "pnp-tv-fastdvdnet")]
-    PnpTvFastDvdNet,
-}
-
-impl Algorithm {
-    /// All algorithms.
-    pub const ALL: [Self; 6] = [
-        Self::GapTv,
-        Self::AdmmTv,
-        Self::PnpNonlocal,
-        Self::PnpFfdNet,
-        Self::PnpFastDvdNet,
-        Self::PnpTvFastDvdNet,
-    ];
-
-    /// The name in JSON, on the command line and in the database.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::GapTv => "gap-tv",
-            Self::AdmmTv => "admm-tv",
-            Self::PnpNonlocal => "pnp-nonlocal",
-            Self::PnpFfdNet => "pnp-ffdnet",
-            Self::PnpFastDvdNet => "pnp-fastdvdnet",
-            Self::PnpTvFastDvdNet => "pnp-tv-fastdvdnet",
-        }
-    }
-
-    /// What it does, in a sentence.
-    #[must_use]
-    pub fn summary(self) -> &'static str {
-        match self {
-            Self::GapTv => {
-                "Accelerated generalized alternating projection with total variation: seconds, \
-                 no network."
-            }
-            Self::AdmmTv => {
-                "The alternating direction method of multipliers with total variation: for noisy \
-                 measurements."
-            }
-            Self::PnpNonlocal => {
-                "Total variation, then groups of similar patches of several frames, filtered by \
-                 their own covariance: no network."
-            }
-            Self::PnpFfdNet => "Total variation, then FFDNet on each frame.",
-            Self::PnpFastDvdNet => "Total variation, then FastDVDNet over the clip.",
-            Self::PnpTvFastDvdNet => {
-                "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best \
-                 on all masks measured."
-            }
-        }
-    }
-
-    /// The schedule of a job that names none.
-    #[must_use]
-    pub fn default_schedule(self) -> ScheduleSpec {
-        ScheduleSpec::from(&match self {
-            Self::GapTv => Schedule::gap_tv(),
-            Self::AdmmTv => Schedule::admm_tv(),
-            Self::PnpNonlocal => Schedule::pnp_nonlocal(),
-            Self::PnpFfdNet => Schedule::pnp_ffdnet(),
-            Self::PnpFastDvdNet => Schedule::pnp_fastdvdnet(),
-            Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
-        })
-    }
-
-    /// The priors that a schedule of this algorithm may name.
-    #[must_use]
-    pub fn priors(self) -> Vec<PriorSpec> {
-        use PriorSpec as P;
-        match self {
-            Self::GapTv | Self::AdmmTv => vec![P::Tv],
-            Self::PnpNonlocal => vec![P::Tv, P::Nonlocal],
-            Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
-            Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNet],
-            Self::PnpTvFastDvdNet => vec![P::Tv, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal],
-        }
-    }
-
-    /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
-    /// what the stages don't do.
-    #[must_use]
-    pub fn misfit(self, schedule: &ScheduleSpec) -> Option<String> {
-        let own = self.priors();
-        let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;
-        let taken = |other: &&Self| other.misfit(schedule).is_none();
-        // Later ones take more.
-        let later = Self::ALL.iter().skip_while(|other| **other != self).skip(1).find(taken);
-        let instead = later.map_or_else(String::new, |other| format!("; ask for {}", other.name()));
-        Some(format!("{} has no stages of {}{instead}", self.name(), stranger.prior.name()))
-    }
-}
 
 /// One thing wrong with a request, and where it stands.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -229,6 +120,14 @@ impl Default for TileSpec {
     }
 }
 
+impl TileSpec {
+    /// One tile for the whole of a picture.
+    #[must_use]
+    pub fn whole(height: usize, width: usize) -> Self {
+        Self { size: height.max(width).max(16), overlap: 0 }
+    }
+}
+
 /// The sizes of a measurement and its calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneShape {
@@ -256,10 +155,14 @@ pub struct JobRequest {
     pub snapshots: SnapshotSelection,
     /// The algorithm.
     pub algorithm: Algorithm,
+    /// The network of [`Algorithm::Learned`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub model: Option<ModelId>,
     /// The schedule; the algorithm's own where it is left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub schedule: Option<ScheduleSpec>,
-    /// The tiles; 256 with 32 shared where it is left out.
+    /// The tiles; 256 with 32 shared where it is left out, or the whole picture for a network that
+    /// takes no other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
     /// Jobs of higher priority are served first; from -100 to 100.
@@ -283,7 +186,10 @@ pub struct JobSpec {
     pub snapshots: SnapshotRange,
     /// The algorithm.
     pub algorithm: Algorithm,
-    /// The schedule.
+    /// The network of [`Algorithm::Learned`]; none for all others.
+    #[serde(default)]
+    pub model: Option<JobModel>,
+    /// The schedule; without stages for [`Algorithm::Learned`].
     pub schedule: ScheduleSpec,
     /// The tiles.
     pub tile: TileSpec,
@@ -297,7 +203,8 @@ pub struct JobSpec {
 }
 
 impl JobRequest {
-    /// Checks the request against the measurement and fills in the defaults.
+    /// Checks the request against the measurement and the model that it names, and fills in the
+    /// defaults.
     ///
     /// # Errors
     /// All that is wrong, each with its place in the request.
@@ -305,6 +212,7 @@ impl JobRequest {
         self,
         calibration: CalibrationId,
         shape: SceneShape,
+        model: Option<JobModel>,
     ) -> Result<JobSpec, Vec<InvalidField>> {
         let mut errors = Vec::new();
         if self.calibration.is_some_and(|given| given != calibration) {
@@ -315,15 +223,23 @@ impl JobRequest {
             errors.push(error);
             SnapshotRange { first: 0, count: 1 }
         });
+        let choice = ModelChoice {
+            algorithm: self.algorithm,
+            model: model.as_ref(),
+            schedule: self.schedule.as_ref(),
+            tile: self.tile,
+        };
+        errors.extend(choice.errors(calibration, shape));
+        let tile = choice.tile(shape);
         let schedule = self.schedule.unwrap_or_else(|| self.algorithm.default_schedule());
         match schedule.to_schedule() {
+            _ if self.algorithm == Algorithm::Learned => {}
             Err(wrong) => errors.extend(wrong.into_iter().map(|error| error.under("/schedule"))),
             Ok(_) => {
                 let misfit = self.algorithm.misfit(&schedule);
                 errors.extend(misfit.map(|detail| InvalidField::new("/algorithm", detail)));
             }
         }
-        let tile = self.tile.unwrap_or_default();
         match TilePlan::new(shape.height, shape.width, tile.size, tile.overlap) {
             Ok(plan) => errors.extend(too_many(plan.len(), snapshots)),
             Err(error) => errors.push(InvalidField::new("/tile", error.to_string())),
@@ -343,6 +259,7 @@ impl JobRequest {
             shape,
             snapshots,
             algorithm,
+            model,
             schedule,
             tile,
             priority,
@@ -408,14 +325,15 @@ mod tests {
     }
 
     fn pointers(fields: Value) -> Vec<String> {
-        let errors = request(fields).unwrap().resolve(CalibrationId::new(), SHAPE).unwrap_err();
+        let errors =
+            request(fields).unwrap().resolve(CalibrationId::new(), SHAPE, None).unwrap_err();
         errors.into_iter().map(|error| error.pointer).collect()
     }
 
     #[test]
     fn defaults_are_filled_in() {
         let calibration = CalibrationId::new();
-        let spec = request(json!({})).unwrap().resolve(calibration, SHAPE).unwrap();
+        let spec = request(json!({})).unwrap().resolve(calibration, SHAPE, None).unwrap();
         assert_eq!(spec.snapshots, SnapshotRange { first: 0, count: 6 });
         assert_eq!(spec.calibration, calibration);
         assert_eq!(spec.tile_plan().unwrap().len(), 2);
@@ -427,7 +345,7 @@ mod tests {
         for (json, first, count) in [(json!(2), 2, 1), (json!([1, 3]), 1, 3), (json!("all"), 0, 6)]
         {
             let request = request(json!({ "snapshots": json })).unwrap();
-            let spec = request.resolve(CalibrationId::new(), SHAPE).unwrap();
+            let spec = request.resolve(CalibrationId::new(), SHAPE, None).unwrap();
             assert_eq!(spec.snapshots, SnapshotRange { first, count });
         }
         assert!(request(json!({"snapshots": "some"})).is_err());

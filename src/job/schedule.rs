@@ -195,6 +195,11 @@ impl StageSpec {
 }
 
 impl ScheduleSpec {
+    /// That of an algorithm that does not iterate.
+    pub(super) fn without_stages() -> Self {
+        Self { method: MethodSpec::Gap, accelerated: false, gamma: 0.0, stages: Vec::new() }
+    }
+
     /// The schedule as the core takes it.
     ///
     /// # Errors

@@ -1,11 +1,19 @@
 //! Alternating projection with plugged-in priors (Algorithm 1 of the paper).
 
-use ndarray::{Array2, Array3, ArrayView2};
+use std::ops::Range;
+
+use ndarray::{Array2, Array3, ArrayView2, Axis};
 
 use super::denoise::{Networks, nonlocal::Nonlocal, tv::TotalVariation};
 use super::error::{ReconError, shape_text};
 use super::schedule::{Method, Prior, Schedule, Sigma, Stage};
 use super::sensing::SensingOperator;
+
+/// Values of a strip of all frames: three arrays of them (frames, masks, projection) stay in a
+/// second-level cache.
+const STRIP_VALUES: usize = 32 * 1024;
+/// Running sums side by side: so many that the compiler keeps them in a loop over registers.
+const LANES: usize = 256;
 
 /// Where a reconstruction stands, after an iteration.
 #[derive(Debug, Clone, Copy)]
@@ -153,7 +161,6 @@ impl<'a> Run<'a> {
     ) -> Self {
         let y = y.as_standard_layout().into_owned();
         let squares: f64 = y.iter().map(|&value| f64::from(value) * f64::from(value)).sum();
-        let (_, height, width) = op.dim();
         let zeros = || Array3::zeros(op.dim());
         Self {
             op,
@@ -164,7 +171,7 @@ impl<'a> Run<'a> {
             x: zeros(),
             start: schedule.has_own_start().then(zeros),
             multiplier: (schedule.method == Method::Admm).then(zeros),
-            tv: TotalVariation::new(height, width),
+            tv: TotalVariation::new(op.dim()),
             nonlocal: None,
             networks,
             done: 0,
@@ -184,15 +191,18 @@ impl<'a> Run<'a> {
         self.nonlocal = None;
         for iteration in 0..stage.iterations {
             let sigma = stage.sigma_at(iteration);
-            let y1 = self.y1.as_mut().map(|y1| (y1, stage.memory));
-            let start = self.start.as_ref().unwrap_or(&self.v);
-            let squares = self.op.project(&self.y, y1, start, &mut self.x);
-            if let (Some(u), Some(z)) = (&self.multiplier, &mut self.start) {
-                self.x -= u;
-                z.assign(&self.x);
-            }
-            self.apply(stage, sigma)?;
-            let change = relative_change(&self.x, &self.v);
+            let (squares, change) = if stage.prior == Prior::Tv && self.multiplier.is_none() {
+                self.project_and_smooth(stage)
+            } else {
+                let squares = self.project(stage.memory, 0..self.y.nrows());
+                if let (Some(u), Some(z)) = (&self.multiplier, &mut self.start) {
+                    self.x -= u;
+                    z.assign(&self.x);
+                }
+                self.apply(stage, sigma)?;
+                (squares, self.change(0..self.y.nrows()))
+            };
+            let change = change.relative();
             self.prepare_start(stage.momentum);
             std::mem::swap(&mut self.v, &mut self.x);
             self.done += 1;
@@ -222,6 +232,38 @@ impl<'a> Run<'a> {
             }
         }
         Ok(StopReason::MaxIterations)
+    }
+
+    /// Projection, total variation and the change, strip by strip, so that what the memory hands
+    /// over is used for all three while it is in cache.
+    fn project_and_smooth(&mut self, stage: &Stage) -> (f64, Change) {
+        let (frames, height, width) = self.op.dim();
+        let rows = (STRIP_VALUES / (frames * width)).clamp(4, height.max(4));
+        let (mut squares, mut change) = (0.0, Change::default());
+        for start in (0..height).step_by(rows) {
+            let strip = start..height.min(start + rows);
+            squares += self.project(stage.memory, strip.clone());
+            let (weight, updates) = (stage.tv_weight, stage.tv_updates);
+            for k in 0..frames {
+                let done = self.tv.advance(k, &mut self.x, strip.clone(), weight, updates);
+                change.add(&self.x, &self.v, k, done);
+            }
+        }
+        self.tv_iterations += usize::from(stage.tv_weight > 0.0);
+        (squares, change)
+    }
+
+    /// Projects some rows into `x`; `||y - H v||^2` of them.
+    fn project(&mut self, memory: f32, rows: Range<usize>) -> f64 {
+        let y1 = self.y1.as_mut().map(|y1| (y1, memory));
+        let start = self.start.as_ref().unwrap_or(&self.v);
+        self.op.project(rows, &self.y, y1, start, &mut self.x)
+    }
+
+    fn change(&self, rows: Range<usize>) -> Change {
+        let mut change = Change::default();
+        (0..self.op.dim().0).for_each(|k| change.add(&self.x, &self.v, k, rows.clone()));
+        change
     }
 
     /// `v = D(x)`, in place.
@@ -258,45 +300,51 @@ impl<'a> Run<'a> {
     }
 
     fn residual(&mut self) -> f32 {
-        let squares = self.op.project(&self.y, None, &self.v, &mut self.x);
+        let squares = self.op.project(0..self.y.nrows(), &self.y, None, &self.v, &mut self.x);
         (squares.sqrt() / self.y_norm) as f32
     }
 }
 
-/// `||new - old|| / ||new||`; 0 if nothing changed.
-fn relative_change(new: &Array3<f32>, old: &Array3<f32>) -> f32 {
-    let (mut difference, mut norm) = (0.0f64, 0.0f64);
-    for (new, old) in new.outer_iter().zip(old.outer_iter()) {
-        let (Some(new), Some(old)) = (new.as_slice(), old.as_slice()) else {
-            unreachable!("arrays of the solver are in standard layout")
-        };
-        let (d, n) = change_sums(new, old);
-        difference += d;
-        norm += n;
-    }
-    if difference == 0.0 { 0.0 } else { (difference / norm).sqrt() as f32 }
+/// Squares of the change and of the new values, added up.
+#[derive(Debug, Default)]
+struct Change {
+    difference: f64,
+    norm: f64,
 }
 
+impl Change {
+    /// Adds rows of frame `k`.
+    fn add(&mut self, new: &Array3<f32>, old: &Array3<f32>, k: usize, rows: Range<usize>) {
+        let width = new.dim().2;
+        let values = rows.start * width..rows.end * width;
+        let (new, old) = (new.index_axis(Axis(0), k), old.index_axis(Axis(0), k));
+        let (Some(new), Some(old)) = (new.to_slice(), old.to_slice()) else {
+            unreachable!("arrays of the solver are in standard layout")
+        };
+        let (difference, norm) = change_sums(&new[values.clone()], &old[values]);
+        self.difference += difference;
+        self.norm += norm;
+    }
+
+    /// `||new - old|| / ||new||`; 0 if nothing changed.
+    fn relative(&self) -> f32 {
+        if self.difference == 0.0 { 0.0 } else { (self.difference / self.norm).sqrt() as f32 }
+    }
+}
+
+/// `(||new - old||^2, ||new||^2)`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn change_sums(new: &[f32], old: &[f32]) -> (f64, f64) {
-    // Sixteen running sums in f32 over short pieces, added up in f64: vectorises, and is
-    // the same on every machine.
-    let (mut difference, mut norm) = (0.0f64, 0.0f64);
-    for (new, old) in new.chunks(1024).zip(old.chunks(1024)) {
-        let (mut d, mut n) = ([0.0f32; 16], [0.0f32; 16]);
-        for (new, old) in new.chunks_exact(16).zip(old.chunks_exact(16)) {
-            for lane in 0..16 {
-                d[lane] += (new[lane] - old[lane]) * (new[lane] - old[lane]);
-                n[lane] += new[lane] * new[lane];
-            }
+    // Running sums in f32 side by side, added up in f64: vectorises, and is the same on every
+    // machine.
+    let (mut difference, mut norm) = ([0.0f32; LANES], [0.0f32; LANES]);
+    for (new, old) in new.chunks(LANES).zip(old.chunks(LANES)) {
+        let sums = difference.iter_mut().zip(&mut norm);
+        for ((difference, norm), (&new, &old)) in sums.zip(new.iter().zip(old)) {
+            *difference += (new - old) * (new - old);
+            *norm += new * new;
         }
-        let rest = new.len() / 16 * 16;
-        for (&new, &old) in new[rest..].iter().zip(&old[rest..]) {
-            d[0] += (new - old) * (new - old);
-            n[0] += new * new;
-        }
-        difference += f64::from(d.iter().sum::<f32>());
-        norm += f64::from(n.iter().sum::<f32>());
     }
-    (difference, norm)
+    let total = |sums: [f32; LANES]| sums.iter().copied().map(f64::from).sum();
+    (total(difference), total(norm))
 }

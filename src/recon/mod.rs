@@ -2,12 +2,13 @@
 //!
 //! A snapshot `y = sum_k C_k x_k` of `B` frames goes through a [`sensing::SensingOperator`];
 //! [`gap::reconstruct`] alternates its projection with the priors that a
-//! [`schedule::Schedule`] names. All arrays are `f32` with axes (frame, row, column); frames
+//! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes (frame, row, column); frames
 //! and masks live on \[0,1\].
 
 pub mod denoise;
 pub mod error;
 pub mod gap;
+pub mod learned;
 pub mod metrics;
 pub mod scale;
 pub mod schedule;

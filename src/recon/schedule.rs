@@ -186,9 +186,12 @@ impl Schedule {
         Self { method, accelerated: false, gamma: 0.01, stages: vec![tv_stage(200, 3e-4)] }
     }
 
-    /// PnP-FFDNet: total variation, then the image denoiser, frame by frame.
+    /// PnP-FFDNet: total variation, then the image denoiser, frame by frame. Behind correlated masks
+    /// it stays above total variation only with a long memory, no momentum and low levels.
     pub fn pnp_ffdnet() -> Self {
-        Self::gap(vec![tv_stage(60, 0.0), deep_stage(Network::FfdNet, 20, 25.0, 8.0)])
+        let deep = deep_stage(Network::FfdNet, 30, 15.0, 3.0);
+        let patient = Stage { memory: 0.95, momentum: 0.0, ..deep };
+        Self::gap(vec![tv_stage(60, 0.0), patient])
     }
 
     /// PnP-FastDVDNet: total variation, then the video denoiser.

@@ -1,5 +1,7 @@
 //! The sensing operator of a snapshot camera and its projection.
 
+use std::ops::Range;
+
 use multiversion::multiversion;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
@@ -112,10 +114,11 @@ impl SensingOperator {
     /// `t = y`, or, accelerated, `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that
     /// is the published `y1 += y - H v` (Liao et al. 2014), with 0 it is plain GAP.
     ///
-    /// `y` and `y1` are \[H,W\], `v` and `x` \[B,H,W\], all of the operator's size and in
-    /// standard layout. Returns `||y - H v||^2`.
+    /// Only `rows` are done; they need no other. `y` and `y1` are \[H,W\], `v` and `x` \[B,H,W\],
+    /// all of the operator's size and in standard layout. Returns `||y - H v||^2` of the rows.
     pub(super) fn project(
         &self,
+        rows: Range<usize>,
         y: &Array2<f32>,
         y1: Option<(&mut Array2<f32>, f32)>,
         v: &Array3<f32>,
@@ -137,7 +140,7 @@ impl SensingOperator {
         let mut squares = 0.0f64;
         // Row by row over all frames: a row of v and of the masks is still in cache when the
         // correction is added.
-        for start in (0..plane).step_by(width) {
+        for start in rows.map(|row| row * width) {
             let row = start..start + width;
             let stack = Stack { plane, start, width, frames };
             let target = accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
@@ -193,21 +196,17 @@ fn project_row(
             *s += c * value;
         }
     }
-    let mut squares = 0.0f32;
+    let squares = squared_distance(y, sum);
     match y1 {
         Some((y1, memory)) => {
             for (((s, &y), t), &inverse) in sum.iter_mut().zip(y).zip(y1).zip(inverse) {
-                let residual = y - *s;
-                squares += residual * residual;
                 *t = y + memory * (*t - *s);
                 *s = (*t - *s) * inverse;
             }
         }
         None => {
             for ((s, &y), &inverse) in sum.iter_mut().zip(y).zip(inverse) {
-                let residual = y - *s;
-                squares += residual * residual;
-                *s = residual * inverse;
+                *s = (y - *s) * inverse;
             }
         }
     }
@@ -219,6 +218,19 @@ fn project_row(
         }
     }
     f64::from(squares)
+}
+
+/// `||a - b||^2`.
+#[inline(always)]
+fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+    // Sums side by side: one after the other they would wait for each other.
+    let mut sums = [0.0f32; 128];
+    for (a, b) in a.chunks(128).zip(b.chunks(128)) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += (a - b) * (a - b);
+        }
+    }
+    sums.iter().sum()
 }
 
 #[cfg(test)]
@@ -257,7 +269,7 @@ mod tests {
             let y = op.forward(truth.view()).unwrap();
             let v = random(seed ^ 2, dim);
             let mut x = Array3::zeros(dim);
-            let squares = op.project(&y, None, &v, &mut x);
+            let squares = op.project(0..y.nrows(), &y, None, &v, &mut x);
             let before = &y - &op.forward(v.view()).unwrap();
             let after = &y - &op.forward(x.view()).unwrap();
             let expected: f64 = before.iter().map(|&r| f64::from(r * r)).sum();
@@ -287,7 +299,7 @@ mod tests {
         let v = random(4, (2, 3, 3));
         let mut x = Array3::zeros((2, 3, 3));
         let mut y1 = Array2::from_elem((3, 3), 5.0);
-        op.project(&Array2::from_elem((3, 3), 1.0), Some((&mut y1, 1.0)), &v, &mut x);
+        op.project(0..3, &Array2::from_elem((3, 3), 1.0), Some((&mut y1, 1.0)), &v, &mut x);
         assert_eq!(x[[0, 1, 1]], v[[0, 1, 1]]);
         assert!(x.iter().all(|value| value.is_finite()));
     }

@@ -36,7 +36,7 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::NotFound`] if the
-    /// measurement is gone.
+    /// measurement or the model is gone.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted, StoreError> {
         let mut transaction = self.write().await?;
         if let Some(key) = &new.idempotency_key
@@ -51,8 +51,8 @@ impl Store {
             .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
         sqlx::query(
             "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-                 idempotency_key, request, created_at, lab, disk_bytes)
-             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
+                 idempotency_key, request, created_at, lab, disk_bytes, model)
+             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?)",
         )
         .bind(id.to_string())
         .bind(new.spec.calibration.to_string())
@@ -65,10 +65,14 @@ impl Store {
         .bind(Timestamp::now().0)
         .bind(new.lab.as_str())
         .bind(disk_bytes)
+        .bind(new.spec.model.as_ref().map(|model| model.id.to_string()))
         .execute(&mut *transaction)
         .await
         .map_err(|error| {
-            let id = new.spec.measurement.to_string();
+            let mut id = new.spec.measurement.to_string();
+            if let Some(model) = &new.spec.model {
+                id += &format!(" or model {}", model.id);
+            }
             super::calibrations::gone_if_foreign_key(error, "measurement", id)
         })?;
         tasks::insert(&mut transaction, id, &new.spec).await?;

@@ -123,6 +123,7 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
                  AND NOT EXISTS (SELECT 1 FROM calibration_captures WHERE sha256 = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM models WHERE file = ?1)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)",
         )
         .bind(sha256.to_string())
@@ -146,7 +147,8 @@ impl Store {
             "DELETE FROM holdings AS h WHERE touched_at < ?
                  AND NOT EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = sha256)
                  AND NOT EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = sha256)
-                 AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c WHERE c.sha256 = h.sha256)",
+                 AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c WHERE c.sha256 = h.sha256)
+                 AND NOT EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = sha256)",
         )
         .bind(before.0)
         .execute(&mut *transaction)
@@ -157,6 +159,7 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
                  AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c WHERE c.sha256 = blobs.sha256)
+                 AND NOT EXISTS (SELECT 1 FROM models WHERE file = sha256)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
              RETURNING sha256",
         )

@@ -134,20 +134,23 @@ impl Store {
         Page::cut(&rows, limit, calibration)
     }
 
-    /// Deletes a calibration that no measurement refers to.
+    /// Deletes a calibration that no measurement and no model refers to.
     ///
     /// # Errors
     /// [`StoreError::NotFound`], [`StoreError::InUse`].
     pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
         let unready = self.unready(lab, id).await?.is_some();
         let mut transaction = self.write().await?;
-        let row = sqlx::query("SELECT count(*) AS users FROM measurements WHERE calibration = ?")
-            .bind(id.to_string())
-            .fetch_one(&mut *transaction)
-            .await?;
-        let users = number(&row, "users")?;
-        if users > 0 {
-            return Err(StoreError::InUse { what: "calibration", by: "measurements", users });
+        for (by, query) in [
+            ("measurements", "SELECT count(*) AS users FROM measurements WHERE calibration = ?"),
+            ("models", "SELECT count(*) AS users FROM models WHERE calibration = ?"),
+        ] {
+            let id = id.to_string();
+            let row = sqlx::query(query).bind(id).fetch_one(&mut *transaction).await?;
+            let users = number(&row, "users")?;
+            if users > 0 {
+                return Err(StoreError::InUse { what: "calibration", by, users });
+            }
         }
         let row = sqlx::query("DELETE FROM calibrations WHERE id = ? RETURNING prepared")
             .bind(id.to_string())

@@ -55,6 +55,8 @@ pub struct ClaimedTask {
     pub measurement: Measurement,
     /// The prepared snapshots: planar f32 [S, H, W], full scale divided out.
     pub snapshots: PathBuf,
+    /// The ONNX file of the job's model, if it has one.
+    pub model: Option<PathBuf>,
     /// What the job's prepare task recorded; none for that task itself.
     pub prepared: Option<Value>,
 }
@@ -183,6 +185,7 @@ impl Store {
             cost: row.try_get("cost")?,
             masks: self.dir().blob(&calibration.prepared),
             snapshots: self.dir().blob(&measurement.prepared),
+            model: spec.model.as_ref().map(|model| self.dir().blob(&model.sha256)),
             spec,
             calibration,
             measurement,

@@ -78,7 +78,7 @@ fn plan(spec: &JobSpec) -> Result<Vec<(TaskKind, f64)>, StoreError> {
         .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
     let pixels = (spec.shape.height * spec.shape.width) as f64;
     let frames = spec.shape.frames as f64;
-    let per_voxel = spec.schedule.planned_ns_per_voxel() * 1e-9;
+    let per_voxel = spec.planned_ns_per_voxel() * 1e-9;
     let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
     for snapshot in spec.snapshots.indices() {
         for (tile, area) in (0..).zip(tiles.tiles()) {

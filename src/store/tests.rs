@@ -8,11 +8,11 @@ use tempfile::TempDir;
 
 use super::{
     ClaimedTask, Completion, Heartbeat, Inserted, JobFilter, MAX_FAILURES, MAX_LOSSES,
-    NewCalibration, NewJob, NewMeasurement, Product, Store, StoreError, WorkerEnd,
+    NewCalibration, NewJob, NewMeasurement, NewModel, Product, Store, StoreError, WorkerEnd,
 };
 use crate::job::{
-    Algorithm, JobId, JobRequest, JobState, MeasurementId, Sha256, SnapshotSelection, TaskKind,
-    TaskProgress, TileSpec, Timestamp, WorkerId,
+    Algorithm, JobId, JobRequest, JobState, MeasurementId, ModelFacts, ModelTrial, Sha256,
+    SnapshotSelection, TaskKind, TaskProgress, TileSpec, Timestamp, WorkerId,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -99,12 +99,13 @@ impl Lab {
             calibration: None,
             snapshots: SnapshotSelection::All,
             algorithm: Algorithm::GapTv,
+            model: None,
             schedule: None,
             tile: Some(TileSpec { size: 64, overlap: 8 }),
             priority,
             label: None,
         };
-        let spec = job.resolve(measurement.calibration, shape).unwrap();
+        let spec = job.resolve(measurement.calibration, shape, None).unwrap();
         let new = NewJob {
             most_jobs: 1000,
             lab: crate::job::Lab::local(),
@@ -433,6 +434,31 @@ async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
 fn walk(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
     let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
     entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
+}
+
+#[tokio::test]
+async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
+    let lab = Lab::new().await;
+    let local = crate::job::Lab::local();
+    let mut writer = lab.store.blob_writer().unwrap();
+    writer.write_all(b"network").unwrap();
+    let (file, _) = lab.store.store_upload(&local, None, writer.finish().unwrap()).await.unwrap();
+    let calibration =
+        lab.store.measurement(&local, lab.measurement).await.unwrap().facts.calibration;
+    let trial = ModelTrial { height: 64, width: 96, cpu_seconds: 1.0, peak_rss_bytes: 1 << 20 };
+    let facts = ModelFacts { inputs: Vec::new(), outputs: Vec::new(), fixed_size: true, trial };
+    let new = NewModel { name: None, calibration, file: file.sha256, facts };
+    let model = lab.store.add_model(&local, new).await.unwrap();
+    assert_eq!(lab.store.model(&local, model.id).await.unwrap(), model);
+    lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
+    let soon = Timestamp(Timestamp::now().0 + 1000);
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the data of the measurement");
+    assert!(lab.store.upload(&local, file.sha256).await.is_ok());
+    let refused = lab.store.delete_calibration(&local, calibration).await;
+    assert!(matches!(refused, Err(StoreError::InUse { by: "models", users: 1, .. })));
+    lab.store.delete_model(&local, model.id).await.unwrap();
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the network");
+    lab.store.delete_calibration(&local, calibration).await.unwrap();
 }
 
 #[tokio::test]

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::manifest::{
     CameraRecord, Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary,
-    frame_attributes,
+    frame_attributes, stored_schedule,
 };
 use super::prepare::{Prepared, to_record};
 use super::result::{ResultFile, ResultSpec, write_result};
@@ -15,7 +15,7 @@ use super::task::{Shared, TaskError};
 use super::tile::TileTaskRecord;
 use crate::formats::Limits;
 use crate::formats::planar::Reader;
-use crate::job::{Finding, ScheduleSpec, TaskProgress, TaskStage, Timestamp};
+use crate::job::{Finding, TaskProgress, TaskStage, Timestamp};
 use crate::recon::tile::TilePlan;
 use crate::store::{ClaimedTask, Completion, Product, Store, TileResult, hash_file};
 
@@ -121,7 +121,7 @@ fn manifest(
     let content = Content {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: ScheduleSpec::from(&spec.schedule.to_schedule()?),
+        schedule: stored_schedule(spec)?,
         frames,
         height: spec.shape.height,
         width: spec.shape.width,
@@ -130,7 +130,7 @@ fn manifest(
             masks_sha256: calibration.masks.to_string(),
             measurement_sha256: measurement.data.to_string(),
         },
-        models: ModelRecord::of(&spec.schedule),
+        models: ModelRecord::of_job(spec),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::assemble::SnapshotRecord;
-use super::manifest::{Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord};
+use super::manifest::{
+    Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord, stored_schedule,
+};
 use super::prepare::{Prepared, to_record};
 use super::result::ResultFile;
 use super::task::TaskError;
@@ -108,13 +110,13 @@ fn content(
     Ok(JobContent {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: ScheduleSpec::from(&spec.schedule.to_schedule()?),
+        schedule: stored_schedule(spec)?,
         shape: spec.shape,
         inputs: Inputs {
             masks_sha256: calibration.masks.to_string(),
             measurement_sha256: measurement.data.to_string(),
         },
-        models: ModelRecord::of(&spec.schedule),
+        models: ModelRecord::of_job(spec),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,

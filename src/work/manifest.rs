@@ -10,7 +10,7 @@ use sha2::{Digest, Sha256};
 
 use super::result::ResultFile;
 use crate::formats::exr::Attributes;
-use crate::job::{Algorithm, Finding, ScheduleSpec, TileSpec};
+use crate::job::{Algorithm, Finding, InvalidField, JobSpec, Label, ScheduleSpec, TileSpec};
 use crate::models::{self, Model};
 use crate::recon::tile::TilePlan;
 
@@ -46,7 +46,7 @@ pub struct Content {
     pub program_version: String,
     /// The algorithm.
     pub algorithm: Algorithm,
-    /// The schedule in full, defaults included.
+    /// The schedule in full, defaults included; without stages for an end-to-end network.
     pub schedule: ScheduleSpec,
     /// Frames of the snapshot (B).
     pub frames: usize,
@@ -58,7 +58,7 @@ pub struct Content {
     pub snapshot: usize,
     /// The files that went in.
     pub inputs: Inputs,
-    /// The networks that the schedule names.
+    /// The networks that the schedule names, or that of a job with a model.
     pub models: Vec<ModelRecord>,
     /// Every scale factor.
     pub scale: ScaleRecord,
@@ -105,11 +105,28 @@ impl ModelRecord {
         schedule.networks().into_iter().map(record).collect()
     }
 
+    /// Those of a job.
+    pub fn of_job(spec: &JobSpec) -> Vec<Self> {
+        let model = spec.model.as_ref().map(|model| Self {
+            name: model.name.as_ref().map_or("learned", Label::as_str).to_owned(),
+            sha256: model.sha256.to_string(),
+        });
+        Self::of(&spec.schedule).into_iter().chain(model).collect()
+    }
+
     /// That of a model with these contents of its files.
     pub(super) fn new<'a>(model: &Model, contents: impl Iterator<Item = &'a [u8]>) -> Self {
         let digest = contents.fold(Sha256::new(), |hash, content| hash.chain_update(content));
         let sha256 = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
         Self { name: model.name.into(), sha256 }
+    }
+}
+
+/// The schedule of a job with all defaults filled in.
+pub(super) fn stored_schedule(spec: &JobSpec) -> Result<ScheduleSpec, Vec<InvalidField>> {
+    match &spec.model {
+        None => Ok(ScheduleSpec::from(&spec.schedule.to_schedule()?)),
+        Some(_) => Ok(spec.schedule.clone()),
     }
 }
 

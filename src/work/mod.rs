@@ -9,6 +9,7 @@ pub mod calibrate;
 mod calibration_task;
 mod finish;
 mod history;
+mod learned;
 mod network;
 mod prepare;
 mod result;
@@ -22,12 +23,13 @@ mod worker;
 
 pub mod manifest;
 
+pub use learned::{ModelFile, run_network};
 pub use network::{NetworkError, NetworkSource};
 pub use result::{
     ResultError, ResultFile, ResultSpec, check_output, replace_result, sha256_of, write_result,
 };
 pub use share::ShareDone;
-pub use snapshot::{SnapshotInput, SolveError, TileProgress, blended_frame, solve};
+pub use snapshot::{SnapshotInput, SolveError, Solver, TileProgress, blended_frame, solve};
 pub use solve::{TileInput, TileOutcome, reconstruct_tile, typical_white};
 pub use usage::{Usage, peak_rss_bytes};
 pub use worker::{Worker, WorkerError};

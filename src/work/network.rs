@@ -5,13 +5,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
+use super::learned::ModelFile;
 use super::manifest::ModelRecord;
-use crate::job::ScheduleSpec;
+use crate::job::{ScheduleSpec, Sha256};
 use crate::models;
 use crate::recon::ReconError;
 use crate::recon::denoise::fastdvdnet::FastDvdNet;
 use crate::recon::denoise::ffdnet::FfdNet;
-use crate::recon::denoise::onnx::{Device, Runtime};
+use crate::recon::denoise::onnx::{Device, EndToEndNetwork, Runtime};
 use crate::recon::denoise::{Denoiser, Networks};
 use crate::recon::schedule::Network;
 
@@ -34,6 +35,14 @@ pub enum NetworkError {
         path: PathBuf,
         /// What is wrong with it.
         reason: std::io::Error,
+    },
+    /// The file of an end-to-end network is not what it was.
+    #[error("the network's file is damaged: its hash should be {expected}, but is {found}")]
+    Damaged {
+        /// The hash that it should have.
+        expected: Sha256,
+        /// The hash that it has.
+        found: Sha256,
     },
     /// It was found, but the network does not run on it.
     #[error(transparent)]
@@ -110,6 +119,14 @@ impl NetworkSource {
         })
     }
 
+    /// An end-to-end network with a session of its own, for one thread.
+    ///
+    /// # Errors
+    /// No library; a file that can't be read, or holds no network that can be run.
+    pub fn end_to_end(&self, file: &ModelFile) -> Result<EndToEndNetwork, NetworkError> {
+        Ok(EndToEndNetwork::load(&self.runtime()?, &file.read()?)?)
+    }
+
     fn runtime(&self) -> Result<Runtime, NetworkError> {
         Ok(Runtime::open(&self.path()?, self.device)?)
     }
@@ -133,12 +150,27 @@ impl NetworkSource {
 pub struct WarmNetworks {
     source: NetworkSource,
     loaded: Vec<(Network, Box<dyn Denoiser + Send>)>,
+    /// The last end-to-end network.
+    end_to_end: Option<(Sha256, EndToEndNetwork)>,
 }
 
 impl WarmNetworks {
     /// Networks from `source`, none of them loaded yet.
     pub fn new(source: NetworkSource) -> Self {
-        Self { source, loaded: Vec::new() }
+        Self { source, loaded: Vec::new(), end_to_end: None }
+    }
+
+    /// The end-to-end network in this file, which is kept until another one is asked for.
+    ///
+    /// # Errors
+    /// As [`NetworkSource::end_to_end`].
+    pub fn end_to_end(&mut self, file: &ModelFile) -> Result<&mut EndToEndNetwork, NetworkError> {
+        let warm = self.end_to_end.take().filter(|(sha256, _)| *sha256 == file.sha256());
+        let network = match warm {
+            Some((_, network)) => network,
+            None => self.source.end_to_end(file)?,
+        };
+        Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
 
     /// Where they come from.

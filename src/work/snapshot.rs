@@ -6,7 +6,8 @@ use std::thread;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 
-use super::network::{NetworkSource, WarmNetworks};
+use super::learned::{ModelFile, run_network};
+use super::network::{NetworkError, NetworkSource, WarmNetworks};
 use super::solve::{TileInput, TileOutcome, reconstruct_tile};
 use crate::recon::ReconError;
 use crate::recon::gap::{Control, Observer, Progress};
@@ -22,10 +23,19 @@ pub struct SnapshotInput<'a> {
     pub measurement: ArrayView2<'a, f32>,
     /// White level of the scene.
     pub white: f32,
-    /// The schedule.
-    pub schedule: &'a Schedule,
+    /// How.
+    pub solver: Solver<'a>,
     /// The cut; it has the size of the masks.
     pub plan: &'a TilePlan,
+}
+
+/// How tiles are solved.
+#[derive(Debug, Clone, Copy)]
+pub enum Solver<'a> {
+    /// By iterations.
+    Schedule(&'a Schedule),
+    /// By one run of an end-to-end network.
+    Network(&'a ModelFile),
 }
 
 /// Why a snapshot was not solved.
@@ -34,6 +44,9 @@ pub enum SolveError {
     /// The solver refused or failed.
     #[error(transparent)]
     Recon(#[from] ReconError),
+    /// There is no network.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
     /// A thread died.
     #[error("a computing thread ended unexpectedly")]
     Thread,
@@ -107,7 +120,6 @@ impl Run<'_, '_> {
     }
 
     fn tiles(&self) -> Result<(), SolveError> {
-        let schedule = self.input.schedule;
         let mut networks = WarmNetworks::new(self.network.clone());
         loop {
             let index = self.next.fetch_add(1, Ordering::Relaxed);
@@ -119,8 +131,17 @@ impl Run<'_, '_> {
                 measurement: self.input.measurement.slice(s![rows, columns]).to_owned(),
                 white: self.input.white,
             };
-            let mut observer = TileObserver { progress: self.progress, stop: &self.stop, tile };
-            let outcome = reconstruct_tile(window, schedule, &mut networks, &mut observer)?;
+            let outcome = match self.input.solver {
+                Solver::Schedule(schedule) => {
+                    let (progress, stop) = (self.progress, &self.stop);
+                    let mut observer = TileObserver { progress, stop, tile };
+                    reconstruct_tile(window, schedule, &mut networks, &mut observer)?
+                }
+                Solver::Network(_) if self.stop.load(Ordering::Relaxed) => {
+                    return Err(ReconError::Cancelled.into());
+                }
+                Solver::Network(file) => run_network(window, networks.end_to_end(file)?)?,
+            };
             self.progress.finished(&tile);
             self.done.lock().map_err(|_| SolveError::Thread)?[index] = Some(outcome);
         }
@@ -154,7 +175,7 @@ pub fn blended_frame(plan: &TilePlan, tiles: &[TileOutcome], k: usize) -> Array2
 
 #[cfg(test)]
 mod tests {
-    use super::{SnapshotInput, SolveError, blended_frame, solve};
+    use super::{SnapshotInput, SolveError, Solver, blended_frame, solve};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
     use crate::recon::denoise::onnx::Device;
@@ -182,7 +203,8 @@ mod tests {
         let schedule = Schedule::gap_tv();
         let frames = |plan: &TilePlan, threads| {
             let (masks, measurement) = (masks.view(), y.view());
-            let input = SnapshotInput { masks, measurement, white: 1.0, schedule: &schedule, plan };
+            let solver = Solver::Schedule(&schedule);
+            let input = SnapshotInput { masks, measurement, white: 1.0, solver, plan };
             let tiles = solve(&input, &network(), threads, &()).unwrap();
             blended_frame(plan, &tiles, 1)
         };
@@ -204,8 +226,8 @@ mod tests {
         y[[90, 90]] = f32::NAN;
         let (schedule, plan) = (Schedule::gap_tv(), TilePlan::new(96, 96, 48, 16).unwrap());
         let (masks, measurement) = (masks.view(), y.view());
-        let input =
-            SnapshotInput { masks, measurement, white: 1.0, schedule: &schedule, plan: &plan };
+        let solver = Solver::Schedule(&schedule);
+        let input = SnapshotInput { masks, measurement, white: 1.0, solver, plan: &plan };
         let error = solve(&input, &network(), 2, &()).unwrap_err();
         assert!(matches!(error, SolveError::Recon(ReconError::Diverged { .. })), "{error}");
     }

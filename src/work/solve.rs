@@ -19,6 +19,19 @@ pub struct TileInput {
     pub white: f32,
 }
 
+impl TileInput {
+    pub(super) fn check_white(&self) -> Result<(), ReconError> {
+        if self.white.is_finite() && self.white > 0.0 {
+            return Ok(());
+        }
+        Err(ReconError::Parameter {
+            name: "white level",
+            value: self.white.to_string(),
+            range: "a finite number above 0",
+        })
+    }
+}
+
 /// A reconstructed tile and how it came about.
 #[derive(Debug, Clone)]
 pub struct TileOutcome {
@@ -48,14 +61,8 @@ pub fn reconstruct_tile(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<TileOutcome, ReconError> {
+    input.check_white()?;
     let TileInput { masks, mut measurement, white } = input;
-    if !(white.is_finite() && white > 0.0) {
-        return Err(ReconError::Parameter {
-            name: "white level",
-            value: white.to_string(),
-            range: "a finite number above 0",
-        });
-    }
     let size = masks.raw_dim();
     let op = match SensingOperator::new(masks) {
         Err(ReconError::DarkMasks { .. }) => return Ok(dark(Array3::zeros(size))),
@@ -72,7 +79,8 @@ pub fn reconstruct_tile(
     })
 }
 
-fn dark(frames: Array3<f32>) -> TileOutcome {
+/// The outcome of a tile without light.
+pub(super) fn dark(frames: Array3<f32>) -> TileOutcome {
     TileOutcome {
         frames,
         tv_iterations: 0,

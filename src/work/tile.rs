@@ -5,6 +5,7 @@ use std::io::BufWriter;
 use ndarray::Axis;
 use serde::{Deserialize, Serialize};
 
+use super::learned::{ModelFile, run_network};
 use super::manifest::TileRecord;
 use super::network::WarmNetworks;
 use super::prepare::{Prepared, to_record};
@@ -48,12 +49,20 @@ pub(super) fn run(
         what: "task",
         problem: format!("tile {index} of a plan of {}", plan.len()),
     })?;
-    let schedule = task.spec.schedule.to_schedule()?;
     let input = window(task, &tile, snapshot as usize)?;
-    let deep = !schedule.networks().is_empty();
-    let share = ShareDone::new(task.spec.schedule.clone());
-    let mut observer = TaskObserver { shared, share, passes: 0 };
-    let outcome = reconstruct_tile(input, &schedule, engine, &mut observer)?;
+    let (outcome, deep) = match (&task.spec.model, &task.model) {
+        (Some(model), Some(path)) => {
+            let file = ModelFile::new(path.clone(), model.sha256);
+            (by_network(input, &file, engine, shared)?, true)
+        }
+        _ => {
+            let schedule = task.spec.schedule.to_schedule()?;
+            let share = ShareDone::new(task.spec.schedule.clone());
+            let mut observer = TaskObserver { shared, share, passes: 0 };
+            let outcome = reconstruct_tile(input, &schedule, engine, &mut observer)?;
+            (outcome, !schedule.networks().is_empty())
+        }
+    };
     let progress = shared.progress();
     shared.set_progress(TaskProgress { stage: TaskStage::Writing, ..progress });
     let record = TileTaskRecord {
@@ -65,6 +74,22 @@ pub(super) fn run(
     };
     let blob = write(store, &outcome)?;
     Ok(Completion { progress, record: to_record(&record)?, product: Product::Tile(blob) })
+}
+
+/// One run of an end-to-end network, which can't be stopped on its way.
+fn by_network(
+    input: TileInput,
+    file: &ModelFile,
+    engine: &mut WarmNetworks,
+    shared: &Shared,
+) -> Result<TileOutcome, TaskError> {
+    shared.set_progress(TaskProgress { stage: TaskStage::Deep, ..TaskProgress::START });
+    let network = engine.end_to_end(file)?;
+    shared.check()?;
+    let outcome = run_network(input, network)?;
+    shared.check()?;
+    shared.set_progress(TaskProgress { passes: 1, fraction: 1.0, ..shared.progress() });
+    Ok(outcome)
 }
 
 fn window(task: &ClaimedTask, tile: &Tile, snapshot: usize) -> Result<TileInput, TaskError> {

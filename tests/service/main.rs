@@ -15,6 +15,7 @@ mod faults;
 mod hangs;
 mod hostile;
 mod jobs;
+mod learned;
 mod load;
 mod pictures;
 mod pipeline;

@@ -43,7 +43,7 @@ pub fn values(file: &[u8]) -> Vec<f32> {
 }
 
 /// PSNR of a snapshot's frames against the scene, in dB.
-fn psnr(scene: Scene, snapshot: usize, frames: &[f32]) -> f64 {
+pub fn psnr(scene: Scene, snapshot: usize, frames: &[f32]) -> f64 {
     let places = (0..scene.frames)
         .flat_map(|k| (0..scene.height).map(move |i| (k, i)))
         .flat_map(|(k, i)| (0..scene.width).map(move |j| (k, i, j)));

@@ -21,7 +21,7 @@ use crate::optics::{
 use crate::recon::metrics;
 use crate::recon::schedule::Schedule;
 use crate::recon::tile::TilePlan;
-use crate::work::{NetworkSource, SnapshotInput, blended_frame, solve};
+use crate::work::{NetworkSource, SnapshotInput, Solver, blended_frame, solve};
 
 /// Compare multiplexed masks with single sub-apertures as noise grows. Masks are normalised by
 /// light throughput, so that a mask through one of twelve sub-apertures is a sixth as bright as one
@@ -186,7 +186,7 @@ impl Bench<'_> {
             measurement: y,
             // The scene's own: its level is known here, so noise does not disturb it.
             white: 1.0,
-            schedule: &self.schedule,
+            solver: Solver::Schedule(&self.schedule),
             plan: &plan,
         };
         let cores = thread::available_parallelism().map_or(1, usize::from);

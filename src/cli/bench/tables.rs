@@ -12,6 +12,7 @@ use clap::Args;
 use super::clips::read_clips;
 use crate::cli::CliError;
 use crate::cli::arguments::{EngineArguments, algorithms};
+use crate::cli::learned::Learned;
 use crate::cli::masks::MaskArguments;
 use crate::job::Algorithm;
 use markdown::Layout;
@@ -39,6 +40,10 @@ pub struct Arguments {
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = algorithms(),
           default_values = PAPER.map(Algorithm::name))]
     algorithms: Vec<Algorithm>,
+    /// Also a row `learned` of this network: an ONNX file as for `reconstruct --model`. At scales and
+    /// ratios that it does not take there is no row.
+    #[arg(long, value_name = "FILE")]
+    learned: Option<PathBuf>,
     #[command(flatten)]
     masks: MaskArguments,
     /// Noise of the measurements on the scale of 255 grey values: S/255 is the standard deviation
@@ -75,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
     let clips = read_clips(&arguments.clips, most(&ratios).unwrap_or(1), most(&scales))?;
     let layout = Layout {
         clips: clips.iter().map(|clip| clip.name.clone()).collect(),
-        algorithms: distinct(&arguments.algorithms),
+        algorithms: named(arguments),
         by_frame: arguments.by_frame,
         by_zone: arguments.by_zone,
     };
@@ -85,7 +90,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
         noise_sigma: arguments.noise_sigma,
         seed: arguments.seed,
     };
-    let bench = Bench::new(arguments.engine.network()?, setting);
+    let network = arguments.engine.network()?;
+    let learned =
+        arguments.learned.as_ref().map(|path| Learned::open(path, &network)).transpose()?;
+    let bench = Bench::new(network, learned, setting);
     // Patterns that can't be are told now, not hours later.
     let smallest = usize::from(scales.iter().copied().min().unwrap_or(1));
     for &ratio in &ratios {
@@ -98,7 +106,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
             for clip in &clips {
                 let snapshot = bench.snapshot(&masks, clip)?;
                 for &algorithm in &layout.algorithms {
-                    let key = bench.key(&snapshot, algorithm);
+                    if let Some(why) = bench.obstacle(algorithm, ratio.into(), scale.into()) {
+                        eprintln!("{}, no {}: {why}", clip.name, algorithm.name());
+                        continue;
+                    }
+                    let key = bench.key(&snapshot, algorithm)?;
                     let row = match records.find(&key) {
                         Some(row) => row.clone(),
                         None => records.add(bench.run(&snapshot, key)?)?,
@@ -112,6 +124,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
     }
     print!("{}", layout.markdown(&rows));
     Ok(())
+}
+
+/// The algorithms, `learned` last.
+fn named(arguments: &Arguments) -> Vec<Algorithm> {
+    let mut algorithms = distinct(&arguments.algorithms);
+    algorithms.extend(arguments.learned.is_some().then_some(Algorithm::Learned));
+    algorithms
 }
 
 /// The values without repetitions, in their order.

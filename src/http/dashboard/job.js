@@ -147,7 +147,7 @@ function repeat(found) {
     measurement: found.measurement,
     algorithm: found.algorithm,
     snapshots: [found.snapshots.first, last],
-    schedule: found.schedule,
+    ...(found.model ? { model: found.model } : { schedule: found.schedule }),
     tile: found.tile,
     priority: found.priority,
     label: found.label,

@@ -19,7 +19,7 @@ export async function submit(root, [query], signal) {
   };
   const measurement = measurementStep(form, ready, reset, signal);
   const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, reset, query.get("calibration"), signal);
-  const job = jobStep(algorithms.items);
+  const job = jobStep(algorithms.items.filter((item) => item.planned_iterations > 0));
   const element = h("form", { class: "steps" }, calibration, measurement.element, job.element, h("div", { class: "row" }, button), result);
   element.addEventListener("submit", async (event) => {
     event.preventDefault();

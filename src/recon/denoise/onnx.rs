@@ -3,14 +3,15 @@
 use std::path::Path;
 use std::sync::OnceLock;
 
-use ndarray::ArrayView4;
+use ndarray::{Array3, ArrayView2, ArrayView3, ArrayView4, Axis};
 use ort::environment::Environment;
 use ort::ep::CUDA;
 use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
-use ort::value::{Tensor, TensorRef};
+use ort::value::{Outlet, Tensor, TensorElementType, TensorRef, ValueType};
 
-use crate::recon::error::ReconError;
+use crate::recon::error::{ReconError, shape_text};
+use crate::recon::learned::{FRAMES, Interface, MASKS, MEASUREMENT, SnapshotNetwork, TensorInfo};
 
 /// Where a network runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -52,6 +53,11 @@ pub struct Runtime {
     environment: Environment,
     device: Device,
 }
+
+/// Where weights lie that a network keeps in other files. Ours have none, and one that was sent in
+/// must not name files of this machine: without this it may name any below the working folder.
+const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
+const NOWHERE: &str = "/dev/null/nowhere";
 
 /// The library can be loaded once a process; the first outcome holds.
 static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
@@ -106,6 +112,8 @@ impl Runtime {
                 .with_intra_threads(1)
                 .map_err(text)?
                 .with_inter_threads(1)
+                .map_err(text)?
+                .with_config_entry(WEIGHTS_FOLDER, NOWHERE)
                 .map_err(text)?;
             if let Device::Cuda(number) = self.device {
                 let cuda = CUDA::default().with_device_id(number).build().error_on_failure();
@@ -161,5 +169,79 @@ impl ClipNetwork {
         }
         output.copy_from_slice(values);
         Ok(())
+    }
+}
+
+/// A network that maps a measurement and its masks to frames.
+pub struct EndToEndNetwork {
+    session: Session,
+}
+
+impl EndToEndNetwork {
+    /// Loads a network; [`Self::interface`] says whether it is one of this kind.
+    ///
+    /// # Errors
+    /// [`ReconError::Runtime`]: no network that ONNX Runtime takes.
+    pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self, ReconError> {
+        Ok(Self { session: runtime.session("of the file", model)? })
+    }
+
+    /// What it takes and gives.
+    pub fn interface(&self) -> Interface {
+        let tensors = |outlets: &[Outlet]| outlets.iter().map(tensor).collect();
+        Interface {
+            inputs: tensors(self.session.inputs()),
+            outputs: tensors(self.session.outputs()),
+        }
+    }
+}
+
+impl SnapshotNetwork for EndToEndNetwork {
+    fn frames(
+        &mut self,
+        y: ArrayView2<'_, f32>,
+        masks: ArrayView3<'_, f32>,
+    ) -> Result<Array3<f32>, ReconError> {
+        let failed = |error: ort::Error| ReconError::Runtime(format!("the network: {error}"));
+        let measurement = y.insert_axis(Axis(0)).insert_axis(Axis(0));
+        let measurement = TensorRef::from_array_view(measurement).map_err(failed)?;
+        let stack = TensorRef::from_array_view(masks.insert_axis(Axis(0))).map_err(failed)?;
+        let outputs = self
+            .session
+            .run(ort::inputs![MEASUREMENT => measurement, MASKS => stack])
+            .map_err(failed)?;
+        let (shape, values) = outputs[FRAMES].try_extract_tensor::<f32>().map_err(failed)?;
+        let wrong = |found: String| ReconError::Shape {
+            what: "what the network gave",
+            found,
+            expected: format!("1x{} of finite numbers", shape_text(masks.shape())),
+        };
+        if let Some(value) = values.iter().find(|value| !value.is_finite()) {
+            return Err(wrong(format!("{value} among others")));
+        }
+        Array3::from_shape_vec(masks.raw_dim(), values.to_vec())
+            .map_err(|_| wrong(shape.to_string()))
+    }
+}
+
+fn tensor(outlet: &Outlet) -> TensorInfo {
+    let name = outlet.name().to_owned();
+    match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => TensorInfo {
+            name,
+            element: element(*ty),
+            // -1 stands for any length.
+            sides: shape.iter().map(|&side| usize::try_from(side).ok()).collect(),
+        },
+        other => TensorInfo { name, element: format!("{other:?}"), sides: Vec::new() },
+    }
+}
+
+/// The type's name as ONNX and NumPy have it.
+fn element(element: TensorElementType) -> String {
+    match element {
+        TensorElementType::Float32 => "float32".to_owned(),
+        TensorElementType::Float64 => "float64".to_owned(),
+        other => format!("{other:?}").to_lowercase(),
     }
 }

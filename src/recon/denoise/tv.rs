@@ -1,147 +1,254 @@
 //! Isotropic total variation, frame by frame (Chambolle, "An algorithm for total variation
 //! minimization and applications", 2004).
 
+use std::ops::{Deref, DerefMut, Range};
+
 use multiversion::multiversion;
-use ndarray::Array3;
+use ndarray::{Array3, Axis};
 
 /// Step of the dual ascent: 1 / (2 * dimensions).
 const TAU: f32 = 0.25;
+/// Values of a cache line.
+const LINE: usize = 16;
 
-/// The dual fields of one frame, kept so that the loop allocates nothing.
+/// The dual fields of a few rows of every frame, kept so that the loop allocates nothing.
+///
+/// All dual updates of a frame are made in one sweep: update `k` follows `k` rows behind the row
+/// that arrives, so a frame is read and written once and everything else stays in cache.
 #[derive(Debug)]
 pub struct TotalVariation {
+    height: usize,
     width: usize,
-    /// Dual field along rows (downwards), then along columns, one row pair after the other.
-    down: Vec<f32>,
-    right: Vec<f32>,
-    here: Vec<f32>,
-    below: Vec<f32>,
+    /// For each frame one level for each number of updates done; the first stays 0 in its dual
+    /// fields.
+    frames: Vec<Vec<Level>>,
+    zeros: Vec<f32>,
+}
+
+/// The two latest rows of the fields after a number of updates, by the rows' parity.
+#[derive(Debug)]
+struct Level {
+    /// Dual field along rows (downwards).
+    down: [Row; 2],
+    /// Dual field along columns, after a 0.
+    right: [Row; 2],
+    /// `u = x + div p`, and its last value once more.
+    primal: [Row; 2],
+}
+
+impl Level {
+    fn new(width: usize) -> Self {
+        let rows = |length, aligned| [Row::new(length, aligned), Row::new(length, aligned)];
+        Self { down: rows(width, 0), right: rows(width + 1, 1), primal: rows(width + 1, 0) }
+    }
+}
+
+/// Values of which one lies where a cache line begins: a register of them is then one access.
+#[derive(Debug)]
+struct Row {
+    values: Vec<f32>,
+    start: usize,
+}
+
+impl Row {
+    fn new(length: usize, aligned: usize) -> Self {
+        let mut values = vec![0.0; length + LINE];
+        let address = values.as_ptr().addr() / size_of::<f32>() + aligned;
+        let start = (LINE - address % LINE) % LINE;
+        values.truncate(start + length);
+        Self { values, start }
+    }
+}
+
+impl Deref for Row {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        &self.values[self.start..]
+    }
+}
+
+impl DerefMut for Row {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut self.values[self.start..]
+    }
 }
 
 impl TotalVariation {
-    /// For frames of `height` x `width` pixels.
-    pub fn new(height: usize, width: usize) -> Self {
-        Self {
-            width,
-            down: vec![0.0; height * width],
-            right: vec![0.0; height * width],
-            here: vec![0.0; width],
-            below: vec![0.0; width],
-        }
+    /// For `frames` frames of `height` x `width` pixels.
+    pub fn new((frames, height, width): (usize, usize, usize)) -> Self {
+        let frames = (0..frames).map(|_| vec![Level::new(width)]).collect();
+        Self { height, width, frames, zeros: vec![0.0; width] }
     }
 
     /// Minimises `||u - x||^2 / 2 + weight * TV(u)` for every frame of `frames` \[B,H,W\], in
     /// place, with a fixed number of dual updates starting from 0 (scikit-image's
     /// `denoise_tv_chambolle` with `max_num_iter = updates + 1` does as many).
     pub fn denoise(&mut self, frames: &mut Array3<f32>, weight: f32, updates: usize) {
-        debug_assert_eq!(frames.dim().1 * frames.dim().2, self.down.len());
-        debug_assert_eq!(frames.dim().2, self.width);
-        if weight <= 0.0 || updates == 0 {
-            return;
-        }
-        for mut frame in frames.outer_iter_mut() {
-            if let Some(frame) = frame.as_slice_mut() {
-                self.denoise_frame(frame, weight, updates);
-            }
+        for k in 0..self.frames.len() {
+            self.advance(k, frames, 0..self.height, weight, updates);
         }
     }
 
-    fn denoise_frame(&mut self, image: &mut [f32], weight: f32, updates: usize) {
-        let Self { width, down, right, here, below, .. } = self;
-        down.fill(0.0);
-        right.fill(0.0);
-        for k in 0..updates {
-            sweep(image, down, right, here, below, *width, TAU / weight, k + 1 == updates);
+    /// The same for frame `k`, as far as it goes with the rows up to `arriving.end`: frames come
+    /// strip by strip, in order. Returns the rows that are done now.
+    pub(in crate::recon) fn advance(
+        &mut self,
+        k: usize,
+        frames: &mut Array3<f32>,
+        arriving: Range<usize>,
+        weight: f32,
+        updates: usize,
+    ) -> Range<usize> {
+        debug_assert_eq!(frames.dim(), (self.frames.len(), self.height, self.width));
+        if weight <= 0.0 || updates == 0 {
+            return arriving;
         }
+        let (width, height) = (self.width, self.height);
+        let levels = &mut self.frames[k];
+        levels.resize_with((updates + 1).max(levels.len()), || Level::new(width));
+        let end = if arriving.end == height { height + updates } else { arriving.end };
+        if let Some(frame) = frames.index_axis_mut(Axis(0), k).as_slice_mut() {
+            let levels = &mut levels[..=updates];
+            sweep(frame, levels, &self.zeros, arriving.start..end, TAU / weight);
+        }
+        arriving.start.saturating_sub(updates)..end.saturating_sub(updates)
     }
 }
 
-/// One dual update. The primal rows `u = x + div p` are made as they are needed, two at a
-/// time, so that one sweep reads and writes everything once. The last sweep also writes `u`
-/// of the updated field over the image, one row behind.
-#[allow(clippy::too_many_arguments)] // one kernel over plain slices, so that it vectorises
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+/// The dual updates that the arriving rows allow, and `u` written over the rows that are done:
+/// row `i` is when row `i + updates` arrives, or would.
+#[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn sweep(
     image: &mut [f32],
-    down: &mut [f32],
-    right: &mut [f32],
-    here: &mut Vec<f32>,
-    below: &mut Vec<f32>,
-    width: usize,
+    levels: &mut [Level],
+    zeros: &[f32],
+    arriving: Range<usize>,
     step: f32,
-    last: bool,
 ) {
+    if multiversion::target::target_cfg_f!(target_feature = "fma") {
+        sweep_rows::<true>(image, levels, zeros, arriving, step);
+    } else {
+        sweep_rows::<false>(image, levels, zeros, arriving, step);
+    }
+}
+
+#[inline(always)]
+fn sweep_rows<const FMA: bool>(
+    image: &mut [f32],
+    levels: &mut [Level],
+    zeros: &[f32],
+    arriving: Range<usize>,
+    step: f32,
+) {
+    let width = zeros.len();
     let height = image.len() / width;
-    primal_row(&image[..width], None, &down[..width], &right[..width], here);
-    for i in 0..height {
-        let row = i * width..(i + 1) * width;
-        if i + 1 < height {
-            let next = (i + 1) * width..(i + 2) * width;
-            // Row i of the field is still the old one here, as it must be.
-            primal_row(
-                &image[next.clone()],
-                Some(&down[row.clone()]),
-                &down[next.clone()],
-                &right[next],
-                below,
-            );
-        } else {
-            below.copy_from_slice(here);
+    let updates = levels.len() - 1;
+    for arriving in arriving {
+        if arriving < height {
+            let row = &image[arriving * width..(arriving + 1) * width];
+            let primal = &mut levels[0].primal[arriving % 2];
+            primal[..width].copy_from_slice(row);
+            primal[width] = row[width - 1];
         }
-        update_row(here, below, &mut down[row.clone()], &mut right[row.clone()], step);
-        std::mem::swap(here, below);
-        if last {
-            // Row i of the image is not needed any more; row i - 1 of the field is new too.
-            let above = (i > 0).then(|| &down[(i - 1) * width..i * width]);
-            add_divergence(&mut image[row.clone()], above, &down[row.clone()], &right[row]);
-        }
-    }
-}
-
-/// A row of `u = x + div p`, given the rows of `p` and the row of its downward part above.
-#[inline(always)]
-fn primal_row(image: &[f32], above: Option<&[f32]>, down: &[f32], right: &[f32], out: &mut [f32]) {
-    out.copy_from_slice(image);
-    add_divergence(out, above, down, right);
-}
-
-/// `u = x + div p` for one row, in place of `x`.
-#[inline(always)]
-fn add_divergence(row: &mut [f32], above: Option<&[f32]>, down: &[f32], right: &[f32]) {
-    let width = row.len();
-    let (down, right) = (&down[..width], &right[..width]);
-    match above.map(|above| &above[..width]) {
-        Some(above) => {
-            for j in 0..width {
-                row[j] += above[j] - down[j] - right[j];
-            }
-        }
-        None => {
-            for j in 0..width {
-                row[j] -= down[j] + right[j];
+        for level in 1.max((arriving + 1).saturating_sub(height))..=updates.min(arriving) {
+            let i = arriving - level;
+            let (before, after) = levels.split_at_mut(level);
+            let (old, new) = (&before[level - 1], &mut after[0]);
+            let [even, odd] = &mut new.down;
+            let (down, above) = if i.is_multiple_of(2) { (even, &**odd) } else { (odd, &**even) };
+            let right = &mut new.right[i % 2];
+            let here = &old.primal[i % 2];
+            let below = if i + 1 < height { &old.primal[(i + 1) % 2] } else { here };
+            let field = (&old.down[i % 2][..], &old.right[i % 2][..]);
+            dual_row::<FMA>(here, below, field, (down, right), step);
+            let above = if i > 0 { above } else { zeros };
+            let x = &mut image[i * width..(i + 1) * width];
+            if level < updates {
+                primal_row(x, above, (down, right), &mut new.primal[i % 2]);
+            } else {
+                add_divergence(x, above, (down, right));
             }
         }
     }
-    row[1..].iter_mut().zip(right).for_each(|(u, &r)| *u += r);
 }
 
 /// `p = (p - tau grad u) / (1 + tau/weight |grad u|)` for one row; forward differences, 0 at
 /// the far edges. `step` is `tau / weight`.
 #[inline(always)]
-fn update_row(here: &[f32], below: &[f32], down: &mut [f32], right: &mut [f32], step: f32) {
-    let last = here.len() - 1;
-    let (below, down, right) = (&below[..=last], &mut down[..=last], &mut right[..=last]);
-    let ahead = &here[1..];
-    for j in 0..last {
+fn dual_row<const FMA: bool>(
+    here: &[f32],
+    below: &[f32],
+    (down, right): (&[f32], &[f32]),
+    (new_down, new_right): (&mut [f32], &mut [f32]),
+    step: f32,
+) {
+    // All loops run over the whole width, which for most sizes leaves no rest of a register.
+    let width = new_down.len();
+    let (here, ahead, below) = (&here[..width], &here[1..=width], &below[..width]);
+    let (down, right, new_right) = (&down[..width], &right[1..=width], &mut new_right[1..=width]);
+    for j in 0..width {
         let (g0, g1) = (below[j] - here[j], ahead[j] - here[j]);
-        let scale = 1.0 / (1.0 + step * (g0 * g0 + g1 * g1).sqrt());
-        down[j] = (down[j] - TAU * g0) * scale;
-        right[j] = (right[j] - TAU * g1) * scale;
+        let norm = root::<FMA>(add_product::<FMA>(g0 * g0, g1, g1));
+        let scale = inverse::<FMA>(add_product::<FMA>(1.0, step, norm));
+        new_down[j] = add_product::<FMA>(down[j], -TAU, g0) * scale;
+        new_right[j] = add_product::<FMA>(right[j], -TAU, g1) * scale;
     }
-    let g0 = below[last] - here[last];
-    let scale = 1.0 / (1.0 + step * g0.abs());
-    down[last] = (down[last] - TAU * g0) * scale;
-    right[last] *= scale;
+}
+
+/// A row of `u = x + div p`, given the rows of `p` and the row of its downward part above.
+#[inline(always)]
+fn primal_row(x: &[f32], above: &[f32], (down, right): (&[f32], &[f32]), out: &mut [f32]) {
+    let width = x.len();
+    let (above, down, left, right) =
+        (&above[..width], &down[..width], &right[..width], &right[1..=width]);
+    let row = &mut out[..width];
+    for j in 0..width {
+        row[j] = x[j] + (above[j] - down[j]) + (left[j] - right[j]);
+    }
+    out[width] = out[width - 1];
+}
+
+/// The same in place of `x`.
+#[inline(always)]
+fn add_divergence(x: &mut [f32], above: &[f32], (down, right): (&[f32], &[f32])) {
+    let width = x.len();
+    let (above, down, left, right) =
+        (&above[..width], &down[..width], &right[..width], &right[1..=width]);
+    for j in 0..width {
+        x[j] += (above[j] - down[j]) + (left[j] - right[j]);
+    }
+}
+
+/// The square root of `q` >= 0 to a relative error of 1e-6: an estimate from the exponent and two
+/// Newton steps, the first with constants that spread its error evenly (Moroz et al., "Fast
+/// calculation of inverse square root with the use of magic constant", 2018). The processors' own
+/// root and division share one slow unit; this and [`inverse`] take half as long and are the same
+/// on every processor.
+#[inline(always)]
+fn root<const FMA: bool>(q: f32) -> f32 {
+    // So that the square of the inverse stays finite.
+    let q = q + 1e-30;
+    let inverse = f32::from_bits(0x5F1F_FFF9_u32.wrapping_sub(q.to_bits() >> 1));
+    let square = q * inverse;
+    let inverse = inverse * add_product::<FMA>(1.681_913_9, -0.703_952_25 * square, inverse);
+    let root = q * inverse;
+    root * add_product::<FMA>(1.5, -0.5 * root, inverse)
+}
+
+/// `1 / d` for `d` >= 1 to the last bits, in the same way: the estimate is good to 1e-4 after the first
+/// step (constants fitted over one octave, which is all of them), to 1e-8 after the second.
+#[inline(always)]
+fn inverse<const FMA: bool>(d: f32) -> f32 {
+    let inverse = f32::from_bits(0x7EB5_0800_u32.wrapping_sub(d.to_bits()));
+    let inverse = inverse * add_product::<FMA>(2.786_286_4, -1.940_631_2 * d, inverse);
+    inverse * add_product::<FMA>(2.0, -d, inverse)
+}
+
+/// `a + b c`: rounded once where the processor does so in one step, for that is faster.
+#[inline(always)]
+fn add_product<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
+    if FMA { b.mul_add(c, a) } else { a + b * c }
 }
 
 #[cfg(test)]
@@ -188,7 +295,7 @@ mod tests {
             let frames = Array3::from_shape_fn((2, h, w), |_| rng.random::<f32>());
             for updates in [1, 2, 4, 20] {
                 let mut fast = frames.clone();
-                TotalVariation::new(h, w).denoise(&mut fast, 0.1, updates);
+                TotalVariation::new((2, h, w)).denoise(&mut fast, 0.1, updates);
                 for (fast, frame) in fast.outer_iter().zip(frames.outer_iter()) {
                     let slow = reference(&frame.to_owned(), 0.1, updates);
                     let worst = (&fast - &slow).mapv(f32::abs).fold(0.0f32, |a, &b| a.max(b));
@@ -201,13 +308,13 @@ mod tests {
     #[test]
     fn constant_images_stay_and_noise_falls() {
         let mut flat = Array3::from_elem((1, 8, 8), 0.4f32);
-        TotalVariation::new(8, 8).denoise(&mut flat, 0.1, 10);
+        TotalVariation::new((1, 8, 8)).denoise(&mut flat, 0.1, 10);
         assert!(flat.iter().all(|&x| (x - 0.4).abs() < 1e-6));
 
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2);
         let mut noisy = Array3::from_shape_fn((1, 32, 32), |_| 0.5 + 0.1 * rng.random::<f32>());
         let before = noisy.index_axis(Axis(0), 0).var(0.0);
-        TotalVariation::new(32, 32).denoise(&mut noisy, 0.1, 20);
+        TotalVariation::new((1, 32, 32)).denoise(&mut noisy, 0.1, 20);
         assert!(noisy.var(0.0) < 0.3 * before);
     }
 }

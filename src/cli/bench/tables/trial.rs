@@ -11,6 +11,7 @@ use super::zones::Zones;
 use crate::cli::CliError;
 use crate::cli::arguments::checked;
 use crate::cli::bench::clips::Clip;
+use crate::cli::learned::{Learned, plan};
 use crate::cli::masks::MaskArguments;
 use crate::job::{Algorithm, TileSpec};
 use crate::optics::{illumination, measure, noisy};
@@ -18,11 +19,13 @@ use crate::recon::metrics;
 use crate::recon::scale::ScaleEstimator;
 use crate::recon::tile::TilePlan;
 use crate::work::manifest::{ModelRecord, Summary, TileRecord};
-use crate::work::{NetworkSource, SnapshotInput, TileOutcome, Usage, blended_frame, solve};
+use crate::work::{NetworkSource, SnapshotInput, Solver, TileOutcome, Usage, blended_frame, solve};
 
 /// Makes rows.
 pub(super) struct Bench {
     network: NetworkSource,
+    /// The network of `learned`.
+    learned: Option<Learned>,
     setting: Setting,
 }
 
@@ -46,9 +49,20 @@ pub(super) struct Snapshot<'a> {
 }
 
 impl Bench {
-    /// With networks from `network`.
-    pub(super) fn new(network: NetworkSource, setting: Setting) -> Self {
-        Self { network, setting }
+    /// With networks from `network`, and one of the user's own.
+    pub(super) fn new(network: NetworkSource, learned: Option<Learned>, setting: Setting) -> Self {
+        Self { network, learned, setting }
+    }
+
+    /// Why `algorithm` can't be run with so many frames of `side` x `side` pixels; none if it can.
+    pub(super) fn obstacle(
+        &self,
+        algorithm: Algorithm,
+        frames: usize,
+        side: usize,
+    ) -> Option<CliError> {
+        let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned)?;
+        learned.size((frames, side, side)).err()
     }
 
     /// The masks of `frames` frames of `side` x `side` pixels.
@@ -86,10 +100,22 @@ impl Bench {
     }
 
     /// All that the row of this algorithm depends on.
-    pub(super) fn key(&self, snapshot: &Snapshot<'_>, algorithm: Algorithm) -> Key {
+    ///
+    /// # Errors
+    /// A network that does not take the snapshot.
+    pub(super) fn key(
+        &self,
+        snapshot: &Snapshot<'_>,
+        algorithm: Algorithm,
+    ) -> Result<Key, CliError> {
         let (compression_ratio, scale, _) = snapshot.masks.dim();
         let schedule = algorithm.default_schedule();
-        Key {
+        let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned);
+        let plan = plan((None, None), learned, snapshot.masks.dim())?;
+        let deep = learned.is_some() || schedule.needs_network();
+        let mut models = ModelRecord::of(&schedule);
+        models.extend(learned.map(Learned::record));
+        Ok(Key {
             program_version: env!("CARGO_PKG_VERSION").into(),
             clip: snapshot.clip.into(),
             algorithm,
@@ -97,11 +123,11 @@ impl Bench {
             compression_ratio,
             setting: self.setting.clone(),
             inputs_sha256: snapshot.sha256.clone(),
-            tile: TileSpec::default(),
-            models: ModelRecord::of(&schedule),
-            provider: schedule.needs_network().then(|| self.network.provider().into()),
+            tile: TileSpec { size: plan.size(), overlap: plan.overlap() },
+            models,
+            provider: deep.then(|| self.network.provider().into()),
             schedule,
-        }
+        })
     }
 
     /// Reconstructs the snapshot as `key` says.
@@ -113,12 +139,19 @@ impl Bench {
         let white = estimator
             .white(measurement.view())
             .map_err(|error| CliError::Input(format!("clip {}: {error}", snapshot.clip)))?;
-        let schedule = checked(&key.schedule)?;
+        let schedule;
+        let solver = match &self.learned {
+            Some(learned) if key.algorithm == Algorithm::Learned => Solver::Network(&learned.file),
+            _ => {
+                schedule = checked(&key.schedule)?;
+                Solver::Schedule(&schedule)
+            }
+        };
         let input = SnapshotInput {
             masks: masks.view(),
             measurement: measurement.view(),
             white,
-            schedule: &schedule,
+            solver,
             plan: &plan,
         };
         let cores = thread::available_parallelism().map_or(1, usize::from);

@@ -1,0 +1,150 @@
+"""One job of any size through the real service: time by stage, memory and disk.
+
+    python scale.py SCI_RECON_BINARY IMAGE [--size 3200] [--frames 10] [--algorithm gap-tv] [--device cuda:0] ...
+
+IMAGE, panned by a few pixels a frame, is the scene; masks and snapshot are simulated (random squares). Everything then goes over HTTP:
+upload, calibration, measurement, job, download. Prints what happens and ends with one JSON line: seconds by stage, the greatest resident
+memory of the server and of each worker (VmHWM), the first remaining time that was promised beside the true one, disk and quality.
+"""
+import argparse
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+
+import numpy as np
+from skimage import io, transform
+
+
+def pan(image, frames, size, step=(3, 5)):
+    """Frames [B,size,size], uint8: a window that moves over the gray image, which is enlarged if it is too small."""
+    need = [size + frames * s for s in step]
+    gray = image[..., :3].mean(-1) if image.ndim == 3 else image.astype(float)
+    factor = max(1, *(n / extent for n, extent in zip(need, gray.shape)))
+    if factor > 1:
+        gray = transform.rescale(gray, factor * 1.001, preserve_range=True)
+    gray = gray.clip(0, 255).astype(np.uint8)
+    return np.stack([gray[k * step[0]:k * step[0] + size, k * step[1]:k * step[1] + size] for k in range(frames)])
+
+
+class Service:
+    def __init__(self, binary, folder, options):
+        self.process = subprocess.Popen([binary, 'serve', '--data', folder, '--listen', '127.0.0.1:0', *options], stdout=subprocess.PIPE,
+                                        stderr=subprocess.DEVNULL, text=True)
+        self.url = json.loads(self.process.stdout.readline())['url']
+        threading.Thread(target=self.process.stdout.read, daemon=True).start()
+        self.memory = {}
+
+    def call(self, method, path, body=None, headers=()):
+        if isinstance(body, dict):
+            body, headers = json.dumps(body).encode(), {'Content-Type': 'application/json'}
+        request = urllib.request.Request(self.url + path, method=method, data=body, headers=dict(headers))
+        with urllib.request.urlopen(request) as answer:
+            return json.load(answer)
+
+    def upload(self, path):
+        with open(path, 'rb') as file:   # streamed
+            headers = {'Content-Type': 'application/octet-stream', 'Content-Length': os.path.getsize(path)}
+            return self.call('POST', '/v1/blobs', file, headers)['sha256']
+
+    def look(self):
+        """Greatest resident memory so far, by process."""
+        children = pathlib.Path(f'/proc/{self.process.pid}/task').glob('*/children')
+        workers = ' '.join(path.read_text() for path in children).split()
+        for name, pid in [('server', self.process.pid), *((f'worker {pid}', pid) for pid in workers)]:
+            try:
+                line = next(line for line in open(f'/proc/{pid}/status') if line.startswith('VmHWM'))
+            except (OSError, StopIteration):
+                continue
+            self.memory[name] = int(line.split()[1]) * 1024
+
+
+def psnr_by_frame(path, truth):
+    """Mean PSNR (dB) over the frames of a .npy file."""
+    frames = np.load(path, mmap_mode='r')
+    errors = [np.mean((frame - true / np.float32(255)) ** 2, dtype=np.float64) for frame, true in zip(frames, truth)]
+    return float(np.mean(-10 * np.log10(errors)))
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('binary')
+    p.add_argument('image')
+    p.add_argument('--size', type=int, default=3200)
+    p.add_argument('--frames', type=int, default=10)
+    p.add_argument('--algorithm', default='gap-tv')
+    p.add_argument('--workers', type=int, default=2)
+    p.add_argument('--tile', type=int, help='tile size [default: the service\'s]')
+    p.add_argument('--overlap', type=int, default=32)
+    p.add_argument('--device', help='for example cuda:0 [default: the CPU]')
+    p.add_argument('--folder', help='where the files go and stay [default: a folder that is removed]')
+    a = p.parse_args()
+    folder = pathlib.Path(a.folder or tempfile.mkdtemp(prefix='sci-recon-scale-'))
+    folder.mkdir(parents=True, exist_ok=True)
+    seconds, began = {}, time.monotonic()
+
+    def lap(name):
+        nonlocal began
+        seconds[name], began = round(time.monotonic() - began, 1), time.monotonic()
+        print(f'{name}: {seconds[name]} s', flush=True)
+
+    truth = pan(io.imread(a.image), a.frames, a.size)
+    np.save(folder / 'frames.npy', truth)
+    subprocess.run([a.binary, 'simulate', '--frames', folder / 'frames.npy', '--compression-ratio', str(a.frames), '--pattern', 'random-squares',
+                    '--seed', '1', '--out', folder / 'snapshot'], check=True, stdout=subprocess.DEVNULL)
+    (folder / 'frames.npy').unlink()
+    lap('simulate')
+    service = Service(a.binary, folder / 'service', ['--workers', str(a.workers), *(['--device', a.device] if a.device else [])])
+    try:
+        masks = service.upload(folder / 'snapshot' / 'masks.npy')
+        measured = service.upload(folder / 'snapshot' / 'measurement.npy')
+        lap('upload')
+        calibration = service.call('POST', '/v1/calibrations', {'masks': masks})['id']
+        while service.call('GET', f'/v1/calibrations/{calibration}').get('state', 'ready') == 'preparing':
+            time.sleep(.2)
+        measurement = service.call('POST', '/v1/measurements', {'calibration': calibration, 'data': measured})['id']
+        lap('calibration and check')
+        wanted = {'measurement': measurement, 'algorithm': a.algorithm}
+        if a.tile:
+            wanted['tile'] = {'size': a.tile, 'overlap': a.overlap}
+        job = service.call('POST', '/v1/jobs', wanted)['id']
+        started, promise, report = time.monotonic(), None, 0
+        while (state := service.call('GET', f'/v1/jobs/{job}'))['state'] in ('queued', 'running'):
+            service.look()
+            elapsed, eta = time.monotonic() - started, state['progress']['eta_seconds']
+            if promise is None and eta is not None and elapsed > min(60, 5 + .05 * eta):
+                promise = (elapsed, eta)
+            if elapsed > report:
+                print(f"  {elapsed:.0f} s: {state['progress']['percent']} %, {eta} s to go", flush=True)
+                report = elapsed + 30
+            time.sleep(.25)
+        lap('job')
+        if state['state'] != 'succeeded':
+            sys.exit(f"the job {state['state']}: {state['error']}")
+        total = time.monotonic() - started
+        manifest = service.call('GET', f'/v1/jobs/{job}/manifest.json')
+        result = folder / 'result.npy'
+        urllib.request.urlretrieve(f'{service.url}/v1/jobs/{job}/snapshots/0/frames.npy', result)
+        lap('download')
+        service.look()
+        disk = sum(path.stat().st_size for path in (folder / 'service').rglob('*') if path.is_file())
+        memory = service.memory
+        print(json.dumps({
+            'target': 'bench-scale', 'size': a.size, 'frames': a.frames, 'algorithm': a.algorithm, 'workers': a.workers, 'device': a.device,
+            'seconds': seconds, 'run': manifest['run'], 'memory_bytes': memory, 'memory_sum_bytes': sum(memory.values()),
+            'promised_seconds': promise and round(sum(promise), 1), 'true_seconds': round(total, 1), 'disk_bytes': disk,
+            'psnr_db': round(psnr_by_frame(result, truth), 3)}))
+    finally:
+        service.process.terminate()
+        service.process.wait()
+        if not a.folder:
+            shutil.rmtree(folder)
+
+
+main()

@@ -1,0 +1,117 @@
+//! `sci-recon check-model`: looks whether a network can be used, in a process of its own.
+//!
+//! Loading a stranger's network runs native code on what it says: it may crash, hang, or take all
+//! memory. The service starts this command so that none of that is the service's.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use ndarray::{Array2, Array3};
+use rustix::process::{Resource, Rlimit};
+
+use super::CliError;
+use super::arguments::EngineArguments;
+use crate::job::{ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
+use crate::recon::ReconError;
+use crate::recon::learned::{PictureSize, SnapshotNetwork, TensorInfo};
+use crate::recon::tile::TilePlan;
+use crate::work::{ModelFile, NetworkError, NetworkSource, Usage, peak_rss_bytes};
+
+/// How much the check stands back for others.
+const NICE: i32 = 10;
+
+/// Check whether a network can be used by `learned` for masks of a size, and run it once on a dark
+/// scene. Prints one JSON object: what was found, or why it is refused.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// The ONNX file.
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Frames in one snapshot.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    frames: u32,
+    /// Rows of the masks.
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(1..))]
+    height: u32,
+    /// Columns of the masks.
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(1..))]
+    width: u32,
+    /// The most memory that the check may take [default: no limit].
+    #[arg(long, value_name = "BYTES")]
+    memory_bytes: Option<u64>,
+    #[command(flatten)]
+    engine: EngineArguments,
+}
+
+/// Runs the command. A network that can't be used is no failure of the command.
+///
+/// # Errors
+/// A file that can't be read, or no libonnxruntime.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
+    rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
+    if let Some(bytes) = arguments.memory_bytes {
+        let limit = Rlimit { current: Some(bytes), maximum: Some(bytes) };
+        rustix::process::setrlimit(Resource::Data, limit).map_err(|error| refused(&error))?;
+    }
+    let network = arguments.engine.network()?;
+    // Without a library nothing can be said of the network.
+    network.version()?;
+    let file =
+        ModelFile::open(&arguments.file).map_err(|error| CliError::Input(error.to_string()))?;
+    let verdict = match facts(arguments, &network, &file) {
+        Ok(facts) => ModelVerdict::Fits(facts),
+        Err(NetworkError::Runtime(error)) => ModelVerdict::Refused(error.to_string()),
+        Err(other) => return Err(other.into()),
+    };
+    let text = serde_json::to_string(&verdict).map_err(|error| refused(&error))?;
+    println!("{text}");
+    Ok(())
+}
+
+fn facts(
+    arguments: &Arguments,
+    network: &NetworkSource,
+    file: &ModelFile,
+) -> Result<ModelFacts, NetworkError> {
+    let length = |length: u32| usize::try_from(length).unwrap_or(usize::MAX);
+    let (height, width) = (length(arguments.height), length(arguments.width));
+    let frames = length(arguments.frames);
+    let mut network = network.end_to_end(file)?;
+    let interface = network.interface();
+    let size = interface.check(frames, height, width)?;
+    let trial = match size {
+        PictureSize::Fixed => (height, width),
+        PictureSize::Free => first_tile(height, width)?,
+    };
+    Ok(ModelFacts {
+        inputs: interface.inputs.into_iter().map(tensor).collect(),
+        outputs: interface.outputs.into_iter().map(tensor).collect(),
+        fixed_size: size == PictureSize::Fixed,
+        trial: run_once(&mut network, frames, trial)?,
+    })
+}
+
+fn tensor(TensorInfo { name, sides, .. }: TensorInfo) -> ModelTensor {
+    ModelTensor { name, shape: sides }
+}
+
+/// The size of the tiles of a job that names none.
+fn first_tile(height: usize, width: usize) -> Result<(usize, usize), ReconError> {
+    let TileSpec { size, overlap } = TileSpec::default();
+    let tile = TilePlan::new(height, width, size, overlap)?.tile(0);
+    Ok(tile.map_or((height, width), |tile| (tile.height, tile.width)))
+}
+
+/// A dark scene through half-open masks: masks of 0 would be divided by in many a network.
+fn run_once(
+    network: &mut dyn SnapshotNetwork,
+    frames: usize,
+    (height, width): (usize, usize),
+) -> Result<ModelTrial, ReconError> {
+    let masks = Array3::from_elem((frames, height, width), 0.5);
+    let before = Usage::now();
+    network.frames(Array2::zeros((height, width)).view(), masks.view())?;
+    let cpu_seconds = (Usage::now() - before).cpu_seconds;
+    Ok(ModelTrial { height, width, cpu_seconds, peak_rss_bytes: peak_rss_bytes() })
+}

@@ -1,0 +1,69 @@
+//! The network of a user's own on the command line.
+
+use std::path::Path;
+
+use super::CliError;
+use crate::job::TileSpec;
+use crate::recon::learned::{Interface, PictureSize};
+use crate::recon::tile::TilePlan;
+use crate::work::manifest::ModelRecord;
+use crate::work::{ModelFile, NetworkSource};
+
+/// An end-to-end network for one size of masks.
+pub(super) struct Learned {
+    name: String,
+    pub(super) file: ModelFile,
+    interface: Interface,
+}
+
+impl Learned {
+    /// Loads the network once, to see what it takes.
+    ///
+    /// # Errors
+    /// A file that can't be read or is no network, or no libonnxruntime.
+    pub(super) fn open(path: &Path, network: &NetworkSource) -> Result<Self, CliError> {
+        let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
+        let interface = network.end_to_end(&file)?.interface();
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { name, file, interface })
+    }
+
+    /// Which pictures it takes, for masks of frames x rows x columns.
+    ///
+    /// # Errors
+    /// A network that is not for these.
+    pub(super) fn size(
+        &self,
+        (frames, height, width): (usize, usize, usize),
+    ) -> Result<PictureSize, CliError> {
+        Ok(self.interface.check(frames, height, width)?)
+    }
+
+    /// For a manifest.
+    pub(super) fn record(&self) -> ModelRecord {
+        ModelRecord { name: self.name.clone(), sha256: self.file.sha256().to_string() }
+    }
+}
+
+/// How masks of frames x rows x columns are cut: as asked for, else as the network wants it.
+///
+/// # Errors
+/// Tiles that can't be, or that the network does not take.
+pub(super) fn plan(
+    (tile, overlap): (Option<usize>, Option<usize>),
+    model: Option<&Learned>,
+    dim: (usize, usize, usize),
+) -> Result<TilePlan, CliError> {
+    let (_, height, width) = dim;
+    let fixed = model.map(|model| model.size(dim)).transpose()? == Some(PictureSize::Fixed);
+    let usual = if fixed { TileSpec::whole(height, width) } else { TileSpec::default() };
+    let (size, overlap) = (tile.unwrap_or(usual.size), overlap.unwrap_or(usual.overlap));
+    let plan = TilePlan::new(height, width, size, overlap)?;
+    if fixed && plan.len() > 1 {
+        return Err(CliError::Input(format!(
+            "the network takes pictures of {height}x{width} pixels only, so they can't be cut into \
+             tiles of {size}: leave --tile out"
+        )));
+    }
+    Ok(plan)
+}

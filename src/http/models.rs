@@ -1,0 +1,85 @@
+//! `/v1/models`: end-to-end networks, each for one calibration.
+
+use axum::Json;
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+
+use super::access::Access;
+use super::app::App;
+use super::calibrations::missing;
+use super::error::ApiError;
+use super::extract::{Body, Params, QueryOf};
+use super::model_check;
+use super::page::{Limit, PageBody};
+use crate::job::{CalibrationId, Label, ModelId, Sha256};
+use crate::store::{Model, ModelFilter, NewModel};
+
+/// The body of `POST /v1/models`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ModelRequest {
+    name: Option<Label>,
+    /// The calibration that it was trained for.
+    calibration: CalibrationId,
+    /// The upload with the ONNX file.
+    file: Sha256,
+}
+
+/// The query of the list.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    #[serde(default)]
+    limit: Limit,
+    cursor: Option<ModelId>,
+    calibration: Option<CalibrationId>,
+}
+
+/// `POST /v1/models`
+pub(super) async fn create(
+    State(app): State<App>,
+    access: Access,
+    Body(request): Body<ModelRequest>,
+) -> Result<Response, ApiError> {
+    let ModelRequest { name, calibration, file } = request;
+    let found = app.store.calibration(&access.lab, calibration).await;
+    let masks = found.map_err(|error| missing("/calibration", error))?.facts;
+    app.store.upload(&access.lab, file).await.map_err(|error| missing("/file", error))?;
+    let facts = model_check::check(&app, &file, &masks).await?;
+    let new = NewModel { name, calibration, file, facts };
+    let model = app.store.add_model(&access.lab, new).await?;
+    let location = [(header::LOCATION, format!("/v1/models/{}", model.id))];
+    Ok((StatusCode::CREATED, location, Json(model)).into_response())
+}
+
+/// `GET /v1/models`
+pub(super) async fn list(
+    State(app): State<App>,
+    access: Access,
+    QueryOf(query): QueryOf<ListQuery>,
+) -> Result<Json<PageBody<Model>>, ApiError> {
+    let filter = ModelFilter { calibration: query.calibration, after: query.cursor };
+    let page = app.store.models(&access.lab, filter, query.limit.get()).await?;
+    Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
+}
+
+/// `GET /v1/models/{model}`
+pub(super) async fn show(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<ModelId>,
+) -> Result<Json<Model>, ApiError> {
+    Ok(Json(app.store.model(&access.lab, id).await?))
+}
+
+/// `DELETE /v1/models/{model}`
+pub(super) async fn delete(
+    State(app): State<App>,
+    access: Access,
+    Params(id): Params<ModelId>,
+) -> Result<StatusCode, ApiError> {
+    app.store.delete_model(&access.lab, id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,126 @@
+//! The algorithms, and what belongs to each.
+
+use serde::{Deserialize, Serialize};
+
+use super::schedule::{PriorSpec, ScheduleSpec};
+use crate::recon::schedule::Schedule;
+
+/// The algorithms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Algorithm {
+    /// GAP with total variation.
+    GapTv,
+    /// ADMM with total variation.
+    AdmmTv,
+    /// GAP with total variation, then with the nonlocal prior.
+    PnpNonlocal,
+    /// GAP with total variation, then with FFDNet.
+    #[serde(rename = "pnp-ffdnet")]
+    PnpFfdNet,
+    /// GAP with total variation, then with FastDVDNet.
+    #[serde(rename = "pnp-fastdvdnet")]
+    PnpFastDvdNet,
+    /// GAP with total variation, with FastDVDNet, then with the nonlocal prior.
+    #[serde(rename = "pnp-tv-fastdvdnet")]
+    PnpTvFastDvdNet,
+    /// A network from measurement and masks to frames, trained for one calibration.
+    Learned,
+}
+
+impl Algorithm {
+    /// All algorithms.
+    pub const ALL: [Self; 7] = [
+        Self::GapTv,
+        Self::AdmmTv,
+        Self::PnpNonlocal,
+        Self::PnpFfdNet,
+        Self::PnpFastDvdNet,
+        Self::PnpTvFastDvdNet,
+        Self::Learned,
+    ];
+
+    /// The name in JSON, on the command line and in the database.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::GapTv => "gap-tv",
+            Self::AdmmTv => "admm-tv",
+            Self::PnpNonlocal => "pnp-nonlocal",
+            Self::PnpFfdNet => "pnp-ffdnet",
+            Self::PnpFastDvdNet => "pnp-fastdvdnet",
+            Self::PnpTvFastDvdNet => "pnp-tv-fastdvdnet",
+            Self::Learned => "learned",
+        }
+    }
+
+    /// What it does, in a sentence.
+    #[must_use]
+    pub fn summary(self) -> &'static str {
+        match self {
+            Self::GapTv => {
+                "Accelerated generalized alternating projection with total variation: seconds, \
+                 no network."
+            }
+            Self::AdmmTv => {
+                "The alternating direction method of multipliers with total variation: for noisy \
+                 measurements."
+            }
+            Self::PnpNonlocal => {
+                "Total variation, then groups of similar patches of several frames, filtered by \
+                 their own covariance: no network."
+            }
+            Self::PnpFfdNet => "Total variation, then FFDNet on each frame.",
+            Self::PnpFastDvdNet => "Total variation, then FastDVDNet over the clip.",
+            Self::PnpTvFastDvdNet => {
+                "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best \
+                 on all masks measured."
+            }
+            Self::Learned => {
+                "A network of your own from measurement and masks to frames, registered for a \
+                 calibration as a model: one run, no schedule."
+            }
+        }
+    }
+
+    /// The schedule of a job that names none; without stages for [`Self::Learned`], which has none.
+    #[must_use]
+    pub fn default_schedule(self) -> ScheduleSpec {
+        ScheduleSpec::from(&match self {
+            Self::GapTv => Schedule::gap_tv(),
+            Self::AdmmTv => Schedule::admm_tv(),
+            Self::PnpNonlocal => Schedule::pnp_nonlocal(),
+            Self::PnpFfdNet => Schedule::pnp_ffdnet(),
+            Self::PnpFastDvdNet => Schedule::pnp_fastdvdnet(),
+            Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
+            Self::Learned => return ScheduleSpec::without_stages(),
+        })
+    }
+
+    /// The priors that a schedule of this algorithm may name.
+    #[must_use]
+    pub fn priors(self) -> Vec<PriorSpec> {
+        use PriorSpec as P;
+        match self {
+            Self::GapTv | Self::AdmmTv => vec![P::Tv],
+            Self::PnpNonlocal => vec![P::Tv, P::Nonlocal],
+            Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
+            Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNet],
+            Self::PnpTvFastDvdNet => vec![P::Tv, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal],
+            Self::Learned => Vec::new(),
+        }
+    }
+
+    /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
+    /// what the stages don't do.
+    #[must_use]
+    pub fn misfit(self, schedule: &ScheduleSpec) -> Option<String> {
+        let own = self.priors();
+        let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;
+        let taken = |other: &&Self| other.misfit(schedule).is_none();
+        // Later ones take more.
+        let later = Self::ALL.iter().skip_while(|other| **other != self).skip(1).find(taken);
+        let instead = later.map_or_else(String::new, |other| format!("; ask for {}", other.name()));
+        Some(format!("{} has no stages of {}{instead}", self.name(), stranger.prior.name()))
+    }
+}

@@ -1,0 +1,177 @@
+//! End-to-end networks (the BIRNAT kind): a measurement and its masks go in, frames come out.
+//!
+//! Such a network is trained for one set of masks. It knows nothing of schedules or priors, so all
+//! that can be checked before it runs is what it takes and gives.
+
+use std::fmt;
+
+use ndarray::{Array3, ArrayView2, ArrayView3};
+
+use super::error::ReconError;
+
+/// A tensor that a network takes or gives.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TensorInfo {
+    /// Its name.
+    pub name: String,
+    /// Type of its elements, such as `float32`.
+    pub element: String,
+    /// Its sides; none for one that may have any length.
+    pub sides: Vec<Option<usize>>,
+}
+
+/// All that a network takes and gives.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Interface {
+    /// The inputs.
+    pub inputs: Vec<TensorInfo>,
+    /// The outputs.
+    pub outputs: Vec<TensorInfo>,
+}
+
+/// Which pictures a network takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PictureSize {
+    /// Those of the masks' size only: they can't be cut into tiles.
+    Fixed,
+    /// Those of any size.
+    Free,
+}
+
+/// A loaded end-to-end network.
+pub trait SnapshotNetwork {
+    /// The frames \[B,H,W\] behind measurement `y` \[H,W\] through `masks` \[B,H,W\], where
+    /// `y = sum_k C_k x_k` with frames `x_k` on \[0,1\]. All in standard layout.
+    ///
+    /// # Errors
+    /// The network fails, or gives something else than B finite frames.
+    fn frames(
+        &mut self,
+        y: ArrayView2<'_, f32>,
+        masks: ArrayView3<'_, f32>,
+    ) -> Result<Array3<f32>, ReconError>;
+}
+
+/// Name of the input that takes the measurement \[1,1,H,W\].
+pub const MEASUREMENT: &str = "measurement";
+/// Name of the input that takes the masks \[1,B,H,W\].
+pub const MASKS: &str = "masks";
+/// Name of the output that gives the frames \[1,B,H,W\].
+pub const FRAMES: &str = "frames";
+
+impl Interface {
+    /// Checks that the network takes a measurement through `frames` masks of `height` x `width`
+    /// pixels and gives as many frames, all float32, and says whether it takes other sizes, too.
+    ///
+    /// # Errors
+    /// [`ReconError::Shape`] with what it has and what is needed.
+    pub fn check(
+        &self,
+        frames: usize,
+        height: usize,
+        width: usize,
+    ) -> Result<PictureSize, ReconError> {
+        let names = |tensors: &[TensorInfo]| {
+            let mut names: Vec<&str> = tensors.iter().map(|tensor| tensor.name.as_str()).collect();
+            names.sort_unstable();
+            names.join(", ")
+        };
+        let (inputs, outputs) = (names(&self.inputs), names(&self.outputs));
+        if inputs != format!("{MASKS}, {MEASUREMENT}") || outputs != FRAMES {
+            return Err(ReconError::Shape {
+                what: "the network's interface",
+                found: format!("inputs {inputs}; outputs {outputs}"),
+                expected: format!("inputs {MASKS}, {MEASUREMENT}; output {FRAMES}"),
+            });
+        }
+        let mut size = PictureSize::Free;
+        for tensor in self.inputs.iter().chain(&self.outputs) {
+            let (what, planes) = match tensor.name.as_str() {
+                MEASUREMENT => ("the network's input measurement", 1),
+                MASKS => ("the network's input masks", frames),
+                _ => ("the network's output frames", frames),
+            };
+            tensor.check(what, [1, planes, height, width])?;
+            if tensor.sides.iter().skip(2).any(Option::is_some) && tensor.name != FRAMES {
+                size = PictureSize::Fixed;
+            }
+        }
+        Ok(size)
+    }
+}
+
+impl TensorInfo {
+    fn check(&self, what: &'static str, needed: [usize; 4]) -> Result<(), ReconError> {
+        let fits = self.sides.len() == needed.len()
+            && self.sides.iter().zip(needed).all(|(side, needed)| side.is_none_or(|s| s == needed));
+        if fits && self.element == "float32" {
+            return Ok(());
+        }
+        let needed =
+            Self { sides: needed.map(Some).into(), element: "float32".into(), ..self.clone() };
+        Err(ReconError::Shape {
+            what,
+            found: self.to_string(),
+            expected: format!("{needed} (that of the masks)"),
+        })
+    }
+}
+
+/// `float32 [1,8,?,?]`.
+impl fmt::Display for TensorInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let side = |side: &Option<usize>| side.map_or_else(|| "?".to_owned(), |s| s.to_string());
+        let sides: Vec<String> = self.sides.iter().map(side).collect();
+        write!(f, "{} [{}]", self.element, sides.join(","))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Interface, PictureSize, TensorInfo};
+
+    fn tensor(name: &str, sides: [usize; 4]) -> TensorInfo {
+        let side = |side: usize| (side > 0).then_some(side);
+        TensorInfo { name: name.into(), element: "float32".into(), sides: sides.map(side).into() }
+    }
+
+    /// A network for `frames` frames; a length of 0 stands for any.
+    fn network(frames: usize, height: usize, width: usize) -> Interface {
+        Interface {
+            inputs: vec![
+                tensor("measurement", [1, 1, height, width]),
+                tensor("masks", [1, frames, height, width]),
+            ],
+            outputs: vec![tensor("frames", [0, frames, height, width])],
+        }
+    }
+
+    #[test]
+    fn sizes_are_fixed_or_free() {
+        assert_eq!(network(4, 48, 64).check(4, 48, 64).unwrap(), PictureSize::Fixed);
+        assert_eq!(network(4, 0, 0).check(4, 48, 64).unwrap(), PictureSize::Free);
+        assert_eq!(network(0, 0, 0).check(9, 5, 64).unwrap(), PictureSize::Free);
+        assert_eq!(network(4, 48, 0).check(4, 48, 64).unwrap(), PictureSize::Fixed);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_told_with_what_would() {
+        let message = |network: &Interface| network.check(4, 48, 64).unwrap_err().to_string();
+        let text = message(&network(8, 48, 64));
+        assert!(text.contains("masks") && text.contains("[1,8,48,64]"), "{text}");
+        assert!(text.contains("[1,4,48,64]"), "{text}");
+        let text = message(&network(4, 32, 64));
+        assert!(text.contains("[1,1,32,64]") && text.contains("[1,1,48,64]"), "{text}");
+        let mut double = network(4, 48, 64);
+        double.outputs[0].element = "float64".into();
+        let text = message(&double);
+        assert!(text.contains("float64 [?,4,48,64]") && text.contains("float32"), "{text}");
+        let mut flat = network(4, 48, 64);
+        flat.inputs[1].sides.pop();
+        assert!(message(&flat).contains("[1,4,48]"));
+        let mut other = network(4, 48, 64);
+        other.inputs[0].name = "y".into();
+        let text = message(&other);
+        assert!(text.contains("masks, y") && text.contains("masks, measurement"), "{text}");
+    }
+}

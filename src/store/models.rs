@@ -1,0 +1,164 @@
+//! Table `models`.
+
+use serde::Serialize;
+use sqlx::Row;
+use sqlx::sqlite::SqliteRow;
+
+use super::calibrations::{gone_if_foreign_key, label};
+use super::error::StoreError;
+use super::rows::{json, number, parsed};
+use super::{Page, Store};
+use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
+
+/// What is known of an end-to-end network when it has been checked.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct NewModel {
+    /// The user's name for it.
+    pub name: Option<Label>,
+    /// The calibration that it was trained for.
+    pub calibration: CalibrationId,
+    /// The upload with the ONNX file.
+    pub file: Sha256,
+    /// What its check has found.
+    #[serde(flatten)]
+    pub facts: ModelFacts,
+}
+
+/// An end-to-end network on record.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Model {
+    /// Its identifier.
+    pub id: ModelId,
+    /// When it was registered.
+    pub created_at: Timestamp,
+    /// What is known of it.
+    #[serde(flatten)]
+    pub content: NewModel,
+}
+
+/// Which models a list holds.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ModelFilter {
+    /// Only those of this calibration.
+    pub calibration: Option<CalibrationId>,
+    /// Only those older than this one.
+    pub after: Option<ModelId>,
+}
+
+impl From<Model> for JobModel {
+    fn from(model: Model) -> Self {
+        let Model { id, content: NewModel { name, calibration, file, facts }, .. } = model;
+        let ModelFacts { fixed_size, trial, .. } = facts;
+        Self { id, calibration, name, sha256: file, fixed_size, trial }
+    }
+}
+
+impl Store {
+    /// Records a network.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] if the calibration or the upload is gone.
+    pub async fn add_model(&self, lab: &Lab, content: NewModel) -> Result<Model, StoreError> {
+        let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
+        let NewModel { name, calibration, file, facts } = &model.content;
+        let mut transaction = self.write().await?;
+        sqlx::query(
+            "INSERT INTO models (id, lab, name, calibration, file, facts, created_at)
+             VALUES (?, ?, ?, ?, ?, ?, ?)",
+        )
+        .bind(model.id.to_string())
+        .bind(lab.as_str())
+        .bind(name.as_ref().map(Label::as_str))
+        .bind(calibration.to_string())
+        .bind(file.to_string())
+        .bind(serde_json::json!(facts).to_string())
+        .bind(model.created_at.0)
+        .execute(&mut *transaction)
+        .await
+        .map_err(|error| {
+            gone_if_foreign_key(error, "calibration", format!("{calibration} or blob {file}"))
+        })?;
+        transaction.commit().await?;
+        Ok(model)
+    }
+
+    /// The lab's model with this identifier.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`].
+    pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model, StoreError> {
+        let row = sqlx::query("SELECT * FROM models WHERE id = ? AND lab = ?")
+            .bind(id.to_string())
+            .bind(lab.as_str())
+            .fetch_optional(&self.readers)
+            .await?;
+        row.as_ref().map(model).transpose()?.ok_or_else(|| not_found(id))
+    }
+
+    /// A page of the lab's models, newest first.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn models(
+        &self,
+        lab: &Lab,
+        filter: ModelFilter,
+        limit: u32,
+    ) -> Result<Page<Model>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT * FROM models
+             WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
+             ORDER BY id DESC LIMIT ?4",
+        )
+        .bind(lab.as_str())
+        .bind(filter.after.map(|id| id.to_string()))
+        .bind(filter.calibration.map(|id| id.to_string()))
+        .bind(i64::from(limit) + 1)
+        .fetch_all(&self.readers)
+        .await?;
+        Page::cut(&rows, limit, model)
+    }
+
+    /// Deletes a model that no job refers to. Its file is left to [`Self::collect`].
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`], [`StoreError::InUse`].
+    pub async fn delete_model(&self, lab: &Lab, id: ModelId) -> Result<(), StoreError> {
+        self.model(lab, id).await?;
+        let mut transaction = self.write().await?;
+        let row = sqlx::query("SELECT count(*) AS users FROM jobs WHERE model = ?")
+            .bind(id.to_string())
+            .fetch_one(&mut *transaction)
+            .await?;
+        let users = number(&row, "users")?;
+        if users > 0 {
+            return Err(StoreError::InUse { what: "model", by: "jobs", users });
+        }
+        let deleted = sqlx::query("DELETE FROM models WHERE id = ?")
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await?;
+        if deleted.rows_affected() == 0 {
+            return Err(not_found(id));
+        }
+        transaction.commit().await?;
+        Ok(())
+    }
+}
+
+fn model(row: &SqliteRow) -> Result<Model, StoreError> {
+    Ok(Model {
+        id: parsed(row, "id")?,
+        created_at: Timestamp(row.try_get("created_at")?),
+        content: NewModel {
+            name: label(row, "name")?,
+            calibration: parsed(row, "calibration")?,
+            file: parsed(row, "file")?,
+            facts: json(row, "facts")?,
+        },
+    })
+}
+
+fn not_found(id: ModelId) -> StoreError {
+    StoreError::NotFound { what: "model", id: id.to_string() }
+}
