@@ -11,7 +11,9 @@ use super::sensing::SensingOperator;
 
 /// Values of a strip of all frames: three arrays of them (frames, masks, projection) stay in a
 /// second-level cache.
-const STRIP_VALUES: usize = 32 * 1024;
+const STRIP_VALUES: usize = 48 * 1024;
+/// Fewer rows would cost more in going from frame to frame than they save.
+const LEAST_ROWS: usize = 16;
 /// Running sums side by side: so many that the compiler keeps them in a loop over registers.
 const LANES: usize = 256;
 
@@ -238,7 +240,7 @@ impl<'a> Run<'a> {
     /// over is used for all three while it is in cache.
     fn project_and_smooth(&mut self, stage: &Stage) -> (f64, Change) {
         let (frames, height, width) = self.op.dim();
-        let rows = (STRIP_VALUES / (frames * width)).clamp(4, height.max(4));
+        let rows = (STRIP_VALUES / (frames * width)).max(LEAST_ROWS);
         let (mut squares, mut change) = (0.0, Change::default());
         for start in (0..height).step_by(rows) {
             let strip = start..height.min(start + rows);
