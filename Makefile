@@ -41,9 +41,10 @@ fuzz: ## every decoder for SECONDS seconds; needs cargo install cargo-fuzz
 SECONDS ?= 60
 
 SCHEMATHESIS := .venv/schemathesis
-schemathesis: $(SCHEMATHESIS)/.stamp ## the API against its contract, with and without a token
+schemathesis: runtime $(SCHEMATHESIS)/.stamp ## the API against its contract, with and without a token
 	$(CARGO) build --release
-	$(PYTHON) tests/judges/schemathesis_runs.py $(SCHEMATHESIS)/bin/schemathesis \
+	ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(PYTHON) tests/judges/schemathesis_runs.py $(SCHEMATHESIS)/bin/schemathesis \
 		$${CARGO_TARGET_DIR:-target}/release/sci-recon
 $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	$(PYTHON) -m venv $(SCHEMATHESIS)
