@@ -102,15 +102,15 @@ const MAX_STAGES: usize = 32;
 const MAX_ITERATIONS: usize = 10_000;
 
 /// Cost of one projection and one accelerated update, CPU-nanoseconds per voxel (measured).
-const PROJECTION_NS: f64 = 0.6;
+const PROJECTION_NS: f64 = 0.7;
 /// Cost of one dual update of TV, CPU-nanoseconds per voxel (measured).
-const TV_UPDATE_NS: f64 = 0.7;
+const TV_UPDATE_NS: f64 = 0.56;
 /// Cost of one nonlocal pass, CPU-nanoseconds per voxel (measured).
-const NONLOCAL_NS: f64 = 1_500.0;
+const NONLOCAL_NS: f64 = 1_700.0;
 /// Cost of one pass of FFDNet, CPU-nanoseconds per voxel (measured).
-const FFDNET_PASS_NS: f64 = 3_700.0;
+const FFDNET_PASS_NS: f64 = 1_450.0;
 /// Cost of one pass of FastDVDNet with a shared first stage, CPU-nanoseconds per voxel (measured).
-const DEEP_PASS_NS: f64 = 9_300.0;
+const DEEP_PASS_NS: f64 = 4_900.0;
 
 impl PriorSpec {
     fn to_prior(self) -> Prior {
