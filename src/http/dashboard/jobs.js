@@ -24,7 +24,7 @@ export async function jobs(root, [query], signal) {
   const empty = h("p", { class: "note", hidden: true });
   root.className = "fill";
   const scroller = h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Jobs, newest first" });
-  const rows = table("Jobs", columns(chosen, () => choose(), () => refresh(null)), scroller, rowHeight);
+  const rows = table("Jobs", columns(chosen, () => choose(), () => look(null)), scroller, rowHeight);
   root.append(
     h("div", { class: "bar" }, h("h1", null, "Jobs"),
       h("label", { for: "state" }, "State"), state,
@@ -67,7 +67,7 @@ export async function jobs(root, [query], signal) {
   }, { passive: true });
   addEventListener("resize", draw, { signal });
   list.filter(state.value, search.value.trim());
-  watch(refresh, signal);
+  const look = watch(refresh, signal);
 }
 
 /** The height of a row as the style sheet has it. */

@@ -10,7 +10,9 @@ const RETRY = 5000;
 
 /**
  * Calls `changed(ids)` when jobs change, with their identifiers or null for "look at all", until the
- * signal. `changed` may return a promise; it is not called again before that is settled.
+ * signal. `changed` may return a promise; it is not called again before that is settled, so that an
+ * old answer never comes after a new one. Returns a function that asks for a call, with identifiers
+ * or null.
  */
 export function watch(changed, signal) {
   const pending = { all: true, ids: new Set(), busy: false };
@@ -23,6 +25,9 @@ export function watch(changed, signal) {
       link(true);
     } catch (error) {
       if (!gaveUp(error)) link(error.status < 500);
+      // What was to be read is not known: everything is looked at again, but not at once.
+      pending.all = true;
+      await pause(POLL, signal);
     }
     pending.busy = false;
     run();
@@ -34,6 +39,7 @@ export function watch(changed, signal) {
   };
   run();
   listen(tell, signal);
+  return tell;
 }
 
 /** Holds events while the tab is seen; polls while they can't be held. */
