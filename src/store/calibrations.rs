@@ -141,16 +141,11 @@ impl Store {
     pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
         let unready = self.unready(lab, id).await?.is_some();
         let mut transaction = self.write().await?;
-        for (by, query) in [
+        for users in [
             ("measurements", "SELECT count(*) AS users FROM measurements WHERE calibration = ?"),
             ("models", "SELECT count(*) AS users FROM models WHERE calibration = ?"),
         ] {
-            let id = id.to_string();
-            let row = sqlx::query(query).bind(id).fetch_one(&mut *transaction).await?;
-            let users = number(&row, "users")?;
-            if users > 0 {
-                return Err(StoreError::InUse { what: "calibration", by, users });
-            }
+            refuse_if_used(&mut transaction, ("calibration", id.to_string()), users).await?;
         }
         let row = sqlx::query("DELETE FROM calibrations WHERE id = ? RETURNING prepared")
             .bind(id.to_string())
@@ -215,6 +210,18 @@ impl<T> Page<T> {
         let items = rows.iter().take(limit).map(read).collect::<Result<_, _>>()?;
         Ok(Self { items, more: rows.len() > limit })
     }
+}
+
+/// Refuses to delete what others refer to: kind and identifier of the one, name of the others and
+/// the query that counts them as `users`.
+pub(super) async fn refuse_if_used(
+    connection: &mut SqliteConnection,
+    (what, id): (&'static str, String),
+    (by, query): (&'static str, &'static str),
+) -> Result<(), StoreError> {
+    let row = sqlx::query(query).bind(id).fetch_one(connection).await?;
+    let users = number(&row, "users")?;
+    if users > 0 { Err(StoreError::InUse { what, by, users }) } else { Ok(()) }
 }
 
 /// What a foreign key refers to was deleted a moment ago: for the user, it is not there.

@@ -5,7 +5,7 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::blobs::Origin;
-use super::calibrations::{gone_if_foreign_key, label};
+use super::calibrations::{gone_if_foreign_key, label, refuse_if_used};
 use super::error::StoreError;
 use super::rows::{integer, json_if, number, parsed, single};
 use super::{Page, StagedBlob, Store};
@@ -177,14 +177,8 @@ impl Store {
     pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<(), StoreError> {
         self.measurement(lab, id).await?;
         let mut transaction = self.write().await?;
-        let row = sqlx::query("SELECT count(*) AS users FROM jobs WHERE measurement = ?")
-            .bind(id.to_string())
-            .fetch_one(&mut *transaction)
-            .await?;
-        let users = number(&row, "users")?;
-        if users > 0 {
-            return Err(StoreError::InUse { what: "measurement", by: "jobs", users });
-        }
+        let jobs = "SELECT count(*) AS users FROM jobs WHERE measurement = ?";
+        refuse_if_used(&mut transaction, ("measurement", id.to_string()), ("jobs", jobs)).await?;
         let row = sqlx::query("DELETE FROM measurements WHERE id = ? RETURNING prepared")
             .bind(id.to_string())
             .fetch_optional(&mut *transaction)

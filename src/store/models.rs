@@ -4,9 +4,9 @@ use serde::Serialize;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::calibrations::{gone_if_foreign_key, label};
+use super::calibrations::{gone_if_foreign_key, label, refuse_if_used};
 use super::error::StoreError;
-use super::rows::{json, number, parsed};
+use super::rows::{json, parsed};
 use super::{Page, Store};
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 
@@ -126,14 +126,8 @@ impl Store {
     pub async fn delete_model(&self, lab: &Lab, id: ModelId) -> Result<(), StoreError> {
         self.model(lab, id).await?;
         let mut transaction = self.write().await?;
-        let row = sqlx::query("SELECT count(*) AS users FROM jobs WHERE model = ?")
-            .bind(id.to_string())
-            .fetch_one(&mut *transaction)
-            .await?;
-        let users = number(&row, "users")?;
-        if users > 0 {
-            return Err(StoreError::InUse { what: "model", by: "jobs", users });
-        }
+        let jobs = "SELECT count(*) AS users FROM jobs WHERE model = ?";
+        refuse_if_used(&mut transaction, ("model", id.to_string()), ("jobs", jobs)).await?;
         let deleted = sqlx::query("DELETE FROM models WHERE id = ?")
             .bind(id.to_string())
             .execute(&mut *transaction)

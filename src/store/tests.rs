@@ -1,5 +1,7 @@
 //! The queue as workers see it: the whole life of a job, and every way in which it can be disturbed.
 
+mod keeping;
+
 use std::io::Write;
 use std::time::Duration;
 
@@ -7,12 +9,12 @@ use serde_json::json;
 use tempfile::TempDir;
 
 use super::{
-    ClaimedTask, Completion, Heartbeat, Inserted, JobFilter, MAX_FAILURES, MAX_LOSSES,
-    NewCalibration, NewJob, NewMeasurement, NewModel, Product, Store, StoreError, WorkerEnd,
+    ClaimedTask, Completion, Heartbeat, Inserted, MAX_FAILURES, MAX_LOSSES, NewCalibration, NewJob,
+    NewMeasurement, Product, Store, StoreError, WorkerEnd,
 };
 use crate::job::{
-    Algorithm, JobId, JobRequest, JobState, MeasurementId, ModelFacts, ModelTrial, Sha256,
-    SnapshotSelection, TaskKind, TaskProgress, TileSpec, Timestamp, WorkerId,
+    Algorithm, JobId, JobRequest, JobState, MeasurementId, Sha256, SnapshotSelection, TaskKind,
+    TaskProgress, TileSpec, WorkerId,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -370,95 +372,6 @@ async fn damaged_tiles_are_done_again() {
     let done = lab.work_off().await;
     assert_eq!(done[..2], [tile(0, 1), TaskKind::Assemble { snapshot: 0 }]);
     assert_eq!(lab.state(job).await, JobState::Succeeded);
-}
-
-#[tokio::test]
-async fn a_key_makes_one_job() {
-    let lab = Lab::new().await;
-    let Inserted::New(first) = lab.add(0, Some("k"), b"a").await.unwrap() else { panic!() };
-    assert_eq!(lab.add(0, Some("k"), b"a").await.unwrap(), Inserted::Before(first));
-    let other = lab.add(0, Some("k"), b"b").await;
-    assert!(matches!(other, Err(StoreError::KeyReused { job, .. }) if job == first));
-    assert_eq!(
-        lab.store
-            .jobs(&crate::job::Lab::local(), &JobFilter::default(), 10)
-            .await
-            .unwrap()
-            .items
-            .len(),
-        1
-    );
-}
-
-#[tokio::test]
-async fn pages_join_without_gaps() {
-    let lab = Lab::new().await;
-    let mut ids = Vec::new();
-    for _ in 0..5 {
-        ids.push(lab.submit(0).await);
-    }
-    ids.reverse();
-    let mut filter = JobFilter::default();
-    let mut seen = Vec::new();
-    loop {
-        let page = lab.store.jobs(&crate::job::Lab::local(), &filter, 2).await.unwrap();
-        seen.extend(page.items.iter().map(|job| job.id));
-        filter.after = seen.last().copied();
-        if !page.more {
-            break;
-        }
-    }
-    assert_eq!(seen, ids);
-}
-
-#[tokio::test]
-async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
-    let lab = Lab::new().await;
-    let job = lab.submit(0).await;
-    let calibration = lab.store.job(&crate::job::Lab::local(), job).await.unwrap().spec.calibration;
-    let in_use = |result| matches!(result, Err(StoreError::InUse { users: 1, .. }));
-    assert!(in_use(lab.store.delete_calibration(&crate::job::Lab::local(), calibration).await));
-    assert!(in_use(lab.store.delete_measurement(&crate::job::Lab::local(), lab.measurement).await));
-    let soon = Timestamp(Timestamp::now().0 + 1000);
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 0);
-    lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
-    lab.store.delete_job(&crate::job::Lab::local(), job).await.unwrap();
-    lab.store.delete_measurement(&crate::job::Lab::local(), lab.measurement).await.unwrap();
-    lab.store.delete_calibration(&crate::job::Lab::local(), calibration).await.unwrap();
-    assert_eq!(lab.store.blob_totals().await.unwrap().0, 2, "uploads wait for their age");
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 2);
-    let left = walk(&lab.store.dir().blobs());
-    assert_eq!(left, Vec::<std::path::PathBuf>::new());
-}
-
-fn walk(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
-    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
-    entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
-}
-
-#[tokio::test]
-async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
-    let lab = Lab::new().await;
-    let local = crate::job::Lab::local();
-    let mut writer = lab.store.blob_writer().unwrap();
-    writer.write_all(b"network").unwrap();
-    let (file, _) = lab.store.store_upload(&local, None, writer.finish().unwrap()).await.unwrap();
-    let calibration =
-        lab.store.measurement(&local, lab.measurement).await.unwrap().facts.calibration;
-    let trial = ModelTrial { height: 64, width: 96, cpu_seconds: 1.0, peak_rss_bytes: 1 << 20 };
-    let facts = ModelFacts { inputs: Vec::new(), outputs: Vec::new(), fixed_size: true, trial };
-    let new = NewModel { name: None, calibration, file: file.sha256, facts };
-    let model = lab.store.add_model(&local, new).await.unwrap();
-    assert_eq!(lab.store.model(&local, model.id).await.unwrap(), model);
-    lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
-    let soon = Timestamp(Timestamp::now().0 + 1000);
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the data of the measurement");
-    assert!(lab.store.upload(&local, file.sha256).await.is_ok());
-    let refused = lab.store.delete_calibration(&local, calibration).await;
-    assert!(matches!(refused, Err(StoreError::InUse { by: "models", users: 1, .. })));
-    lab.store.delete_model(&local, model.id).await.unwrap();
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the network");
-    lab.store.delete_calibration(&local, calibration).await.unwrap();
 }
 
 #[tokio::test]

@@ -3,15 +3,14 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ndarray::Array3;
+use ndarray::ArrayView2;
 
 use super::network::NetworkError;
-use super::solve::{TileInput, TileOutcome, dark};
+use super::solve::{TileInput, TileOutcome};
 use crate::job::Sha256;
 use crate::recon::ReconError;
 use crate::recon::gap::StopReason;
 use crate::recon::learned::SnapshotNetwork;
-use crate::recon::sensing::SensingOperator;
 
 /// An end-to-end network in its ONNX file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -55,10 +54,7 @@ fn read(path: &Path) -> Result<Vec<u8>, NetworkError> {
     fs::read(path).map_err(|reason| NetworkError::Model { path: path.to_owned(), reason })
 }
 
-/// Reconstructs one tile in one run of a network: divides the measurement by the white level, so
-/// that it is `sum_k C_k x_k` with frames on \[0,1\], and multiplies the frames by it again.
-///
-/// A tile that no light reaches through any mask has frames of 0.
+/// Reconstructs one tile in one run of a network, brought to \[0,1\] by its white level.
 ///
 /// # Errors
 /// Inputs that can't be, or a network that fails.
@@ -66,27 +62,22 @@ pub fn run_network(
     input: TileInput,
     network: &mut dyn SnapshotNetwork,
 ) -> Result<TileOutcome, ReconError> {
-    input.check_white()?;
-    let TileInput { masks, mut measurement, white } = input;
-    let size = masks.raw_dim();
-    let op = match SensingOperator::new(masks) {
-        Err(ReconError::DarkMasks { .. }) => return Ok(dark(Array3::zeros(size))),
-        other => other?,
-    };
-    measurement /= white;
-    let frames = network.frames(measurement.view(), op.masks())?;
-    let rest = &measurement - &op.forward(frames.view())?;
-    let squares = |values: &ndarray::Array2<f32>| {
-        values.iter().map(|&value| f64::from(value) * f64::from(value)).sum::<f64>()
-    };
-    let norm = squares(&measurement).max(f64::MIN_POSITIVE);
-    Ok(TileOutcome {
-        frames: frames * white,
-        tv_iterations: 0,
-        denoiser_passes: 1,
-        residual: (squares(&rest) / norm).sqrt() as f32,
-        stop_reason: StopReason::MaxIterations,
+    input.on_unit_scale(|op, measurement| {
+        let frames = network.frames(measurement, op.masks())?;
+        let rest = &measurement - &op.forward(frames.view())?;
+        let norm = squares(measurement).max(f64::MIN_POSITIVE);
+        Ok(TileOutcome {
+            frames,
+            tv_iterations: 0,
+            denoiser_passes: 1,
+            residual: (squares(rest.view()) / norm).sqrt() as f32,
+            stop_reason: StopReason::MaxIterations,
+        })
     })
+}
+
+fn squares(values: ArrayView2<'_, f32>) -> f64 {
+    values.iter().map(|&value| f64::from(value) * f64::from(value)).sum()
 }
 
 #[cfg(test)]

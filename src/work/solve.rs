@@ -1,6 +1,6 @@
 //! One tile: the unit of work.
 
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, ArrayView2};
 
 use crate::recon::ReconError;
 use crate::recon::denoise::Networks;
@@ -20,7 +20,7 @@ pub struct TileInput {
 }
 
 impl TileInput {
-    pub(super) fn check_white(&self) -> Result<(), ReconError> {
+    fn check_white(&self) -> Result<(), ReconError> {
         if self.white.is_finite() && self.white > 0.0 {
             return Ok(());
         }
@@ -29,6 +29,28 @@ impl TileInput {
             value: self.white.to_string(),
             range: "a finite number above 0",
         })
+    }
+
+    /// Has the tile solved with the measurement divided by the white level, so that it is
+    /// `sum_k C_k x_k` with frames on \[0,1\], and multiplies the frames by it again.
+    ///
+    /// A tile that no light reaches through any mask (a corner outside a round aperture, say) has
+    /// frames of 0 and no iterations.
+    pub(super) fn on_unit_scale(
+        self,
+        solve: impl FnOnce(SensingOperator, ArrayView2<'_, f32>) -> Result<TileOutcome, ReconError>,
+    ) -> Result<TileOutcome, ReconError> {
+        self.check_white()?;
+        let Self { masks, mut measurement, white } = self;
+        let size = masks.raw_dim();
+        let op = match SensingOperator::new(masks) {
+            Err(ReconError::DarkMasks { .. }) => return Ok(dark(Array3::zeros(size))),
+            other => other?,
+        };
+        measurement /= white;
+        let mut outcome = solve(op, measurement.view())?;
+        outcome.frames *= white;
+        Ok(outcome)
     }
 }
 
@@ -47,11 +69,7 @@ pub struct TileOutcome {
     pub stop_reason: StopReason,
 }
 
-/// Reconstructs one tile: divides the measurement by the white level, runs the schedule, and
-/// multiplies the frames by it again.
-///
-/// A tile that no light reaches through any mask (a corner outside a round aperture, say) has
-/// frames of 0 and no iterations.
+/// Reconstructs one tile: runs the schedule on it, brought to \[0,1\] by its white level.
 ///
 /// # Errors
 /// As [`gap::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
@@ -61,26 +79,21 @@ pub fn reconstruct_tile(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<TileOutcome, ReconError> {
-    input.check_white()?;
-    let TileInput { masks, mut measurement, white } = input;
-    let size = masks.raw_dim();
-    let op = match SensingOperator::new(masks) {
-        Err(ReconError::DarkMasks { .. }) => return Ok(dark(Array3::zeros(size))),
-        other => other?.with_gamma(schedule.gamma)?,
-    };
-    measurement /= white;
-    let outcome = gap::reconstruct(&op, measurement.view(), schedule, networks, observer)?;
-    Ok(TileOutcome {
-        frames: outcome.frames * white,
-        tv_iterations: outcome.tv_iterations,
-        denoiser_passes: outcome.denoiser_passes,
-        residual: outcome.residual,
-        stop_reason: outcome.stop_reason,
+    input.on_unit_scale(|op, measurement| {
+        let op = op.with_gamma(schedule.gamma)?;
+        let outcome = gap::reconstruct(&op, measurement, schedule, networks, observer)?;
+        Ok(TileOutcome {
+            frames: outcome.frames,
+            tv_iterations: outcome.tv_iterations,
+            denoiser_passes: outcome.denoiser_passes,
+            residual: outcome.residual,
+            stop_reason: outcome.stop_reason,
+        })
     })
 }
 
 /// The outcome of a tile without light.
-pub(super) fn dark(frames: Array3<f32>) -> TileOutcome {
+fn dark(frames: Array3<f32>) -> TileOutcome {
     TileOutcome {
         frames,
         tv_iterations: 0,

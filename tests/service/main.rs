@@ -17,6 +17,7 @@ mod hostile;
 mod jobs;
 mod learned;
 mod load;
+mod measurement_check;
 mod pictures;
 mod pipeline;
 mod resumable;

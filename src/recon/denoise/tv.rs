@@ -306,6 +306,30 @@ mod tests {
     }
 
     #[test]
+    fn strips_of_any_height_give_the_same_frames() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        for (height, updates) in [(1, 4), (3, 4), (23, 4), (40, 7)] {
+            let frames = Array3::from_shape_fn((2, height, 19), |_| rng.random::<f32>());
+            let mut whole = frames.clone();
+            TotalVariation::new(frames.dim()).denoise(&mut whole, 0.1, updates);
+            for rows in [1, 2, 5, 16, 64] {
+                let (mut strips, mut tv) = (frames.clone(), TotalVariation::new(frames.dim()));
+                let mut done = vec![0; 2];
+                for start in (0..height).step_by(rows) {
+                    for (k, done) in done.iter_mut().enumerate() {
+                        let strip = start..height.min(start + rows);
+                        let ready = tv.advance(k, &mut strips, strip, 0.1, updates);
+                        assert_eq!(ready.start, *done, "every row is told once");
+                        *done = ready.end;
+                    }
+                }
+                assert_eq!(done, [height; 2]);
+                assert_eq!(strips, whole, "{height} rows in strips of {rows}");
+            }
+        }
+    }
+
+    #[test]
     fn constant_images_stay_and_noise_falls() {
         let mut flat = Array3::from_elem((1, 8, 8), 0.4f32);
         TotalVariation::new((1, 8, 8)).denoise(&mut flat, 0.1, 10);
