@@ -81,11 +81,14 @@ impl EngineArguments {
 
 /// The schedule as the solver takes it; all that is wrong with it in one message.
 pub(super) fn checked(spec: &ScheduleSpec) -> Result<Schedule, CliError> {
-    spec.to_schedule().map_err(|errors| {
-        let line = |error: &InvalidField| format!("{}: {}", error.pointer, error.detail);
-        let lines: Vec<String> = errors.iter().map(line).collect();
-        CliError::Input(format!("the schedule can't be used: {}", lines.join("; ")))
-    })
+    spec.to_schedule().map_err(|errors| refused(&errors))
+}
+
+/// All that is wrong with a schedule in one message.
+pub(super) fn refused(errors: &[InvalidField]) -> CliError {
+    let line = |error: &InvalidField| format!("{}: {}", error.pointer, error.detail);
+    let lines: Vec<String> = errors.iter().map(line).collect();
+    CliError::Input(format!("the schedule can't be used: {}", lines.join("; ")))
 }
 
 /// Names of algorithms that need no network of the user's.

@@ -11,7 +11,7 @@ use clap::Args;
 use ndarray::{Array2, Array3, s};
 
 use super::CliError;
-use super::arguments::{EngineArguments, ScheduleArguments, checked};
+use super::arguments::{EngineArguments, ScheduleArguments, checked, refused};
 use super::input::{Scaled, Source};
 use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
@@ -22,10 +22,11 @@ use crate::recon::scale::ScaleEstimator;
 use crate::recon::tile::TilePlan;
 use crate::work::manifest::{
     Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
-    frame_attributes,
+    frame_attributes, full_schedule,
 };
+use crate::work::pilot::PilotRecord;
 use crate::work::{
-    NetworkSource, ResultSpec, SnapshotInput, Solver, TileOutcome, Usage, blended_frame,
+    NetworkSource, ResultSpec, SnapshotInput, Solved, Solver, TileOutcome, Usage, blended_frame,
     check_output, peak_rss_bytes, replace_result, solve, write_result,
 };
 use report::Report;
@@ -95,6 +96,7 @@ pub struct Arguments {
 struct Setup {
     algorithm: Algorithm,
     schedule: ScheduleSpec,
+    snapshot: usize,
     plan: TilePlan,
     network: NetworkSource,
     model: Option<Learned>,
@@ -104,14 +106,6 @@ struct Setup {
 impl Setup {
     fn needs_network(&self) -> bool {
         self.model.is_some() || self.schedule.needs_network()
-    }
-
-    /// The schedule with all defaults filled in.
-    fn full_schedule(&self) -> Result<ScheduleSpec, CliError> {
-        match self.model {
-            None => Ok(ScheduleSpec::from(&checked(&self.schedule)?)),
-            Some(_) => Ok(self.schedule.clone()),
-        }
     }
 
     fn models(&self) -> Result<Vec<ModelRecord>, CliError> {
@@ -137,6 +131,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let setup = Setup {
         algorithm: arguments.schedule.algorithm,
         schedule,
+        snapshot: arguments.snapshot,
         plan: plan((arguments.tile, arguments.overlap), model.as_ref(), input.masks.array.dim())?,
         network,
         model,
@@ -151,7 +146,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     };
 
     if let Some(out) = &arguments.out {
-        let manifest = solution.manifest(&input, &setup, arguments.snapshot, spent)?;
+        let manifest = solution.manifest(&input, &setup, spent)?;
         solution.write(out, &setup, manifest)?;
     }
     solution.report(&input, &setup, spent)?.print(arguments)
@@ -249,6 +244,7 @@ impl<'a> Input<'a> {
             }
         };
         let input = SnapshotInput {
+            snapshot: setup.snapshot,
             masks: self.masks.array.view(),
             measurement: self.measurement.array.view(),
             white,
@@ -256,14 +252,15 @@ impl<'a> Input<'a> {
             plan: &setup.plan,
         };
         let bar = SnapshotBar::new(&setup.schedule, setup.plan.len());
-        let tiles = solve(&input, &setup.network, setup.threads, &bar)?;
-        Ok(Solution { white, tiles })
+        let Solved { tiles, pilot } = solve(&input, &setup.network, setup.threads, &bar)?;
+        Ok(Solution { white, tiles, pilot })
     }
 }
 
 struct Solution {
     white: f32,
     tiles: Vec<TileOutcome>,
+    pilot: Option<PilotRecord>,
 }
 
 impl Solution {
@@ -292,6 +289,7 @@ impl Solution {
             peak_rss_bytes: peak_rss_bytes(),
             provider: setup.needs_network().then(|| setup.network.provider()),
             stop_reason: summary.stop_reason,
+            pilot: self.pilot.clone(),
         })
     }
 
@@ -322,7 +320,6 @@ impl Solution {
         &self,
         input: &Input<'_>,
         setup: &Setup,
-        snapshot: usize,
         spent: Spent,
     ) -> Result<Manifest, CliError> {
         let (frames, height, width) = input.masks.array.dim();
@@ -331,11 +328,13 @@ impl Solution {
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
             algorithm: setup.algorithm,
-            schedule: setup.full_schedule()?,
+            schedule: full_schedule(&setup.schedule, self.pilot.as_ref())
+                .map_err(|errors| refused(&errors))?,
+            pilot: self.pilot.clone(),
             frames,
             height,
             width,
-            snapshot,
+            snapshot: setup.snapshot,
             inputs: Inputs {
                 masks_sha256: input.sources.masks.sha256()?,
                 measurement_sha256: input.sources.measurement.sha256()?,

@@ -21,6 +21,10 @@ pub struct ScheduleSpec {
     /// Noise term added to the gram diagonal, at least 0. 0 forces y = Hx.
     #[serde(default)]
     pub gamma: f32,
+    /// Find out on a piece of the measurement, once for all tiles, how many iterations of the stages
+    /// with a level pay; `iterations` is the most that there will be.
+    #[serde(default)]
+    pub adaptive: bool,
     /// The stages, at least one.
     pub stages: Vec<StageSpec>,
 }
@@ -197,7 +201,13 @@ impl StageSpec {
 impl ScheduleSpec {
     /// That of an algorithm that does not iterate.
     pub(super) fn without_stages() -> Self {
-        Self { method: MethodSpec::Gap, accelerated: false, gamma: 0.0, stages: Vec::new() }
+        Self {
+            method: MethodSpec::Gap,
+            accelerated: false,
+            gamma: 0.0,
+            adaptive: false,
+            stages: Vec::new(),
+        }
     }
 
     /// The schedule as the core takes it.
@@ -210,8 +220,8 @@ impl ScheduleSpec {
             MethodSpec::Gap => Method::Gap,
             MethodSpec::Admm => Method::Admm,
         };
-        let (accelerated, gamma) = (self.accelerated, self.gamma);
-        let mut whole = Schedule { method, accelerated, gamma, stages: Vec::new() };
+        let (accelerated, gamma, adaptive) = (self.accelerated, self.gamma, self.adaptive);
+        let mut whole = Schedule { method, accelerated, gamma, adaptive, stages: Vec::new() };
         if self.stages.len() > MAX_STAGES {
             let message = format!("{} stages; at most {MAX_STAGES} are taken", self.stages.len());
             return Err(vec![InvalidField::new("/stages", message)]);
@@ -328,6 +338,7 @@ impl From<&Schedule> for ScheduleSpec {
             },
             accelerated: schedule.accelerated,
             gamma: schedule.gamma,
+            adaptive: schedule.adaptive,
             stages: schedule.stages.iter().map(stage).collect(),
         }
     }

@@ -4,12 +4,20 @@ use serde::{Deserialize, Serialize};
 
 /// What a task does. Snapshots are counted from 0 within the measurement, tiles within the tile plan.
 ///
-/// The order of work is prepare, then all tiles; a snapshot is assembled when its tiles are done,
-/// and the manifest is written when all snapshots are assembled.
+/// The order of work is prepare, then previews, the pilot of an adaptive schedule, and all tiles; a
+/// snapshot is assembled when its tiles are done, and the manifest is written when all snapshots
+/// are assembled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TaskKind {
     /// Estimate the scene's scale, once a job, so that no two tiles differ in it.
     Prepare,
+    /// Reconstruct one snapshot coarsely, to be looked at until its tiles are done.
+    Preview {
+        /// The snapshot's index.
+        snapshot: u32,
+    },
+    /// Find out how many iterations of an adaptive schedule pay. Tiles wait for it.
+    Pilot,
     /// Reconstruct one tile of one snapshot.
     Tile {
         /// The snapshot's index.
@@ -32,6 +40,8 @@ impl TaskKind {
     pub fn name(self) -> &'static str {
         match self {
             Self::Prepare => "prepare",
+            Self::Preview { .. } => "preview",
+            Self::Pilot => "pilot",
             Self::Tile { .. } => "tile",
             Self::Assemble { .. } => "assemble",
             Self::Manifest => "manifest",
@@ -42,8 +52,10 @@ impl TaskKind {
     #[must_use]
     pub fn snapshot(self) -> Option<u32> {
         match self {
-            Self::Tile { snapshot, .. } | Self::Assemble { snapshot } => Some(snapshot),
-            Self::Prepare | Self::Manifest => None,
+            Self::Preview { snapshot }
+            | Self::Tile { snapshot, .. }
+            | Self::Assemble { snapshot } => Some(snapshot),
+            Self::Prepare | Self::Pilot | Self::Manifest => None,
         }
     }
 
@@ -61,6 +73,8 @@ impl TaskKind {
     pub fn from_parts(name: &str, snapshot: Option<u32>, tile: Option<u32>) -> Option<Self> {
         match (name, snapshot, tile) {
             ("prepare", None, None) => Some(Self::Prepare),
+            ("preview", Some(snapshot), None) => Some(Self::Preview { snapshot }),
+            ("pilot", None, None) => Some(Self::Pilot),
             ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, tile }),
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),

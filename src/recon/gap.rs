@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, Array3, ArrayView2, Axis};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 
 use super::denoise::{Networks, nonlocal::Nonlocal, tv::TotalVariation};
 use super::error::{ReconError, shape_text};
@@ -134,7 +134,23 @@ pub fn reconstruct(
     })
 }
 
-struct Run<'a> {
+/// What an iteration tells: see [`Progress`].
+pub(super) struct Step {
+    pub(super) sigma: Option<Sigma>,
+    pub(super) residual: f32,
+    pub(super) change: f32,
+}
+
+/// What an iteration starts from.
+pub(super) struct State {
+    v: Array3<f32>,
+    y1: Option<Array2<f32>>,
+    start: Option<Array3<f32>>,
+    multiplier: Option<Array3<f32>>,
+}
+
+/// A reconstruction on its way.
+pub(super) struct Run<'a> {
     op: &'a SensingOperator,
     y: Array2<f32>,
     y_norm: f64,
@@ -155,7 +171,7 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn new(
+    pub(super) fn new(
         op: &'a SensingOperator,
         y: ArrayView2<'_, f32>,
         schedule: &Schedule,
@@ -189,51 +205,103 @@ impl<'a> Run<'a> {
         stage: &Stage,
         observer: &mut dyn Observer,
     ) -> Result<StopReason, ReconError> {
-        // Its groups belong to the iterates of one stage.
-        self.nonlocal = None;
+        self.enter();
         for iteration in 0..stage.iterations {
-            let sigma = stage.sigma_at(iteration);
-            let (squares, change) = if stage.prior == Prior::Tv && self.multiplier.is_none() {
-                self.project_and_smooth(stage)
-            } else {
-                let squares = self.project(stage.memory, 0..self.y.nrows());
-                if let (Some(u), Some(z)) = (&self.multiplier, &mut self.start) {
-                    self.x -= u;
-                    z.assign(&self.x);
-                }
-                self.apply(stage, sigma)?;
-                (squares, self.change(0..self.y.nrows()))
-            };
-            let change = change.relative();
-            self.prepare_start(stage.momentum);
-            std::mem::swap(&mut self.v, &mut self.x);
-            self.done += 1;
-            if !change.is_finite() {
-                let (iteration, planned) = (self.done, self.planned);
-                return Err(ReconError::Diverged { iteration, planned });
-            }
+            let step = self.iterate(stage, iteration)?;
             let left = stage.iterations - iteration - 1;
-            let converged = change < stage.tolerance && left > 0;
+            let converged = step.change < stage.tolerance && left > 0;
             if converged {
                 self.planned -= left;
             }
-            let progress = Progress {
-                stage: index,
-                done: self.done,
-                planned: self.planned,
-                residual: (squares.sqrt() / self.y_norm) as f32,
-                change,
-                sigma,
-                deep: stage.prior.network().is_some(),
-            };
-            if observer.iteration(&progress) == Control::Cancel {
-                return Err(ReconError::Cancelled);
-            }
+            self.tell(index, stage, &step, observer)?;
             if converged {
                 return Ok(StopReason::Converged);
             }
         }
         Ok(StopReason::MaxIterations)
+    }
+
+    /// To be called before the first iteration of a stage.
+    pub(super) fn enter(&mut self) {
+        // Its groups belong to the iterates of one stage.
+        self.nonlocal = None;
+    }
+
+    /// What the next iteration starts from.
+    pub(super) fn state(&self) -> State {
+        State {
+            v: self.v.clone(),
+            y1: self.y1.clone(),
+            start: self.start.clone(),
+            multiplier: self.multiplier.clone(),
+        }
+    }
+
+    /// Goes back to where [`Run::state`] was called.
+    pub(super) fn restore(&mut self, state: &State) {
+        self.v.clone_from(&state.v);
+        self.y1.clone_from(&state.y1);
+        self.start.clone_from(&state.start);
+        self.multiplier.clone_from(&state.multiplier);
+    }
+
+    /// The frames as they stand \[B,H,W\].
+    pub(super) fn frames(&self) -> ArrayView3<'_, f32> {
+        self.v.view()
+    }
+
+    /// Tells the observer of an iteration of the stage with this index.
+    ///
+    /// # Errors
+    /// [`ReconError::Cancelled`] if it says so.
+    pub(super) fn tell(
+        &self,
+        index: usize,
+        stage: &Stage,
+        step: &Step,
+        observer: &mut dyn Observer,
+    ) -> Result<(), ReconError> {
+        let progress = Progress {
+            stage: index,
+            done: self.done,
+            planned: self.planned,
+            residual: step.residual,
+            change: step.change,
+            sigma: step.sigma,
+            deep: stage.prior.network().is_some(),
+        };
+        match observer.iteration(&progress) {
+            Control::Continue => Ok(()),
+            Control::Cancel => Err(ReconError::Cancelled),
+        }
+    }
+
+    /// Iteration `iteration` (from 0) of a stage.
+    ///
+    /// # Errors
+    /// A network that fails, or values that are no numbers any more.
+    pub(super) fn iterate(&mut self, stage: &Stage, iteration: usize) -> Result<Step, ReconError> {
+        let sigma = stage.sigma_at(iteration);
+        let (squares, change) = if stage.prior == Prior::Tv && self.multiplier.is_none() {
+            self.project_and_smooth(stage)
+        } else {
+            let squares = self.project(stage.memory, 0..self.y.nrows());
+            if let (Some(u), Some(z)) = (&self.multiplier, &mut self.start) {
+                self.x -= u;
+                z.assign(&self.x);
+            }
+            self.apply(stage, sigma)?;
+            (squares, self.change(0..self.y.nrows()))
+        };
+        let change = change.relative();
+        self.prepare_start(stage.momentum);
+        std::mem::swap(&mut self.v, &mut self.x);
+        self.done += 1;
+        if !change.is_finite() {
+            let (iteration, planned) = (self.done, self.planned);
+            return Err(ReconError::Diverged { iteration, planned });
+        }
+        Ok(Step { sigma, residual: (squares.sqrt() / self.y_norm) as f32, change })
     }
 
     /// Projection, total variation and the change, strip by strip, so that what the memory hands

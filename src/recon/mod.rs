@@ -10,6 +10,8 @@ pub mod error;
 pub mod gap;
 pub mod learned;
 pub mod metrics;
+pub mod pilot;
+pub mod preview;
 pub mod scale;
 pub mod schedule;
 pub mod sensing;

@@ -170,6 +170,9 @@ pub struct Schedule {
     pub accelerated: bool,
     /// Noise term added to the gram diagonal, >= 0.
     pub gamma: f32,
+    /// The iterations of stages with a level are the most that may be: how many pay is found out
+    /// on a piece of the measurement ([`super::pilot`]), once for all tiles.
+    pub adaptive: bool,
     /// The stages, one after the other ("in cascade").
     pub stages: Vec<Stage>,
 }
@@ -183,7 +186,7 @@ impl Schedule {
     /// ADMM-TV: slower than GAP, but it does not force `y = Hx`, so it amplifies less noise.
     pub fn admm_tv() -> Self {
         let method = Method::Admm;
-        Self { method, accelerated: false, gamma: 0.01, stages: vec![tv_stage(200, 3e-4)] }
+        Self { method, accelerated: false, gamma: 0.01, ..Self::gap(vec![tv_stage(200, 3e-4)]) }
     }
 
     /// PnP-FFDNet: total variation, then the image denoiser, frame by frame. Behind correlated masks
@@ -196,12 +199,12 @@ impl Schedule {
 
     /// PnP-FastDVDNet: total variation, then the video denoiser.
     pub fn pnp_fastdvdnet() -> Self {
-        Self::gap(vec![tv_stage(60, 0.0), deep_stage(Network::FastDvdNet, 16, 25.0, 8.0)])
+        Self::gap(vec![tv_stage(60, 0.0), deep_stage(Network::FastDvdNet, 24, 25.0, 4.4)])
     }
 
     /// PnP with the nonlocal prior, which needs no network.
     pub fn pnp_nonlocal() -> Self {
-        Self::gap(vec![tv_stage(60, 0.0), nonlocal_stage(40, 30.0, 6.0)])
+        Self::gap(vec![tv_stage(60, 0.0), nonlocal_stage(60, 30.0, 2.6)])
     }
 
     /// PnP-TV-FastDVDNet: total variation, a few passes of the video denoiser, then the nonlocal
@@ -212,12 +215,13 @@ impl Schedule {
     /// the scene that no training has seen. Total variation in series (Algorithm 1's second
     /// period; `tv+fastdvdnet` in a schedule) gained only while the memory was 1.
     pub fn pnp_tv_fastdvdnet() -> Self {
-        let deep = deep_stage(Network::FastDvdNet, 12, 25.0, 8.0);
-        Self::gap(vec![tv_stage(60, 0.0), deep, nonlocal_stage(30, 20.0, 6.0)])
+        let deep = deep_stage(Network::FastDvdNet, 16, 25.0, 5.3);
+        Self::gap(vec![tv_stage(60, 0.0), deep, nonlocal_stage(50, 20.0, 2.6)])
     }
 
     fn gap(stages: Vec<Stage>) -> Self {
-        Self { method: Method::Gap, accelerated: true, gamma: 0.0, stages }
+        let adaptive = stages.iter().any(|stage| stage.sigma.is_some());
+        Self { method: Method::Gap, accelerated: true, gamma: 0.0, adaptive, stages }
     }
 
     /// Most iterations of all stages together.
@@ -248,6 +252,7 @@ impl Schedule {
     /// Fixes the total number of iterations and switches the convergence tests off: earlier
     /// stages keep their length as far as it goes, the last one takes the rest.
     pub fn with_iterations(mut self, total: usize) -> Self {
+        self.adaptive = false;
         let mut left = total;
         let count = self.stages.len();
         for (index, stage) in self.stages.iter_mut().enumerate() {

@@ -65,6 +65,15 @@ impl SensingOperator {
         Ok(self)
     }
 
+    /// Keeps some pixels of the measurement, given by row and column, from the projection, as if no
+    /// mask reached them.
+    pub(super) fn without(mut self, pixels: &[(usize, usize)]) -> Self {
+        for &pixel in pixels {
+            self.inverse_gram[pixel] = 0.0;
+        }
+        self
+    }
+
     /// The noise term that the projection adds to the gram diagonal.
     pub fn gamma(&self) -> f32 {
         self.gamma

@@ -216,6 +216,8 @@ fn failure_text(kind: TaskKind, failures: u32, losses: u32, reason: &str) -> Str
         TaskKind::Tile { snapshot, tile } => format!("tile {tile} of snapshot {snapshot}"),
         TaskKind::Assemble { snapshot } => format!("assembling snapshot {snapshot}"),
         TaskKind::Prepare => "preparing".into(),
+        TaskKind::Preview { snapshot } => format!("the preview of snapshot {snapshot}"),
+        TaskKind::Pilot => "the pilot".into(),
         TaskKind::Manifest => "writing the manifest".into(),
     };
     let attempts = failures + losses;

@@ -57,9 +57,11 @@ pub struct JobProgress {
     pub tiles_running: u64,
     /// Snapshots that can be downloaded.
     pub snapshots_done: u64,
-    /// Solver iterations done, over all tiles.
+    /// Snapshots with a preview that is kept until the job ends.
+    pub previews_done: u64,
+    /// Solver iterations done, over all tiles and the pilot.
     pub iterations_done: u64,
-    /// Deep passes done, over all tiles.
+    /// Deep passes done, over all tiles and the pilot.
     pub passes_done: u64,
 }
 
@@ -106,6 +108,7 @@ impl Store {
                  count(*) FILTER (WHERE kind = 'tile' AND state = 'done') AS tiles_done,
                  count(*) FILTER (WHERE kind = 'tile' AND state = 'running') AS tiles_running,
                  count(*) FILTER (WHERE kind = 'assemble' AND state = 'done') AS snapshots_done,
+                 count(*) FILTER (WHERE kind = 'preview' AND result IS NOT NULL) AS previews_done,
                  count(*) FILTER (WHERE kind = 'prepare' AND state = 'done') AS prepared,
                  count(*) FILTER (WHERE state = 'running' AND stage = 'deep') AS deep,
                  count(*) FILTER (WHERE state = 'running' AND stage = 'nonlocal') AS nonlocal,
@@ -156,7 +159,7 @@ impl Store {
             .fetch_all(&self.readers)
             .await?;
         let mut counts = TaskCounts::new();
-        for kind in ["prepare", "tile", "assemble", "manifest"] {
+        for kind in ["prepare", "preview", "pilot", "tile", "assemble", "manifest"] {
             for state in ["blocked", "ready", "running", "done", "failed", "cancelled"] {
                 counts.insert((kind.to_owned(), state.to_owned()), 0);
             }
@@ -193,6 +196,7 @@ fn progress(
         tiles_total: number(row, "tiles_total")?,
         tiles_running: number(row, "tiles_running")?,
         snapshots_done: number(row, "snapshots_done")?,
+        previews_done: number(row, "previews_done")?,
         iterations_done: number(row, "iterations")?,
         passes_done: number(row, "passes")?,
     })

@@ -59,6 +59,8 @@ pub struct ClaimedTask {
     pub model: Option<PathBuf>,
     /// What the job's prepare task recorded; none for that task itself.
     pub prepared: Option<Value>,
+    /// What its pilot recorded, if it has one that is done.
+    pub pilot: Option<Value>,
 }
 
 /// The answer to a heartbeat.
@@ -77,7 +79,9 @@ pub enum Heartbeat {
 pub enum Product {
     /// Nothing but its record (prepare).
     Record,
-    /// The reconstructed tile.
+    /// The share of their planned cost that the tiles still have, on \[0,1\] (pilot).
+    TileCost(f64),
+    /// The reconstructed tile, or preview.
     Tile(StagedBlob),
     /// The files of a snapshot (assemble) or of the job (manifest).
     Files(StagedDir),
@@ -168,7 +172,8 @@ impl Store {
         row: &SqliteRow,
     ) -> Result<ClaimedTask, StoreError> {
         let found = sqlx::query(
-            "SELECT spec, (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared
+            "SELECT spec, (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot
              FROM jobs WHERE id = ?",
         )
         .bind(job.to_string())
@@ -177,7 +182,10 @@ impl Store {
         let spec: JobSpec = json(&found, "spec")?;
         let calibration = self.find_calibration(None, spec.calibration).await?;
         let measurement = self.find_measurement(None, spec.measurement).await?;
-        let prepared: Option<String> = found.try_get("prepared")?;
+        let record = |column| {
+            let text: Option<String> = found.try_get(column)?;
+            Ok::<_, StoreError>(text.and_then(|text| serde_json::from_str(&text).ok()))
+        };
         Ok(ClaimedTask {
             lease,
             kind: tasks::kind(row)?,
@@ -189,7 +197,8 @@ impl Store {
             spec,
             calibration,
             measurement,
-            prepared: prepared.and_then(|text| serde_json::from_str(&text).ok()),
+            prepared: record("prepared")?,
+            pilot: record("pilot")?,
         })
     }
 
@@ -268,6 +277,9 @@ impl Store {
         let mut result = None;
         match product {
             Product::Record => {}
+            Product::TileCost(share) => {
+                tasks::scale_tiles(&mut transaction, job, share).await?;
+            }
             Product::Tile(staged) => {
                 result = Some(staged.sha256().to_string());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;

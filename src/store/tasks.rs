@@ -10,6 +10,7 @@ use super::Store;
 use super::error::StoreError;
 use super::rows::{json as from_json, number, number_if, parsed};
 use crate::job::{JobId, JobSpec, Sha256, TaskId, TaskKind};
+use crate::recon::pilot;
 
 /// The stored result of a tile.
 #[derive(Debug, Clone)]
@@ -40,6 +41,8 @@ pub struct TaskRecord {
 /// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
 const READ_S: f64 = 5e-9;
 const WRITE_S: f64 = 150e-9;
+/// CPU-seconds of a preview for each voxel of the snapshot (measured).
+const PREVIEW_S: f64 = 15e-9;
 
 /// Writes the tasks of a job.
 pub(super) async fn insert(
@@ -80,6 +83,13 @@ fn plan(spec: &JobSpec) -> Result<Vec<(TaskKind, f64)>, StoreError> {
     let frames = spec.shape.frames as f64;
     let per_voxel = spec.planned_ns_per_voxel() * 1e-9;
     let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
+    let preview = pixels * frames * PREVIEW_S;
+    tasks.extend(spec.snapshots.indices().map(|s| (TaskKind::Preview { snapshot: s }, preview)));
+    if spec.schedule.adaptive {
+        let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
+        // The preview of the first snapshot is there at once; the others may wait.
+        tasks.insert(2, (TaskKind::Pilot, voxels * per_voxel));
+    }
     for snapshot in spec.snapshots.indices() {
         for (tile, area) in (0..).zip(tiles.tiles()) {
             let voxels = (area.height * area.width) as f64 * frames;
@@ -91,6 +101,20 @@ fn plan(spec: &JobSpec) -> Result<Vec<(TaskKind, f64)>, StoreError> {
     Ok(tasks)
 }
 
+/// Sets the planned cost of the tiles of a job to a share of it.
+pub(super) async fn scale_tiles(
+    connection: &mut SqliteConnection,
+    job: JobId,
+    share: f64,
+) -> Result<(), StoreError> {
+    sqlx::query("UPDATE tasks SET cost = cost * ? WHERE job = ? AND kind = 'tile'")
+        .bind(share)
+        .bind(job.to_string())
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
 /// Makes ready the tasks of a job that waited for `done`, if that was the last one they waited for.
 pub(super) async fn unblock(
     connection: &mut SqliteConnection,
@@ -99,6 +123,13 @@ pub(super) async fn unblock(
 ) -> Result<(), StoreError> {
     let query = match done {
         TaskKind::Prepare => sqlx::query(
+            "UPDATE tasks SET state = 'ready'
+             WHERE job = ?1 AND state = 'blocked'
+               AND (kind IN ('preview', 'pilot')
+                    OR kind = 'tile' AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1
+                                                         AND kind = 'pilot' AND state <> 'done'))",
+        ),
+        TaskKind::Pilot => sqlx::query(
             "UPDATE tasks SET state = 'ready' WHERE job = ?1 AND kind = 'tile' AND state = 'blocked'",
         ),
         TaskKind::Tile { .. } => sqlx::query(
@@ -107,11 +138,11 @@ pub(super) async fn unblock(
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'tile'
                                    AND snapshot = ?2 AND state <> 'done')",
         ),
-        TaskKind::Assemble { .. } => sqlx::query(
+        TaskKind::Assemble { .. } | TaskKind::Preview { .. } => sqlx::query(
             "UPDATE tasks SET state = 'ready'
              WHERE job = ?1 AND kind = 'manifest' AND state = 'blocked'
-               AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'assemble'
-                                   AND state <> 'done')",
+               AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1
+                                   AND kind IN ('preview', 'assemble') AND state <> 'done')",
         ),
         TaskKind::Manifest => return Ok(()),
     };
@@ -120,6 +151,28 @@ pub(super) async fn unblock(
 }
 
 impl Store {
+    /// The stored preview of a snapshot, while there is one: a prepared array of coarse frames.
+    ///
+    /// # Errors
+    /// If the database fails.
+    pub async fn preview(
+        &self,
+        job: JobId,
+        snapshot: u32,
+    ) -> Result<Option<(Sha256, PathBuf)>, StoreError> {
+        let row = sqlx::query(
+            "SELECT result FROM tasks
+             WHERE job = ? AND kind = 'preview' AND snapshot = ? AND result IS NOT NULL",
+        )
+        .bind(job.to_string())
+        .bind(snapshot)
+        .fetch_optional(&self.readers)
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let sha256 = parsed(&row, "result")?;
+        Ok(Some((sha256, self.dir().blob(&sha256))))
+    }
+
     /// The stored tiles of a snapshot, in the order of the plan. The job's assembly has the right to
     /// count on all of them being there.
     ///

@@ -78,13 +78,25 @@ impl Lab {
 
     /// A job with two tiles in each of two snapshots.
     async fn submit(&self, priority: i32) -> JobId {
-        match self.add(priority, None, b"request").await.unwrap() {
-            Inserted::New(id) | Inserted::Before(id) => id,
-        }
+        id(self.add(priority, None, b"request").await.unwrap())
+    }
+
+    async fn submit_algorithm(&self, algorithm: Algorithm) -> JobId {
+        id(self.add_algorithm(algorithm, 0, None, b"request").await.unwrap())
     }
 
     async fn add(
         &self,
+        priority: i32,
+        key: Option<&str>,
+        request: &[u8],
+    ) -> Result<Inserted, StoreError> {
+        self.add_algorithm(Algorithm::GapTv, priority, key, request).await
+    }
+
+    async fn add_algorithm(
+        &self,
+        algorithm: Algorithm,
         priority: i32,
         key: Option<&str>,
         request: &[u8],
@@ -100,7 +112,7 @@ impl Lab {
             measurement: self.measurement,
             calibration: None,
             snapshots: SnapshotSelection::All,
-            algorithm: Algorithm::GapTv,
+            algorithm,
             model: None,
             schedule: None,
             tile: Some(TileSpec { size: 64, overlap: 8 }),
@@ -122,15 +134,19 @@ impl Lab {
         self.store.claim(self.worker, LEASE).await.unwrap()
     }
 
+    fn blob(&self, content: &str) -> Product {
+        let mut writer = self.store.blob_writer().unwrap();
+        writer.write_all(content.as_bytes()).unwrap();
+        Product::Tile(writer.finish().unwrap())
+    }
+
     /// Does the task as a worker would and says what the store answered.
     async fn work(&self, task: &ClaimedTask) -> Heartbeat {
         let product = match task.kind {
             TaskKind::Prepare => Product::Record,
-            TaskKind::Tile { snapshot, tile } => {
-                let mut writer = self.store.blob_writer().unwrap();
-                writer.write_all(format!("{snapshot} {tile}").as_bytes()).unwrap();
-                Product::Tile(writer.finish().unwrap())
-            }
+            TaskKind::Pilot => Product::TileCost(0.5),
+            TaskKind::Preview { snapshot } => self.blob(&format!("preview {snapshot}")),
+            TaskKind::Tile { snapshot, tile } => self.blob(&format!("{snapshot} {tile}")),
             TaskKind::Assemble { .. } => {
                 let folder = self.store.staged_dir().unwrap();
                 std::fs::create_dir(folder.path().join("frames")).unwrap();
@@ -158,8 +174,22 @@ impl Lab {
         done
     }
 
+    /// Does so many tasks.
+    async fn work_on(&self, tasks: usize) {
+        for _ in 0..tasks {
+            let task = self.claim().await.unwrap();
+            self.work(&task).await;
+        }
+    }
+
     async fn state(&self, job: JobId) -> JobState {
         self.store.job(&crate::job::Lab::local(), job).await.unwrap().state
+    }
+}
+
+fn id(inserted: Inserted) -> JobId {
+    match inserted {
+        Inserted::New(id) | Inserted::Before(id) => id,
     }
 }
 
@@ -174,6 +204,8 @@ async fn a_job_runs_in_order_and_leaves_its_results_and_no_tiles() {
     assert_eq!(lab.state(job).await, JobState::Queued);
     let order = [
         TaskKind::Prepare,
+        TaskKind::Preview { snapshot: 0 },
+        TaskKind::Preview { snapshot: 1 },
         tile(0, 0),
         tile(0, 1),
         TaskKind::Assemble { snapshot: 0 },
@@ -268,7 +300,7 @@ async fn cancel_stops_running_tasks_at_their_heartbeat() {
     assert_eq!(lab.state(job).await, JobState::Cancelled);
     assert!(lab.claim().await.is_none());
     lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
-    assert_eq!(lab.work_off().await.len(), 8);
+    assert_eq!(lab.work_off().await.len(), 10);
     assert!(matches!(
         lab.store.cancel_job(&crate::job::Lab::local(), job).await,
         Err(StoreError::State(_))
@@ -310,8 +342,7 @@ async fn a_waiting_job_is_cancelled_at_once_and_twice_is_no_error() {
 async fn an_error_that_no_repetition_helps_fails_the_job_at_once() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    let prepare = lab.claim().await.unwrap();
-    lab.work(&prepare).await;
+    lab.work_on(3).await;
     let (task, sibling) = (lab.claim().await.unwrap(), lab.claim().await.unwrap());
     lab.store.fail(&task.lease, "the masks are gone", false).await.unwrap();
     let failed = lab.store.job(&crate::job::Lab::local(), job).await.unwrap();
@@ -321,7 +352,7 @@ async fn an_error_that_no_repetition_helps_fails_the_job_at_once() {
     assert_eq!(beat, Heartbeat::Cancelled, "the others need not go on");
     lab.store.cancelled(&sibling.lease).await.unwrap();
     lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
-    assert_eq!(lab.work_off().await.len(), 7, "all but the prepare task");
+    assert_eq!(lab.work_off().await.len(), 7, "all but what was done");
     assert_eq!(lab.state(job).await, JobState::Succeeded);
 }
 
@@ -358,13 +389,40 @@ async fn a_task_that_is_interrupted_is_not_given_up_for_a_long_time() {
 }
 
 #[tokio::test]
+async fn tiles_wait_for_the_pilot_and_cost_what_it_leaves_of_them() {
+    let lab = Lab::new().await;
+    let job = lab.submit_algorithm(Algorithm::PnpNonlocal).await;
+    let cost = async || -> f64 {
+        sqlx::query_scalar("SELECT sum(cost) FROM tasks WHERE kind = 'tile'")
+            .fetch_one(&lab.store.writer)
+            .await
+            .unwrap()
+    };
+    let planned = cost().await;
+    lab.work_on(2).await;
+    let (pilot, preview) = (lab.claim().await.unwrap(), lab.claim().await.unwrap());
+    assert_eq!((pilot.kind, pilot.pilot.clone()), (TaskKind::Pilot, None));
+    assert_eq!(preview.kind, TaskKind::Preview { snapshot: 1 });
+    assert!(lab.claim().await.is_none(), "the tiles wait");
+    lab.work(&pilot).await;
+    assert!((cost().await - 0.5 * planned).abs() < 1e-9 * planned);
+    let task = lab.claim().await.unwrap();
+    assert_eq!((task.kind, task.pilot), (tile(0, 0), Some(json!({"kind": "pilot"}))));
+    lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
+    lab.store.cancelled(&task.lease).await.unwrap();
+    lab.store.cancelled(&preview.lease).await.unwrap();
+    lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
+    let left = [TaskKind::Preview { snapshot: 1 }, tile(0, 0), tile(0, 1)];
+    assert_eq!(lab.work_off().await[..3], left, "the pilot is not done again");
+    assert_eq!(lab.state(job).await, JobState::Succeeded);
+    assert!(lab.store.preview(job, 0).await.unwrap().is_none(), "previews go with the tiles");
+}
+
+#[tokio::test]
 async fn damaged_tiles_are_done_again() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    for _ in 0..3 {
-        let task = lab.claim().await.unwrap();
-        lab.work(&task).await;
-    }
+    lab.work_on(5).await;
     let assemble = lab.claim().await.unwrap();
     assert_eq!(assemble.kind, TaskKind::Assemble { snapshot: 0 });
     assert_eq!(lab.store.tile_results(job, 0).await.unwrap().len(), 2);

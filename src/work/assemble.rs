@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::manifest::{
     CameraRecord, Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary,
-    frame_attributes, stored_schedule,
+    frame_attributes,
 };
 use super::prepare::{Prepared, to_record};
 use super::result::{ResultFile, ResultSpec, write_result};
@@ -118,10 +118,12 @@ fn manifest(
         (&task.spec, &task.calibration.facts, &task.measurement.facts);
     let tiles: Vec<_> = records.iter().map(|record| record.tile.clone()).collect();
     let (frames, snapshot) = (spec.shape.frames, snapshot as usize);
+    let prepared = Prepared::of(task)?;
     let content = Content {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: stored_schedule(spec)?,
+        schedule: prepared.schedule(spec)?,
+        pilot: prepared.pilot,
         frames,
         height: spec.shape.height,
         width: spec.shape.width,
@@ -134,7 +136,7 @@ fn manifest(
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,
-            white: Prepared::of(task)?.white,
+            white: prepared.white,
         },
         tile_plan: plan.into(),
         summary: Summary::of(&tiles),

@@ -6,9 +6,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::assemble::SnapshotRecord;
-use super::manifest::{
-    Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord, stored_schedule,
-};
+use super::manifest::{Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord};
+use super::pilot::PilotRecord;
 use super::prepare::{Prepared, to_record};
 use super::result::ResultFile;
 use super::task::TaskError;
@@ -34,6 +33,9 @@ struct JobContent {
     program_version: String,
     algorithm: Algorithm,
     schedule: ScheduleSpec,
+    /// How an adaptive schedule became this one.
+    #[serde(default)]
+    pilot: Option<PilotRecord>,
     shape: SceneShape,
     inputs: Inputs,
     models: Vec<ModelRecord>,
@@ -107,10 +109,12 @@ fn content(
         let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
         SnapshotEntry { snapshot, summary: record.summary, files: files.collect() }
     };
+    let prepared = Prepared::of(task)?;
     Ok(JobContent {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: stored_schedule(spec)?,
+        schedule: prepared.schedule(spec)?,
+        pilot: prepared.pilot,
         shape: spec.shape,
         inputs: Inputs {
             masks_sha256: calibration.masks.to_string(),
@@ -120,7 +124,7 @@ fn content(
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,
-            white: Prepared::of(task)?.white,
+            white: prepared.white,
         },
         tile_plan: (&spec.tile_plan()?).into(),
         warnings: spec.warnings.clone(),

@@ -62,7 +62,7 @@ pub fn run_network(
     input: TileInput,
     network: &mut dyn SnapshotNetwork,
 ) -> Result<TileOutcome, ReconError> {
-    input.on_unit_scale(|op, measurement| {
+    input.solved(|op, measurement| {
         let frames = network.frames(measurement, op.masks())?;
         let rest = &measurement - &op.forward(frames.view())?;
         let norm = squares(measurement).max(f64::MIN_POSITIVE);

@@ -8,6 +8,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::pilot::PilotRecord;
 use super::result::ResultFile;
 use crate::formats::exr::Attributes;
 use crate::job::{Algorithm, Finding, InvalidField, JobSpec, Label, ScheduleSpec, TileSpec};
@@ -46,8 +47,12 @@ pub struct Content {
     pub program_version: String,
     /// The algorithm.
     pub algorithm: Algorithm,
-    /// The schedule in full, defaults included; without stages for an end-to-end network.
+    /// The schedule of the tiles in full, defaults included; without stages for an end-to-end
+    /// network.
     pub schedule: ScheduleSpec,
+    /// How an adaptive schedule became this one.
+    #[serde(default)]
+    pub pilot: Option<PilotRecord>,
     /// Frames of the snapshot (B).
     pub frames: usize,
     /// Rows.
@@ -122,12 +127,16 @@ impl ModelRecord {
     }
 }
 
-/// The schedule of a job with all defaults filled in.
-pub(super) fn stored_schedule(spec: &JobSpec) -> Result<ScheduleSpec, Vec<InvalidField>> {
-    match &spec.model {
-        None => Ok(ScheduleSpec::from(&spec.schedule.to_schedule()?)),
-        Some(_) => Ok(spec.schedule.clone()),
+/// A schedule as the tiles run it, with all defaults filled in; one without stages as it is.
+pub fn full_schedule(
+    schedule: &ScheduleSpec,
+    pilot: Option<&PilotRecord>,
+) -> Result<ScheduleSpec, Vec<InvalidField>> {
+    if schedule.stages.is_empty() {
+        return Ok(schedule.clone());
     }
+    let schedule = schedule.to_schedule()?;
+    Ok(ScheduleSpec::from(&pilot.map_or(schedule.clone(), |pilot| pilot.decide(&schedule))))
 }
 
 /// Every factor between the stored numbers and the solver's \[0,1\]. All are undone in the
@@ -314,6 +323,7 @@ pub(super) fn sample() -> Manifest {
         program_version: "0.0.0".into(),
         algorithm,
         schedule: ScheduleSpec::from(&Schedule::gap_tv()),
+        pilot: None,
         frames: 3,
         height: 20,
         width: 24,

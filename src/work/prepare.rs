@@ -4,28 +4,41 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+use super::manifest::full_schedule;
+use super::pilot::PilotRecord;
 use super::solve::typical_white;
 use super::task::{Shared, TaskError};
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
-use crate::job::{Sha256, TaskProgress, TaskStage};
+use crate::job::{InvalidField, JobSpec, ScheduleSpec, Sha256, TaskProgress, TaskStage};
 use crate::recon::scale::ScaleEstimator;
 use crate::store::{ClaimedTask, Completion, Product, hash_file};
 
-/// What the other tasks of the job learn from this one.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+/// What the other tasks of the job learn from this one, and from the pilot.
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Prepared {
     /// White level of the scene: the median over the snapshots of the job (see
     /// [`typical_white`]).
     pub(super) white: f32,
+    /// How far the stages of an adaptive schedule go.
+    #[serde(skip)]
+    pub(super) pilot: Option<PilotRecord>,
 }
 
 impl Prepared {
-    /// The record of the job's prepare task.
+    /// The records of the job's first tasks.
     pub(super) fn of(task: &ClaimedTask) -> Result<Self, TaskError> {
         let record = |problem: String| TaskError::Record { what: "prepare task", problem };
         let prepared = task.prepared.clone().ok_or_else(|| record("there is none".into()))?;
-        serde_json::from_value(prepared).map_err(|error| record(error.to_string()))
+        let mut prepared: Self =
+            serde_json::from_value(prepared).map_err(|error| record(error.to_string()))?;
+        prepared.pilot = PilotRecord::of(task)?;
+        Ok(prepared)
+    }
+
+    /// The schedule of the job's tiles.
+    pub(super) fn schedule(&self, spec: &JobSpec) -> Result<ScheduleSpec, Vec<InvalidField>> {
+        full_schedule(&spec.schedule, self.pilot.as_ref())
     }
 }
 
@@ -51,7 +64,8 @@ pub(super) fn run(task: &ClaimedTask, shared: &Shared) -> Result<Completion, Tas
         whites.push(white.map_err(|source| TaskError::Snapshot { snapshot, source })?);
     }
     let none = || TaskError::Record { what: "job", problem: "it names no snapshots".into() };
-    let prepared = Prepared { white: typical_white(whites).ok_or_else(none)? };
+    let white = typical_white(whites).ok_or_else(none)?;
+    let prepared = Prepared { white, pilot: None };
     let progress = TaskProgress { stage: TaskStage::Reading, fraction: 1.0, ..shared.progress() };
     Ok(Completion { progress, record: to_record(&prepared)?, product: Product::Record })
 }
@@ -65,7 +79,7 @@ fn check(what: &'static str, path: &Path, sha256: Sha256) -> Result<(), TaskErro
 }
 
 /// One frame \[H,W\] of a prepared array.
-fn plane(reader: &Reader, frame: usize) -> Result<ndarray::Array2<f32>, FormatError> {
+pub(super) fn plane(reader: &Reader, frame: usize) -> Result<ndarray::Array2<f32>, FormatError> {
     let (height, width) = (reader.info().height, reader.info().width);
     let window = reader.read_window(frame..frame + 1, 0..height, 0..width)?;
     Ok(window.index_axis_move(ndarray::Axis(0), 0))

@@ -1,5 +1,6 @@
 //! A whole snapshot in memory, its tiles on several threads.
 
+use std::ops::Range;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
@@ -8,15 +9,18 @@ use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 
 use super::learned::{ModelFile, run_network};
 use super::network::{NetworkError, NetworkSource, WarmNetworks};
+use super::pilot::{self, PilotRecord};
 use super::solve::{TileInput, TileOutcome, reconstruct_tile};
-use crate::recon::ReconError;
 use crate::recon::gap::{Control, Observer, Progress};
 use crate::recon::schedule::Schedule;
 use crate::recon::tile::{Tile, TilePlan};
+use crate::recon::{self, ReconError};
 
 /// What is to be solved.
 #[derive(Debug, Clone, Copy)]
 pub struct SnapshotInput<'a> {
+    /// Its index in the measurement, for the record.
+    pub snapshot: usize,
     /// Masks \[B,H,W\] on \[0,1\].
     pub masks: ArrayView3<'a, f32>,
     /// Measurement \[H,W\].
@@ -36,6 +40,26 @@ pub enum Solver<'a> {
     Schedule(&'a Schedule),
     /// By one run of an end-to-end network.
     Network(&'a ModelFile),
+}
+
+impl SnapshotInput<'_> {
+    /// What one tile is made of.
+    fn window(&self, rows: Range<usize>, columns: Range<usize>) -> TileInput {
+        TileInput {
+            masks: self.masks.slice(s![.., rows.clone(), columns.clone()]).to_owned(),
+            measurement: self.measurement.slice(s![rows, columns]).to_owned(),
+            white: self.white,
+        }
+    }
+}
+
+/// A snapshot whose tiles are solved.
+#[derive(Debug)]
+pub struct Solved {
+    /// The tiles in the plan's order.
+    pub tiles: Vec<TileOutcome>,
+    /// What the pilot of an adaptive schedule found.
+    pub pilot: Option<PilotRecord>,
 }
 
 /// Why a snapshot was not solved.
@@ -66,12 +90,39 @@ impl TileProgress for () {
     fn finished(&self, _: &Tile) {}
 }
 
-/// Solves all tiles of a snapshot on up to `threads` threads, one denoiser a thread, and gives
-/// them in the plan's order. The result does not depend on the number of threads.
+/// Solves all tiles of a snapshot on up to `threads` threads, one denoiser a thread; an adaptive
+/// schedule is decided before. The result does not depend on the number of threads.
 ///
 /// # Errors
 /// The first failure of any tile; the others stop at their next iteration.
 pub fn solve(
+    input: &SnapshotInput<'_>,
+    network: &NetworkSource,
+    threads: usize,
+    progress: &dyn TileProgress,
+) -> Result<Solved, SolveError> {
+    let pilot = run_pilot(input, network)?;
+    let decided = match (&pilot, input.solver) {
+        (Some(pilot), Solver::Schedule(schedule)) => Some(pilot.decide(schedule)),
+        _ => None,
+    };
+    let solver = decided.as_ref().map_or(input.solver, Solver::Schedule);
+    let tiles = run_tiles(&SnapshotInput { solver, ..*input }, network, threads, progress)?;
+    Ok(Solved { tiles, pilot })
+}
+
+fn run_pilot(
+    input: &SnapshotInput<'_>,
+    network: &NetworkSource,
+) -> Result<Option<PilotRecord>, SolveError> {
+    let Solver::Schedule(schedule) = input.solver else { return Ok(None) };
+    let (rows, columns) = recon::pilot::piece(input.measurement);
+    let place = (input.snapshot, rows.start, columns.start);
+    let mut networks = WarmNetworks::new(network.clone());
+    Ok(pilot::decide(input.window(rows, columns), place, schedule, &mut networks, &mut ())?)
+}
+
+fn run_tiles(
     input: &SnapshotInput<'_>,
     network: &NetworkSource,
     threads: usize,
@@ -126,11 +177,7 @@ impl Run<'_, '_> {
             let Some(tile) = self.input.plan.tile(index) else { return Ok(()) };
             let (rows, columns) =
                 (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
-            let window = TileInput {
-                masks: self.input.masks.slice(s![.., rows.clone(), columns.clone()]).to_owned(),
-                measurement: self.input.measurement.slice(s![rows, columns]).to_owned(),
-                white: self.input.white,
-            };
+            let window = self.input.window(rows, columns);
             let outcome = match self.input.solver {
                 Solver::Schedule(schedule) => {
                     let (progress, stop) = (self.progress, &self.stop);
@@ -204,8 +251,8 @@ mod tests {
         let frames = |plan: &TilePlan, threads| {
             let (masks, measurement) = (masks.view(), y.view());
             let solver = Solver::Schedule(&schedule);
-            let input = SnapshotInput { masks, measurement, white: 1.0, solver, plan };
-            let tiles = solve(&input, &network(), threads, &()).unwrap();
+            let input = SnapshotInput { snapshot: 0, masks, measurement, white: 1.0, solver, plan };
+            let tiles = solve(&input, &network(), threads, &()).unwrap().tiles;
             blended_frame(plan, &tiles, 1)
         };
         let cut = TilePlan::new(96, 96, 48, 16).unwrap();
@@ -227,7 +274,8 @@ mod tests {
         let (schedule, plan) = (Schedule::gap_tv(), TilePlan::new(96, 96, 48, 16).unwrap());
         let (masks, measurement) = (masks.view(), y.view());
         let solver = Solver::Schedule(&schedule);
-        let input = SnapshotInput { masks, measurement, white: 1.0, solver, plan: &plan };
+        let input =
+            SnapshotInput { snapshot: 0, masks, measurement, white: 1.0, solver, plan: &plan };
         let error = solve(&input, &network(), 2, &()).unwrap_err();
         assert!(matches!(error, SolveError::Recon(ReconError::Diverged { .. })), "{error}");
     }

@@ -31,23 +31,30 @@ impl TileInput {
         })
     }
 
-    /// Has the tile solved with the measurement divided by the white level, so that it is
-    /// `sum_k C_k x_k` with frames on \[0,1\], and multiplies the frames by it again.
-    ///
-    /// A tile that no light reaches through any mask (a corner outside a round aperture, say) has
-    /// frames of 0 and no iterations.
+    /// The tile with the measurement divided by the white level, so that it is `sum_k C_k x_k` with
+    /// frames on \[0,1\]; none if no light reaches it through any mask (a corner outside a round
+    /// aperture, say).
     pub(super) fn on_unit_scale(
+        self,
+    ) -> Result<Option<(SensingOperator, Array2<f32>)>, ReconError> {
+        self.check_white()?;
+        let op = match SensingOperator::new(self.masks) {
+            Err(ReconError::DarkMasks { .. }) => return Ok(None),
+            other => other?,
+        };
+        Ok(Some((op, self.measurement / self.white)))
+    }
+
+    /// Has the tile solved on the unit scale, and multiplies the frames by the white level again. A
+    /// tile without light has frames of 0 and no iterations.
+    pub(super) fn solved(
         self,
         solve: impl FnOnce(SensingOperator, ArrayView2<'_, f32>) -> Result<TileOutcome, ReconError>,
     ) -> Result<TileOutcome, ReconError> {
-        self.check_white()?;
-        let Self { masks, mut measurement, white } = self;
-        let size = masks.raw_dim();
-        let op = match SensingOperator::new(masks) {
-            Err(ReconError::DarkMasks { .. }) => return Ok(dark(Array3::zeros(size))),
-            other => other?,
+        let (size, white) = (self.masks.raw_dim(), self.white);
+        let Some((op, measurement)) = self.on_unit_scale()? else {
+            return Ok(dark(Array3::zeros(size)));
         };
-        measurement /= white;
         let mut outcome = solve(op, measurement.view())?;
         outcome.frames *= white;
         Ok(outcome)
@@ -79,7 +86,7 @@ pub fn reconstruct_tile(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<TileOutcome, ReconError> {
-    input.on_unit_scale(|op, measurement| {
+    input.solved(|op, measurement| {
         let op = op.with_gamma(schedule.gamma)?;
         let outcome = gap::reconstruct(&op, measurement, schedule, networks, observer)?;
         Ok(TileOutcome {

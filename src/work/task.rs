@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::history::History;
 use super::network::{NetworkError, WarmNetworks};
 use super::result::ResultError;
-use super::{assemble, finish, prepare, tile};
+use super::{assemble, finish, pilot, prepare, preview, tile};
 use crate::formats::FormatError;
 use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
 use crate::recon::ReconError;
@@ -170,7 +170,10 @@ pub(super) enum Material {
 impl Material {
     pub(super) async fn of(store: &Store, task: &ClaimedTask) -> Result<Self, StoreError> {
         Ok(match task.kind {
-            TaskKind::Prepare | TaskKind::Tile { .. } => Self::None,
+            TaskKind::Prepare
+            | TaskKind::Preview { .. }
+            | TaskKind::Pilot
+            | TaskKind::Tile { .. } => Self::None,
             TaskKind::Assemble { snapshot } => {
                 Self::Tiles(store.tile_results(task.job, snapshot).await?)
             }
@@ -195,6 +198,8 @@ pub(super) fn perform(
             assemble::run(store, task, snapshot, &tiles, shared)
         }
         (TaskKind::Manifest, Material::Records(records)) => finish::run(store, task, &records),
+        (TaskKind::Preview { snapshot }, _) => preview::run(store, task, snapshot, shared),
+        (TaskKind::Pilot, _) => pilot::run(task, engine, shared),
         _ => prepare::run(task, shared),
     }
 }

@@ -1,8 +1,9 @@
 //! The task of one tile.
 
 use std::io::BufWriter;
+use std::ops::Range;
 
-use ndarray::Axis;
+use ndarray::{ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 
 use super::learned::{ModelFile, run_network};
@@ -15,9 +16,8 @@ use super::task::{Shared, TaskError};
 use super::usage::{Usage, peak_rss_bytes};
 use crate::formats::planar::{Reader, Writer};
 use crate::formats::{FormatError, Limits};
-use crate::job::{TaskProgress, TaskStage};
+use crate::job::{ScheduleSpec, TaskProgress, TaskStage};
 use crate::recon::gap::{Control, Observer, Progress};
-use crate::recon::tile::Tile;
 use crate::store::{ClaimedTask, Completion, Product, StagedBlob, Store};
 
 /// What is remembered of a tile's task.
@@ -49,16 +49,18 @@ pub(super) fn run(
         what: "task",
         problem: format!("tile {index} of a plan of {}", plan.len()),
     })?;
-    let input = window(task, &tile, snapshot as usize)?;
+    let prepared = Prepared::of(task)?;
+    let place = (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
+    let input = window(task, snapshot as usize, place, prepared.white)?;
     let (outcome, deep) = match (&task.spec.model, &task.model) {
         (Some(model), Some(path)) => {
             let file = ModelFile::new(path.clone(), model.sha256);
             (by_network(input, &file, engine, shared)?, true)
         }
         _ => {
-            let schedule = task.spec.schedule.to_schedule()?;
-            let share = ShareDone::new(task.spec.schedule.clone());
-            let mut observer = TaskObserver { shared, share, passes: 0 };
+            let spec = prepared.schedule(&task.spec)?;
+            let schedule = spec.to_schedule()?;
+            let mut observer = TaskObserver::new(shared, spec);
             let outcome = reconstruct_tile(input, &schedule, engine, &mut observer)?;
             (outcome, !schedule.networks().is_empty())
         }
@@ -72,7 +74,7 @@ pub(super) fn run(
         cpu_seconds: (Usage::now() - before).cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };
-    let blob = write(store, &outcome)?;
+    let blob = write(store, outcome.frames.view())?;
     Ok(Completion { progress, record: to_record(&record)?, product: Product::Tile(blob) })
 }
 
@@ -92,10 +94,15 @@ fn by_network(
     Ok(outcome)
 }
 
-fn window(task: &ClaimedTask, tile: &Tile, snapshot: usize) -> Result<TileInput, TaskError> {
+/// A piece of a snapshot, by rows and columns.
+pub(super) fn window(
+    task: &ClaimedTask,
+    snapshot: usize,
+    (rows, columns): (Range<usize>, Range<usize>),
+    white: f32,
+) -> Result<TileInput, TaskError> {
     let limits = Limits::default();
     let masks = Reader::open(&task.masks, &limits)?;
-    let (rows, columns) = (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
     let frames = 0..masks.info().frames;
     let measurement = Reader::open(&task.snapshots, &limits)?.read_window(
         snapshot..snapshot + 1,
@@ -105,15 +112,16 @@ fn window(task: &ClaimedTask, tile: &Tile, snapshot: usize) -> Result<TileInput,
     Ok(TileInput {
         masks: masks.read_window(frames, rows, columns)?,
         measurement: measurement.index_axis_move(Axis(0), 0),
-        white: Prepared::of(task)?.white,
+        white,
     })
 }
 
-fn write(store: &Store, outcome: &TileOutcome) -> Result<StagedBlob, TaskError> {
-    let (frames, height, width) = outcome.frames.dim();
+/// Writes frames \[B,h,w\] as a prepared array.
+pub(super) fn write(store: &Store, frames: ArrayView3<'_, f32>) -> Result<StagedBlob, TaskError> {
+    let (count, height, width) = frames.dim();
     let blob = BufWriter::new(store.blob_writer()?);
-    let mut writer = Writer::new(blob, frames, height, width)?;
-    outcome.frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
+    let mut writer = Writer::new(blob, count, height, width)?;
+    frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
     let blob = writer.finish()?.into_inner();
     let blob = blob.map_err(|error| FormatError::Io {
         action: "write the tile",
@@ -123,10 +131,17 @@ fn write(store: &Store, outcome: &TileOutcome) -> Result<StagedBlob, TaskError> 
 }
 
 /// Tells the heartbeat about iterations, and the solver when to stop.
-struct TaskObserver<'a> {
+pub(super) struct TaskObserver<'a> {
     shared: &'a Shared,
     share: ShareDone,
     passes: u32,
+}
+
+impl<'a> TaskObserver<'a> {
+    /// For one run of a schedule.
+    pub(super) fn new(shared: &'a Shared, schedule: ScheduleSpec) -> Self {
+        Self { shared, share: ShareDone::new(schedule), passes: 0 }
+    }
 }
 
 impl Observer for TaskObserver<'_> {

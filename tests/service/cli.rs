@@ -90,6 +90,7 @@ fn a_simulated_snapshot_is_reconstructed() {
             "peak_rss_bytes",
             "provider",
             "stop_reason",
+            "pilot",
         ];
         expected.sort_unstable();
         assert_eq!(fields, expected);

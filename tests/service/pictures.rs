@@ -147,7 +147,9 @@ async fn tiles_show_while_others_run_and_tell_how_the_solver_goes() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let job = job(&app, tv(5_000, 8)).await;
     let base = format!("/v1/jobs/{job}/snapshots/1");
-    app.get(&format!("{base}/pictures/frame-1")).await.problem(404, "not_ready");
+    let waits = self::job(&app, tv(5_000, 8)).await;
+    let picture = format!("/v1/jobs/{waits}/snapshots/1/pictures/frame-1");
+    app.get(&picture).await.problem(404, "not_ready");
     app.when(&job, |job| {
         job["progress"]["tiles_done"].as_u64() >= Some(1)
             && job["progress"]["tiles_running"] == 1
@@ -169,6 +171,30 @@ async fn tiles_show_while_others_run_and_tell_how_the_solver_goes() {
     assert_eq!(points.last().unwrap()[0], 5_000);
     assert!(points[0][1].as_f64() > points.last().unwrap()[1].as_f64(), "the residual falls");
     app.get(&format!("{base}/tiles/6/history")).await.problem(404, "not_found");
+    for job in [waits, job] {
+        app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
+        app.ended(&job).await;
+    }
+}
+
+#[tokio::test]
+async fn a_coarse_preview_comes_before_the_tiles() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let job = job(&app, tv(10_000, 50)).await;
+    let preview = |job: &Value| job["progress"]["previews_done"] == 1;
+    let early = app.when(&job, preview).await;
+    assert_eq!(early["progress"]["tiles_done"], 0, "{early:#}");
+    let base = format!("/v1/jobs/{job}/snapshots/1/pictures/frame-3");
+    let picture = app.get(&format!("{base}/tiles/0/0/0?black=0&white=1")).await.expect(200);
+    assert_eq!(picture.header("cache-control"), "no-cache");
+    let (height, width, shown) = decode(&picture);
+    let difference = |i: usize, j: usize| {
+        f64::from(shown[i * width + j]) / 255.0 - f64::from(Scene::SMALL.pixel(1, 2, i, j))
+    };
+    let pixels = (0..height).flat_map(|i| (0..width).map(move |j| (i, j)));
+    let error = pixels.map(|(i, j)| difference(i, j).powi(2)).sum::<f64>() / shown.len() as f64;
+    assert!(error < 0.02, "the preview shows the scene: {error}");
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
-    app.ended(&job).await;
+    let ended = app.ended(&job).await;
+    assert_eq!(ended["state"], "cancelled");
 }

@@ -45,8 +45,8 @@ async fn the_manifest_tells_all_and_the_command_line_makes_the_same_frames() {
     assert_eq!(manifest["run"]["job"], job);
     let whole = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
     assert_eq!(whole["content"]["snapshots"][0]["summary"], content["summary"]);
-    // Prepare, six tiles, assemble, manifest.
-    assert_eq!(whole["run"]["tasks"], 9);
+    // Prepare, preview, six tiles, assemble, manifest.
+    assert_eq!(whole["run"]["tasks"], 10);
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

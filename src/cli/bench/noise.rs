@@ -182,6 +182,7 @@ impl Bench<'_> {
         let TileSpec { size, overlap } = TileSpec::default();
         let plan = TilePlan::new(height, width, size.max(overlap * 2), overlap)?;
         let input = SnapshotInput {
+            snapshot: 0,
             masks: made.masks.view(),
             measurement: y,
             // The scene's own: its level is known here, so noise does not disturb it.
@@ -190,7 +191,7 @@ impl Bench<'_> {
             plan: &plan,
         };
         let cores = thread::available_parallelism().map_or(1, usize::from);
-        let tiles = solve(&input, &self.network, cores, &())?;
+        let tiles = solve(&input, &self.network, cores, &())?.tiles;
         let mut psnr = 0.0;
         for (k, truth) in truth.axis_chunks_iter(ndarray::Axis(0), 1).enumerate() {
             let frame = blended_frame(&plan, &tiles, k);

@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::Arguments;
 use crate::cli::CliError;
+use crate::work::pilot::PilotRecord;
 
 /// What `--json` prints.
 #[derive(Debug, Serialize)]
@@ -22,6 +23,8 @@ pub(super) struct Report {
     /// None for a schedule without a network.
     pub(super) provider: Option<&'static str>,
     pub(super) stop_reason: String,
+    /// How an adaptive schedule was decided.
+    pub(super) pilot: Option<PilotRecord>,
 }
 
 impl Report {
@@ -46,6 +49,17 @@ impl Report {
             self.denoiser_passes,
             self.stop_reason
         );
+        for stage in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
+            println!(
+                "{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}",
+                stage.prior.name(),
+                stage.iterations,
+                stage.planned,
+                stage.end,
+                stage.error_before,
+                stage.error_after
+            );
+        }
         if let Some(psnr) = self.psnr_db {
             let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
             println!("PSNR {psnr:.2} dB{ssim}");

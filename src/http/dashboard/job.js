@@ -41,7 +41,7 @@ export async function job(root, [id], signal) {
     }
     put(progress, line(now));
     await tiles.renew(snapshot.value());
-    const done = `${now.progress.tiles_done} ${now.progress.snapshots_done} ${now.state}`;
+    const done = `${now.progress.previews_done} ${now.progress.tiles_done} ${now.progress.snapshots_done} ${now.state}`;
     if (shown && done !== ready) await viewer.renew();
     if (done !== ready) await results(now);
     ready = done;
@@ -128,11 +128,19 @@ async function showManifest(element, now, snapshot, signal) {
     ["Ended", content.summary.stop_reason === "converged" ? "converged" : "all planned iterations done"],
     ["Iterations", `${content.summary.tv_iterations} with TV, ${content.summary.denoiser_passes} deep`],
     ["White level", figure(content.scale.white)],
-    ["Network", content.model ? `${content.model.name}, ${content.model.sha256.slice(0, 12)}…` : "none"],
+    ["Networks", content.models.map((model) => `${model.name}, ${model.sha256.slice(0, 12)}…`).join("; ") || "none"],
+    ...pilot(content),
     ["Provider", run.provider ? `${run.provider}, ONNX Runtime ${run.onnxruntime}` : "none"],
     ["Computing", duration(run.cpu_seconds)],
     ["Memory", bytes(run.peak_rss_bytes)],
   ]), h("details", null, h("summary", null, "All of it"), h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
+}
+
+/** How far the stages of an adaptive schedule went, and why. */
+function pilot(content) {
+  const stages = (content.pilot?.stages ?? []).filter((stage) => stage.end !== "fixed");
+  const why = { "max-iterations": "all that were planned", converged: "later ones raise the error", diverged: "later ones diverge" };
+  return stages.map((stage) => [`Pilot, ${stage.prior}`, `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]}), error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`]);
 }
 
 function warnings(manifest) {

@@ -111,7 +111,7 @@ export class Viewer {
       if (error.code !== "not_ready") throw error;
       this.ready = false;
       this.right.show(null);
-      this.right.tell("No tile of this snapshot is done yet. Frames appear here tile by tile.");
+      this.right.tell("Nothing of this snapshot is done yet. A coarse preview comes first, then the frames tile by tile.");
       this.rightContrast.element.hidden = true;
       return;
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::render::Picture;
-use super::source::{Files, Stack};
+use super::source::{Files, Stack, Unfinished};
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code};
 use crate::http::jobs::with_snapshot;
@@ -164,7 +164,7 @@ fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Stack {
     Stack { shape, identity: sha256.to_string(), files }
 }
 
-/// The frames of a snapshot: those of the result, or of the tiles that are done.
+/// The frames of a snapshot: those of the result, or the tiles that are done, on the preview.
 async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiError> {
     let spec = &job.spec;
     let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
@@ -180,16 +180,20 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiErro
         Err(error) => return Err(error.into()),
     }
     let done = app.store.tile_results(job.id, snapshot).await?;
-    if done.is_empty() {
-        let detail = "no tile of this snapshot is done yet; the job's state says how far it is";
+    let preview = app.store.preview(job.id, snapshot).await?;
+    if done.is_empty() && preview.is_none() {
+        let detail = "neither the preview nor a tile of this snapshot is done yet; the job's state \
+                      says how far it is";
         return Err(ApiError::new(Code::NotReady, detail));
     }
-    let hashes: String = done.iter().map(|tile| tile.sha256.to_string()).collect();
+    let parts = preview.iter().map(|(sha256, _)| sha256).chain(done.iter().map(|t| &t.sha256));
+    let hashes: String = parts.map(ToString::to_string).collect();
     let plan = spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
     let place = |tile: crate::store::TileResult| Some((plan.tile(tile.tile as usize)?, tile.path));
-    let tiles = Arc::new(done.into_iter().filter_map(place).collect());
+    let tiles = done.into_iter().filter_map(place).collect();
+    let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };
     let identity = Sha256::of(hashes.as_bytes()).to_string();
-    Ok(Stack { shape, identity, files: Files::Tiles(tiles) })
+    Ok(Stack { shape, identity, files: Files::Tiles(Arc::new(unfinished)) })
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! are not.
 
 use std::ops::Range;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use ndarray::{Array2, Array3, Axis, s};
@@ -28,8 +28,17 @@ pub(super) enum Files {
     Prepared(PathBuf),
     /// The frames of a result.
     Frames(PathBuf),
-    /// Tiles of an unfinished result; NaN where none is done.
-    Tiles(Arc<Vec<(Tile, PathBuf)>>),
+    /// Tiles of an unfinished result, on the preview; NaN where there is neither.
+    Tiles(Arc<Unfinished>),
+}
+
+/// What there is of a snapshot before it is assembled.
+#[derive(Debug)]
+pub(super) struct Unfinished {
+    /// A prepared array of coarse frames.
+    pub(super) preview: Option<PathBuf>,
+    /// The tiles that are done.
+    pub(super) tiles: Vec<(Tile, PathBuf)>,
 }
 
 type Window = Result<Array3<f32>, FormatError>;
@@ -44,7 +53,14 @@ impl Stack {
             Files::Frames(path) => {
                 npy::open_windows(path, &limits)?.read_window(frames, rows, columns)
             }
-            Files::Tiles(tiles) => mosaic(tiles, frames, rows, columns),
+            Files::Tiles(unfinished) => {
+                let mut whole = match &unfinished.preview {
+                    Some(path) => enlarged(path, self.shape, frames.clone(), &rows, &columns)?,
+                    None => Array3::from_elem((frames.len(), rows.len(), columns.len()), f32::NAN),
+                };
+                lay(&unfinished.tiles, frames, rows, columns, &mut whole)?;
+                Ok(whole)
+            }
         }
     }
 
@@ -145,15 +161,32 @@ fn first(window: Array3<f32>) -> Array2<f32> {
     window.index_axis_move(Axis(0), 0)
 }
 
-/// A window of a picture of which only some tiles are there. Where they overlap the later one
-/// counts: they are blended when all are done.
-fn mosaic(
+/// A window of a preview as large as the frames: every pixel has the value of its place.
+fn enlarged(
+    path: &Path,
+    (_, height, width): (usize, usize, usize),
+    frames: Range<usize>,
+    rows: &Range<usize>,
+    columns: &Range<usize>,
+) -> Window {
+    let reader = planar::Reader::open(path, &Limits::default())?;
+    let (h, w) = (reader.info().height, reader.info().width);
+    let size = (frames.len(), rows.len(), columns.len());
+    let coarse = reader.read_window(frames, 0..h, 0..w)?;
+    Ok(Array3::from_shape_fn(size, |(k, i, j)| {
+        coarse[[k, (rows.start + i) * h / height, (columns.start + j) * w / width]]
+    }))
+}
+
+/// Lays the tiles that are done over a window of a picture. Where they overlap the later one counts:
+/// they are blended when all are done.
+fn lay(
     tiles: &[(Tile, PathBuf)],
     frames: Range<usize>,
     rows: Range<usize>,
     columns: Range<usize>,
-) -> Window {
-    let mut whole = Array3::from_elem((frames.len(), rows.len(), columns.len()), f32::NAN);
+    whole: &mut Array3<f32>,
+) -> Result<(), FormatError> {
     for (tile, path) in tiles {
         let (down, across) =
             (common(&rows, tile.row, tile.height), common(&columns, tile.column, tile.width));
@@ -172,7 +205,7 @@ fn mosaic(
         ];
         whole.slice_mut(place).assign(&part);
     }
-    Ok(whole)
+    Ok(())
 }
 
 /// The part of a range that a tile of this start and length covers.
@@ -185,7 +218,7 @@ fn common(range: &Range<usize>, start: usize, length: usize) -> Range<usize> {
 mod tests {
     use std::sync::Arc;
 
-    use super::{Files, Stack};
+    use super::{Files, Stack, Unfinished};
     use crate::formats::planar::Writer;
     use crate::recon::tile::Tile;
     use ndarray::{Array3, s};
@@ -231,19 +264,25 @@ mod tests {
     }
 
     #[test]
-    fn tiles_that_are_done_stand_in_their_place() {
+    fn tiles_that_are_done_stand_in_their_place_on_the_preview() {
         let folder = tempfile::tempdir().unwrap();
         let x = Array3::from_shape_fn((2, 40, 40), |(k, i, j)| (k * 1600 + i * 40 + j) as f32);
         let tile = Tile { index: 3, row: 16, column: 20, height: 24, width: 20 };
         let part = x.slice(s![.., 16..40, 20..40]).to_owned();
         let path = prepared(folder.path(), "tile", &part);
-        let stack = stack((2, 40, 40), Files::Tiles(Arc::new(vec![(tile, path)])));
-        let picture = stack.frame(1);
-        assert!(!picture.settled);
-        let found = picture.reduce(&picture.whole(0)).unwrap();
-        for ((i, j), &value) in found.indexed_iter() {
-            let expected = (i >= 16 && j >= 20).then_some(x[[1, i, j]]);
-            assert_eq!(value.is_finite().then_some(value), expected, "{i} {j}");
+        let coarse = Array3::from_shape_fn((2, 5, 5), |(k, i, j)| (k + i * 5 + j) as f32);
+        let coarse_path = prepared(folder.path(), "preview", &coarse);
+        for preview in [None, Some(coarse_path)] {
+            let below = |i: usize, j: usize| preview.as_ref().map(|_| coarse[[1, i / 8, j / 8]]);
+            let tiles = vec![(tile, path.clone())];
+            let unfinished = Unfinished { preview: preview.clone(), tiles };
+            let picture = stack((2, 40, 40), Files::Tiles(Arc::new(unfinished))).frame(1);
+            assert!(!picture.settled);
+            let found = picture.reduce(&picture.whole(0)).unwrap();
+            for ((i, j), &value) in found.indexed_iter() {
+                let expected = (i >= 16 && j >= 20).then_some(x[[1, i, j]]).or(below(i, j));
+                assert_eq!(value.is_finite().then_some(value), expected, "{i} {j}");
+            }
         }
     }
 }

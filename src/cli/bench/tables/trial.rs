@@ -148,6 +148,7 @@ impl Bench {
             }
         };
         let input = SnapshotInput {
+            snapshot: 0,
             masks: masks.view(),
             measurement: measurement.view(),
             white,
@@ -156,7 +157,7 @@ impl Bench {
         };
         let cores = thread::available_parallelism().map_or(1, usize::from);
         let (started, before) = (Instant::now(), Usage::now());
-        let tiles = solve(&input, &self.network, cores, &())?;
+        let tiles = solve(&input, &self.network, cores, &())?.tiles;
         let cpu_seconds = (Usage::now() - before).cpu_seconds;
         let seconds = started.elapsed().as_secs_f64();
         let quality = Quality::of(&plan, &tiles, &snapshot.truth)?;

@@ -1,0 +1,311 @@
+//! How many iterations of each stage pay for a scene, found out on a piece of its measurement.
+//!
+//! Without the truth, only the measurement can judge. One in fourteen of the piece's pixels is
+//! kept from the solver, and after each iteration what the frames say about these pixels is compared
+//! with what was measured there (cross-validation). That error falls as long as the frames get
+//! better and rises when the solver begins to fit noise or the network to invent: on the clips that
+//! were tried its least value lies within a few passes of the best PSNR.
+
+use std::ops::Range;
+
+use ndarray::{ArrayView2, ArrayView3, s};
+use rand::{Rng, SeedableRng};
+
+use super::denoise::Networks;
+use super::error::ReconError;
+use super::gap::{Observer, Run};
+use super::schedule::{Schedule, Stage};
+use super::sensing::SensingOperator;
+
+/// Side of the piece that the pilot is run on: a seventh of a tile of 256.
+pub const SIDE: usize = 96;
+
+/// The share of pixels that are kept from the solver.
+const HELD_OUT: f64 = 0.07;
+/// A stage goes on as long as its error comes this near to its least: about there the frames still
+/// get better.
+const SLACK: f64 = 0.005;
+/// So many iterations that don't come near end the stage. Where the prior changes, the error may
+/// rise for ten iterations while the frames get better.
+const PATIENCE: usize = 20;
+
+/// The rows and columns of the piece: of all that lie side by side in a measurement \[H,W\], the one
+/// with the greatest variance. Flat sky would tell nothing.
+pub fn piece(y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
+    let (height, width) = y.dim();
+    let starts = |length: usize| {
+        let last = length.saturating_sub(SIDE);
+        (0..last).step_by(SIDE).chain([last])
+    };
+    let window =
+        |row: usize, column: usize| (row..height.min(row + SIDE), column..width.min(column + SIDE));
+    let variance = |(rows, columns): &(Range<usize>, Range<usize>)| {
+        y.slice(s![rows.clone(), columns.clone()]).var(0.0)
+    };
+    starts(height)
+        .flat_map(|row| starts(width).map(move |column| window(row, column)))
+        .max_by(|a, b| variance(a).total_cmp(&variance(b)))
+        .unwrap_or((0..height, 0..width))
+}
+
+/// What was found out about a stage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StageFinding {
+    /// Iterations that pay; 0 if the first one diverges.
+    pub iterations: usize,
+    /// Error at the held-out pixels before the stage: `||y - Hv|| / ||y||` over them.
+    pub before: f64,
+    /// The same after so many iterations.
+    pub after: f64,
+    /// Why no more.
+    pub end: StageEnd,
+}
+
+/// Why a stage has as many iterations as it has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StageEnd {
+    /// Its number is fixed.
+    Fixed,
+    /// All that may be were done, and paid.
+    Planned,
+    /// Those that followed raised the error.
+    Converged,
+    /// The iteration left the finite numbers soon after.
+    Diverged,
+}
+
+impl StageEnd {
+    /// Name for records.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fixed => "fixed",
+            Self::Planned => "max-iterations",
+            Self::Converged => "converged",
+            Self::Diverged => "diverged",
+        }
+    }
+}
+
+/// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],
+/// and tells for every stage how many of its iterations pay. Stages of total variation alone, which
+/// cost next to nothing, are taken as they are.
+///
+/// # Errors
+/// As [`super::gap::reconstruct`].
+pub fn run(
+    op: SensingOperator,
+    y: ArrayView2<'_, f32>,
+    schedule: &Schedule,
+    networks: &mut dyn Networks,
+    observer: &mut dyn Observer,
+) -> Result<Vec<StageFinding>, ReconError> {
+    schedule.validate()?;
+    let held_out = HeldOut::of(&op, y);
+    let op = op.without(&held_out.pixels);
+    let mut run = Run::new(&op, y, schedule, networks);
+    let mut findings = Vec::with_capacity(schedule.stages.len());
+    let mut before = 1.0;
+    for (index, stage) in schedule.stages.iter().enumerate() {
+        let watch = Watch { op: &op, y, held_out: &held_out, index, observer };
+        let finding = watch.stage(stage, &mut run, before)?;
+        before = finding.after;
+        findings.push(finding);
+    }
+    Ok(findings)
+}
+
+impl Schedule {
+    /// The fixed schedule with so many iterations of each stage: levels fall as they did, but end
+    /// earlier. A stage of none is left out, unless no other is left.
+    pub fn decided(&self, iterations: &[usize]) -> Self {
+        let stage = |(stage, &iterations): (&Stage, &usize)| {
+            let last = stage.sigma_at(iterations.checked_sub(1)?);
+            let sigma = stage.sigma.zip(last).map(|((first, _), last)| (first, last));
+            Some(Stage { iterations, sigma, ..stage.clone() })
+        };
+        let mut stages: Vec<Stage> = self.stages.iter().zip(iterations).filter_map(stage).collect();
+        if stages.is_empty() {
+            stages.clone_from(&self.stages);
+        }
+        Self { adaptive: false, stages, ..self.clone() }
+    }
+}
+
+struct Watch<'a, 'b> {
+    op: &'a SensingOperator,
+    y: ArrayView2<'a, f32>,
+    held_out: &'a HeldOut,
+    index: usize,
+    observer: &'b mut dyn Observer,
+}
+
+impl Watch<'_, '_> {
+    fn error(&self, run: &Run<'_>) -> f64 {
+        self.held_out.error(self.op, self.y, run.frames())
+    }
+
+    fn stage(
+        self,
+        stage: &Stage,
+        run: &mut Run<'_>,
+        before: f64,
+    ) -> Result<StageFinding, ReconError> {
+        let fixed = stage.sigma.is_none();
+        let mut end = if fixed { StageEnd::Fixed } else { StageEnd::Planned };
+        let mut best = (0, before, run.state());
+        let mut least = f64::INFINITY;
+        run.enter();
+        for done in 1..=stage.iterations {
+            let step = match run.iterate(stage, done - 1) {
+                Err(ReconError::Diverged { .. }) if !fixed => {
+                    end = StageEnd::Diverged;
+                    break;
+                }
+                other => other?,
+            };
+            run.tell(self.index, stage, &step, &mut *self.observer)?;
+            if fixed {
+                if done == stage.iterations || step.change < stage.tolerance {
+                    let after = self.error(run);
+                    return Ok(StageFinding { iterations: stage.iterations, before, after, end });
+                }
+                continue;
+            }
+            let error = self.error(run);
+            least = least.min(error);
+            if error <= least * (1.0 + SLACK) {
+                best = (done, error, run.state());
+            } else if done - best.0 >= PATIENCE {
+                break;
+            }
+        }
+        let (iterations, after, state) = best;
+        if end == StageEnd::Planned && iterations < stage.iterations {
+            end = StageEnd::Converged;
+        }
+        run.restore(&state);
+        Ok(StageFinding { iterations, before, after, end })
+    }
+}
+
+/// Pixels that the solver does not see.
+struct HeldOut {
+    /// Rows and columns.
+    pixels: Vec<(usize, usize)>,
+}
+
+impl HeldOut {
+    /// Drawn from those that a mask reaches; always the same for the same masks.
+    fn of(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Self {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(0);
+        let mut draw = |&(pixel, _): &((usize, usize), &f32)| {
+            random.random_bool(HELD_OUT) && op.gram()[pixel] > 0.0
+        };
+        let pixels = y.indexed_iter().filter(|entry| draw(entry)).map(|(pixel, _)| pixel).collect();
+        Self { pixels }
+    }
+
+    /// `||y - Hv|| / ||y||` over the pixels.
+    fn error(&self, op: &SensingOperator, y: ArrayView2<'_, f32>, v: ArrayView3<'_, f32>) -> f64 {
+        let (mut rest, mut norm) = (0.0, f64::MIN_POSITIVE);
+        for &(i, j) in &self.pixels {
+            let seen = (0..v.dim().0).map(|k| op.masks()[[k, i, j]] * v[[k, i, j]]).sum::<f32>();
+            rest += f64::from(y[[i, j]] - seen).powi(2);
+            norm += f64::from(y[[i, j]]).powi(2);
+        }
+        (rest / norm).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{StageEnd, StageFinding, piece, run};
+    use crate::optics::{iid_masks, measure};
+    use crate::recon::ReconError;
+    use crate::recon::denoise::{Denoiser, Networks};
+    use crate::recon::schedule::{Network, Schedule, Sigma};
+    use crate::recon::sensing::SensingOperator;
+    use ndarray::{Array2, Array3, s};
+
+    /// Goes to the truth for some passes, and away from it afterwards.
+    struct Tiring {
+        truth: Array3<f32>,
+        good: usize,
+        passes: usize,
+        /// What it does to the frames when it is tired.
+        harm: f32,
+    }
+
+    impl Denoiser for Tiring {
+        fn denoise(&mut self, frames: &mut Array3<f32>, _: Sigma) -> Result<(), ReconError> {
+            self.passes += 1;
+            match self.passes <= self.good {
+                true => frames.zip_mut_with(&self.truth, |x, &truth| *x += 0.3 * (truth - *x)),
+                false => frames.mapv_inplace(|x| x * self.harm),
+            }
+            Ok(())
+        }
+    }
+
+    impl Networks for Tiring {
+        fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
+            Ok(self)
+        }
+    }
+
+    fn find(planned: usize, good: usize, harm: f32) -> (Schedule, Vec<StageFinding>) {
+        let masks = iid_masks(4, 48, 48, 3).unwrap();
+        let truth = Array3::from_shape_fn((4, 48, 48), |(k, i, j)| {
+            0.5 + 0.4 * ((i + 3 * k) as f32 * 0.4).sin() * (j as f32 * 0.3).cos()
+        });
+        let y = measure(masks.view(), truth.view()).unwrap();
+        let op = SensingOperator::new(masks).unwrap();
+        let mut schedule = Schedule::pnp_fastdvdnet();
+        // Without momentum, so that each pass helps.
+        schedule.stages[1].iterations = planned;
+        schedule.stages[1].momentum = 0.0;
+        schedule.stages[1].memory = 0.0;
+        let mut network = Tiring { truth, good, passes: 0, harm };
+        let found = run(op, y.view(), &schedule, &mut network, &mut ()).unwrap();
+        (schedule, found)
+    }
+
+    #[test]
+    fn passes_that_harm_are_left_out() {
+        let (schedule, found) = find(60, 9, 0.7);
+        assert_eq!((found[0].iterations, found[0].end), (60, StageEnd::Fixed));
+        assert_eq!((found[1].iterations, found[1].end), (9, StageEnd::Converged));
+        assert!(found[1].after < 0.5 * found[1].before && found[1].before == found[0].after);
+        let iterations: Vec<usize> = found.iter().map(|stage| stage.iterations).collect();
+        let decided = schedule.decided(&iterations);
+        assert!(!decided.adaptive);
+        let level = |schedule: &Schedule, index| schedule.stages[1].sigma_at(index);
+        assert_eq!(level(&decided, 0), level(&schedule, 0));
+        let (last, planned) = (level(&decided, 8).unwrap(), level(&schedule, 8).unwrap());
+        assert!((last.value() - planned.value()).abs() < 1e-6, "levels fall as they were planned");
+    }
+
+    #[test]
+    fn all_passes_that_help_are_kept() {
+        let (_, found) = find(6, 6, 1.0);
+        assert_eq!((found[1].iterations, found[1].end), (6, StageEnd::Planned));
+    }
+
+    #[test]
+    fn divergence_ends_the_stage_before_it() {
+        let (schedule, found) = find(60, 5, f32::INFINITY);
+        assert_eq!((found[1].iterations, found[1].end), (5, StageEnd::Diverged));
+        let (_, none) = find(60, 0, f32::INFINITY);
+        assert_eq!((none[1].iterations, none[1].end), (0, StageEnd::Diverged));
+        assert_eq!(schedule.decided(&[60, 0]).stages.len(), 1, "a stage of none is left out");
+        assert_eq!(schedule.decided(&[0, 0]).stages.len(), 2, "but not all of them");
+    }
+
+    #[test]
+    fn the_piece_has_the_greatest_contrast_and_lies_inside() {
+        let mut y = Array2::zeros((200, 300));
+        y.slice_mut(s![150.., 250..]).assign(&Array2::from_shape_fn((50, 50), |(i, _)| i as f32));
+        assert_eq!(piece(y.view()), (104..200, 204..300));
+        assert_eq!(piece(Array2::zeros((40, 60)).view()), (0..40, 0..60));
+    }
+}

@@ -1,0 +1,124 @@
+//! The pilot of a job: which of its planned iterations pay, decided once for all its tiles.
+
+use serde::{Deserialize, Serialize};
+
+use super::manifest::full_schedule;
+use super::network::WarmNetworks;
+use super::prepare::{Prepared, plane, to_record};
+use super::solve::TileInput;
+use super::task::{Shared, TaskError};
+use super::tile::{TaskObserver, window};
+use crate::formats::Limits;
+use crate::formats::planar::Reader;
+use crate::job::{PriorSpec, ScheduleSpec, StageSpec, TaskProgress};
+use crate::recon::ReconError;
+use crate::recon::denoise::Networks;
+use crate::recon::gap::Observer;
+use crate::recon::pilot::{self, StageFinding};
+use crate::recon::schedule::Schedule;
+use crate::store::{ClaimedTask, Completion, Product};
+
+/// What the pilot found, as it stands in manifests.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PilotRecord {
+    /// The snapshot, from 0.
+    pub snapshot: usize,
+    /// First row of the piece.
+    pub row: usize,
+    /// First column.
+    pub column: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// The stages of the schedule that was asked for.
+    pub stages: Vec<StageRecord>,
+}
+
+/// What was found out about a stage.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StageRecord {
+    /// Its prior.
+    pub prior: PriorSpec,
+    /// The most iterations that might have been.
+    pub planned: usize,
+    /// Those that pay.
+    pub iterations: usize,
+    /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
+    pub end: String,
+    /// Error at the held-out pixels before the stage, relative to the measurement.
+    pub error_before: f64,
+    /// The same after its iterations.
+    pub error_after: f64,
+}
+
+impl PilotRecord {
+    /// The record of the job's pilot; none before it, and for a job without one.
+    pub(super) fn of(task: &ClaimedTask) -> Result<Option<Self>, TaskError> {
+        let record = |error: serde_json::Error| TaskError::Record {
+            what: "pilot",
+            problem: error.to_string(),
+        };
+        let pilot = task.pilot.clone().map(serde_json::from_value::<Option<Self>>);
+        Ok(pilot.transpose().map_err(record)?.flatten())
+    }
+
+    /// The schedule for the tiles.
+    pub fn decide(&self, schedule: &Schedule) -> Schedule {
+        let iterations: Vec<usize> = self.stages.iter().map(|stage| stage.iterations).collect();
+        schedule.decided(&iterations)
+    }
+}
+
+/// The task of the pilot, on the first snapshot of the job.
+pub(super) fn run(
+    task: &ClaimedTask,
+    engine: &mut WarmNetworks,
+    shared: &Shared,
+) -> Result<Completion, TaskError> {
+    let snapshot = task.spec.snapshots.first as usize;
+    let y = plane(&Reader::open(&task.snapshots, &Limits::default())?, snapshot)?;
+    let (rows, columns) = pilot::piece(y.view());
+    let place = (snapshot, rows.start, columns.start);
+    let input = window(task, snapshot, (rows, columns), Prepared::of(task)?.white)?;
+    let spec = &task.spec.schedule;
+    let schedule = spec.to_schedule()?;
+    let mut observer = TaskObserver::new(shared, spec.clone());
+    let record = decide(input, place, &schedule, engine, &mut observer)?;
+    let decided = full_schedule(spec, record.as_ref())?;
+    let share = decided.planned_ns_per_voxel() / spec.planned_ns_per_voxel();
+    let progress = TaskProgress { fraction: 1.0, ..shared.progress() };
+    Ok(Completion { progress, record: to_record(&record)?, product: Product::TileCost(share) })
+}
+
+/// Runs the pilot of an adaptive schedule on a piece of a snapshot; none for a schedule that is
+/// fixed, or a piece that no light reaches.
+///
+/// # Errors
+/// As [`pilot::run`].
+pub fn decide(
+    input: TileInput,
+    (snapshot, row, column): (usize, usize, usize),
+    schedule: &Schedule,
+    networks: &mut dyn Networks,
+    observer: &mut dyn Observer,
+) -> Result<Option<PilotRecord>, ReconError> {
+    if !schedule.adaptive {
+        return Ok(None);
+    }
+    let (height, width) = input.measurement.dim();
+    let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
+    let op = op.with_gamma(schedule.gamma)?;
+    let findings = pilot::run(op, y.view(), schedule, networks, observer)?;
+    let record = |(stage, finding): (&StageSpec, StageFinding)| StageRecord {
+        prior: stage.prior,
+        planned: stage.iterations,
+        iterations: finding.iterations,
+        end: finding.end.name().into(),
+        error_before: finding.before,
+        error_after: finding.after,
+    };
+    let spec = ScheduleSpec::from(schedule);
+    let stages = spec.stages.iter().zip(findings).map(record).collect();
+    Ok(Some(PilotRecord { snapshot, row, column, height, width, stages }))
+}

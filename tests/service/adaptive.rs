@@ -1,0 +1,45 @@
+//! Schedules that find out for themselves how far to go.
+
+use serde_json::{Value, json};
+
+use crate::app::TestApp;
+use crate::faults::results;
+use crate::samples::Scene;
+
+#[tokio::test]
+async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let adaptive = json!({"adaptive": true, "stages": [
+        {"prior": "tv", "iterations": 20, "tv_weight": 0.1},
+        {"prior": "nonlocal", "iterations": 40, "sigma": [0.2, 0.02], "memory": 0.6},
+    ]});
+    let (first, content) = run(&app, &measurement, &adaptive).await;
+    let stages = content["pilot"]["stages"].as_array().unwrap();
+    assert_eq!((&stages[0]["end"], &stages[0]["iterations"]), (&json!("fixed"), &json!(20)));
+    let paid = stages[1]["iterations"].as_u64().unwrap();
+    assert!((1..=40).contains(&paid), "{stages:#?}");
+    assert!(stages[0]["error_after"].as_f64() < stages[0]["error_before"].as_f64());
+    let decided = &content["schedule"];
+    assert_eq!(decided["adaptive"], false);
+    assert_eq!(decided["stages"][1]["iterations"], paid);
+
+    let (second, content) = run(&app, &measurement, decided).await;
+    assert_eq!(content["pilot"], Value::Null);
+    assert!(first == second, "the schedule in the manifest gives the same frames");
+}
+
+/// The hashes of all result files, and what the job's manifest says of its content.
+async fn run(
+    app: &TestApp,
+    measurement: &str,
+    schedule: &Value,
+) -> (std::collections::BTreeMap<String, String>, Value) {
+    let body = json!({"measurement": measurement, "algorithm": "pnp-nonlocal",
+        "schedule": schedule, "tile": {"size": 32, "overlap": 8}});
+    let job = app.submit(&body).await;
+    let ended = app.ended(&job).await;
+    assert_eq!(ended["state"], "succeeded", "{ended:#}");
+    let manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    (results(app, &job).await, manifest["content"].clone())
+}
