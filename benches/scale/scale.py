@@ -79,6 +79,7 @@ def main():
     p.add_argument('--size', type=int, default=3200)
     p.add_argument('--frames', type=int, default=10)
     p.add_argument('--algorithm', default='gap-tv')
+    p.add_argument('--schedule', help='a schedule as JSON [default: the algorithm\'s own]')
     p.add_argument('--workers', type=int, default=2)
     p.add_argument('--tile', type=int, help='tile size [default: the service\'s]')
     p.add_argument('--overlap', type=int, default=32)
@@ -111,6 +112,8 @@ def main():
         measurement = service.call('POST', '/v1/measurements', {'calibration': calibration, 'data': measured})['id']
         lap('calibration and check')
         wanted = {'measurement': measurement, 'algorithm': a.algorithm}
+        if a.schedule:
+            wanted['schedule'] = json.loads(pathlib.Path(a.schedule).read_text())
         if a.tile:
             wanted['tile'] = {'size': a.tile, 'overlap': a.overlap}
         job = service.call('POST', '/v1/jobs', wanted)['id']

@@ -11,7 +11,7 @@ use rustix::process::{Resource, Rlimit};
 
 use super::CliError;
 use super::arguments::EngineArguments;
-use crate::job::{ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
+use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use crate::recon::ReconError;
 use crate::recon::learned::{PictureSize, SnapshotNetwork, TensorInfo};
 use crate::recon::tile::TilePlan;
@@ -98,7 +98,7 @@ fn tensor(TensorInfo { name, sides, .. }: TensorInfo) -> ModelTensor {
 
 /// The size of the tiles of a job that names none.
 fn first_tile(height: usize, width: usize) -> Result<(usize, usize), ReconError> {
-    let TileSpec { size, overlap } = TileSpec::default();
+    let TileSpec { size, overlap } = Algorithm::Learned.default_tile();
     let tile = TilePlan::new(height, width, size, overlap)?.tile(0);
     Ok(tile.map_or((height, width), |tile| (tile.height, tile.width)))
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::CliError;
-use crate::job::TileSpec;
+use crate::job::{Algorithm, TileSpec};
 use crate::recon::learned::{Interface, PictureSize};
 use crate::recon::tile::TilePlan;
 use crate::work::manifest::ModelRecord;
@@ -45,18 +45,20 @@ impl Learned {
     }
 }
 
-/// How masks of frames x rows x columns are cut: as asked for, else as the network wants it.
+/// How masks of frames x rows x columns are cut: as asked for, else as the algorithm or the network
+/// wants it.
 ///
 /// # Errors
 /// Tiles that can't be, or that the network does not take.
 pub(super) fn plan(
+    algorithm: Algorithm,
     (tile, overlap): (Option<usize>, Option<usize>),
     model: Option<&Learned>,
     dim: (usize, usize, usize),
 ) -> Result<TilePlan, CliError> {
     let (_, height, width) = dim;
     let fixed = model.map(|model| model.size(dim)).transpose()? == Some(PictureSize::Fixed);
-    let usual = if fixed { TileSpec::whole(height, width) } else { TileSpec::default() };
+    let usual = if fixed { TileSpec::whole(height, width) } else { algorithm.default_tile() };
     let (size, overlap) = (tile.unwrap_or(usual.size), overlap.unwrap_or(usual.overlap));
     let plan = TilePlan::new(height, width, size, overlap)?;
     if fixed && plan.len() > 1 {

@@ -77,11 +77,12 @@ pub struct Arguments {
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels [default: 256; the whole picture for a network that takes
-    /// no other].
+    /// Largest side of a tile, in pixels [default: 256, 384 for gap-tv and admm-tv; the whole picture
+    /// for a network that takes no other].
     #[arg(long, value_name = "PIXELS")]
     tile: Option<usize>,
-    /// Least overlap of neighbouring tiles, in pixels [default: 32, or 0 for the whole picture].
+    /// Least overlap of neighbouring tiles, in pixels [default: 32, 16 for gap-tv and admm-tv, or 0
+    /// for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
     /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json.
@@ -132,7 +133,12 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         algorithm: arguments.schedule.algorithm,
         schedule,
         snapshot: arguments.snapshot,
-        plan: plan((arguments.tile, arguments.overlap), model.as_ref(), input.masks.array.dim())?,
+        plan: plan(
+            arguments.schedule.algorithm,
+            (arguments.tile, arguments.overlap),
+            model.as_ref(),
+            input.masks.array.dim(),
+        )?,
         network,
         model,
         threads: arguments.threads.map_or(cores, usize::from),

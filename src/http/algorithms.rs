@@ -37,7 +37,7 @@ pub(super) async fn list() -> Json<ListBody> {
             planned_iterations: schedule.planned_iterations(),
             planned_passes: schedule.planned_passes(),
             schedule,
-            tile: TileSpec::default(),
+            tile: name.default_tile(),
         }
     };
     Json(ListBody { items: Algorithm::ALL.map(show).into() })

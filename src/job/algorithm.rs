@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::request::TileSpec;
 use super::schedule::{PriorSpec, ScheduleSpec};
 use crate::recon::schedule::Schedule;
 
@@ -95,6 +96,16 @@ impl Algorithm {
             Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
             Self::Learned => return ScheduleSpec::without_stages(),
         })
+    }
+
+    /// The tiles of a job that names none. Total variation is as fast on larger ones, which share less;
+    /// a network's memory grows with them.
+    #[must_use]
+    pub fn default_tile(self) -> TileSpec {
+        match self {
+            Self::GapTv | Self::AdmmTv => TileSpec { size: 384, overlap: 16 },
+            _ => TileSpec { size: 256, overlap: 32 },
+        }
     }
 
     /// The priors that a schedule of this algorithm may name.

@@ -138,6 +138,6 @@ impl ModelChoice<'_> {
     pub(super) fn tile(&self, shape: SceneShape) -> TileSpec {
         let whole = TileSpec::whole(shape.height, shape.width);
         let fixed = self.model.is_some_and(|model| model.fixed_size);
-        self.tile.unwrap_or_else(|| if fixed { whole } else { TileSpec::default() })
+        self.tile.unwrap_or_else(|| if fixed { whole } else { self.algorithm.default_tile() })
     }
 }

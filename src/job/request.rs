@@ -114,12 +114,6 @@ pub struct TileSpec {
     pub overlap: usize,
 }
 
-impl Default for TileSpec {
-    fn default() -> Self {
-        Self { size: 256, overlap: 32 }
-    }
-}
-
 impl TileSpec {
     /// One tile for the whole of a picture.
     #[must_use]
@@ -161,8 +155,8 @@ pub struct JobRequest {
     /// The schedule; the algorithm's own where it is left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub schedule: Option<ScheduleSpec>,
-    /// The tiles; 256 with 32 shared where it is left out, or the whole picture for a network that
-    /// takes no other.
+    /// The tiles; [`Algorithm::default_tile`] where it is left out, or the whole picture for a network
+    /// that takes no other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
     /// Jobs of higher priority are served first; from -100 to 100.
@@ -313,7 +307,7 @@ impl JobSpec {
 #[cfg(test)]
 mod tests {
     use super::{JobRequest, SceneShape, SnapshotRange};
-    use crate::job::{CalibrationId, MeasurementId};
+    use crate::job::{Algorithm, CalibrationId, MeasurementId};
     use serde_json::{Value, json};
 
     const SHAPE: SceneShape = SceneShape { frames: 8, height: 256, width: 300, snapshots: 6 };
@@ -336,7 +330,10 @@ mod tests {
         let spec = request(json!({})).unwrap().resolve(calibration, SHAPE, None).unwrap();
         assert_eq!(spec.snapshots, SnapshotRange { first: 0, count: 6 });
         assert_eq!(spec.calibration, calibration);
-        assert_eq!(spec.tile_plan().unwrap().len(), 2);
+        assert_eq!(
+            (spec.tile_plan().unwrap().len(), spec.tile),
+            (1, Algorithm::GapTv.default_tile())
+        );
         assert!(!spec.schedule.needs_network());
     }
 

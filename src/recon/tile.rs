@@ -19,6 +19,9 @@ pub struct Tile {
     pub width: usize,
 }
 
+/// Sides of tiles are multiples of this, where the picture allows it: networks halve them twice.
+const MULTIPLE: usize = 8;
+
 /// How a picture is cut. It depends on the picture's size and the parameters alone, never on
 /// the number of workers.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,8 +42,8 @@ struct Span {
 }
 
 impl TilePlan {
-    /// Cuts `height` x `width` pixels into tiles of at most `size` x `size` that share at least
-    /// `overlap` pixels with each neighbour. A side that fits into one tile is not cut.
+    /// Cuts `height` x `width` pixels into as few tiles of at most `size` x `size` as share at least
+    /// `overlap` pixels with each neighbour, and makes these tiles as small as that allows. A side that fits into one tile is not cut.
     ///
     /// # Errors
     /// `size` below 16 or above 8192, or `overlap` of more than half of `size`.
@@ -141,6 +144,9 @@ impl TilePlan {
 fn spans(length: usize, size: usize, overlap: usize) -> Vec<Span> {
     let size = size.min(length);
     let count = 1 + (length - size).div_ceil((size - overlap.min(size / 2)).max(1));
+    // No more is shared than was asked for: what is shared is computed twice.
+    let least = (length + (count - 1) * overlap).div_ceil(count);
+    let size = least.next_multiple_of(MULTIPLE).min(size);
     let start = |k: usize| if k == 0 { 0 } else { k * (length - size) / (count - 1) };
     let mut spans: Vec<Span> = (0..count)
         .map(|k| {
@@ -213,6 +219,17 @@ mod tests {
                 let shared = pair[0].start + pair[0].weights.len() - pair[1].start;
                 assert!(shared >= 32, "{shared}");
             }
+        }
+    }
+
+    #[test]
+    fn no_more_is_shared_than_was_asked_for() {
+        for (length, size, overlap, count, side) in
+            [(1024, 256, 32, 5, 232), (3200, 256, 32, 15, 248), (3200, 384, 16, 9, 376)]
+        {
+            let plan = TilePlan::new(length, 200, size, overlap).unwrap();
+            let tile = plan.tile(0).unwrap();
+            assert_eq!((plan.len(), tile.height, tile.width), (count, side, 200));
         }
     }
 

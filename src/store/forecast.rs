@@ -20,6 +20,8 @@ pub(super) struct Forecast {
     workers: u32,
     /// Seconds that a planned CPU-second takes.
     rate: f64,
+    /// The same for jobs with tiles that are done: their tiles converge about as early as each other.
+    own_rates: HashMap<JobId, f64>,
     ahead: HashMap<JobId, Ahead>,
 }
 
@@ -33,12 +35,14 @@ struct Ahead {
 }
 
 impl Forecast {
-    /// Seconds until a job ends, at most, of which `left` planned CPU-seconds are left, `longest` of
+    /// Seconds until a job ends, of which `left` planned CPU-seconds are left, `longest` of
     /// them in one task; none if no worker lives.
     pub(super) fn eta_seconds(&self, job: JobId, left: f64, longest: f64) -> Option<f64> {
         let workers = f64::from(self.workers);
-        let work = left + self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
-        let seconds = self.rate * (work / workers + (1.0 - 1.0 / workers) * longest);
+        let ahead = self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
+        let own = self.own_rates.get(&job).unwrap_or(&self.rate);
+        let seconds =
+            self.rate * ahead / workers + own * (left / workers + (1.0 - 1.0 / workers) * longest);
         (self.workers > 0).then_some(seconds)
     }
 
@@ -71,7 +75,22 @@ impl Store {
         }
         let workers = self.live_workers(WORKER_AGE).await?.len();
         let workers = u32::try_from(workers).unwrap_or(u32::MAX);
-        Ok(Some(Forecast { workers, rate: self.seconds_per_cost().await?, ahead }))
+        let (rate, own_rates) = (self.seconds_per_cost().await?, self.own_rates().await?);
+        Ok(Some(Forecast { workers, rate, own_rates, ahead }))
+    }
+
+    /// Seconds that a planned CPU-second of a tile has taken in each job that runs, what converged
+    /// early included.
+    async fn own_rates(&self) -> Result<HashMap<JobId, f64>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT job, sum(seconds) / sum(cost) AS rate FROM tasks
+             WHERE job IN (SELECT id FROM jobs WHERE state = 'running')
+               AND kind = 'tile' AND state = 'done' AND seconds > 0
+             GROUP BY job HAVING sum(cost) > 0",
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        rows.iter().map(|row| Ok((parsed(row, "job")?, row.try_get("rate")?))).collect()
     }
 
     /// Seconds that a planned CPU-second takes on this machine: measured on the last tiles done, by

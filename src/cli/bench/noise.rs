@@ -179,7 +179,7 @@ impl Bench<'_> {
         truth: ndarray::ArrayView3<'_, f32>,
     ) -> Result<f64, CliError> {
         let (frames, height, width) = truth.dim();
-        let TileSpec { size, overlap } = TileSpec::default();
+        let TileSpec { size, overlap } = Algorithm::GapTv.default_tile();
         let plan = TilePlan::new(height, width, size.max(overlap * 2), overlap)?;
         let input = SnapshotInput {
             snapshot: 0,

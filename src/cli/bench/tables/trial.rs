@@ -111,7 +111,7 @@ impl Bench {
         let (compression_ratio, scale, _) = snapshot.masks.dim();
         let schedule = algorithm.default_schedule();
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned);
-        let plan = plan((None, None), learned, snapshot.masks.dim())?;
+        let plan = plan(algorithm, (None, None), learned, snapshot.masks.dim())?;
         let deep = learned.is_some() || schedule.needs_network();
         let mut models = ModelRecord::of(&schedule);
         models.extend(learned.map(Learned::record));
