@@ -25,6 +25,15 @@ pub(super) struct Forecast {
     ahead: HashMap<JobId, Ahead>,
 }
 
+/// Planned CPU-seconds that are left of some tasks of a job.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Left {
+    /// Of all of them.
+    pub(super) sum: f64,
+    /// Of the one that has most left.
+    pub(super) longest: f64,
+}
+
 /// What is served before a job.
 #[derive(Debug, Clone, Copy)]
 struct Ahead {
@@ -35,14 +44,15 @@ struct Ahead {
 }
 
 impl Forecast {
-    /// Seconds until a job ends, of which `left` planned CPU-seconds are left, `longest` of
-    /// them in one task; none if no worker lives.
-    pub(super) fn eta_seconds(&self, job: JobId, left: f64, longest: f64) -> Option<f64> {
+    /// Seconds until a job ends, of whose tiles and other tasks so much is left; none if no worker
+    /// lives.
+    pub(super) fn eta_seconds(&self, job: JobId, tiles: Left, others: Left) -> Option<f64> {
         let workers = f64::from(self.workers);
         let ahead = self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
         let own = self.own_rates.get(&job).unwrap_or(&self.rate);
-        let seconds =
-            self.rate * ahead / workers + own * (left / workers + (1.0 - 1.0 / workers) * longest);
+        let left = self.rate * (ahead + others.sum) + own * tiles.sum;
+        let longest = (self.rate * others.longest).max(own * tiles.longest);
+        let seconds = left / workers + (1.0 - 1.0 / workers) * longest;
         (self.workers > 0).then_some(seconds)
     }
 

@@ -1,8 +1,7 @@
 //! How far jobs are and how long they may still take, from what their tasks have reported.
 //!
-//! All shares are by planned cost. The time left is an upper bound in the sense of Graham: `m`
-//! workers need at most `work / m + (1 - 1/m) * longest task`, with all stages at their most
-//! iterations; it shrinks when the solver converges early.
+//! All shares are by planned cost. For the time left, `m` workers need at most `work / m + (1 - 1/m) *
+//! longest task` (Graham); tiles are taken to cost what those of the same job that are done did.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -12,7 +11,7 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::error::StoreError;
-use super::forecast::Forecast;
+use super::forecast::{Forecast, Left};
 use super::rows::{number, parsed};
 use super::{Job, Store};
 use crate::job::{JobId, JobState};
@@ -44,7 +43,7 @@ pub struct JobProgress {
     pub stage: ProgressStage,
     /// The share of the planned cost that is behind it, in percent.
     pub percent: f64,
-    /// Seconds until it ends, at most; none if it has ended or no worker lives.
+    /// Seconds until it ends; none if it has ended or no worker lives.
     pub eta_seconds: Option<f64>,
     /// Its place among the jobs that wait, from 1 for the next to be taken up; none if it does not
     /// wait.
@@ -103,7 +102,10 @@ impl Store {
             "SELECT job, sum(cost) AS cost,
                  sum(CASE state WHEN 'done' THEN cost WHEN 'running' THEN cost * fraction
                                 ELSE 0.0 END) AS cost_done,
-                 max(CASE state WHEN 'done' THEN 0.0 ELSE cost * (1 - fraction) END) AS longest,
+                 sum(left) FILTER (WHERE kind = 'tile') AS tiles_left,
+                 max(left) FILTER (WHERE kind = 'tile') AS tiles_longest,
+                 sum(left) FILTER (WHERE kind <> 'tile') AS others_left,
+                 max(left) FILTER (WHERE kind <> 'tile') AS others_longest,
                  count(*) FILTER (WHERE kind = 'tile') AS tiles_total,
                  count(*) FILTER (WHERE kind = 'tile' AND state = 'done') AS tiles_done,
                  count(*) FILTER (WHERE kind = 'tile' AND state = 'running') AS tiles_running,
@@ -113,7 +115,9 @@ impl Store {
                  count(*) FILTER (WHERE state = 'running' AND stage = 'deep') AS deep,
                  count(*) FILTER (WHERE state = 'running' AND stage = 'nonlocal') AS nonlocal,
                  sum(iterations) AS iterations, sum(passes) AS passes
-             FROM tasks WHERE job IN (SELECT value FROM json_each(?)) GROUP BY job",
+             FROM (SELECT *, CASE state WHEN 'done' THEN 0.0 ELSE cost * (1 - fraction) END AS left
+                   FROM tasks WHERE job IN (SELECT value FROM json_each(?)))
+             GROUP BY job",
         )
         .bind(Value::from(ids).to_string())
         .fetch_all(&self.readers)
@@ -181,10 +185,13 @@ fn progress(
     forecast: Option<&Forecast>,
 ) -> Result<JobProgress, StoreError> {
     let (cost, done): (f64, f64) = (row.try_get("cost")?, row.try_get("cost_done")?);
-    let longest: f64 = row.try_get("longest")?;
+    let left = |sum, longest| -> Result<Left, StoreError> {
+        Ok(Left { sum: row.try_get(sum)?, longest: row.try_get(longest)? })
+    };
+    let (tiles, others) =
+        (left("tiles_left", "tiles_longest")?, left("others_left", "others_longest")?);
     let forecast = forecast.filter(|_| has_eta(job.state));
-    let left = (cost - done).max(0.0);
-    let eta = forecast.and_then(|forecast| forecast.eta_seconds(job.id, left, longest));
+    let eta = forecast.and_then(|forecast| forecast.eta_seconds(job.id, tiles, others));
     let share = if cost > 0.0 { done / cost } else { 0.0 };
     Ok(JobProgress {
         stage: stage(job.state, row)?,
