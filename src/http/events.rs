@@ -76,7 +76,11 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
         }
         // A failing database shows in every other answer, too.
         let Ok(now) = store.job_marks().await else { continue };
-        let changes = before.as_ref().map(|before| changes(before, &now)).unwrap_or_default();
+        let changes = match &before {
+            Some(before) => changes(before, &now),
+            // What changed between the greeting and this first look is not known.
+            None => everything(&now),
+        };
         if !changes.is_empty() {
             // Fails only if the last listener has just gone.
             let _ = sender.send(changes.into());
@@ -98,6 +102,13 @@ fn changes(before: &Marks, now: &Marks) -> HashMap<Lab, String> {
         Some((lab.clone(), serde_json::to_string(&change.cut()).ok()?))
     };
     changes.into_iter().filter_map(text).collect()
+}
+
+/// Has every lab that has jobs read its list again.
+fn everything(now: &Marks) -> HashMap<Lab, String> {
+    let all = Change { more: true, ..Change::default() };
+    let text = serde_json::to_string(&all).unwrap_or_default();
+    now.keys().map(|(lab, _)| (lab.clone(), text.clone())).collect()
 }
 
 impl Change {

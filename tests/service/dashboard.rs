@@ -88,6 +88,20 @@ async fn waiting_jobs_know_their_place_and_are_found_by_a_part_of_their_name() {
 }
 
 #[tokio::test]
+async fn the_first_listener_is_told_to_read_again_after_the_first_look() {
+    let app = TestApp::start().await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    let mut stream = app.request(Method::GET, "/v1/events").send().await.unwrap().bytes_stream();
+    let mut text = String::new();
+    // A change between the greeting and the first look would be lost otherwise.
+    while !text.contains(r#"{"changed":[],"deleted":[],"more":true}"#) {
+        text += std::str::from_utf8(&stream.next().await.unwrap().unwrap()).unwrap();
+        assert!(text.len() < 10_000, "{text}");
+    }
+}
+
+#[tokio::test]
 async fn listeners_hear_of_changes_and_do_not_hold_up_a_stop() {
     let mut app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
