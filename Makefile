@@ -40,7 +40,7 @@ load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once
 	$(PYTHON) scripts/figures.py load \
 		$(CARGO) test --release --test service -- --nocapture --ignored --test-threads 1 load::
 
-fuzz: ## every decoder for SECONDS seconds; needs cargo install cargo-fuzz
+fuzz: ## every decoder for SECONDS seconds of CPU; needs cargo install cargo-fuzz
 	$(PYTHON) scripts/fuzz.py $(SECONDS)
 SECONDS ?= 60
 

@@ -124,13 +124,14 @@ class Program:
         return [f'--{name}={folder}/{name}.npy' for name in ('masks', 'measurement', 'truth')]
 
     def defaults(self, algorithm, models, frames):
-        """The schedule and the models of an algorithm, as the manifest of a small snapshot tells them."""
+        """The schedule of an algorithm, and its models as the manifest of a small snapshot tells them."""
+        schedule = json.loads(self.run('schedule', '--algorithm', algorithm))
         with tempfile.TemporaryDirectory() as folder:
             inputs = self.simulate(middle(frames, 8, 64), Setting('any', 'iid', 8), folder)
             self.run('reconstruct', *inputs, *models, '--algorithm', algorithm, '--threads', 1, '--out', f'{folder}/result')
             with open(f'{folder}/result/manifest.json') as f:
                 content = json.load(f)['content']
-        return content['schedule'], content['models']
+        return schedule, content['models']
 
 
 @dataclasses.dataclass
@@ -155,14 +156,14 @@ def exported(checkpoint, out):
 
 
 def ways(program, a, frames, folder):
-    """Name -> Way. The deep stage of the default schedule, without what follows it, is what networks are compared in."""
+    """Name -> Way. The deep stage of the default schedule, without what follows it and with all its iterations, is what networks are compared in."""
     own = ['--models', a.models] if a.models else []
     white = exported(a.white, a.out)
     default, _ = program.defaults(DEFAULT, own, frames)
     deep = [i for i, stage in enumerate(default['stages']) if stage['prior'].endswith('fastdvdnet')]
     if not deep:
         raise SystemExit(f'the schedule of {DEFAULT} has no stage of the network')
-    short = {**default, 'stages': default['stages'][:deep[-1] + 1]}
+    short = {**default, 'adaptive': False, 'stages': default['stages'][:deep[-1] + 1]}
     twice = json.loads(json.dumps(short))
     for i in deep:
         twice['stages'][i]['iterations'] *= 2

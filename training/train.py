@@ -4,6 +4,7 @@
     python train.py --data DATA --out run/full.pt  --stage full   --minutes 45 --init run/block.pt      # both blocks jointly
     python train.py --data DATA --out run/loop.pt  --stage loop   --minutes 90 --init run/full.pt       # half white noise, half solver iterates
     python train.py --data DATA --out run/ffdnet.pt --stage ffdnet --minutes 45
+    python train.py --data DATA --out run/ff-loop.pt --stage ffdnet-loop --minutes 45 --init run/ffdnet.pt                # as loop
 
 The checkpoint at --out holds everything: the same command again continues where it stood. --minutes counts training time over all runs.
 """
@@ -25,7 +26,8 @@ import model
 import solver
 from data import Footage
 
-FRAMES = {'block': 3, 'full': 5, 'loop': 5, 'ffdnet': 1}
+# What a stage trains, and the frames that its network looks at.
+STAGES = {'block': ('block', 3), 'full': ('fastdvdnet', 5), 'loop': ('fastdvdnet', 5), 'ffdnet': ('ffdnet', 1), 'ffdnet-loop': ('ffdnet', 1)}
 
 
 # ---------------------------------------------------------------- producers
@@ -98,7 +100,7 @@ def rms_error(output, truth):
 
 def predict(net, stage, x, sigma):
     """The output and the frames of x that it stands for."""
-    if stage == 'loop' or stage == 'ffdnet':
+    if 'loop' in stage or stage == 'ffdnet':
         return net.clips(x, sigma), slice(None)
     return evaluate.denoise(net, x, sigma), slice(x.shape[1] // 2, x.shape[1] // 2 + 1)
 
@@ -106,7 +108,7 @@ def predict(net, stage, x, sigma):
 class Training:
     def __init__(self, a, device):
         self.a, self.device = a, device
-        self.net = model.KINDS[{'full': 'fastdvdnet', 'loop': 'fastdvdnet'}.get(a.stage, a.stage)]()
+        self.net = model.KINDS[STAGES[a.stage][0]]()
         self.step, self.seconds = 0, 0.
         state = torch.load(a.out, map_location='cpu', weights_only=True) if os.path.exists(a.out) else None
         if state:
@@ -216,7 +218,7 @@ def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--data', required=True)
     p.add_argument('--out', required=True)
-    p.add_argument('--stage', choices=FRAMES, required=True)
+    p.add_argument('--stage', choices=STAGES, required=True)
     p.add_argument('--init', help='weights to start from: a checkpoint, or a folder with exported ONNX files')
     p.add_argument('--minutes', type=float, default=45, help='training time over all runs; the learning rate falls to its end')
     p.add_argument('--run-minutes', type=float, default=math.inf, help='stop this run after so many minutes')
@@ -224,7 +226,7 @@ def main():
     p.add_argument('--frames', type=int, default=0, help='frames a batch (default: 16 on a CPU, 384 on a GPU)')
     p.add_argument('--crop', type=int, default=64)
     p.add_argument('--lr', type=float, default=2e-4)
-    p.add_argument('--runs', type=int, default=12, help='solver runs that stand open in stage loop')
+    p.add_argument('--runs', type=int, default=12, help='solver runs that stand open in the loop stages')
     p.add_argument('--workers', type=int, default=1, help='producer processes of each kind')
     p.add_argument('--threads', type=int, default=1)
     p.add_argument('--scene', help='a .mat scene that evaluation also runs')
@@ -236,13 +238,13 @@ def main():
 
     t = Training(a, device)
     count = a.frames or (384 if device == 'cuda' else 16)
-    frames = FRAMES[a.stage]
+    frames = STAGES[a.stage][1]
     clips = start_producers(produce_clips, a.workers, a.data, max(1, count // frames), frames, a.crop)
     loop, scenes = None, None
-    if a.stage == 'loop':
+    if 'loop' in a.stage:
         snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop)
         loop = Iterates(snapshots, device, a.runs)
-    if a.stage in ('loop', 'full', 'ffdnet'):
+    if a.stage != 'block':
         scenes = evaluate.LoopScenes(a.data, a.scene, device=device)
         print('TV', json.dumps(scenes.tv()), flush=True)
 

@@ -117,10 +117,12 @@ def main():
         if a.tile:
             wanted['tile'] = {'size': a.tile, 'overlap': a.overlap}
         job = service.call('POST', '/v1/jobs', wanted)['id']
-        started, promise, report = time.monotonic(), None, 0
+        started, promise, preview, report = time.monotonic(), None, None, 0
         while (state := service.call('GET', f'/v1/jobs/{job}'))['state'] in ('queued', 'running'):
             service.look()
             elapsed, eta = time.monotonic() - started, state['progress']['eta_seconds']
+            if preview is None and state['progress']['previews_done']:
+                preview = round(elapsed, 1)
             if promise is None and eta is not None and elapsed > min(60, 5 + .05 * eta):
                 promise = (elapsed, eta)
             if elapsed > report:
@@ -141,7 +143,7 @@ def main():
         print(json.dumps({
             'target': 'bench-scale', 'size': a.size, 'frames': a.frames, 'algorithm': a.algorithm, 'workers': a.workers, 'device': a.device,
             'seconds': seconds, 'run': manifest['run'], 'memory_bytes': memory, 'memory_sum_bytes': sum(memory.values()),
-            'promised_seconds': promise and round(sum(promise), 1), 'true_seconds': round(total, 1), 'disk_bytes': disk,
+            'preview_seconds': preview, 'promised_seconds': promise and round(sum(promise), 1), 'true_seconds': round(total, 1), 'disk_bytes': disk,
             'psnr_db': round(psnr_by_frame(result, truth), 3)}))
     finally:
         service.process.terminate()

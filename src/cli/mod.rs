@@ -18,6 +18,7 @@ pub mod check_model;
 pub mod demo;
 pub mod optics;
 pub mod reconstruct;
+pub mod schedule;
 pub mod serve;
 pub mod simulate;
 pub mod token;

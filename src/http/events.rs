@@ -3,7 +3,7 @@
 //! Workers are other processes, so the server looks at the database once a second, as long as
 //! somebody listens, and compares what it sees with what it saw before.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
@@ -98,17 +98,19 @@ fn changes(before: &Marks, now: &Marks) -> HashMap<Lab, String> {
     for (lab, job) in before.keys().filter(|id| !now.contains_key(id)) {
         changes.entry(lab).or_default().deleted.push(*job);
     }
-    let text = |(lab, change): (&Lab, Change)| {
-        Some((lab.clone(), serde_json::to_string(&change.cut()).ok()?))
-    };
-    changes.into_iter().filter_map(text).collect()
+    told(changes.into_iter().map(|(lab, change)| (lab, change.cut())))
 }
 
 /// Has every lab that has jobs read its list again.
 fn everything(now: &Marks) -> HashMap<Lab, String> {
-    let all = Change { more: true, ..Change::default() };
-    let text = serde_json::to_string(&all).unwrap_or_default();
-    now.keys().map(|(lab, _)| (lab.clone(), text.clone())).collect()
+    let labs: HashSet<&Lab> = now.keys().map(|(lab, _)| lab).collect();
+    told(labs.into_iter().map(|lab| (lab, Change { more: true, ..Change::default() })))
+}
+
+fn told<'a>(changes: impl Iterator<Item = (&'a Lab, Change)>) -> HashMap<Lab, String> {
+    let text =
+        |(lab, change): (&Lab, Change)| Some((lab.clone(), serde_json::to_string(&change).ok()?));
+    changes.filter_map(text).collect()
 }
 
 impl Change {

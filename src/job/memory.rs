@@ -2,6 +2,7 @@
 
 use super::schedule::{MethodSpec, PriorSpec};
 use super::{JobModel, JobSpec};
+use crate::recon::preview;
 
 /// The program, its thread stacks and, with the deep denoiser, ONNX Runtime and the network.
 const BASE_BYTES: u64 = 128 << 20;
@@ -34,9 +35,16 @@ impl JobSpec {
         }
     }
 
-    /// An upper bound of the resident memory, in bytes, of a worker that does a tile of this job.
+    /// An upper bound of the resident memory, in bytes, of a worker that does any task of this job.
     #[must_use]
     pub fn worker_bytes(&self) -> u64 {
+        // A preview by blocks takes far less than a tile.
+        let voxels = self.shape.height * self.shape.width * self.shape.frames;
+        let whole = if voxels <= preview::WHOLE { voxels as u64 } else { 0 };
+        self.tile_bytes().max(BASE_BYTES + whole * SOLVER_BYTES_PER_VOXEL)
+    }
+
+    fn tile_bytes(&self) -> u64 {
         let side = |length: usize| length.min(self.tile.size) as u64;
         let pixels = side(self.shape.height) * side(self.shape.width);
         let voxels = pixels * self.shape.frames as u64;
@@ -67,12 +75,17 @@ impl JobSpec {
 
 #[cfg(test)]
 mod tests {
+    use super::{BASE_BYTES, SOLVER_BYTES_PER_VOXEL};
     use crate::job::{
         Algorithm, CalibrationId, JobSpec, MeasurementId, SceneShape, SnapshotRange, TileSpec,
     };
 
     fn megabytes(algorithm: Algorithm, side: usize, frames: usize) -> u64 {
-        let spec = JobSpec {
+        spec(algorithm, side, frames).worker_bytes() >> 20
+    }
+
+    fn spec(algorithm: Algorithm, side: usize, frames: usize) -> JobSpec {
+        JobSpec {
             calibration: CalibrationId::new(),
             measurement: MeasurementId::new(),
             shape: SceneShape { frames, height: side, width: side, snapshots: 1 },
@@ -84,8 +97,17 @@ mod tests {
             priority: 0,
             label: None,
             warnings: Vec::new(),
-        };
-        spec.worker_bytes() >> 20
+        }
+    }
+
+    #[test]
+    fn a_preview_of_the_whole_picture_may_need_more_than_a_tile() {
+        let small_tiles = TileSpec { size: 64, overlap: 8 };
+        let small = JobSpec { tile: small_tiles, ..spec(Algorithm::GapTv, 900, 10) };
+        let voxels = 900 * 900 * 10;
+        assert_eq!(small.worker_bytes(), BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL);
+        let large = JobSpec { tile: small_tiles, ..spec(Algorithm::GapTv, 1000, 10) };
+        assert!(large.worker_bytes() < small.worker_bytes(), "previews by blocks are small");
     }
 
     #[test]

@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
+use super::change::Change;
 use super::denoise::{Networks, nonlocal::Nonlocal, tv::TotalVariation};
 use super::error::{ReconError, shape_text};
 use super::schedule::{Method, Prior, Schedule, Sigma, Stage};
@@ -14,8 +15,6 @@ use super::sensing::SensingOperator;
 const STRIP_VALUES: usize = 48 * 1024;
 /// Fewer rows would cost more in going from frame to frame than they save.
 const LEAST_ROWS: usize = 16;
-/// Running sums side by side: so many that the compiler keeps them in a loop over registers.
-const LANES: usize = 256;
 
 /// Where a reconstruction stands, after an iteration.
 #[derive(Debug, Clone, Copy)]
@@ -373,48 +372,4 @@ impl<'a> Run<'a> {
         let squares = self.op.project(0..self.y.nrows(), &self.y, None, &self.v, &mut self.x);
         (squares.sqrt() / self.y_norm) as f32
     }
-}
-
-/// Squares of the change and of the new values, added up.
-#[derive(Debug, Default)]
-struct Change {
-    difference: f64,
-    norm: f64,
-}
-
-impl Change {
-    /// Adds rows of frame `k`.
-    fn add(&mut self, new: &Array3<f32>, old: &Array3<f32>, k: usize, rows: Range<usize>) {
-        let width = new.dim().2;
-        let values = rows.start * width..rows.end * width;
-        let (new, old) = (new.index_axis(Axis(0), k), old.index_axis(Axis(0), k));
-        let (Some(new), Some(old)) = (new.to_slice(), old.to_slice()) else {
-            unreachable!("arrays of the solver are in standard layout")
-        };
-        let (difference, norm) = change_sums(&new[values.clone()], &old[values]);
-        self.difference += difference;
-        self.norm += norm;
-    }
-
-    /// `||new - old|| / ||new||`; 0 if nothing changed.
-    fn relative(&self) -> f32 {
-        if self.difference == 0.0 { 0.0 } else { (self.difference / self.norm).sqrt() as f32 }
-    }
-}
-
-/// `(||new - old||^2, ||new||^2)`.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn change_sums(new: &[f32], old: &[f32]) -> (f64, f64) {
-    // Running sums in f32 side by side, added up in f64: vectorises, and is the same on every
-    // machine.
-    let (mut difference, mut norm) = ([0.0f32; LANES], [0.0f32; LANES]);
-    for (new, old) in new.chunks(LANES).zip(old.chunks(LANES)) {
-        let sums = difference.iter_mut().zip(&mut norm);
-        for ((difference, norm), (&new, &old)) in sums.zip(new.iter().zip(old)) {
-            *difference += (new - old) * (new - old);
-            *norm += new * new;
-        }
-    }
-    let total = |sums: [f32; LANES]| sums.iter().copied().map(f64::from).sum();
-    (total(difference), total(norm))
 }

@@ -5,6 +5,7 @@
 //! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes (frame, row, column); frames
 //! and masks live on \[0,1\].
 
+mod change;
 pub mod denoise;
 pub mod error;
 pub mod gap;

@@ -13,8 +13,8 @@ use super::gap;
 use super::schedule::Schedule;
 use super::sensing::SensingOperator;
 
-/// Voxels that total variation does in a second or two; more are done by blocks.
-const WHOLE: usize = 8 << 20;
+/// Voxels that total variation does in a second or two; pictures of more are done by blocks.
+pub const WHOLE: usize = 8 << 20;
 /// Iterations where a picture is done whole.
 const ITERATIONS: usize = 40;
 /// The longer side of a preview by blocks, about.

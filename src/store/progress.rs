@@ -56,7 +56,7 @@ pub struct JobProgress {
     pub tiles_running: u64,
     /// Snapshots that can be downloaded.
     pub snapshots_done: u64,
-    /// Snapshots with a preview that is kept until the job ends.
+    /// Snapshots with a preview; previews go when the job has succeeded.
     pub previews_done: u64,
     /// Solver iterations done, over all tiles and the pilot.
     pub iterations_done: u64,

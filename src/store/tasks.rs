@@ -10,7 +10,7 @@ use super::Store;
 use super::error::StoreError;
 use super::rows::{json as from_json, number, number_if, parsed};
 use crate::job::{JobId, JobSpec, Sha256, TaskId, TaskKind};
-use crate::recon::pilot;
+use crate::recon::{pilot, preview};
 
 /// The stored result of a tile.
 #[derive(Debug, Clone)]
@@ -41,8 +41,9 @@ pub struct TaskRecord {
 /// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
 const READ_S: f64 = 5e-9;
 const WRITE_S: f64 = 150e-9;
-/// CPU-seconds of a preview for each voxel of the snapshot (measured).
-const PREVIEW_S: f64 = 15e-9;
+/// The same of a preview by blocks, and of one that is done whole (measured).
+const PREVIEW_BLOCKS_S: f64 = 9e-9;
+const PREVIEW_WHOLE_S: f64 = 120e-9;
 
 /// Writes the tasks of a job.
 pub(super) async fn insert(
@@ -83,7 +84,8 @@ fn plan(spec: &JobSpec) -> Result<Vec<(TaskKind, f64)>, StoreError> {
     let frames = spec.shape.frames as f64;
     let per_voxel = spec.planned_ns_per_voxel() * 1e-9;
     let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
-    let preview = pixels * frames * PREVIEW_S;
+    let whole = preview::block(spec.shape.frames, spec.shape.height, spec.shape.width) == 1;
+    let preview = pixels * frames * if whole { PREVIEW_WHOLE_S } else { PREVIEW_BLOCKS_S };
     tasks.extend(spec.snapshots.indices().map(|s| (TaskKind::Preview { snapshot: s }, preview)));
     if spec.schedule.adaptive {
         let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;

@@ -18,7 +18,7 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     let stages = content["pilot"]["stages"].as_array().unwrap();
     assert_eq!((&stages[0]["end"], &stages[0]["iterations"]), (&json!("fixed"), &json!(20)));
     let paid = stages[1]["iterations"].as_u64().unwrap();
-    assert!((1..=40).contains(&paid), "{stages:#?}");
+    assert!(paid > 0, "the stage has begun: {stages:#?}");
     assert!(stages[0]["error_after"].as_f64() < stages[0]["error_before"].as_f64());
     let decided = &content["schedule"];
     assert_eq!(decided["adaptive"], false);
@@ -41,5 +41,11 @@ async fn run(
     let ended = app.ended(&job).await;
     assert_eq!(ended["state"], "succeeded", "{ended:#}");
     let manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
-    (results(app, &job).await, manifest["content"].clone())
+    let content = manifest["content"].clone();
+    let stages = content["schedule"]["stages"].as_array().unwrap();
+    let decided: u64 = stages.iter().filter_map(|stage| stage["iterations"].as_u64()).sum();
+    let last = app.get(&format!("/v1/jobs/{job}/snapshots/0/tiles/0/history")).await.expect(200);
+    let last = last.json()["points"].as_array().unwrap().last().unwrap()[0].clone();
+    assert_eq!(last, decided, "the tiles do as many iterations as the schedule says");
+    (results(app, &job).await, content)
 }

@@ -251,6 +251,23 @@ fn a_row_of_the_tables_is_what_reconstruct_gives() {
 }
 
 #[test]
+fn schedules_are_printed_as_they_are_read() {
+    let files = Files::new();
+    let own = sci_recon(&["schedule", "--algorithm", "pnp-nonlocal"]).stdout;
+    std::fs::write(files.path("own.json"), &own).unwrap();
+    let (file, line) = (files.text("own.json"), ["schedule", "--schedule"]);
+    let read = |more: &[&str]| sci_recon(&[&line[..], &[&file], more].concat()).stdout;
+    assert_eq!(read(&["--algorithm", "pnp-nonlocal"]), own);
+    let cut: Value = serde_json::from_slice(&read(&["--iterations", "5"])).unwrap();
+    assert_eq!(
+        (&cut["stages"][0]["prior"], &cut["stages"][0]["iterations"]),
+        (&"tv".into(), &5.into())
+    );
+    let message = refused(&["schedule", "--schedule", &file, "--algorithm", "gap-tv"]);
+    assert!(message.contains("gap-tv has no stages of nonlocal"), "{message}");
+}
+
+#[test]
 fn optics_that_can_not_be_are_refused_at_once() {
     let files = Files::new();
     let optics = files.text("optics.toml");

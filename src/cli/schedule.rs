@@ -1,0 +1,25 @@
+//! `sci-recon schedule`: what an algorithm does by itself, as a file to change.
+
+use clap::Args;
+use serde_json::json;
+
+use super::CliError;
+use super::arguments::ScheduleArguments;
+
+/// Print the schedule of an algorithm as JSON: the start of a file for `reconstruct --schedule`, or
+/// of the field `schedule` of a job. With --schedule it checks a file of your own.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    schedule: ScheduleArguments,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A file that is no schedule, or one that does not fit the algorithm.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+    let schedule = arguments.schedule.resolve()?;
+    println!("{:#}", json!(schedule));
+    Ok(())
+}
