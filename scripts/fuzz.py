@@ -31,7 +31,8 @@ def fuzz(target, seconds):
     found = pathlib.Path("fuzz/target/corpus", target)
     found.mkdir(parents=True, exist_ok=True)
     command = ["cargo", "fuzz", "run", "-s", "none", target, str(found), f"fuzz/corpus/{target}", "--"]
-    command += ["-max_len=8192", "-rss_limit_mb=1024", "-timeout=10"]
+    # The timeout is of the clock, and the machine may be busy.
+    command += ["-max_len=8192", "-rss_limit_mb=1024", "-timeout=60"]
     runs, used, clean = 0, 0.0, True
     while clean and used < seconds:
         before = cpu_seconds()

@@ -17,7 +17,7 @@ use super::gap::{Observer, Run};
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
 
-/// Side of the piece that the pilot is run on: a seventh of a tile of 256.
+/// Side of the piece that the pilot is run on: a tenth of a tile.
 pub const SIDE: usize = 96;
 
 /// The share of pixels that are kept from the solver.

@@ -221,7 +221,7 @@ async fn a_job_that_no_worker_has_the_memory_for_is_refused_with_the_numbers() {
     let mut body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
     let refused = app.post("/v1/jobs", &body).await;
     let detail = refused.problem(422, "invalid_request");
-    assert!(detail.contains("381 MiB") && detail.contains("256x256"), "{detail}");
+    assert!(detail.contains("381 MiB") && detail.contains("320x320"), "{detail}");
     assert_eq!(refused.json()["pointer"], "/tile/size");
     body["algorithm"] = json!("gap-tv");
     app.post("/v1/jobs", &body).await.expect(201);
