@@ -13,13 +13,25 @@ use crate::job::{JobId, JobState};
 /// Workers that were silent for longer do not count.
 const WORKER_AGE: Duration = Duration::from_secs(15);
 
+/// What the last tiles took, and what they spent of the plan: they may converge early.
+const LAST_TILES: &str = "SELECT sum(seconds) AS seconds, sum(spent) AS spent FROM (
+    SELECT seconds, cost * fraction AS spent FROM tasks
+    WHERE state = 'done' AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)";
+/// The same of tasks that mostly read and write.
+const LAST_OTHERS: &str = "SELECT sum(seconds) AS seconds, sum(cost) AS spent FROM (
+    SELECT seconds, cost FROM tasks
+    WHERE state = 'done' AND kind IN ('prepare', 'preview', 'assemble')
+    ORDER BY job DESC, ordinal DESC LIMIT 32)";
+
 /// What is ahead of every unfinished job.
 #[derive(Debug)]
 pub(super) struct Forecast {
     /// Workers that live.
     workers: u32,
-    /// Seconds that a planned CPU-second takes.
+    /// Seconds that a planned CPU-second of a tile takes.
     rate: f64,
+    /// The same of all other tasks: reading and writing are not as fast as computing is.
+    others_rate: f64,
     /// The same for jobs with tiles that are done: their tiles converge about as early as each other.
     own_rates: HashMap<JobId, f64>,
     ahead: HashMap<JobId, Ahead>,
@@ -50,8 +62,8 @@ impl Forecast {
         let workers = f64::from(self.workers);
         let ahead = self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
         let own = self.own_rates.get(&job).unwrap_or(&self.rate);
-        let left = self.rate * (ahead + others.sum) + own * tiles.sum;
-        let longest = (self.rate * others.longest).max(own * tiles.longest);
+        let left = self.rate * ahead + self.others_rate * others.sum + own * tiles.sum;
+        let longest = (self.others_rate * others.longest).max(own * tiles.longest);
         let seconds = left / workers + (1.0 - 1.0 / workers) * longest;
         (self.workers > 0).then_some(seconds)
     }
@@ -85,8 +97,10 @@ impl Store {
         }
         let workers = self.live_workers(WORKER_AGE).await?.len();
         let workers = u32::try_from(workers).unwrap_or(u32::MAX);
-        let (rate, own_rates) = (self.seconds_per_cost().await?, self.own_rates().await?);
-        Ok(Some(Forecast { workers, rate, own_rates, ahead }))
+        let rate = self.seconds_per_cost(LAST_TILES).await?;
+        let others_rate = self.seconds_per_cost(LAST_OTHERS).await?;
+        let own_rates = self.own_rates().await?;
+        Ok(Some(Forecast { workers, rate, others_rate, own_rates, ahead }))
     }
 
     /// Seconds that a planned CPU-second of a tile has taken in each job that runs, what converged
@@ -103,16 +117,10 @@ impl Store {
         rows.iter().map(|row| Ok((parsed(row, "job")?, row.try_get("rate")?))).collect()
     }
 
-    /// Seconds that a planned CPU-second takes on this machine: measured on the last tiles done, by
-    /// what they really did and not by what was planned; 1 before there are any.
-    async fn seconds_per_cost(&self) -> Result<f64, StoreError> {
-        let row = sqlx::query(
-            "SELECT sum(seconds) AS seconds, sum(spent) AS spent FROM (
-                 SELECT seconds, cost * fraction AS spent FROM tasks
-                 WHERE state = 'done' AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)",
-        )
-        .fetch_one(&self.readers)
-        .await?;
+    /// Seconds that a planned CPU-second takes on this machine: measured on tasks that are done, by what
+    /// they really did and not by what was planned; 1 before there are any.
+    async fn seconds_per_cost(&self, of_last_tasks: &'static str) -> Result<f64, StoreError> {
+        let row = sqlx::query(of_last_tasks).fetch_one(&self.readers).await?;
         let seconds: Option<f64> = row.try_get("seconds")?;
         let spent: Option<f64> = row.try_get("spent")?;
         Ok(match (seconds, spent) {

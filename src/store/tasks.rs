@@ -39,10 +39,10 @@ pub struct TaskRecord {
 }
 
 /// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
-const READ_S: f64 = 5e-9;
-const WRITE_S: f64 = 150e-9;
+const READ_S: f64 = 12e-9;
+const WRITE_S: f64 = 110e-9;
 /// The same of a preview by blocks, and of one that is done whole (measured).
-const PREVIEW_BLOCKS_S: f64 = 9e-9;
+const PREVIEW_BLOCKS_S: f64 = 10e-9;
 const PREVIEW_WHOLE_S: f64 = 120e-9;
 
 /// Writes the tasks of a job.
