@@ -123,15 +123,17 @@ class Program:
                  '--noise-sigma', setting.sigma, '--out', folder)
         return [f'--{name}={folder}/{name}.npy' for name in ('masks', 'measurement', 'truth')]
 
-    def defaults(self, algorithm, models, frames):
-        """The schedule of an algorithm, and its models as the manifest of a small snapshot tells them."""
-        schedule = json.loads(self.run('schedule', '--algorithm', algorithm))
+    def schedule(self, algorithm):
+        """The schedule of an algorithm."""
+        return json.loads(self.run('schedule', '--algorithm', algorithm))
+
+    def models(self, algorithm, models, frames):
+        """The models of an algorithm, as the manifest of a small snapshot tells them."""
         with tempfile.TemporaryDirectory() as folder:
             inputs = self.simulate(middle(frames, 8, 64), Setting('any', 'iid', 8), folder)
             self.run('reconstruct', *inputs, *models, '--algorithm', algorithm, '--threads', 1, '--out', f'{folder}/result')
             with open(f'{folder}/result/manifest.json') as f:
-                content = json.load(f)['content']
-        return schedule, content['models']
+                return json.load(f)['content']['models']
 
 
 @dataclasses.dataclass
@@ -159,7 +161,7 @@ def ways(program, a, frames, folder):
     """Name -> Way. The deep stage of the default schedule, without what follows it and with all its iterations, is what networks are compared in."""
     own = ['--models', a.models] if a.models else []
     white = exported(a.white, a.out)
-    default, _ = program.defaults(DEFAULT, own, frames)
+    default = program.schedule(DEFAULT)
     deep = [i for i, stage in enumerate(default['stages']) if stage['prior'].endswith('fastdvdnet')]
     if not deep:
         raise SystemExit(f'the schedule of {DEFAULT} has no stage of the network')
@@ -168,18 +170,17 @@ def ways(program, a, frames, folder):
     for i in deep:
         twice['stages'][i]['iterations'] *= 2
     # As long as it needs: the test for convergence ends it.
-    tv, _ = program.defaults(TV, own, frames)
+    tv = program.schedule(TV)
     tv['stages'][-1]['iterations'] = 2000
 
     def way(name, algorithm, models, schedule=None):
         file = os.path.join(folder, f'{ALGORITHMS.index(name)}.json')
-        used, records = program.defaults(algorithm, models, frames)
         arguments = ['--algorithm', algorithm, *models]
         if schedule:
             with open(file, 'w') as f:
                 json.dump(schedule, f)
             arguments += ['--schedule', file]
-        return name, Way(algorithm, arguments, schedule or used, records)
+        return name, Way(algorithm, arguments, schedule or program.schedule(algorithm), program.models(algorithm, models, frames))
 
     return dict([way(TV, TV, own, tv), way(FFDNET, FFDNET, own), way(WHITE, DEFAULT, ['--models', white], short), way(LOOP, DEFAULT, own, short),
                  way(TWICE, DEFAULT, own, twice), way(DEFAULT, DEFAULT, own)])
