@@ -107,12 +107,24 @@ def tv(x, weight, iterations=5):
     return out
 
 
+def temporal_tv(x, weight, updates=4):
+    """Total variation along time, pixel by pixel: projected gradient on the dual; x [N,B,H,W]. One frame has nothing beside it."""
+    p, out = torch.zeros_like(x[:, 1:]), x
+    for _ in range(updates if x.shape[1] > 1 else 0):
+        p = (p - .25 * (out[:, 1:] - out[:, :-1])).clamp(-weight, weight)
+        out = x.clone()
+        out[:, :-1] -= p
+        out[:, 1:] += p
+    return out
+
+
 @torch.no_grad()
-def start(y, masks, iterations=40, weight=.1):
+def start(y, masks, iterations=40, weight=.1, temporal=0.):
     """The TV iterations from zero: the solver's state and the estimate."""
     gap, v = Gap(y, masks), torch.zeros_like(masks)
     for _ in range(iterations):
-        v = tv(gap.project(v), weight)
+        x = gap.project(v)
+        v = tv(temporal_tv(x, temporal) if temporal else x, weight)
     return gap, v
 
 

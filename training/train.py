@@ -29,6 +29,9 @@ from data import Footage
 # What a stage trains, and the frames that its network looks at.
 STAGES = {'block': ('block', 3), 'full': ('fastdvdnet', 5), 'loop': ('fastdvdnet', 5), 'ffdnet': ('ffdnet', 1), 'ffdnet-loop': ('ffdnet', 1)}
 
+# The program's default schedules: first and last level (/255), passes, memory, momentum.
+DEFAULTS = {'loop': (25, 5.3, 16, .85, .5), 'ffdnet-loop': (15, 3, 30, .95, 0)}
+
 
 # ---------------------------------------------------------------- producers
 def produce_clips(queue, root, seed, clips, frames, size):
@@ -63,28 +66,38 @@ class Iterates:
     The forward pass that trains is the pass that moves the run on, so iterates cost nothing but the projection.
     """
 
-    def __init__(self, queue, device, runs):
-        self.queue, self.device = queue, device
+    def __init__(self, queue, device, runs, default):
+        """default: the schedule near which most runs stay."""
+        self.queue, self.device, self.default = queue, device, default
         self.rng = random.Random(0)
         self.runs = [self.fresh() for _ in range(runs)]
 
     def fresh(self):
         x, masks, y = (torch.from_numpy(a).to(self.device) for a in self.queue.get())
-        gap, v = solver.start(y, masks, self.rng.randint(20, 50), self.rng.uniform(.07, .15))
-        gap.memory = self.rng.choice([0, .5, .8, 1])   # for the deep passes
-        return {'truth': x, 'gap': gap, 'v': v, 'levels': random_levels(self.rng), 'tv': self.rng.choice([0, 0, 0, .02])}
+        temporal = self.rng.choice([0, .004])
+        if self.rng.random() < .3:
+            gap, v = solver.start(y, masks, self.rng.randint(20, 50), self.rng.uniform(.07, .15), temporal)
+            gap.memory = self.rng.choice([0, .5, .8, 1])   # for the deep passes
+            levels, momentum, tv = random_levels(self.rng), 0, self.rng.choice([0, 0, 0, .02])
+        else:
+            gap, v = solver.start(y, masks, 60, .15, temporal)
+            first, last, passes, gap.memory, momentum = self.default
+            near = lambda value: value * math.exp(self.rng.uniform(-.2, .2))
+            levels, tv = solver.geometric(near(first), near(last), round(near(passes))), 0
+        return {'truth': x, 'gap': gap, 'v': v, 'start': v, 'levels': levels, 'momentum': momentum, 'tv': tv}
 
     @torch.no_grad()
     def next(self):
         """(input, sigma, truth, done): call done(output) with what the network made of the input."""
         i = self.rng.randrange(len(self.runs))
         run = self.runs[i]
-        x = run['gap'].project(run['v'])
+        x = run['gap'].project(run['start'])
         if run['tv']:
             x = solver.tv(x, run['tv'])
         sigma = torch.full((len(x), 1, 1, 1), run['levels'].pop(0), device=self.device)
 
         def done(output):
+            run['start'] = output + run['momentum'] * (output - run['v'])
             run['v'] = output
             if not run['levels'] or not torch.isfinite(output).all() or output.abs().max() > 4:
                 self.runs[i] = self.fresh()
@@ -243,7 +256,7 @@ def main():
     loop, scenes = None, None
     if 'loop' in a.stage:
         snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop)
-        loop = Iterates(snapshots, device, a.runs)
+        loop = Iterates(snapshots, device, a.runs, DEFAULTS[a.stage])
     if a.stage != 'block':
         scenes = evaluate.LoopScenes(a.data, a.scene, device=device)
         print('TV', json.dumps(scenes.tv()), flush=True)
@@ -265,10 +278,11 @@ def main():
             evaluated = t.seconds
             report()
         began = time.monotonic()
-        truth = torch.from_numpy(clips.get()).to(device, non_blocking=True)
-        white, _ = t.learn(*t.white_noise(truth), truth)
-        sums['white'] += white
-        if loop:   # every step sees both kinds
+        if not loop or t.step % 3 == 0:   # of iterates there are more kinds than of white noise
+            truth = torch.from_numpy(clips.get()).to(device, non_blocking=True)
+            white, _ = t.learn(*t.white_noise(truth), truth)
+            sums['white'] += white * (3 if loop else 1)
+        if loop:
             x, sigma, truth, done = loop.next()
             looped, y = t.learn(x, sigma, truth)
             done(y)

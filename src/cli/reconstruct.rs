@@ -77,11 +77,11 @@ pub struct Arguments {
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels [default: 320, 384 for gap-tv and admm-tv; for learned 256,
+    /// Largest side of a tile, in pixels [default: 320, 384 for those of TV alone; for learned 256,
     /// or the whole picture for a network that takes no other].
     #[arg(long, value_name = "PIXELS")]
     tile: Option<usize>,
-    /// Least overlap of neighbouring tiles, in pixels [default: 32, 16 for gap-tv and admm-tv, or 0
+    /// Least overlap of neighbouring tiles, in pixels [default: 32, 16 for those of TV alone, or 0
     /// for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,

@@ -12,6 +12,9 @@ use crate::recon::schedule::Schedule;
 pub enum Algorithm {
     /// GAP with total variation.
     GapTv,
+    /// GAP with total variation in space and, where it pays, in time.
+    #[serde(rename = "gap-tv3d")]
+    GapTv3d,
     /// ADMM with total variation.
     AdmmTv,
     /// GAP with total variation, then with the nonlocal prior.
@@ -31,8 +34,9 @@ pub enum Algorithm {
 
 impl Algorithm {
     /// All algorithms.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::GapTv,
+        Self::GapTv3d,
         Self::AdmmTv,
         Self::PnpNonlocal,
         Self::PnpFfdNet,
@@ -46,6 +50,7 @@ impl Algorithm {
     pub fn name(self) -> &'static str {
         match self {
             Self::GapTv => "gap-tv",
+            Self::GapTv3d => "gap-tv3d",
             Self::AdmmTv => "admm-tv",
             Self::PnpNonlocal => "pnp-nonlocal",
             Self::PnpFfdNet => "pnp-ffdnet",
@@ -62,6 +67,10 @@ impl Algorithm {
             Self::GapTv => {
                 "Accelerated generalized alternating projection with total variation: seconds, \
                  no network."
+            }
+            Self::GapTv3d => {
+                "As gap-tv, with total variation along time, too, where a pilot finds that it pays: \
+                 the best that takes seconds."
             }
             Self::AdmmTv => {
                 "The alternating direction method of multipliers with total variation: for noisy \
@@ -89,6 +98,7 @@ impl Algorithm {
     pub fn default_schedule(self) -> ScheduleSpec {
         ScheduleSpec::from(&match self {
             Self::GapTv => Schedule::gap_tv(),
+            Self::GapTv3d => Schedule::gap_tv3d(),
             Self::AdmmTv => Schedule::admm_tv(),
             Self::PnpNonlocal => Schedule::pnp_nonlocal(),
             Self::PnpFfdNet => Schedule::pnp_ffdnet(),
@@ -103,7 +113,7 @@ impl Algorithm {
     #[must_use]
     pub fn default_tile(self) -> TileSpec {
         match self {
-            Self::GapTv | Self::AdmmTv => TileSpec { size: 384, overlap: 16 },
+            Self::GapTv | Self::GapTv3d | Self::AdmmTv => TileSpec { size: 384, overlap: 16 },
             Self::Learned => TileSpec { size: 256, overlap: 32 },
             _ => TileSpec { size: 320, overlap: 32 },
         }
@@ -114,7 +124,7 @@ impl Algorithm {
     pub fn priors(self) -> Vec<PriorSpec> {
         use PriorSpec as P;
         match self {
-            Self::GapTv | Self::AdmmTv => vec![P::Tv],
+            Self::GapTv | Self::GapTv3d | Self::AdmmTv => vec![P::Tv],
             Self::PnpNonlocal => vec![P::Tv, P::Nonlocal],
             Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
             Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNet],

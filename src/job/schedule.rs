@@ -58,6 +58,10 @@ pub struct StageSpec {
     /// Dual (Chambolle) updates for each TV step; 4 where it is left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tv_updates: Option<usize>,
+    /// Weight of the total variation along time, which comes before that of each frame; none where it
+    /// is left out. An adaptive schedule leaves it out where it does not pay.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub temporal_weight: Option<f32>,
     /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the
     /// next, on [0, 1]; 1 where it is left out.
     #[serde(default = "one")]
@@ -109,6 +113,8 @@ const MAX_ITERATIONS: usize = 10_000;
 const PROJECTION_NS: f64 = 0.7;
 /// Cost of one dual update of TV, CPU-nanoseconds per voxel (measured).
 const TV_UPDATE_NS: f64 = 0.56;
+/// Cost of one dual update of TV along time, CPU-nanoseconds per voxel (measured).
+const TEMPORAL_UPDATE_NS: f64 = 0.2;
 /// Cost of one nonlocal pass, CPU-nanoseconds per voxel (measured).
 const NONLOCAL_NS: f64 = 1_700.0;
 /// Cost of one pass of FFDNet, CPU-nanoseconds per voxel (measured).
@@ -174,6 +180,7 @@ impl StageSpec {
             sigma,
             tv_weight: self.tv_weight.unwrap_or(0.0),
             tv_updates: self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES),
+            temporal_weight: self.temporal_weight.unwrap_or(0.0),
             memory: self.memory,
             momentum: self.momentum,
             tolerance: self.tolerance,
@@ -186,6 +193,9 @@ impl StageSpec {
         match (self.prior.has_tv(), self.tv_weight) {
             (true, None) => Some(("tv_weight", "a stage with TV needs its weight".into())),
             (false, Some(_)) => Some(("tv_weight", "this stage has no TV; leave it out".into())),
+            (false, None) if self.temporal_weight.is_some() => {
+                Some(("temporal_weight", "this stage has no TV; leave it out".into()))
+            }
             _ => None,
         }
     }
@@ -193,7 +203,9 @@ impl StageSpec {
     fn iteration_ns(&self) -> f64 {
         let dual_updates =
             u32::try_from(self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES)).unwrap_or(u32::MAX);
-        let tv = if self.prior.has_tv() { TV_UPDATE_NS * f64::from(dual_updates) } else { 0.0 };
+        let in_time = self.temporal_weight.is_some_and(|weight| weight > 0.0);
+        let update_ns = TV_UPDATE_NS + if in_time { TEMPORAL_UPDATE_NS } else { 0.0 };
+        let tv = if self.prior.has_tv() { update_ns * f64::from(dual_updates) } else { 0.0 };
         PROJECTION_NS + tv + self.prior.pass_ns()
     }
 }
@@ -326,6 +338,7 @@ impl From<&Schedule> for ScheduleSpec {
                 sigma: stage.sigma.map(|(first, last)| [first.value(), last.value()]),
                 tv_weight: tv.then_some(stage.tv_weight),
                 tv_updates: tv.then_some(stage.tv_updates),
+                temporal_weight: (stage.temporal_weight > 0.0).then_some(stage.temporal_weight),
                 memory: stage.memory,
                 momentum: stage.momentum,
                 tolerance: stage.tolerance,
@@ -376,8 +389,17 @@ mod tests {
         let deep = json!({"prior": "fastdvdnet", "iterations": 5});
         let zero = json!({"prior": "tv", "iterations": 0, "tv_weight": 0.1});
         let bare = json!({"prior": "tv", "iterations": 3});
-        let stages = json!({"stages": [tv, deep, zero, bare]});
-        let expected = ["/stages/1/sigma", "/stages/2/iterations", "/stages/3/tv_weight"];
+        let timed = json!({"prior": "nonlocal", "iterations": 3, "sigma": [0.1, 0.1], "temporal_weight": 0.1});
+        let negative =
+            json!({"prior": "tv", "iterations": 3, "tv_weight": 0.1, "temporal_weight": -0.1});
+        let stages = json!({"stages": [tv, deep, zero, bare, timed, negative]});
+        let expected = [
+            "/stages/1/sigma",
+            "/stages/2/iterations",
+            "/stages/3/tv_weight",
+            "/stages/4/temporal_weight",
+            "/stages/5/temporal_weight",
+        ];
         assert_eq!(pointers(stages), expected);
         assert_eq!(pointers(json!({"stages": []})), ["/stages"]);
         assert_eq!(pointers(json!({"gamma": -1.0, "stages": [tv]})), ["/gamma"]);

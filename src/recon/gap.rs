@@ -5,7 +5,9 @@ use std::ops::Range;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
 use super::change::Change;
-use super::denoise::{Networks, nonlocal::Nonlocal, tv::TotalVariation};
+use super::denoise::{
+    Networks, nonlocal::Nonlocal, temporal::TemporalVariation, tv::TotalVariation,
+};
 use super::error::{ReconError, shape_text};
 use super::schedule::{Method, Prior, Schedule, Sigma, Stage};
 use super::sensing::SensingOperator;
@@ -161,6 +163,7 @@ pub(super) struct Run<'a> {
     /// ADMM's multiplier `u`.
     multiplier: Option<Array3<f32>>,
     tv: TotalVariation,
+    temporal: TemporalVariation,
     nonlocal: Option<Nonlocal>,
     networks: &'a mut dyn Networks,
     done: usize,
@@ -189,6 +192,7 @@ impl<'a> Run<'a> {
             start: schedule.has_own_start().then(zeros),
             multiplier: (schedule.method == Method::Admm).then(zeros),
             tv: TotalVariation::new(op.dim()),
+            temporal: TemporalVariation::new(op.dim().0),
             nonlocal: None,
             networks,
             done: 0,
@@ -312,6 +316,7 @@ impl<'a> Run<'a> {
         for start in (0..height).step_by(rows) {
             let strip = start..height.min(start + rows);
             squares += self.project(stage.memory, strip.clone());
+            self.smooth_in_time(stage, strip.clone());
             let (weight, updates) = (stage.tv_weight, stage.tv_updates);
             for k in 0..frames {
                 let done = self.tv.advance(k, &mut self.x, strip.clone(), weight, updates);
@@ -329,6 +334,12 @@ impl<'a> Run<'a> {
         self.op.project(rows, &self.y, y1, start, &mut self.x)
     }
 
+    fn smooth_in_time(&mut self, stage: &Stage, rows: Range<usize>) {
+        if stage.temporal_weight > 0.0 {
+            self.temporal.denoise(&mut self.x, rows, stage.temporal_weight, stage.tv_updates);
+        }
+    }
+
     fn change(&self, rows: Range<usize>) -> Change {
         let mut change = Change::default();
         (0..self.op.dim().0).for_each(|k| change.add(&self.x, &self.v, k, rows.clone()));
@@ -337,6 +348,9 @@ impl<'a> Run<'a> {
 
     /// `v = D(x)`, in place.
     fn apply(&mut self, stage: &Stage, sigma: Option<Sigma>) -> Result<(), ReconError> {
+        if stage.prior.uses_tv() {
+            self.smooth_in_time(stage, 0..self.y.nrows());
+        }
         if stage.prior.uses_tv() && stage.tv_weight > 0.0 {
             self.tv.denoise(&mut self.x, stage.tv_weight, stage.tv_updates);
             self.tv_iterations += 1;

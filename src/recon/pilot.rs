@@ -53,6 +53,8 @@ pub fn piece(y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
 pub struct StageFinding {
     /// Iterations that pay; 0 if the first one diverges.
     pub iterations: usize,
+    /// Weight of the total variation along time, if it pays; else 0.
+    pub temporal_weight: f32,
     /// Error at the held-out pixels before the stage: `||y - Hv|| / ||y||` over them.
     pub before: f64,
     /// The same after so many iterations.
@@ -88,7 +90,8 @@ impl StageEnd {
 
 /// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],
 /// and tells for every stage how many of its iterations pay. Stages of total variation alone, which
-/// cost next to nothing, are taken as they are.
+/// cost next to nothing, are taken as they are, but for their part along time: it is left out if the
+/// stage's error is less without.
 ///
 /// # Errors
 /// As [`super::gap::reconstruct`].
@@ -106,8 +109,20 @@ pub fn run(
     let mut findings = Vec::with_capacity(schedule.stages.len());
     let mut before = 1.0;
     for (index, stage) in schedule.stages.iter().enumerate() {
-        let watch = Watch { op: &op, y, held_out: &held_out, index, observer };
-        let finding = watch.stage(stage, &mut run, before)?;
+        let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
+        let start = (stage.temporal_weight > 0.0).then(|| run.state());
+        let mut finding = watch.stage(stage, &mut run, before)?;
+        if let Some(start) = start {
+            let with = run.state();
+            run.restore(&start);
+            let without = Stage { temporal_weight: 0.0, ..stage.clone() };
+            let other = watch.stage(&without, &mut run, before)?;
+            if other.after < finding.after {
+                finding = other;
+            } else {
+                run.restore(&with);
+            }
+        }
         before = finding.after;
         findings.push(finding);
     }
@@ -115,15 +130,16 @@ pub fn run(
 }
 
 impl Schedule {
-    /// The fixed schedule with so many iterations of each stage: levels fall as they did, but end
-    /// earlier. A stage of none is left out, unless no other is left.
-    pub fn decided(&self, iterations: &[usize]) -> Self {
-        let stage = |(stage, &iterations): (&Stage, &usize)| {
+    /// The fixed schedule with so many iterations of each stage, and this weight of its total variation
+    /// along time: levels fall as they did, but end earlier. A stage of none is left out, unless no other
+    /// is left.
+    pub fn decided(&self, findings: &[(usize, f32)]) -> Self {
+        let stage = |(stage, &(iterations, temporal_weight)): (&Stage, &(usize, f32))| {
             let last = stage.sigma_at(iterations.checked_sub(1)?);
             let sigma = stage.sigma.zip(last).map(|((first, _), last)| (first, last));
-            Some(Stage { iterations, sigma, ..stage.clone() })
+            Some(Stage { iterations, temporal_weight, sigma, ..stage.clone() })
         };
-        let mut stages: Vec<Stage> = self.stages.iter().zip(iterations).filter_map(stage).collect();
+        let mut stages: Vec<Stage> = self.stages.iter().zip(findings).filter_map(stage).collect();
         if stages.is_empty() {
             stages.clone_from(&self.stages);
         }
@@ -145,12 +161,13 @@ impl Watch<'_, '_> {
     }
 
     fn stage(
-        self,
+        &mut self,
         stage: &Stage,
         run: &mut Run<'_>,
         before: f64,
     ) -> Result<StageFinding, ReconError> {
         let fixed = stage.sigma.is_none();
+        let temporal_weight = stage.temporal_weight;
         let mut end = if fixed { StageEnd::Fixed } else { StageEnd::Planned };
         let mut best = (0, before, run.state());
         let mut least = f64::INFINITY;
@@ -167,7 +184,13 @@ impl Watch<'_, '_> {
             if fixed {
                 if done == stage.iterations || step.change < stage.tolerance {
                     let after = self.error(run);
-                    return Ok(StageFinding { iterations: stage.iterations, before, after, end });
+                    return Ok(StageFinding {
+                        iterations: stage.iterations,
+                        temporal_weight,
+                        before,
+                        after,
+                        end,
+                    });
                 }
                 continue;
             }
@@ -184,7 +207,7 @@ impl Watch<'_, '_> {
             end = StageEnd::Converged;
         }
         run.restore(&state);
-        Ok(StageFinding { iterations, before, after, end })
+        Ok(StageFinding { iterations, temporal_weight, before, after, end })
     }
 }
 
@@ -276,8 +299,8 @@ mod tests {
         assert_eq!((found[0].iterations, found[0].end), (60, StageEnd::Fixed));
         assert_eq!((found[1].iterations, found[1].end), (9, StageEnd::Converged));
         assert!(found[1].after < 0.5 * found[1].before && found[1].before == found[0].after);
-        let iterations: Vec<usize> = found.iter().map(|stage| stage.iterations).collect();
-        let decided = schedule.decided(&iterations);
+        let paid: Vec<_> = found.iter().map(|stage| (stage.iterations, 0.0)).collect();
+        let decided = schedule.decided(&paid);
         assert!(!decided.adaptive);
         let level = |schedule: &Schedule, index| schedule.stages[1].sigma_at(index);
         assert_eq!(level(&decided, 0), level(&schedule, 0));
@@ -292,13 +315,33 @@ mod tests {
     }
 
     #[test]
+    fn total_variation_along_time_is_left_out_where_it_blurs() {
+        let masks = iid_masks(6, 64, 64, 3).unwrap();
+        let weight = |flicker: bool| {
+            let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
+                let wave = 0.4 * (i as f32 * 0.2).sin() * (j as f32 * 0.15).sin();
+                0.5 + if flicker && k % 2 == 1 { -wave } else { wave }
+            });
+            let y = measure(masks.view(), truth.view()).unwrap();
+            let op = SensingOperator::new(masks.clone()).unwrap();
+            run(op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap()[0].temporal_weight
+        };
+        let asked = Schedule::gap_tv3d().stages[0].temporal_weight;
+        assert_eq!((weight(false), weight(true)), (asked, 0.0));
+    }
+
+    #[test]
     fn divergence_ends_the_stage_before_it() {
         let (schedule, found) = find(60, 5, f32::INFINITY);
         assert_eq!((found[1].iterations, found[1].end), (5, StageEnd::Diverged));
         let (_, none) = find(60, 0, f32::INFINITY);
         assert_eq!((none[1].iterations, none[1].end), (0, StageEnd::Diverged));
-        assert_eq!(schedule.decided(&[60, 0]).stages.len(), 1, "a stage of none is left out");
-        assert_eq!(schedule.decided(&[0, 0]).stages.len(), 2, "but not all of them");
+        assert_eq!(
+            schedule.decided(&[(60, 0.0), (0, 0.0)]).stages.len(),
+            1,
+            "a stage of none is left out"
+        );
+        assert_eq!(schedule.decided(&[(0, 0.0); 2]).stages.len(), 2, "but not all of them");
     }
 
     #[test]

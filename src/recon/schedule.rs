@@ -92,6 +92,9 @@ pub struct Stage {
     pub tv_weight: f32,
     /// Dual updates of the total variation in each iteration.
     pub tv_updates: usize,
+    /// Weight of the total variation along time, which comes before that of each frame and makes as
+    /// many updates; 0 for none. In an adaptive schedule it is left out where it does not pay.
+    pub temporal_weight: f32,
     /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the
     /// next, on \[0,1\]: 1 is accelerated GAP, 0 is plain GAP. A learned denoiser never explains
     /// the measurement fully, so with 1 the residual winds up in its stages.
@@ -121,6 +124,10 @@ impl Stage {
         }
         if !self.tv_weight.is_finite() || self.tv_weight < 0.0 {
             return parameter("tv_weight", self.tv_weight.to_string(), "a number of at least 0");
+        }
+        if !self.temporal_weight.is_finite() || self.temporal_weight < 0.0 {
+            let value = self.temporal_weight.to_string();
+            return parameter("temporal_weight", value, "a number of at least 0");
         }
         if self.prior.uses_tv() && self.tv_weight > 0.0 && !(1..=1000).contains(&self.tv_updates) {
             return parameter("tv_updates", self.tv_updates.to_string(), "from 1 to 1000");
@@ -183,6 +190,12 @@ impl Schedule {
         Self::gap(vec![tv_stage(150, 3e-4)])
     }
 
+    /// GAP-TV with total variation along time, too, where it pays.
+    pub fn gap_tv3d() -> Self {
+        let stage = Stage { temporal_weight: TEMPORAL_WEIGHT, ..tv_stage(150, 3e-4) };
+        Self { adaptive: true, ..Self::gap(vec![stage]) }
+    }
+
     /// ADMM-TV: slower than GAP, but it does not force `y = Hx`, so it amplifies less noise.
     pub fn admm_tv() -> Self {
         let method = Method::Admm;
@@ -194,17 +207,17 @@ impl Schedule {
     pub fn pnp_ffdnet() -> Self {
         let deep = deep_stage(Network::FfdNet, 30, 15.0, 3.0);
         let patient = Stage { memory: 0.95, momentum: 0.0, ..deep };
-        Self::gap(vec![tv_stage(60, 0.0), patient])
+        Self::gap(vec![first_stage(), patient])
     }
 
     /// PnP-FastDVDNet: total variation, then the video denoiser.
     pub fn pnp_fastdvdnet() -> Self {
-        Self::gap(vec![tv_stage(60, 0.0), deep_stage(Network::FastDvdNet, 24, 25.0, 4.4)])
+        Self::gap(vec![first_stage(), deep_stage(Network::FastDvdNet, 24, 25.0, 4.4)])
     }
 
     /// PnP with the nonlocal prior, which needs no network.
     pub fn pnp_nonlocal() -> Self {
-        Self::gap(vec![tv_stage(60, 0.0), nonlocal_stage(60, 30.0, 2.6)])
+        Self::gap(vec![first_stage(), nonlocal_stage(60, 30.0, 2.6)])
     }
 
     /// PnP-TV-FastDVDNet: total variation, a few passes of the video denoiser, then the nonlocal
@@ -216,7 +229,7 @@ impl Schedule {
     /// period; `tv+fastdvdnet` in a schedule) gained only while the memory was 1.
     pub fn pnp_tv_fastdvdnet() -> Self {
         let deep = deep_stage(Network::FastDvdNet, 16, 25.0, 5.3);
-        Self::gap(vec![tv_stage(60, 0.0), deep, nonlocal_stage(50, 20.0, 2.6)])
+        Self::gap(vec![first_stage(), deep, nonlocal_stage(50, 20.0, 2.6)])
     }
 
     fn gap(stages: Vec<Stage>) -> Self {
@@ -285,6 +298,15 @@ impl Schedule {
     }
 }
 
+/// Of the weights from 0.002 to 0.01 the one that gains most in the mean over scenes, masks and noise. More
+/// blurs what moves; where even this does, the pilot leaves it out.
+const TEMPORAL_WEIGHT: f32 = 0.004;
+
+/// What comes before the plugged-in priors.
+fn first_stage() -> Stage {
+    Stage { temporal_weight: TEMPORAL_WEIGHT, ..tv_stage(60, 0.0) }
+}
+
 fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
     Stage {
         prior: Prior::Tv,
@@ -292,6 +314,7 @@ fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
         sigma: None,
         tv_weight: 0.15,
         tv_updates: 4,
+        temporal_weight: 0.0,
         memory: 1.0,
         momentum: 0.0,
         tolerance,
@@ -323,9 +346,10 @@ fn nonlocal_stage(iterations: usize, first: f32, last: f32) -> Stage {
 #[cfg(test)]
 impl Schedule {
     /// All of them.
-    pub(crate) fn defaults() -> [Self; 6] {
+    pub(crate) fn defaults() -> [Self; 7] {
         [
             Self::gap_tv(),
+            Self::gap_tv3d(),
             Self::admm_tv(),
             Self::pnp_nonlocal(),
             Self::pnp_ffdnet(),

@@ -44,6 +44,9 @@ pub struct StageRecord {
     pub planned: usize,
     /// Those that pay.
     pub iterations: usize,
+    /// Weight of the total variation along time, if it pays; else 0.
+    #[serde(default)]
+    pub temporal_weight: f32,
     /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
     pub end: String,
     /// Error at the held-out pixels before the stage, relative to the measurement.
@@ -65,8 +68,8 @@ impl PilotRecord {
 
     /// The schedule for the tiles.
     pub fn decide(&self, schedule: &Schedule) -> Schedule {
-        let iterations: Vec<usize> = self.stages.iter().map(|stage| stage.iterations).collect();
-        schedule.decided(&iterations)
+        let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
+        schedule.decided(&found.collect::<Vec<_>>())
     }
 }
 
@@ -114,6 +117,7 @@ pub fn decide(
         prior: stage.prior,
         planned: stage.iterations,
         iterations: finding.iterations,
+        temporal_weight: finding.temporal_weight,
         end: finding.end.name().into(),
         error_before: finding.before,
         error_after: finding.after,

@@ -11,7 +11,7 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let adaptive = json!({"adaptive": true, "stages": [
-        {"prior": "tv", "iterations": 20, "tv_weight": 0.1},
+        {"prior": "tv", "iterations": 20, "tv_weight": 0.1, "temporal_weight": 0.004},
         {"prior": "nonlocal", "iterations": 40, "sigma": [0.2, 0.02], "memory": 0.6},
     ]});
     let (first, content) = run(&app, &measurement, &adaptive).await;
@@ -19,6 +19,10 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     assert_eq!((&stages[0]["end"], &stages[0]["iterations"]), (&json!("fixed"), &json!(20)));
     let paid = stages[1]["iterations"].as_u64().unwrap();
     assert!(paid > 0, "the stage has begun: {stages:#?}");
+    let temporal = stages[0]["temporal_weight"].as_f64().unwrap() as f32;
+    assert!(temporal == 0.004 || temporal == 0.0, "kept or left out: {temporal}");
+    let kept = content["schedule"]["stages"][0].get("temporal_weight").is_some();
+    assert_eq!(kept, temporal > 0.0, "the manifest's schedule says so, too");
     assert!(stages[0]["error_after"].as_f64() < stages[0]["error_before"].as_f64());
     let decided = &content["schedule"];
     assert_eq!(decided["adaptive"], false);

@@ -51,8 +51,9 @@ impl Report {
         );
         for stage in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             println!(
-                "{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}",
+                "{}{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}",
                 stage.prior.name(),
+                if stage.temporal_weight > 0.0 { " in space and time" } else { "" },
                 stage.iterations,
                 stage.planned,
                 stage.end,

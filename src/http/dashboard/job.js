@@ -140,7 +140,7 @@ async function showManifest(element, now, snapshot, signal) {
 function pilot(content) {
   const stages = (content.pilot?.stages ?? []).filter((stage) => stage.end !== "fixed");
   const why = { "max-iterations": "all that were planned", converged: "later ones raise the error", diverged: "later ones diverge" };
-  return stages.map((stage) => [`Pilot, ${stage.prior}`, `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]}), error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`]);
+  return stages.map((stage) => [`Pilot, ${stage.prior}${stage.temporal_weight > 0 ? " in space and time" : ""}`, `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]}), error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`]);
 }
 
 function warnings(manifest) {

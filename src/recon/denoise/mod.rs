@@ -4,6 +4,7 @@ pub mod fastdvdnet;
 pub mod ffdnet;
 pub mod nonlocal;
 pub mod onnx;
+pub mod temporal;
 pub mod tv;
 
 use ndarray::Array3;
