@@ -8,6 +8,7 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
 use rand::{Rng, SeedableRng};
+use sci_recon::recon::denoise::temporal::TemporalVariation;
 use sci_recon::recon::denoise::tv::TotalVariation;
 use sci_recon::recon::gap::reconstruct;
 use sci_recon::recon::schedule::Schedule;
@@ -38,6 +39,12 @@ fn kernels(criterion: &mut Criterion) {
             bencher.iter(|| tv.denoise(black_box(&mut frames), 0.1, updates));
         });
     }
+
+    let mut temporal = TemporalVariation::new(DIM.0);
+    let mut frames = random(1);
+    group.bench_function("tv along time, 4 dual updates", |bencher| {
+        bencher.iter(|| temporal.denoise(black_box(&mut frames), 0..DIM.1, 0.004, 4));
+    });
 
     let op = SensingOperator::new(random(2)).expect("random masks are valid");
     let y = op.forward(random(3).view()).expect("sizes agree");

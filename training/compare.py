@@ -97,7 +97,7 @@ def main():
     nets = {PUBLISHED: published_ffdnet(a.published)} if a.published else {}
     for path in a.models:
         name = os.path.basename(os.path.normpath(path))
-        nets[path if name in nets else name] = export.weights_of(path) if os.path.isdir(path) else model.load(path)
+        nets[path if name in nets else name] = export.load(path)
     scenes = {'validation': torch.from_numpy(Footage(a.data, 'val', 7).batch(a.clips, 7, 96))}
     if a.scene:
         scenes[os.path.basename(a.scene)] = scene(a.scene, a.size, a.frames)

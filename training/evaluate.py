@@ -101,7 +101,7 @@ def main():
     scenes = LoopScenes(a.data, a.scene)
     print(json.dumps({'model': 'tv', 'loop': scenes.tv()}), flush=True)
     for path in a.weights:
-        net = export.weights_of(path) if os.path.isdir(path) else model.load(path)
+        net = export.load(path)
         row = {'model': path} if a.no_white else {'model': path, 'white': white(net, a.data)}
         if not isinstance(net, model.Block):
             row['loop'] = scenes.run(net, solver.geometric(a.first, a.last, a.passes), a.tv_weight, a.memory)

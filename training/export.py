@@ -2,6 +2,7 @@
 
     python export.py run/full.pt ../models/fastdvdnet-gray      # stage1.onnx, stage2.onnx
     python export.py run/ffdnet.pt ../models/ffdnet-gray        # model.onnx
+    python export.py run/loop.pt ../models/fastdvdnet-gray run/mean       # the mean of two
 
 The graphs are built node by node: they hold what the runtime needs and nothing that an exporter adds.
 """
@@ -190,12 +191,25 @@ def export(net, folder, notes=''):
     return worst
 
 
+def load(path):
+    """The network of a checkpoint, or of a folder with exported ONNX files."""
+    return weights_of(path) if os.path.isdir(path) else model.load(path)
+
+
+def mean(nets):
+    """The network whose weights are the mean of these networks' weights. Runs that began with the same weights end in one valley, and their
+    mean has less of the noise of small batches than each of them (Wortsman and others, "Model soups", 2022)."""
+    states = [net.state_dict() for net in nets]
+    nets[0].load_state_dict({k: sum(state[k] for state in states) / len(states) for k in states[0]})
+    return nets[0]
+
+
 def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('weights')
+    p.add_argument('weights', nargs='+', help='a checkpoint or a folder with exported ONNX files; of several, the mean of their weights')
     p.add_argument('folder')
     a = p.parse_args()
-    worst = export(model.load(a.weights), a.folder)
+    worst = export(mean([load(path) for path in a.weights]), a.folder)
     print(f'greatest difference from PyTorch: {worst:.1e}')
     if worst > 1e-5:
         raise SystemExit('the ONNX graph does not compute what PyTorch does')

@@ -89,6 +89,10 @@ def test_pipeline():
             run('export.py', out(f'{name}.pt'), out(name))
             for k, v in model.load(out(f'{name}.pt')).state_dict().items():
                 assert torch.equal(v, export.weights_of(out(name)).state_dict()[k]), k
+        run('export.py', out('loop.pt'), out('full.pt'), out('mean'))
+        parts = [model.load(out(f'{name}.pt')).state_dict() for name in ('loop', 'full')]
+        for k, v in export.weights_of(out('mean')).state_dict().items():
+            assert torch.allclose(v, (parts[0][k] + parts[1][k]) / 2), k
         rows = [json.loads(line) for line in run('evaluate.py', '--data', data, out('loop'), out('ffdnet'), '--passes', 2).splitlines()]
         assert [os.path.basename(r['model']) for r in rows] == ['tv', 'loop', 'ffdnet']
         assert all(np.isfinite(list(r['loop'].values())).all() for r in rows)

@@ -138,7 +138,7 @@ class Training:
             self.step, self.seconds = state['step'], state['seconds']
 
     def initial(self, path):
-        weights = (export.weights_of(path) if os.path.isdir(path) else model.load(path)).state_dict()
+        weights = export.load(path).state_dict()
         if isinstance(self.net, model.FastDVDnet) and 't1.inc.0.weight' not in weights:
             return {f'{t}.{k}': v for t in ('t1', 't2') for k, v in weights.items()}   # both stages start from the 3-frame denoiser
         return weights
