@@ -3,6 +3,7 @@
 mod access;
 mod algorithm;
 mod captures;
+mod cost;
 mod disk;
 mod finding;
 mod ids;

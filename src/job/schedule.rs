@@ -103,24 +103,11 @@ fn one() -> f32 {
 }
 
 /// Dual updates of a TV step where the schedule does not say.
-const DEFAULT_TV_UPDATES: usize = 4;
+pub(super) const DEFAULT_TV_UPDATES: usize = 4;
 /// The most stages of a schedule.
 const MAX_STAGES: usize = 32;
 /// The most iterations of a schedule; with more, a job would look hung.
 const MAX_ITERATIONS: usize = 10_000;
-
-/// Cost of one projection and one accelerated update, CPU-nanoseconds per voxel (measured).
-const PROJECTION_NS: f64 = 0.7;
-/// Cost of one dual update of TV, CPU-nanoseconds per voxel (measured).
-const TV_UPDATE_NS: f64 = 0.56;
-/// Cost of one dual update of TV along time, CPU-nanoseconds per voxel (measured).
-const TEMPORAL_UPDATE_NS: f64 = 0.26;
-/// Cost of one nonlocal pass, CPU-nanoseconds per voxel (measured).
-const NONLOCAL_NS: f64 = 1_700.0;
-/// Cost of one pass of FFDNet, CPU-nanoseconds per voxel (measured).
-const FFDNET_PASS_NS: f64 = 1_450.0;
-/// Cost of one pass of FastDVDNet with a shared first stage, CPU-nanoseconds per voxel (measured).
-const DEEP_PASS_NS: f64 = 4_900.0;
 
 impl PriorSpec {
     fn to_prior(self) -> Prior {
@@ -156,16 +143,6 @@ impl PriorSpec {
     pub fn has_tv(self) -> bool {
         self.to_prior().uses_tv()
     }
-
-    /// Cost of one iteration without projection and TV, CPU-nanoseconds per voxel.
-    fn pass_ns(self) -> f64 {
-        match self {
-            Self::Tv => 0.0,
-            Self::Nonlocal => NONLOCAL_NS,
-            Self::FfdNet => FFDNET_PASS_NS,
-            Self::FastDvdNet | Self::TvFastDvdNet => DEEP_PASS_NS,
-        }
-    }
 }
 
 impl StageSpec {
@@ -198,15 +175,6 @@ impl StageSpec {
             }
             _ => None,
         }
-    }
-    /// The cost of one iteration in CPU-nanoseconds per voxel, as on the machine it was measured on.
-    fn iteration_ns(&self) -> f64 {
-        let dual_updates =
-            u32::try_from(self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES)).unwrap_or(u32::MAX);
-        let in_time = self.temporal_weight.is_some_and(|weight| weight > 0.0);
-        let update_ns = TV_UPDATE_NS + if in_time { TEMPORAL_UPDATE_NS } else { 0.0 };
-        let tv = if self.prior.has_tv() { update_ns * f64::from(dual_updates) } else { 0.0 };
-        PROJECTION_NS + tv + self.prior.pass_ns()
     }
 }
 
@@ -264,6 +232,7 @@ impl ScheduleSpec {
         }
         Err(errors)
     }
+
     /// The most iterations that a run takes.
     #[must_use]
     pub fn planned_iterations(&self) -> usize {
@@ -290,26 +259,6 @@ impl ScheduleSpec {
     #[must_use]
     pub fn needs_network(&self) -> bool {
         self.stages.iter().any(|stage| stage.prior.is_deep())
-    }
-
-    /// The planned cost in CPU-nanoseconds per voxel.
-    #[must_use]
-    pub fn planned_ns_per_voxel(&self) -> f64 {
-        self.stages.iter().map(|stage| stage.iteration_ns() * count(stage.iterations)).sum()
-    }
-
-    /// The share of the planned cost, on [0, 1], that is behind a run which has done `iteration`
-    /// iterations of the stage with index `stage` and has left all stages before it.
-    #[must_use]
-    pub fn share_done(&self, stage: usize, iteration: usize) -> f64 {
-        let before: f64 =
-            self.stages.iter().take(stage).map(|s| s.iteration_ns() * count(s.iterations)).sum();
-        let here = self
-            .stages
-            .get(stage)
-            .map_or(0.0, |s| s.iteration_ns() * count(iteration.min(s.iterations)));
-        let planned = self.planned_ns_per_voxel();
-        if planned > 0.0 { ((before + here) / planned).clamp(0.0, 1.0) } else { 0.0 }
     }
 }
 
@@ -357,10 +306,6 @@ impl From<&Schedule> for ScheduleSpec {
     }
 }
 
-fn count(n: usize) -> f64 {
-    f64::from(u32::try_from(n).unwrap_or(u32::MAX))
-}
-
 #[cfg(test)]
 mod tests {
     use super::ScheduleSpec;
@@ -392,13 +337,15 @@ mod tests {
         let timed = json!({"prior": "nonlocal", "iterations": 3, "sigma": [0.1, 0.1], "temporal_weight": 0.1});
         let negative =
             json!({"prior": "tv", "iterations": 3, "tv_weight": 0.1, "temporal_weight": -0.1});
-        let stages = json!({"stages": [tv, deep, zero, bare, timed, negative]});
+        let idle = json!({"prior": "tv", "iterations": 3, "tv_weight": 0.0, "temporal_weight": 0.1, "tv_updates": 0});
+        let stages = json!({"stages": [tv, deep, zero, bare, timed, negative, idle]});
         let expected = [
             "/stages/1/sigma",
             "/stages/2/iterations",
             "/stages/3/tv_weight",
             "/stages/4/temporal_weight",
             "/stages/5/temporal_weight",
+            "/stages/6/tv_updates",
         ];
         assert_eq!(pointers(stages), expected);
         assert_eq!(pointers(json!({"stages": []})), ["/stages"]);
@@ -409,15 +356,5 @@ mod tests {
     fn unknown_fields_are_refused() {
         let typo = json!({"stages": [{"prior": "tv", "iteration": 5}]});
         assert!(serde_json::from_value::<ScheduleSpec>(typo).is_err());
-    }
-
-    #[test]
-    fn one_deep_pass_weighs_as_thousands_of_tv_iterations() {
-        let spec = ScheduleSpec::from(&Schedule::pnp_fastdvdnet());
-        assert_eq!(spec.share_done(0, 0), 0.0);
-        assert!(spec.share_done(1, 0) < 0.01, "after all TV iterations");
-        let half = spec.stages[1].iterations / 2;
-        assert!((spec.share_done(1, half) - 0.5).abs() < 0.01, "half of the deep passes");
-        assert_eq!(spec.share_done(2, 0), 1.0);
     }
 }

@@ -6,6 +6,7 @@
 //! and masks live on \[0,1\].
 
 mod change;
+mod defaults;
 pub mod denoise;
 pub mod error;
 pub mod gap;

@@ -19,6 +19,11 @@ impl Sigma {
         })
     }
 
+    /// A level given in grey values of 255.
+    pub(super) fn of_grey(level: f32) -> Self {
+        Self(level / 255.0)
+    }
+
     /// The level on \[0,1\].
     pub fn value(self) -> f32 {
         self.0
@@ -129,7 +134,8 @@ impl Stage {
             let value = self.temporal_weight.to_string();
             return parameter("temporal_weight", value, "a number of at least 0");
         }
-        if self.prior.uses_tv() && self.tv_weight > 0.0 && !(1..=1000).contains(&self.tv_updates) {
+        let updated = self.prior.uses_tv() && self.tv_weight.max(self.temporal_weight) > 0.0;
+        if updated && !(1..=1000).contains(&self.tv_updates) {
             return parameter("tv_updates", self.tv_updates.to_string(), "from 1 to 1000");
         }
         if !self.tolerance.is_finite() || !(0.0..1.0).contains(&self.tolerance) {
@@ -185,58 +191,6 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// GAP-TV.
-    pub fn gap_tv() -> Self {
-        Self::gap(vec![tv_stage(150, 3e-4)])
-    }
-
-    /// GAP-TV with total variation along time, too, where it pays.
-    pub fn gap_tv3d() -> Self {
-        let stage = Stage { temporal_weight: TEMPORAL_WEIGHT, ..tv_stage(150, 3e-4) };
-        Self { adaptive: true, ..Self::gap(vec![stage]) }
-    }
-
-    /// ADMM-TV: slower than GAP, but it does not force `y = Hx`, so it amplifies less noise.
-    pub fn admm_tv() -> Self {
-        let method = Method::Admm;
-        Self { method, accelerated: false, gamma: 0.01, ..Self::gap(vec![tv_stage(200, 3e-4)]) }
-    }
-
-    /// PnP-FFDNet: total variation, then the image denoiser, frame by frame. Behind correlated masks
-    /// it stays above total variation only with a long memory, no momentum and low levels.
-    pub fn pnp_ffdnet() -> Self {
-        let deep = deep_stage(Network::FfdNet, 30, 15.0, 3.0);
-        let patient = Stage { memory: 0.95, momentum: 0.0, ..deep };
-        Self::gap(vec![first_stage(), patient])
-    }
-
-    /// PnP-FastDVDNet: total variation, then the video denoiser.
-    pub fn pnp_fastdvdnet() -> Self {
-        Self::gap(vec![first_stage(), deep_stage(Network::FastDvdNet, 24, 25.0, 4.4)])
-    }
-
-    /// PnP with the nonlocal prior, which needs no network.
-    pub fn pnp_nonlocal() -> Self {
-        Self::gap(vec![first_stage(), nonlocal_stage(60, 30.0, 2.6)])
-    }
-
-    /// PnP-TV-FastDVDNet: total variation, a few passes of the video denoiser, then the nonlocal
-    /// prior.
-    ///
-    /// The order was chosen by measurement. The network gets through where masks are correlated
-    /// and total variation stands still; from there the nonlocal prior goes on, with structure of
-    /// the scene that no training has seen. Total variation in series (Algorithm 1's second
-    /// period; `tv+fastdvdnet` in a schedule) gained only while the memory was 1.
-    pub fn pnp_tv_fastdvdnet() -> Self {
-        let deep = deep_stage(Network::FastDvdNet, 16, 25.0, 5.3);
-        Self::gap(vec![first_stage(), deep, nonlocal_stage(50, 20.0, 2.6)])
-    }
-
-    fn gap(stages: Vec<Stage>) -> Self {
-        let adaptive = stages.iter().any(|stage| stage.sigma.is_some());
-        Self { method: Method::Gap, accelerated: true, gamma: 0.0, adaptive, stages }
-    }
-
     /// Most iterations of all stages together.
     pub fn planned_iterations(&self) -> usize {
         self.stages.iter().map(|stage| stage.iterations).sum()
@@ -295,67 +249,6 @@ impl Schedule {
             });
         }
         self.stages.iter().try_for_each(Stage::validate)
-    }
-}
-
-/// Of the weights from 0.002 to 0.01 the one that gains most in the mean over scenes, masks and noise. More
-/// blurs what moves; where even this does, the pilot leaves it out.
-const TEMPORAL_WEIGHT: f32 = 0.004;
-
-/// What comes before the plugged-in priors.
-fn first_stage() -> Stage {
-    Stage { temporal_weight: TEMPORAL_WEIGHT, ..tv_stage(60, 0.0) }
-}
-
-fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
-    Stage {
-        prior: Prior::Tv,
-        iterations,
-        sigma: None,
-        tv_weight: 0.15,
-        tv_updates: 4,
-        temporal_weight: 0.0,
-        memory: 1.0,
-        momentum: 0.0,
-        tolerance,
-    }
-}
-
-/// Levels in units of 255 grey values.
-fn deep_stage(network: Network, iterations: usize, first: f32, last: f32) -> Stage {
-    Stage {
-        prior: Prior::Deep(network),
-        sigma: Some((Sigma(first / 255.0), Sigma(last / 255.0))),
-        tv_weight: 0.0,
-        memory: 0.85,
-        momentum: 0.5,
-        ..tv_stage(iterations, 0.0)
-    }
-}
-
-/// Levels in units of 255 grey values.
-fn nonlocal_stage(iterations: usize, first: f32, last: f32) -> Stage {
-    Stage {
-        prior: Prior::Nonlocal,
-        memory: 0.6,
-        momentum: 0.8,
-        ..deep_stage(Network::FastDvdNet, iterations, first, last)
-    }
-}
-
-#[cfg(test)]
-impl Schedule {
-    /// All of them.
-    pub(crate) fn defaults() -> [Self; 7] {
-        [
-            Self::gap_tv(),
-            Self::gap_tv3d(),
-            Self::admm_tv(),
-            Self::pnp_nonlocal(),
-            Self::pnp_ffdnet(),
-            Self::pnp_fastdvdnet(),
-            Self::pnp_tv_fastdvdnet(),
-        ]
     }
 }
 

@@ -7,6 +7,7 @@
 mod assemble;
 pub mod calibrate;
 mod calibration_task;
+mod camera;
 mod finish;
 mod history;
 mod learned;

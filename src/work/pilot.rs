@@ -44,7 +44,10 @@ pub struct StageRecord {
     pub planned: usize,
     /// Those that pay.
     pub iterations: usize,
-    /// Weight of the total variation along time, if it pays; else 0.
+    /// Weight of the total variation along time that was asked for; 0 for none.
+    #[serde(default)]
+    pub planned_temporal_weight: f32,
+    /// The same if it pays; else 0.
     #[serde(default)]
     pub temporal_weight: f32,
     /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
@@ -53,6 +56,14 @@ pub struct StageRecord {
     pub error_before: f64,
     /// The same after its iterations.
     pub error_after: f64,
+}
+
+impl StageRecord {
+    /// What became of the total variation along time; none if it was not asked for.
+    pub fn along_time(&self) -> Option<&'static str> {
+        let kept = self.temporal_weight > 0.0;
+        (self.planned_temporal_weight > 0.0).then_some(if kept { "kept" } else { "left out" })
+    }
 }
 
 impl PilotRecord {
@@ -117,6 +128,7 @@ pub fn decide(
         prior: stage.prior,
         planned: stage.iterations,
         iterations: finding.iterations,
+        planned_temporal_weight: stage.temporal_weight.unwrap_or(0.0),
         temporal_weight: finding.temporal_weight,
         end: finding.end.name().into(),
         error_before: finding.before,

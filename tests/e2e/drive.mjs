@@ -157,6 +157,13 @@ export async function compare(page, checks, labels, truth) {
   await checks.look(page, "compare-flicker");
 }
 
+/** Reads what the pilot of a job has decided. */
+export async function decided(page, checks) {
+  const card = await page.waitForSelector("section[aria-label=Manifest]:has-text('Pilot, tv')", { timeout: 30_000 });
+  const text = await card.textContent();
+  checks.that(/total variation along time (kept|left out), error at held-out pixels 1 to 0\.\d+/.test(text), `what the pilot decided is told: ${text}`);
+}
+
 /** Cancels, retries and deletes a job that would run for long. */
 export async function manage(page, checks, label) {
   await page.click("#nav >> text=Jobs");

@@ -7,7 +7,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, compare, manage, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, compare, decided, manage, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene } from "./scene.mjs";
@@ -40,6 +40,11 @@ async function everything() {
   const other = await service.submit({ measurement, algorithm: "gap-tv", label: "ten iterations", schedule: { stages: [{ prior: "tv", iterations: 10, tv_weight: 0.05 }] } });
   await service.when(other.id, (job) => job.state === "succeeded");
   await checks.step("compare", () => compare(page, checks, ["ten iterations", HOSTILE], shown.truth));
+  const adaptive = await service.submit({ measurement, algorithm: "gap-tv3d", label: "with a pilot" });
+  await service.when(adaptive.id, (job) => job.state === "succeeded");
+  await page.goto(`${service.url}/#/jobs/${adaptive.id}`);
+  await checks.step("decided", () => decided(page, checks));
+  await checks.look(page, "job-pilot");
   await service.submit(long(measurement, "long job"));
   await checks.step("manage", () => manage(page, checks, "long job"));
   checks.that((await page.textContent(`.list a >> text=${HOSTILE}`)) === HOSTILE, "the list shows the name as text");

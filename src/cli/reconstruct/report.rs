@@ -51,14 +51,16 @@ impl Report {
         );
         for stage in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             println!(
-                "{}{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}",
+                "{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}{}",
                 stage.prior.name(),
-                if stage.temporal_weight > 0.0 { " in space and time" } else { "" },
                 stage.iterations,
                 stage.planned,
                 stage.end,
                 stage.error_before,
-                stage.error_after
+                stage.error_after,
+                stage.along_time().map_or_else(String::new, |fate| format!(
+                    ", total variation along time {fate}"
+                ))
             );
         }
         if let Some(psnr) = self.psnr_db {

@@ -136,11 +136,18 @@ async function showManifest(element, now, snapshot, signal) {
   ]), h("details", null, h("summary", null, "All of it"), h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
 }
 
-/** How far the stages of an adaptive schedule went, and why. */
+/** What the pilot decided of the stages of an adaptive schedule, and why. */
 function pilot(content) {
-  const stages = (content.pilot?.stages ?? []).filter((stage) => stage.end !== "fixed");
   const why = { "max-iterations": "all that were planned", converged: "later ones raise the error", diverged: "later ones diverge" };
-  return stages.map((stage) => [`Pilot, ${stage.prior}${stage.temporal_weight > 0 ? " in space and time" : ""}`, `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]}), error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`]);
+  const row = (stage) => {
+    const decided = [
+      why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
+      stage.planned_temporal_weight > 0 && `total variation along time ${stage.temporal_weight > 0 ? "kept" : "left out"}`,
+    ].filter(Boolean);
+    const error = `error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`;
+    return decided.length > 0 && [`Pilot, ${stage.prior}`, [...decided, error].join(", ")];
+  };
+  return (content.pilot?.stages ?? []).map(row).filter(Boolean);
 }
 
 function warnings(manifest) {

@@ -5,11 +5,14 @@ use std::ops::Range;
 use multiversion::multiversion;
 use ndarray::{Array3, Axis};
 
-/// Step of the dual ascent: 1 / (2 * dimensions) of one dimension would be 1/2; a quarter is safe for any
-/// number of frames.
+/// Step of the dual ascent: `1 / ||D||^2`, and the difference `D` along one dimension has a squared norm
+/// below 4 for any number of frames.
 const TAU: f32 = 0.25;
 /// Pixels that are worked on at once: their values in all frames stay in the first-level cache.
 const LANES: usize = 64;
+
+/// Of what the solver makes.
+const CONTIGUOUS: &str = "frames are in standard layout";
 
 /// The values of `LANES` pixels in one frame.
 type Lanes = [f32; LANES];
@@ -33,6 +36,9 @@ impl TemporalVariation {
     /// some rows of `frames` \[B,H,W\], in place: `updates` steps of projected gradient ascent on
     /// the dual from 0 (`p <- clamp(p - tau (u_(k+1) - u_k), +-weight)`, `u_k = x_k - p_k +
     /// p_(k-1)`).
+    ///
+    /// # Panics
+    /// If the frames are not in standard layout.
     pub fn denoise(
         &mut self,
         frames: &mut Array3<f32>,
@@ -46,16 +52,15 @@ impl TemporalVariation {
         for start in (rows.start * width..end).step_by(LANES) {
             let pixels = start..end.min(start + LANES);
             for (values, frame) in self.values.iter_mut().zip(frames.axis_iter(Axis(0))) {
-                if let Some(frame) = frame.to_slice() {
-                    values[..pixels.len()].copy_from_slice(&frame[pixels.clone()]);
-                }
+                let frame = frame.to_slice().unwrap_or_else(|| unreachable!("{CONTIGUOUS}"));
+                values[..pixels.len()].copy_from_slice(&frame[pixels.clone()]);
             }
             self.dual.fill([0.0; LANES]);
             (0..updates).for_each(|_| update(&self.values, &mut self.dual, weight));
             let mut before = &[0.0; LANES];
             let sums = self.values.iter().zip(&self.dual);
             for ((values, dual), mut frame) in sums.zip(frames.axis_iter_mut(Axis(0))) {
-                let Some(frame) = frame.as_slice_mut() else { continue };
+                let frame = frame.as_slice_mut().unwrap_or_else(|| unreachable!("{CONTIGUOUS}"));
                 let lanes = values.iter().zip(dual).zip(before);
                 for (out, ((x, after), before)) in frame[pixels.clone()].iter_mut().zip(lanes) {
                     *out = x - after + before;
