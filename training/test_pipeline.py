@@ -83,7 +83,7 @@ def test_pipeline():
         run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2)
         run('train.py', *common, '--stage', 'ffdnet', '--out', out('white.pt'))
         run('train.py', *common, '--stage', 'ffdnet-loop', '--init', out('white.pt'), '--out', out('ffdnet.pt'), '--runs', 2)
-        run('train.py', *common, '--stage', 'loop', '--out', out('loop.pt'), '--runs', 2)
+        run('train.py', *common, '--stage', 'loop', '--out', out('loop.pt'), '--runs', 2, '--unroll', 2)
         assert torch.load(out('loop.pt'), weights_only=True)['step'] == 6, 'the second run continues the first'
         for name in ('loop', 'ffdnet'):
             run('export.py', out(f'{name}.pt'), out(name))

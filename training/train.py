@@ -86,22 +86,23 @@ class Iterates:
             levels, tv = solver.geometric(near(first), near(last), round(near(passes))), 0
         return {'truth': x, 'gap': gap, 'v': v, 'start': v, 'levels': levels, 'momentum': momentum, 'tv': tv}
 
-    @torch.no_grad()
-    def next(self):
-        """(input, sigma, truth, done): call done(output) with what the network made of the input."""
+    def passes(self, most, denoise):
+        """Advances one of the runs by up to so many passes of denoise(x, sigma); the rms error after each, with the gradient through
+        projection, momentum and network back to where the first of them began."""
         i = self.rng.randrange(len(self.runs))
-        run = self.runs[i]
-        x = run['gap'].project(run['start'])
-        if run['tv']:
-            x = solver.tv(x, run['tv'])
-        sigma = torch.full((len(x), 1, 1, 1), run['levels'].pop(0), device=self.device)
-
-        def done(output):
+        run, errors = self.runs[i], []
+        for _ in range(min(most, len(run['levels']))):
+            x = run['gap'].project(run['start'])
+            if run['tv']:
+                x = solver.tv(x, run['tv'])
+            output = denoise(x, torch.full((len(x), 1, 1, 1), run['levels'].pop(0), device=self.device))
+            errors.append(rms_error(output, run['truth']))
             run['start'] = output + run['momentum'] * (output - run['v'])
             run['v'] = output
-            if not run['levels'] or not torch.isfinite(output).all() or output.abs().max() > 4:
-                self.runs[i] = self.fresh()
-        return x, sigma, run['truth'], done
+        run['gap'].excess, run['start'], run['v'] = (a.detach() for a in (run['gap'].excess, run['start'], run['v']))
+        if not run['levels'] or not torch.isfinite(run['v']).all() or run['v'].abs().max() > 4:
+            self.runs[i] = self.fresh()
+        return errors
 
 
 # ---------------------------------------------------------------- training
@@ -154,14 +155,26 @@ class Training:
         net.load_state_dict(self.average)
         return net.to(self.device, memory_format=torch.channels_last).eval()
 
-    def learn(self, x, sigma, truth):
-        """Add the gradient of one batch; returns the loss and the output."""
+    def denoise(self, x, sigma):
+        """The output for a batch, and the frames of x that it stands for."""
         # On a GPU in bf16; on the CPUs tried, bf16 was slower than float32.
         with torch.autocast(self.device, torch.bfloat16, enabled=self.device == 'cuda'):
             y, frames = predict(self.net, self.a.stage, x, sigma)
+        return y.float(), frames
+
+    def learn_white(self, truth):
+        """Add the gradient of a batch of white noise; the loss."""
+        y, frames = self.denoise(*self.white_noise(truth))
         loss = rms_error(y, truth[:, frames])
         loss.backward()
-        return loss.detach(), y.detach().float()
+        return loss.detach()
+
+    def learn_loop(self, loop):
+        """Add the gradient of a few passes of the solver; the loss, which is the mean of theirs."""
+        errors = loop.passes(self.a.unroll, lambda x, sigma: self.denoise(x, sigma)[0])
+        loss = sum(errors) / len(errors)
+        loss.backward()
+        return loss.detach()
 
     def update(self):
         """One step of the optimizer with the gradients added so far."""
@@ -239,6 +252,7 @@ def main():
     p.add_argument('--frames', type=int, default=0, help='frames a batch (default: 16 on a CPU, 384 on a GPU)')
     p.add_argument('--crop', type=int, default=64)
     p.add_argument('--lr', type=float, default=2e-4)
+    p.add_argument('--unroll', type=int, default=1, help='passes of the solver a step; the gradient goes through all of them')
     p.add_argument('--runs', type=int, default=12, help='solver runs that stand open in the loop stages')
     p.add_argument('--workers', type=int, default=1, help='producer processes of each kind')
     p.add_argument('--threads', type=int, default=1)
@@ -280,13 +294,9 @@ def main():
         began = time.monotonic()
         if not loop or t.step % 3 == 0:   # of iterates there are more kinds than of white noise
             truth = torch.from_numpy(clips.get()).to(device, non_blocking=True)
-            white, _ = t.learn(*t.white_noise(truth), truth)
-            sums['white'] += white * (3 if loop else 1)
+            sums['white'] += t.learn_white(truth) * (3 if loop else 1)
         if loop:
-            x, sigma, truth, done = loop.next()
-            looped, y = t.learn(x, sigma, truth)
-            done(y)
-            sums['loop'] += looped
+            sums['loop'] += t.learn_loop(loop)
         sums['gradient norm'] += t.update()
         n += 1
         t.seconds += time.monotonic() - began
