@@ -73,6 +73,14 @@ def test_projection_explains_the_measurement():
         assert torch.isfinite(v).all()
 
 
+def test_gradients_go_through_total_variation():
+    x = torch.rand(1, 4, 16, 16)
+    x[..., 4:9, 4:9] = .5   # a flat area
+    x.requires_grad_()
+    (solver.tv(x, .02) * torch.rand(1, 4, 16, 16)).sum().backward()
+    assert torch.isfinite(x.grad).all() and x.grad.abs().max() > 0
+
+
 def test_pipeline():
     with tempfile.TemporaryDirectory() as folder:
         data = make_footage(folder)

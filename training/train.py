@@ -61,7 +61,7 @@ def random_levels(rng):
 
 
 class Iterates:
-    """What the solver hands to the network. Several runs stand open; each step advances one of them by one pass.
+    """What the solver hands to the network. Several runs stand open; each step advances one of them by one pass, or by a few.
 
     The forward pass that trains is the pass that moves the run on, so iterates cost nothing but the projection.
     """
@@ -259,6 +259,8 @@ def main():
     p.add_argument('--scene', help='a .mat scene that evaluation also runs')
     p.add_argument('--every', type=float, default=15, help='minutes between evaluations')
     a = p.parse_args()
+    if a.unroll < 1:
+        p.error(f'--unroll {a.unroll}: a step needs at least 1 pass')
     device = 'cuda' if torch.cuda.is_available() else 'cpu'
     torch.set_num_threads(a.threads)
     os.makedirs(os.path.dirname(os.path.abspath(a.out)), exist_ok=True)

@@ -7,8 +7,9 @@
 
 use sqlx::SqliteConnection;
 
+use super::claims::Lease;
 use super::error::StoreError;
-use super::queue::{self, Lease};
+use super::queue;
 use super::rows::{number, parsed};
 use super::{Store, jobs, tasks};
 use crate::job::{JobId, JobState, TaskId, TaskKind, Timestamp};

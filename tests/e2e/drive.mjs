@@ -157,11 +157,12 @@ export async function compare(page, checks, labels, truth) {
   await checks.look(page, "compare-flicker");
 }
 
-/** Reads what the pilot of a job has decided. */
-export async function decided(page, checks) {
+/** Reads what the pilot of a job has decided; stage is its record in the manifest. */
+export async function decided(page, checks, stage) {
   const card = await page.waitForSelector("section[aria-label=Manifest]:has-text('Pilot, tv')", { timeout: 30_000 });
   const text = await card.textContent();
-  checks.that(/total variation along time (kept|left out), error at held-out pixels 1 to 0\.\d+/.test(text), `what the pilot decided is told: ${text}`);
+  const expected = `total variation along time ${stage.temporal_weight === 0 ? "left out" : "kept"}, error at held-out pixels 1 to ${Number(stage.error_after.toPrecision(3))}`;
+  checks.that(stage.planned_temporal_weight > 0 && text.includes(expected), `what the pilot decided is told: ${text}`);
 }
 
 /** Cancels, retries and deletes a job that would run for long. */

@@ -43,7 +43,8 @@ async function everything() {
   const adaptive = await service.submit({ measurement, algorithm: "gap-tv3d", label: "with a pilot" });
   await service.when(adaptive.id, (job) => job.state === "succeeded");
   await page.goto(`${service.url}/#/jobs/${adaptive.id}`);
-  await checks.step("decided", () => decided(page, checks));
+  const { content } = await service.call("GET", `/v1/jobs/${adaptive.id}/manifest.json`);
+  await checks.step("decided", () => decided(page, checks, content.pilot.stages[0]));
   await checks.look(page, "job-pilot");
   await service.submit(long(measurement, "long job"));
   await checks.step("manage", () => manage(page, checks, "long job"));
