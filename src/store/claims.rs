@@ -55,7 +55,7 @@ pub struct ClaimedTask {
 pub enum Heartbeat {
     /// Go on; the lease is renewed.
     Continue,
-    /// The job is not wanted any more: stop, and call [`Store::cancelled`].
+    /// The job is not wanted any more: stop, and call [`super::Store::cancelled`].
     Cancelled,
     /// The lease ran out and the task is someone else's: stop, and drop everything.
     Lost,
