@@ -41,6 +41,7 @@ pub type Content = Cow<'static, [u8]>;
 pub const fn of(network: Network) -> Model {
     match network {
         Network::FastDvdNet => FASTDVDNET_GRAY,
+        Network::FastDvdNetInt8 => FASTDVDNET_GRAY_INT8,
         Network::FfdNet => FFDNET_GRAY,
     }
 }
@@ -50,6 +51,14 @@ const FASTDVDNET_GRAY: Model = Model {
     files: &[
         ("stage1.onnx", include_bytes!("../models/fastdvdnet-gray/stage1.onnx")),
         ("stage2.onnx", include_bytes!("../models/fastdvdnet-gray/stage2.onnx")),
+    ],
+};
+
+const FASTDVDNET_GRAY_INT8: Model = Model {
+    name: "fastdvdnet-gray-int8",
+    files: &[
+        ("stage1.onnx", include_bytes!("../models/fastdvdnet-gray-int8/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../models/fastdvdnet-gray-int8/stage2.onnx")),
     ],
 };
 

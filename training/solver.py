@@ -134,11 +134,13 @@ def geometric(first, last, passes):
 
 
 @torch.no_grad()
-def passes(gap, v, net, sigmas, tv_weight=0.):
+def passes(gap, v, net, sigmas, tv_weight=0., momentum=0.):
     """The deep iterations; yields the estimate after each."""
+    start = v
     for sigma in sigmas:
-        x = gap.project(v)
+        x = gap.project(start)
         if tv_weight:
             x = tv(x, tv_weight)
-        v = net.clips(x, torch.full((len(x), 1, 1, 1), sigma, device=x.device))
+        output = net.clips(x, torch.full((len(x), 1, 1, 1), sigma, device=x.device))
+        start, v = output + momentum * (output - v), output
         yield v

@@ -1,6 +1,6 @@
 """The whole pipeline on tiny settings and footage made here: pack, train every stage, resume, export, read back, evaluate.
 
-    python test_pipeline.py      (or through pytest; about a minute on one core)
+    python test_pipeline.py      (or through pytest; four to five minutes on one core)
 """
 import json
 import os
@@ -14,6 +14,7 @@ import torch
 
 import export
 import model
+import quantize
 import solver
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -101,6 +102,13 @@ def test_pipeline():
         parts = [model.load(out(f'{name}.pt')).state_dict() for name in ('loop', 'full')]
         for k, v in export.weights_of(out('mean')).state_dict().items():
             assert torch.allclose(v, (parts[0][k] + parts[1][k]) / 2), k
+        run('quantize.py', '--data', data, '--snapshots', 1, '--size', 32, '--quick', 2, out('loop'), out('int8'))
+        exact, quick = quantize.Exported(out('loop')), quantize.Exported(out('int8'))
+        x, sigma = torch.rand(1, 6, 32, 32), torch.full((1, 1, 1, 1), .1)
+        change = (quick.clips(x, sigma) - exact.clips(x, sigma)).abs().max()
+        assert 0 < change < .05, change
+        size = lambda name: os.path.getsize(os.path.join(out(name), 'stage1.onnx'))
+        assert size('int8') < .3 * size('loop')
         rows = [json.loads(line) for line in run('evaluate.py', '--data', data, out('loop'), out('ffdnet'), '--passes', 2).splitlines()]
         assert [os.path.basename(r['model']) for r in rows] == ['tv', 'loop', 'ffdnet']
         assert all(np.isfinite(list(r['loop'].values())).all() for r in rows)

@@ -127,8 +127,10 @@ impl Algorithm {
             Self::GapTv | Self::GapTv3d | Self::AdmmTv => vec![P::Tv],
             Self::PnpNonlocal => vec![P::Tv, P::Nonlocal],
             Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
-            Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNet],
-            Self::PnpTvFastDvdNet => vec![P::Tv, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal],
+            Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNetInt8, P::FastDvdNet],
+            Self::PnpTvFastDvdNet => {
+                vec![P::Tv, P::FastDvdNetInt8, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal]
+            }
             Self::Learned => Vec::new(),
         }
     }

@@ -89,6 +89,9 @@ pub enum PriorSpec {
     /// FastDVDNet over the clip.
     #[serde(rename = "fastdvdnet")]
     FastDvdNet,
+    /// FastDVDNet with weights and activations of 8 bits.
+    #[serde(rename = "fastdvdnet-int8")]
+    FastDvdNetInt8,
     /// TV, then FastDVDNet, in each iteration.
     #[serde(rename = "tv+fastdvdnet")]
     TvFastDvdNet,
@@ -116,6 +119,7 @@ impl PriorSpec {
             Self::Nonlocal => Prior::Nonlocal,
             Self::FfdNet => Prior::Deep(Network::FfdNet),
             Self::FastDvdNet => Prior::Deep(Network::FastDvdNet),
+            Self::FastDvdNetInt8 => Prior::Deep(Network::FastDvdNetInt8),
             Self::TvFastDvdNet => Prior::TvFastDvdNet,
         }
     }
@@ -128,6 +132,7 @@ impl PriorSpec {
             Self::Nonlocal => "nonlocal",
             Self::FfdNet => "ffdnet",
             Self::FastDvdNet => "fastdvdnet",
+            Self::FastDvdNetInt8 => "fastdvdnet-int8",
             Self::TvFastDvdNet => "tv+fastdvdnet",
         }
     }
@@ -281,6 +286,7 @@ impl From<&Schedule> for ScheduleSpec {
                     Prior::Nonlocal => PriorSpec::Nonlocal,
                     Prior::Deep(Network::FfdNet) => PriorSpec::FfdNet,
                     Prior::Deep(Network::FastDvdNet) => PriorSpec::FastDvdNet,
+                    Prior::Deep(Network::FastDvdNetInt8) => PriorSpec::FastDvdNetInt8,
                     Prior::TvFastDvdNet => PriorSpec::TvFastDvdNet,
                 },
                 iterations: stage.iterations,

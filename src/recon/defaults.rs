@@ -1,5 +1,7 @@
 //! The schedules of the algorithms: what runs where a job names none of its own.
 
+use std::ops::Range;
+
 use super::schedule::{Method, Network, Prior, Schedule, Sigma, Stage};
 
 impl Schedule {
@@ -30,7 +32,8 @@ impl Schedule {
 
     /// PnP-FastDVDNet: total variation, then the video denoiser.
     pub fn pnp_fastdvdnet() -> Self {
-        Self::gap(vec![first_stage(), deep_stage(Network::FastDvdNet, 24, 25.0, 4.4)])
+        let [quick, exact] = fastdvdnet_stages(18, 6, 25.0, 4.4);
+        Self::gap(vec![first_stage(), quick, exact])
     }
 
     /// PnP with the nonlocal prior, which needs no network.
@@ -46,8 +49,8 @@ impl Schedule {
     /// the scene that no training has seen. Total variation in series (Algorithm 1's second
     /// period; `tv+fastdvdnet` in a schedule) gained only while the memory was 1.
     pub fn pnp_tv_fastdvdnet() -> Self {
-        let deep = deep_stage(Network::FastDvdNet, 16, 25.0, 5.3);
-        Self::gap(vec![first_stage(), deep, nonlocal_stage(50, 20.0, 2.6)])
+        let [quick, exact] = fastdvdnet_stages(12, 4, 25.0, 5.3);
+        Self::gap(vec![first_stage(), quick, exact, nonlocal_stage(50, 20.0, 2.6)])
     }
 
     fn gap(stages: Vec<Stage>) -> Self {
@@ -89,6 +92,19 @@ fn deep_stage(network: Network, iterations: usize, first: f32, last: f32) -> Sta
         momentum: 0.5,
         ..tv_stage(iterations, 0.0)
     }
+}
+
+/// The video denoiser with 8 bits for as many iterations as that costs nothing, then with floating point: the
+/// levels fall through both as through one. Levels in units of 255 grey values.
+fn fastdvdnet_stages(quick: usize, exact: usize, first: f32, last: f32) -> [Stage; 2] {
+    let whole = deep_stage(Network::FastDvdNet, quick + exact, first, last);
+    let part = |network, range: Range<usize>| Stage {
+        prior: Prior::Deep(network),
+        iterations: range.len(),
+        sigma: whole.sigma_at(range.start).zip(whole.sigma_at(range.end - 1)),
+        ..whole.clone()
+    };
+    [part(Network::FastDvdNetInt8, 0..quick), part(Network::FastDvdNet, quick..quick + exact)]
 }
 
 /// Levels in units of 255 grey values.

@@ -283,10 +283,9 @@ mod tests {
         });
         let y = measure(masks.view(), truth.view()).unwrap();
         let op = SensingOperator::new(masks).unwrap();
-        let mut schedule = Schedule::pnp_fastdvdnet();
-        // Without momentum, so that each pass helps.
+        let mut schedule = Schedule::pnp_ffdnet();
         schedule.stages[1].iterations = planned;
-        schedule.stages[1].momentum = 0.0;
+        // So that each pass helps.
         schedule.stages[1].memory = 0.0;
         let mut network = Tiring { truth, good, passes: 0, harm };
         let found = run(op, y.view(), &schedule, &mut network, &mut ()).unwrap();

@@ -37,6 +37,9 @@ pub enum Network {
     FfdNet,
     /// FastDVDNet, five frames at a time.
     FastDvdNet,
+    /// The same with weights and activations of 8 bits: about three times as fast on a CPU, and a little
+    /// less exact.
+    FastDvdNetInt8,
 }
 
 /// What stands for `D` in `v = D(x)`.
@@ -262,7 +265,8 @@ mod tests {
             schedule.validate().unwrap();
         }
         assert!(Schedule::pnp_tv_fastdvdnet().planned_passes() <= 24);
-        assert_eq!(Schedule::pnp_tv_fastdvdnet().networks(), [Network::FastDvdNet]);
+        let both = [Network::FastDvdNet, Network::FastDvdNetInt8];
+        assert_eq!(Schedule::pnp_tv_fastdvdnet().networks(), both);
         assert_eq!(Schedule::pnp_nonlocal().networks(), []);
     }
 
@@ -275,6 +279,9 @@ mod tests {
         assert_eq!(at(0), first.value());
         assert!((at(stage.iterations - 1) - last.value()).abs() < 1e-6);
         assert!((at(2) / at(1) - at(1) / at(0)).abs() < 1e-5);
+        // From 8 bits to floating point as from one iteration to the next.
+        let next = schedule.stages[2].sigma_at(0).unwrap().value();
+        assert!((next / last.value() - at(1) / at(0)).abs() < 1e-5);
     }
 
     #[test]

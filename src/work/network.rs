@@ -1,6 +1,7 @@
 //! Where the denoiser comes from: libonnxruntime, and the network that the program carries or a
 //! folder holds.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
@@ -80,7 +81,16 @@ impl NetworkSource {
             let contents = self.contents(network)?;
             Ok(ModelRecord::new(&models::of(network), contents.iter().map(AsRef::as_ref)))
         };
-        schedule.networks().into_iter().map(record).collect()
+        let used: BTreeSet<_> = schedule.networks().into_iter().map(|n| self.used(n)).collect();
+        used.into_iter().map(record).collect()
+    }
+
+    /// The network that stands for `asked` on the device: 8 bits pay on a CPU only.
+    fn used(&self, asked: Network) -> Network {
+        match (asked, self.device) {
+            (Network::FastDvdNetInt8, Device::Cuda(_)) => Network::FastDvdNet,
+            _ => asked,
+        }
     }
 
     fn contents(&self, which: Network) -> Result<Vec<models::Content>, NetworkError> {
@@ -109,9 +119,10 @@ impl NetworkSource {
 
     /// A network with sessions of its own, for one thread.
     fn load(&self, which: Network) -> Result<Box<dyn Denoiser + Send>, NetworkError> {
+        let which = self.used(which);
         let (runtime, files) = (self.runtime()?, self.contents(which)?);
         Ok(match (which, files.as_slice()) {
-            (Network::FastDvdNet, [first, second]) => {
+            (Network::FastDvdNet | Network::FastDvdNetInt8, [first, second]) => {
                 Box::new(FastDvdNet::load(&runtime, first, second)?)
             }
             (_, [model, ..]) => Box::new(FfdNet::load(&runtime, model)?),
@@ -231,6 +242,18 @@ mod tests {
         assert!(error.contains("/nowhere/libonnxruntime.so"), "{error}");
         assert!(error.contains("--onnxruntime"), "{error}");
     }
+
+    #[test]
+    fn a_gpu_computes_with_floating_point_and_the_records_say_so() {
+        let schedule = Algorithm::PnpFastDvdNet.default_schedule();
+        let names = |device| -> Vec<String> {
+            let records = NetworkSource::new(None, device).records(&schedule).unwrap();
+            records.into_iter().map(|record| record.name).collect()
+        };
+        assert_eq!(names(Device::Cpu), ["fastdvdnet-gray", "fastdvdnet-gray-int8"]);
+        assert_eq!(names(Device::Cuda(0)), ["fastdvdnet-gray"]);
+    }
+
     #[test]
     fn networks_of_a_folder_replace_the_carried_ones_and_are_recorded() {
         let carried = NetworkSource::new(None, Device::Cpu);

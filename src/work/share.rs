@@ -37,7 +37,7 @@ mod tests {
 
     #[test]
     fn an_early_end_of_a_stage_jumps_to_its_end() {
-        let schedule = Schedule::pnp_fastdvdnet();
+        let schedule = Schedule::pnp_ffdnet();
         let passes = schedule.stages[1].iterations;
         let mut share = ShareDone::new(ScheduleSpec::from(&schedule));
         let at = |stage, done| Progress {
