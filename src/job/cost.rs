@@ -17,8 +17,8 @@ const NONLOCAL_NS: f64 = 1_700.0;
 const FFDNET_PASS_NS: f64 = 1_450.0;
 /// Cost of one pass of FastDVDNet with a shared first stage, CPU-nanoseconds per voxel (measured).
 const DEEP_PASS_NS: f64 = 4_900.0;
-/// Cost of the same with 8 bits (measured: a third, with AVX-512 VNNI).
-const INT8_PASS_NS: f64 = 1_640.0;
+/// Cost of the same with 8 bits (measured: 0.36 of it, with AVX-512 VNNI).
+const INT8_PASS_NS: f64 = 1_800.0;
 
 impl PriorSpec {
     /// Cost of one iteration without projection and TV, CPU-nanoseconds per voxel.

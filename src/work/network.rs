@@ -119,7 +119,6 @@ impl NetworkSource {
 
     /// A network with sessions of its own, for one thread.
     fn load(&self, which: Network) -> Result<Box<dyn Denoiser + Send>, NetworkError> {
-        let which = self.used(which);
         let (runtime, files) = (self.runtime()?, self.contents(which)?);
         Ok(match (which, files.as_slice()) {
             (Network::FastDvdNet | Network::FastDvdNetInt8, [first, second]) => {
@@ -191,7 +190,8 @@ impl WarmNetworks {
 }
 
 impl Networks for WarmNetworks {
-    fn network(&mut self, which: Network) -> Result<&mut dyn Denoiser, ReconError> {
+    fn network(&mut self, asked: Network) -> Result<&mut dyn Denoiser, ReconError> {
+        let which = self.source.used(asked);
         let index = match self.loaded.iter().position(|(kind, _)| *kind == which) {
             Some(index) => index,
             None => {
