@@ -66,3 +66,21 @@ const FFDNET_GRAY: Model = Model {
     name: "ffdnet-gray",
     files: &[("model.onnx", include_bytes!("../models/ffdnet-gray/model.onnx"))],
 };
+
+#[cfg(test)]
+mod tests {
+    use super::of;
+    use crate::recon::schedule::Network;
+    use crate::work::sha256_of;
+
+    #[test]
+    fn the_twin_with_8_bits_was_made_from_these_weights() {
+        let (exact, quick) = (of(Network::FastDvdNet), of(Network::FastDvdNetInt8));
+        for ((name, exact), (_, quick)) in exact.files.iter().zip(quick.files) {
+            // `training/quantize.py` writes it among the file's properties.
+            let source = sha256_of(&mut &**exact).unwrap();
+            let found = quick.windows(source.len()).any(|window| window == source.as_bytes());
+            assert!(found, "{name}: make the twin anew with training/quantize.py");
+        }
+    }
+}

@@ -10,6 +10,7 @@ each other, which changes no result (`balance`). The residual's addition, which 
 At the end it says what the 8 bits cost in the loop on snapshots of the validation part, which set no scale.
 """
 import argparse
+import hashlib
 import itertools
 import os
 
@@ -23,29 +24,7 @@ import evaluate
 import export
 import solver
 from data import Footage
-from train import DEFAULTS
-
-STAGES = 'stage1.onnx', 'stage2.onnx'
-
-
-class Exported:
-    """The network as its ONNX files compute it; `seen` collects what each file was given."""
-
-    def __init__(self, folder, seen=None):
-        self.stages = [export.session(os.path.join(folder, name)) for name in STAGES]
-        self.seen = seen
-
-    def clips(self, x, sigma):
-        """A clip x [1,B,H,W] and sigma [1,1,1,1] -> [1,B,H,W]."""
-        b, level = x.shape[1], sigma.numpy().reshape(())
-        frames = x[0, [2, 1, *range(b), b - 2, b - 3], None].numpy()
-        for k, stage in enumerate(self.stages):
-            inputs = {'frames': np.ascontiguousarray(frames), 'sigma': level}
-            if self.seen is not None:
-                self.seen[k].append(inputs)
-            frames = stage.run(None, inputs)[0]
-        return torch.from_numpy(frames[None, :, 0])
-
+from train import DEFAULTS, TV_STAGE
 
 def snapshots(data, split, count, size):
     """Truth, measurement and masks of simulated snapshots, always the same for the same footage."""
@@ -61,7 +40,7 @@ def snapshots(data, split, count, size):
 def run(y, masks, networks):
     """The estimate after the passes of the default schedule, each with the next of the networks."""
     first, last, count, memory, momentum = DEFAULTS['loop']
-    gap, v = solver.start(y, masks, 60, .15, .004)
+    gap, v = solver.start(y, masks, *TV_STAGE)
     gap.memory = memory
 
     class InTurn:
@@ -115,6 +94,8 @@ def balance(network, inputs, share=.8):
 
 def quantize(source, target, inputs):
     network = onnx.load(source)
+    with open(source, 'rb') as f:   # so that weights and a twin of other weights are not taken for a pair
+        onnx.helper.set_model_props(network, {'source_sha256': hashlib.sha256(f.read()).hexdigest()})
     balance(network, inputs)
     result = [node.name for node in network.graph.node if node.op_type == 'Add'][-1]
     quantize_static(network, target, Inputs(inputs), quant_format=QuantFormat.QDQ, op_types_to_quantize=['Conv', 'Relu', 'Add', 'DepthToSpace'],
@@ -132,13 +113,13 @@ def main():
     a = p.parse_args()
     torch.set_num_threads(1)
     seen = [], []
-    exact = Exported(a.source, seen)
+    exact = export.Exported(a.source, seen)
     for _, y, masks in snapshots(a.data, 'train', a.snapshots, a.size):
         run(y, masks, itertools.repeat(exact))
     os.makedirs(a.folder, exist_ok=True)
-    for name, inputs in zip(STAGES, seen):
+    for name, inputs in zip(export.STAGES, seen):
         quantize(os.path.join(a.source, name), os.path.join(a.folder, name), inputs[::4])   # passes that follow each other are alike
-    exact, quick = Exported(a.source), Exported(a.folder)
+    exact, quick = export.Exported(a.source), export.Exported(a.folder)
     losses = []
     for x, y, masks in snapshots(a.data, 'val', a.snapshots, a.size):
         whole, part = (run(y, masks, networks) for networks in

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Half an hour of one CUDA GPU, from the committed weights to better ones. The same command again continues an interrupted run.
 #   training/run_gpu.sh DATA OUT [TOTAL_MINUTES] [MINUTES_OF_THIS_CALL]
-# Leaves OUT/loop.pt (checkpoint), OUT/fastdvdnet-gray/*.onnx and OUT/evaluation-loop.json. PYTHON names the interpreter;
+# Leaves OUT/loop.pt (checkpoint), OUT/fastdvdnet-gray/*.onnx, their 8-bit twin in OUT/fastdvdnet-gray-int8 and OUT/evaluation-loop.json. PYTHON names the interpreter;
 # NETWORK=ffdnet trains the small network instead, for which five minutes are much.
 set -eu
 data=$1 out=$2 total=${3:-28} now=${4:-$total}
@@ -17,4 +17,5 @@ mkdir -p "$out"
 "$python" "$here/train.py" --data "$data" --out "$out/$stage.pt" --stage "$stage" --init "$here/../models/$name" \
     --minutes "$total" --run-minutes "$now" --crop 96 --frames "${FRAMES:-256}" --lr 3e-4 --workers "$workers" --runs 24 --every 8 ${EXTRA:-}
 "$python" "$here/export.py" "$out/$stage.pt" "$out/$name"
+[ "$stage" != loop ] || "$python" "$here/quantize.py" --data "$data" "$out/$name" "$out/$name-int8"   # weights and twin go together
 "$python" "$here/evaluate.py" --data "$data" "$here/../models/$name" "$out/$name" | tee "$out/evaluation-$stage.json"

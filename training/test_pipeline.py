@@ -14,7 +14,6 @@ import torch
 
 import export
 import model
-import quantize
 import solver
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -103,7 +102,7 @@ def test_pipeline():
         for k, v in export.weights_of(out('mean')).state_dict().items():
             assert torch.allclose(v, (parts[0][k] + parts[1][k]) / 2), k
         run('quantize.py', '--data', data, '--snapshots', 1, '--size', 32, '--quick', 2, out('loop'), out('int8'))
-        exact, quick = quantize.Exported(out('loop')), quantize.Exported(out('int8'))
+        exact, quick = export.Exported(out('loop')), export.Exported(out('int8'))
         x, sigma = torch.rand(1, 6, 32, 32), torch.full((1, 1, 1, 1), .1)
         change = (quick.clips(x, sigma) - exact.clips(x, sigma)).abs().max()
         assert 0 < change < .05, change

@@ -30,6 +30,7 @@ from data import Footage
 STAGES = {'block': ('block', 3), 'full': ('fastdvdnet', 5), 'loop': ('fastdvdnet', 5), 'ffdnet': ('ffdnet', 1), 'ffdnet-loop': ('ffdnet', 1)}
 
 # The program's default schedules: first and last level (/255), passes, memory, momentum.
+TV_STAGE = 60, .15, .004   # iterations, weight, weight along time (the program leaves that out where it does not pay)
 DEFAULTS = {'loop': (25, 5.3, 16, .85, .5), 'ffdnet-loop': (15, 3, 30, .95, 0)}
 
 
@@ -74,13 +75,13 @@ class Iterates:
 
     def fresh(self):
         x, masks, y = (torch.from_numpy(a).to(self.device) for a in self.queue.get())
-        temporal = self.rng.choice([0, .004])
+        temporal = self.rng.choice([0, TV_STAGE[2]])
         if self.rng.random() < .3:
             gap, v = solver.start(y, masks, self.rng.randint(20, 50), self.rng.uniform(.07, .15), temporal)
             gap.memory = self.rng.choice([0, .5, .8, 1])   # for the deep passes
             levels, momentum, tv = random_levels(self.rng), 0, self.rng.choice([0, 0, 0, .02])
         else:
-            gap, v = solver.start(y, masks, 60, .15, temporal)
+            gap, v = solver.start(y, masks, *TV_STAGE[:2], temporal)
             first, last, passes, gap.memory, momentum = self.default
             near = lambda value: value * math.exp(self.rng.uniform(-.2, .2))
             levels, tv = solver.geometric(near(first), near(last), round(near(passes))), 0
