@@ -5,34 +5,17 @@
 //! processes work on the same content: the database is the one mutex of the service. No transaction
 //! is open while anything is computed or uploaded.
 
-mod acceptance;
 mod backup;
-mod blobs;
-mod calibrating;
-mod calibrations;
-mod claims;
 mod cleaning;
 mod dir;
 mod error;
-mod forecast;
-mod jobs;
-mod losses;
-mod marks;
-mod measurements;
-mod models;
-mod partials;
-mod progress;
 mod queue;
-mod reports;
-mod results;
 mod rows;
 mod staging;
-mod tasks;
+mod submit;
+mod tables;
 #[cfg(test)]
 mod tests;
-mod tiles;
-mod tokens;
-mod workers;
 
 use std::path::Path;
 use std::time::Duration;
@@ -42,29 +25,21 @@ use sqlx::sqlite::{
 };
 use sqlx::{Connection, SqlitePool};
 
-pub use acceptance::{Inserted, NewJob};
 pub use backup::Backup;
-pub use blobs::{Blob, Origin};
-pub use calibrating::{CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration};
-pub use calibrations::{Calibration, NewCalibration};
-pub use claims::{ClaimedTask, Completion, Heartbeat, Lease, Product};
 pub use dir::DataDir;
 pub use error::StoreError;
-pub use jobs::{Job, JobFilter};
-pub use losses::{MAX_FAILURES, MAX_LOSSES};
-pub use marks::JobMark;
-pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
-pub use models::{Model, ModelFilter, NewModel};
-pub use partials::{NewPartial, Partial, PartialFile};
-pub use progress::{JobProgress, ProgressStage, TaskCounts, TaskTotals};
-
-pub use reports::Unready;
-pub use results::ResultFile;
+pub use queue::{
+    CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration, ClaimedTask,
+    Completion, Heartbeat, JobMark, JobProgress, Lease, MAX_FAILURES, MAX_LOSSES, Product,
+    ProgressStage, TaskCounts, TaskRecord, TaskTotals, TileResult,
+};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
-pub use tasks::{TaskRecord, TileResult};
-pub use tiles::{TileHistory, TileState};
-pub use tokens::Token;
-pub use workers::{WorkerEnd, WorkerRow, WorkerTask};
+pub use submit::{Inserted, NewJob};
+pub use tables::{
+    Blob, Calibration, Job, JobFilter, Measurement, MeasurementFilter, Model, ModelFilter,
+    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, ResultFile,
+    TileHistory, TileState, Token, Unready, WorkerEnd, WorkerRow, WorkerTask,
+};
 
 /// One page of a list, and the identifier to go on after.
 #[derive(Debug, Clone)]

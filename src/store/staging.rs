@@ -13,7 +13,7 @@ use uuid::Uuid;
 use super::Store;
 use super::dir::{self, sync_dir};
 use super::error::StoreError;
-use super::results::ResultFile;
+use super::tables::results::ResultFile;
 use crate::job::Sha256;
 
 /// A temporary file or folder; its lock and its removal.

@@ -2,9 +2,10 @@
 
 use sqlx::SqliteConnection;
 
+use super::Store;
 use super::error::StoreError;
+use super::queue::graph;
 use super::rows::{integer, number, parsed};
-use super::{Store, tasks};
 use crate::job::{JobId, JobSpec, Lab, Label, Sha256, Timestamp};
 
 /// A job to be accepted.
@@ -73,9 +74,9 @@ impl Store {
             if let Some(model) = &new.spec.model {
                 id += &format!(" or model {}", model.id);
             }
-            super::calibrations::gone_if_foreign_key(error, "measurement", id)
+            super::tables::calibrations::gone_if_foreign_key(error, "measurement", id)
         })?;
-        tasks::insert(&mut transaction, id, &new.spec).await?;
+        graph::insert(&mut transaction, id, &new.spec).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }

@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use sqlx::Row;
 
-use super::Store;
-use super::error::StoreError;
-use super::rows::parsed;
 use crate::job::{JobId, JobState};
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::rows::parsed;
 
 /// Workers that were silent for longer do not count.
 const WORKER_AGE: Duration = Duration::from_secs(15);
@@ -25,7 +25,7 @@ const LAST_OTHERS: &str = "SELECT sum(seconds) AS seconds, sum(cost) AS spent FR
 
 /// What is ahead of every unfinished job.
 #[derive(Debug)]
-pub(super) struct Forecast {
+pub(in crate::store) struct Forecast {
     /// Workers that live.
     workers: u32,
     /// Seconds that a planned CPU-second of a tile takes.
@@ -39,11 +39,11 @@ pub(super) struct Forecast {
 
 /// Planned CPU-seconds that are left of some tasks of a job.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Left {
+pub(in crate::store) struct Left {
     /// Of all of them.
-    pub(super) sum: f64,
+    pub(in crate::store) sum: f64,
     /// Of the one that has most left.
-    pub(super) longest: f64,
+    pub(in crate::store) longest: f64,
 }
 
 /// What is served before a job.
@@ -58,7 +58,12 @@ struct Ahead {
 impl Forecast {
     /// Seconds until a job ends, of whose tiles and other tasks so much is left; none if no worker
     /// lives.
-    pub(super) fn eta_seconds(&self, job: JobId, tiles: Left, others: Left) -> Option<f64> {
+    pub(in crate::store) fn eta_seconds(
+        &self,
+        job: JobId,
+        tiles: Left,
+        others: Left,
+    ) -> Option<f64> {
         let workers = f64::from(self.workers);
         let ahead = self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
         let own = self.own_rates.get(&job).unwrap_or(&self.rate);
@@ -69,14 +74,14 @@ impl Forecast {
     }
 
     /// The job's place among those that wait, from 1.
-    pub(super) fn position(&self, job: JobId) -> Option<usize> {
+    pub(in crate::store) fn position(&self, job: JobId) -> Option<usize> {
         self.ahead.get(&job)?.position
     }
 }
 
 impl Store {
     /// What is ahead of every unfinished job; none if there is no such job.
-    pub(super) async fn forecast(&self) -> Result<Option<Forecast>, StoreError> {
+    pub(in crate::store) async fn forecast(&self) -> Result<Option<Forecast>, StoreError> {
         let rows = sqlx::query(
             "SELECT job, sum(cost * (1 - fraction)) AS cost,
                  (SELECT state FROM jobs WHERE id = job) AS state

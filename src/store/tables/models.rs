@@ -5,10 +5,10 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::calibrations::{gone_if_foreign_key, label, refuse_if_used};
-use super::error::StoreError;
-use super::rows::{json, parsed};
-use super::{Page, Store};
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
+use crate::store::error::StoreError;
+use crate::store::rows::{json, parsed};
+use crate::store::{Page, Store};
 
 /// What is known of an end-to-end network when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -3,12 +3,13 @@
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::error::StoreError;
-use super::rows::{json, number, parsed};
-use super::{Page, Store, dir, on_files, tasks};
 use crate::job::{
     CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, TaskKind, Timestamp,
 };
+use crate::store::error::StoreError;
+use crate::store::queue::graph;
+use crate::store::rows::{json, number, parsed};
+use crate::store::{Page, Store, dir, on_files};
 
 /// A job on record.
 #[derive(Debug, Clone, PartialEq)]
@@ -131,13 +132,13 @@ impl Store {
         .execute(&mut *transaction)
         .await?;
         if prepared(&mut transaction, id).await? {
-            tasks::unblock(&mut transaction, id, TaskKind::Prepare).await?;
+            graph::unblock(&mut transaction, id, TaskKind::Prepare).await?;
         }
         for snapshot in snapshots(&mut transaction, id).await? {
             let tile = TaskKind::Tile { snapshot, tile: 0 };
-            tasks::unblock(&mut transaction, id, tile).await?;
+            graph::unblock(&mut transaction, id, tile).await?;
         }
-        tasks::unblock(&mut transaction, id, TaskKind::Assemble { snapshot: 0 }).await?;
+        graph::unblock(&mut transaction, id, TaskKind::Assemble { snapshot: 0 }).await?;
         transaction.commit().await?;
         Ok(())
     }
@@ -152,7 +153,7 @@ impl Store {
     }
 
     /// As [`Self::delete_job`], whosever it is.
-    pub(super) async fn remove_job(&self, id: JobId) -> Result<(), StoreError> {
+    pub(in crate::store) async fn remove_job(&self, id: JobId) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
         let state = state(&mut transaction, id).await?;
         if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
@@ -184,7 +185,7 @@ impl Store {
 }
 
 /// The job's state.
-pub(super) async fn state(
+pub(in crate::store) async fn state(
     connection: &mut SqliteConnection,
     id: JobId,
 ) -> Result<JobState, StoreError> {
@@ -197,7 +198,7 @@ pub(super) async fn state(
 }
 
 /// Takes a legal step to another state and notes the time.
-pub(super) async fn set_state(
+pub(in crate::store) async fn set_state(
     connection: &mut SqliteConnection,
     id: JobId,
     to: JobState,
@@ -221,7 +222,7 @@ pub(super) async fn set_state(
 }
 
 /// Cancels the tasks of a job that no worker has.
-pub(super) async fn cancel_waiting_tasks(
+pub(in crate::store) async fn cancel_waiting_tasks(
     connection: &mut SqliteConnection,
     id: JobId,
 ) -> Result<(), StoreError> {
@@ -235,7 +236,10 @@ pub(super) async fn cancel_waiting_tasks(
 }
 
 /// Ends a job that was being cancelled, once no worker is at it any more.
-pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Result<(), StoreError> {
+pub(in crate::store) async fn settle(
+    connection: &mut SqliteConnection,
+    id: JobId,
+) -> Result<(), StoreError> {
     if state(connection, id).await? != JobState::Cancelling {
         return Ok(());
     }

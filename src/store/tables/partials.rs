@@ -8,10 +8,10 @@ use std::time::Duration;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::error::StoreError;
-use super::rows::{integer, number, parsed, parsed_if};
-use super::{Blob, Store, dir, on_files};
 use crate::job::{Lab, PartialId, Sha256, Timestamp, TokenId};
+use crate::store::error::StoreError;
+use crate::store::rows::{integer, number, parsed, parsed_if};
+use crate::store::{Blob, Store, dir, on_files};
 
 /// An upload to be begun.
 #[derive(Debug, Clone)]

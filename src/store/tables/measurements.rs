@@ -6,10 +6,10 @@ use sqlx::sqlite::SqliteRow;
 
 use super::blobs::Origin;
 use super::calibrations::{gone_if_foreign_key, label, refuse_if_used};
-use super::error::StoreError;
-use super::rows::{integer, json_if, number, parsed, single};
-use super::{Page, StagedBlob, Store};
 use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
+use crate::store::error::StoreError;
+use crate::store::rows::{integer, json_if, number, parsed, single};
+use crate::store::{Page, StagedBlob, Store};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -132,7 +132,7 @@ impl Store {
     }
 
     /// As [`Self::measurement`]; without a lab, for those who work for all of them.
-    pub(super) async fn find_measurement(
+    pub(in crate::store) async fn find_measurement(
         &self,
         lab: Option<&Lab>,
         id: MeasurementId,

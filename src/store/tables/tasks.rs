@@ -5,10 +5,10 @@ use serde_json::Value;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::Store;
-use super::error::StoreError;
-use super::rows::{json, number};
 use crate::job::JobId;
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::rows::{json, number};
 
 /// Where a tile stands.
 #[derive(Debug, Clone, PartialEq, Serialize)]

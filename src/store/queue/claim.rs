@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::{Calibration, Measurement, StagedBlob, StagedDir};
 use crate::job::{JobId, JobSpec, TaskId, TaskKind, TaskProgress, WorkerId};
+use crate::store::{Calibration, Measurement, StagedBlob, StagedDir};
 
 /// The right to work on a task, until it runs out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,7 +55,7 @@ pub struct ClaimedTask {
 pub enum Heartbeat {
     /// Go on; the lease is renewed.
     Continue,
-    /// The job is not wanted any more: stop, and call [`super::Store::cancelled`].
+    /// The job is not wanted any more: stop, and call [`crate::store::Store::cancelled`].
     Cancelled,
     /// The lease ran out and the task is someone else's: stop, and drop everything.
     Lost,

@@ -5,10 +5,10 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::calibrations::label;
-use super::error::StoreError;
-use super::rows::{json, parsed};
-use super::{Page, Store};
 use crate::job::{CalibrationId, CalibrationReport, Captures, Lab, Label, Timestamp};
+use crate::store::error::StoreError;
+use crate::store::rows::{json, parsed};
+use crate::store::{Page, Store};
 
 /// A calibration whose masks are not there.
 #[derive(Debug, Clone)]

@@ -5,11 +5,12 @@ use std::time::Duration;
 use serde::Serialize;
 use sqlx::{Row, SqliteConnection};
 
-use super::error::StoreError;
-use super::losses::{self, Loss};
-use super::rows::{number, number_if, parsed, parsed_if};
-use super::{Store, calibrating};
 use crate::job::{JobId, Timestamp, WorkerId};
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::queue::calibrating;
+use crate::store::queue::lease::{self, Loss};
+use crate::store::rows::{number, number_if, parsed, parsed_if};
 
 /// A worker process on record.
 #[derive(Debug, Clone, Serialize)]
@@ -99,7 +100,7 @@ impl Store {
             .fetch_all(&mut *transaction)
             .await?;
         for row in &tasks {
-            losses::lose(&mut transaction, parsed(row, "id")?, &loss).await?;
+            lease::lose(&mut transaction, parsed(row, "id")?, &loss).await?;
         }
         calibrating::worker_ended(&mut transaction, id, &loss).await?;
         sqlx::query("DELETE FROM workers WHERE id = ?")
@@ -167,7 +168,7 @@ impl Store {
 }
 
 /// Notes a sign of life.
-pub(super) async fn seen(
+pub(in crate::store) async fn seen(
     connection: &mut SqliteConnection,
     id: WorkerId,
 ) -> Result<(), StoreError> {

@@ -6,11 +6,11 @@ use serde_json::{Value, json};
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::Store;
-use super::error::StoreError;
-use super::rows::{json as from_json, number, number_if, parsed};
 use crate::job::{JobId, JobSpec, Sha256, TaskId, TaskKind};
 use crate::recon::{pilot, preview};
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::rows::{json as from_json, number, number_if, parsed};
 
 /// The stored result of a tile.
 #[derive(Debug, Clone)]
@@ -46,7 +46,7 @@ const PREVIEW_BLOCKS_S: f64 = 10e-9;
 const PREVIEW_WHOLE_S: f64 = 120e-9;
 
 /// Writes the tasks of a job.
-pub(super) async fn insert(
+pub(in crate::store) async fn insert(
     connection: &mut SqliteConnection,
     job: JobId,
     spec: &JobSpec,
@@ -112,7 +112,7 @@ fn place(tile: u32) -> f64 {
 }
 
 /// Sets the planned cost of the tiles of a job to a share of it.
-pub(super) async fn scale_tiles(
+pub(in crate::store) async fn scale_tiles(
     connection: &mut SqliteConnection,
     job: JobId,
     share: f64,
@@ -126,7 +126,7 @@ pub(super) async fn scale_tiles(
 }
 
 /// Makes ready the tasks of a job that waited for `done`, if that was the last one they waited for.
-pub(super) async fn unblock(
+pub(in crate::store) async fn unblock(
     connection: &mut SqliteConnection,
     job: JobId,
     done: TaskKind,
@@ -238,7 +238,7 @@ impl Store {
 }
 
 /// The kind of the task in this row.
-pub(super) fn kind(row: &SqliteRow) -> Result<TaskKind, StoreError> {
+pub(in crate::store) fn kind(row: &SqliteRow) -> Result<TaskKind, StoreError> {
     let name: String = row.try_get("kind")?;
     TaskKind::from_parts(&name, number_if(row, "snapshot")?, number_if(row, "tile")?)
         .ok_or(StoreError::Corrupt { column: "kind", value: name })

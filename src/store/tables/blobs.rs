@@ -3,11 +3,11 @@
 use serde::Serialize;
 use sqlx::{Row, SqliteConnection};
 
-use super::error::StoreError;
-use super::rows::{integer, number, parsed};
-use super::staging::StagedBlob;
-use super::{Store, dir, on_files};
 use crate::job::{Lab, Sha256, Timestamp, TokenId};
+use crate::store::error::StoreError;
+use crate::store::rows::{integer, number, parsed};
+use crate::store::staging::StagedBlob;
+use crate::store::{Store, dir, on_files};
 
 /// A stored file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -85,7 +85,7 @@ impl Store {
     }
 
     /// Puts a file in its place and writes its row, in one step for all other processes.
-    pub(super) async fn publish(
+    pub(in crate::store) async fn publish(
         &self,
         transaction: &mut SqliteConnection,
         staged: StagedBlob,
@@ -112,7 +112,7 @@ impl Store {
     }
 
     /// Removes a derived file if nothing refers to it any more. Uploads are left to [`Self::collect`].
-    pub(super) async fn release(
+    pub(in crate::store) async fn release(
         &self,
         transaction: &mut SqliteConnection,
         sha256: Sha256,

@@ -3,10 +3,10 @@
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::Store;
-use super::error::StoreError;
-use super::rows::{integer, number, number_if, parsed, parsed_if};
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::rows::{integer, number, number_if, parsed, parsed_if};
 
 /// A token on record, without the secret.
 #[derive(Debug, Clone, PartialEq, Eq)]

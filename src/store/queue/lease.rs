@@ -7,12 +7,14 @@
 
 use sqlx::SqliteConnection;
 
-use super::claims::Lease;
-use super::error::StoreError;
-use super::queue;
-use super::rows::{number, parsed};
-use super::{Store, jobs, tasks};
+use super::claim::Lease;
+use super::complete::held;
+use super::graph;
 use crate::job::{JobId, JobState, TaskId, TaskKind, Timestamp};
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::rows::{number, parsed};
+use crate::store::tables::jobs;
 
 /// So many failures of a task, and its job has failed.
 pub const MAX_FAILURES: u32 = 3;
@@ -21,7 +23,7 @@ pub const MAX_LOSSES: u32 = 25;
 
 /// How a worker and its task were parted.
 #[derive(Debug)]
-pub(super) enum Loss {
+pub(in crate::store) enum Loss {
     /// Given back unharmed.
     Released,
     /// The worker was killed or fell silent.
@@ -65,7 +67,7 @@ impl Store {
 
     async fn part(&self, lease: &Lease, loss: &Loss) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
-        if queue::held(&mut transaction, lease).await?.is_some() {
+        if held(&mut transaction, lease).await?.is_some() {
             lose(&mut transaction, lease.task, loss).await?;
             transaction.commit().await?;
         }
@@ -79,7 +81,9 @@ impl Store {
     /// If the database fails.
     pub async fn redo_tiles(&self, lease: &Lease, damaged: &[u32]) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
-        let Some((job, kind)) = queue::held(&mut transaction, lease).await? else { return Ok(()) };
+        let Some((job, kind)) = held(&mut transaction, lease).await? else {
+            return Ok(());
+        };
         let row = sqlx::query(
             "SELECT coalesce(max(failures), 0) AS worst FROM tasks
              WHERE job = ? AND kind = 'tile' AND snapshot = ?",
@@ -116,7 +120,10 @@ impl Store {
 
 /// Takes back the tasks of workers that have fallen silent. No lease lasts for ten minutes: one that
 /// ends later was given before the clock was set back.
-pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<(), StoreError> {
+pub(in crate::store) async fn reap(
+    connection: &mut SqliteConnection,
+    now: i64,
+) -> Result<(), StoreError> {
     let rows = sqlx::query(
         "SELECT id FROM tasks WHERE state = 'running'
                             AND lease_until NOT BETWEEN ?1 AND ?1 + 600000",
@@ -131,7 +138,7 @@ pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<
     Ok(())
 }
 
-pub(super) async fn end_attempt(
+pub(in crate::store) async fn end_attempt(
     connection: &mut SqliteConnection,
     task: TaskId,
     outcome: &'static str,
@@ -152,7 +159,7 @@ pub(super) async fn end_attempt(
 
 /// Parts a running task from its worker: it becomes ready again, or is cancelled with its job, or
 /// is given up and its job with it.
-pub(super) async fn lose(
+pub(in crate::store) async fn lose(
     connection: &mut SqliteConnection,
     task: TaskId,
     loss: &Loss,
@@ -204,7 +211,7 @@ pub(super) async fn lose(
     .execute(&mut *connection)
     .await?;
     if wanted && hopeless {
-        let kind = tasks::kind(&row)?;
+        let kind = graph::kind(&row)?;
         let error = failure_text(kind, failures, losses, reason.unwrap_or("no reason is known"));
         jobs::set_state(connection, job, JobState::Failed, Some(&error)).await?;
         jobs::cancel_waiting_tasks(connection, job).await?;

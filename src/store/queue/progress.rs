@@ -10,11 +10,11 @@ use serde_json::Value;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::error::StoreError;
 use super::forecast::{Forecast, Left};
-use super::rows::{number, parsed};
-use super::{Job, Store};
 use crate::job::{JobId, JobState};
+use crate::store::error::StoreError;
+use crate::store::rows::{number, parsed};
+use crate::store::{Job, Store};
 
 /// What a job is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]

@@ -5,10 +5,11 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use super::blobs::Origin;
-use super::error::StoreError;
-use super::rows::{integer, number, parsed, parsed_if, single};
-use super::{Page, StagedBlob, Store, calibrating};
 use crate::job::{CalibrationId, Lab, Label, Sha256, Timestamp};
+use crate::store::error::StoreError;
+use crate::store::queue::calibrating;
+use crate::store::rows::{integer, number, parsed, parsed_if, single};
+use crate::store::{Page, StagedBlob, Store};
 
 /// What is known of a calibration when its masks have been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -98,7 +99,7 @@ impl Store {
     }
 
     /// As [`Self::calibration`]; without a lab, for those who work for all of them.
-    pub(super) async fn find_calibration(
+    pub(in crate::store) async fn find_calibration(
         &self,
         lab: Option<&Lab>,
         id: CalibrationId,
@@ -167,7 +168,7 @@ impl Store {
 }
 
 /// Writes the row of a calibration whose masks are there.
-pub(super) async fn insert(
+pub(in crate::store) async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
     calibration: &Calibration,
@@ -201,7 +202,7 @@ pub(super) async fn insert(
 
 impl<T> Page<T> {
     /// A page of at most `limit` items from up to `limit + 1` rows.
-    pub(super) fn cut(
+    pub(in crate::store) fn cut(
         rows: &[SqliteRow],
         limit: u32,
         read: impl Fn(&SqliteRow) -> Result<T, StoreError>,
@@ -214,7 +215,7 @@ impl<T> Page<T> {
 
 /// Refuses to delete what others refer to: kind and identifier of the one, name of the others and
 /// the query that counts them as `users`.
-pub(super) async fn refuse_if_used(
+pub(in crate::store) async fn refuse_if_used(
     connection: &mut SqliteConnection,
     (what, id): (&'static str, String),
     (by, query): (&'static str, &'static str),
@@ -225,7 +226,7 @@ pub(super) async fn refuse_if_used(
 }
 
 /// What a foreign key refers to was deleted a moment ago: for the user, it is not there.
-pub(super) fn gone_if_foreign_key(
+pub(in crate::store) fn gone_if_foreign_key(
     error: sqlx::Error,
     what: &'static str,
     id: String,
@@ -260,7 +261,10 @@ fn calibration(row: &SqliteRow) -> Result<Calibration, StoreError> {
 }
 
 /// The column as a label, if there is one.
-pub(super) fn label(row: &SqliteRow, column: &'static str) -> Result<Option<Label>, StoreError> {
+pub(in crate::store) fn label(
+    row: &SqliteRow,
+    column: &'static str,
+) -> Result<Option<Label>, StoreError> {
     parsed_if(row, column)
 }
 

@@ -4,10 +4,10 @@ use std::collections::HashMap;
 
 use sqlx::Row;
 
-use super::Store;
-use super::error::StoreError;
-use super::rows::parsed;
 use crate::job::{JobId, JobState, Lab};
+use crate::store::Store;
+use crate::store::error::StoreError;
+use crate::store::rows::parsed;
 
 /// The mark of a job: it differs when the job's state or what its workers have told differs.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -11,12 +11,17 @@ use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::blobs::Origin;
-use super::claims::{ClaimedTask, Completion, Heartbeat, Lease, Product};
-use super::error::StoreError;
-use super::rows::{json, number, parsed};
-use super::{StagedDir, Store, dir, jobs, losses, on_files, results, tasks, workers};
+use super::claim::{ClaimedTask, Completion, Heartbeat, Lease, Product};
+use super::graph;
+use super::lease;
 use crate::job::{JobId, JobSpec, JobState, TaskKind, TaskProgress, Timestamp, WorkerId};
+use crate::store::error::StoreError;
+use crate::store::rows::{json, number, parsed};
+use crate::store::tables::blobs::Origin;
+use crate::store::tables::jobs;
+use crate::store::tables::results;
+use crate::store::tables::workers;
+use crate::store::{StagedDir, Store, dir, on_files};
 
 impl Store {
     /// Hands out the next task, if there is one.
@@ -44,7 +49,7 @@ impl Store {
         }
         let mut transaction = self.write().await?;
         // 2. Take back what silent workers hold.
-        losses::reap(&mut transaction, now).await?;
+        lease::reap(&mut transaction, now).await?;
         // 3. Claim: one statement finds the task, marks it and counts the attempt.
         let claimed = sqlx::query(
             "UPDATE tasks SET state = 'running', worker = ?1, lease_until = ?2, attempt = attempt + 1,
@@ -108,7 +113,7 @@ impl Store {
         };
         Ok(ClaimedTask {
             lease,
-            kind: tasks::kind(row)?,
+            kind: graph::kind(row)?,
             job,
             cost: row.try_get("cost")?,
             masks: self.dir().blob(&calibration.prepared),
@@ -135,7 +140,7 @@ impl Store {
     }
 
     /// As [`Store::heartbeat`], and notes how the solver went: JSON as
-    /// [`TileHistory::points`](super::TileHistory) has it. Without one, what was noted stays.
+    /// [`TileHistory::points`](crate::store::TileHistory) has it. Without one, what was noted stays.
     ///
     /// # Errors
     /// If the database fails; the lease is not renewed then.
@@ -198,7 +203,7 @@ impl Store {
         match product {
             Product::Record => {}
             Product::TileCost(share) => {
-                tasks::scale_tiles(&mut transaction, job, share).await?;
+                graph::scale_tiles(&mut transaction, job, share).await?;
             }
             Product::Tile(staged) => {
                 result = Some(staged.sha256().to_string());
@@ -210,7 +215,7 @@ impl Store {
             }
         }
         finish(&mut transaction, lease, &completion.progress, &completion.record, result).await?;
-        tasks::unblock(&mut transaction, job, kind).await?;
+        graph::unblock(&mut transaction, job, kind).await?;
         if kind == TaskKind::Manifest
             && jobs::state(&mut transaction, job).await? == JobState::Running
         {
@@ -228,7 +233,7 @@ impl Store {
         job: JobId,
         kind: TaskKind,
         staged: StagedDir,
-        files: Vec<super::ResultFile>,
+        files: Vec<crate::store::ResultFile>,
     ) -> Result<(), StoreError> {
         let folder = self.dir().results(job);
         let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));
@@ -243,7 +248,7 @@ impl Store {
     }
 
     /// Removes the tiles of a job that needs them no more.
-    pub(super) async fn drop_tiles(
+    pub(in crate::store) async fn drop_tiles(
         &self,
         transaction: &mut SqliteConnection,
         job: JobId,
@@ -264,13 +269,13 @@ impl Store {
     }
 }
 
-pub(super) fn millis(length: Duration) -> i64 {
+pub(in crate::store) fn millis(length: Duration) -> i64 {
     i64::try_from(length.as_millis()).unwrap_or(i64::MAX / 2)
 }
 
 /// The job and kind of the task, if the lease is still good. A lease that ran out but was not
 /// claimed by anyone else is good: the work is done, so it may as well count.
-pub(super) async fn held(
+pub(in crate::store) async fn held(
     connection: &mut SqliteConnection,
     lease: &Lease,
 ) -> Result<Option<(JobId, TaskKind)>, StoreError> {
@@ -281,7 +286,7 @@ pub(super) async fn held(
     .bind(lease.attempt)
     .fetch_optional(connection)
     .await?;
-    row.map(|row| Ok((parsed(&row, "job")?, tasks::kind(&row)?))).transpose()
+    row.map(|row| Ok((parsed(&row, "job")?, graph::kind(&row)?))).transpose()
 }
 
 /// Marks a task done.
@@ -318,5 +323,5 @@ async fn finish(
     .bind(lease.task.to_string())
     .execute(&mut *connection)
     .await?;
-    losses::end_attempt(connection, lease.task, "done", None).await
+    lease::end_attempt(connection, lease.task, "done", None).await
 }

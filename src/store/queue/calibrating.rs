@@ -1,6 +1,6 @@
 //! Table `calibration_tasks`: masks from raw captures, and reports, as workers do them.
 //!
-//! The same rules as in [`super::queue`]: a claim is held under a lease, has a number, and what an
+//! The same rules as in [`super`]: a claim is held under a lease, has a number, and what an
 //! earlier attempt says later is refused. A calibration has one task, no jobs wait in line for it,
 //! and a job can't refer to it before its masks are there; so it stands in a table of its own.
 
@@ -10,14 +10,15 @@ use std::time::Duration;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::blobs::Origin;
-use super::calibrations::label;
-use super::error::StoreError;
-use super::losses::{Loss, MAX_FAILURES, MAX_LOSSES};
-use super::queue::millis;
-use super::rows::{json, number, parsed};
-use super::{Calibration, Heartbeat, NewCalibration, StagedBlob, Store, workers};
+use super::complete::millis;
+use super::lease::{Loss, MAX_FAILURES, MAX_LOSSES};
 use crate::job::{CalibrationId, CalibrationReport, Captures, Lab, Label, Timestamp, WorkerId};
+use crate::store::error::StoreError;
+use crate::store::rows::{json, number, parsed};
+use crate::store::tables::blobs::Origin;
+use crate::store::tables::calibrations::label;
+use crate::store::tables::workers;
+use crate::store::{Calibration, Heartbeat, NewCalibration, StagedBlob, Store};
 
 /// The right to work on a calibration, until it runs out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,7 +90,11 @@ impl Store {
             .execute(&mut *transaction)
             .await
             .map_err(|error| {
-                super::calibrations::gone_if_foreign_key(error, "blob", upload.to_string())
+                crate::store::tables::calibrations::gone_if_foreign_key(
+                    error,
+                    "blob",
+                    upload.to_string(),
+                )
             })?;
         }
         transaction.commit().await?;
@@ -210,7 +215,8 @@ impl Store {
             };
             self.publish(&mut transaction, staged, Origin::Prepared).await?;
             let lab: Lab = parsed(&row, "lab")?;
-            super::calibrations::insert(&mut transaction, &lab, &calibration).await?;
+            crate::store::tables::calibrations::insert(&mut transaction, &lab, &calibration)
+                .await?;
             sqlx::query("DELETE FROM calibration_captures WHERE calibration = ?")
                 .bind(&id)
                 .execute(&mut *transaction)
@@ -287,7 +293,7 @@ impl Store {
 }
 
 /// Writes the row of a calibration to be worked on.
-pub(super) async fn insert(
+pub(in crate::store) async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
     id: CalibrationId,
@@ -317,7 +323,7 @@ enum Lost {
 }
 
 /// Takes back what a worker that has ended had in hand.
-pub(super) async fn worker_ended(
+pub(in crate::store) async fn worker_ended(
     connection: &mut SqliteConnection,
     worker: WorkerId,
     loss: &Loss,

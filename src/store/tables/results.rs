@@ -6,10 +6,10 @@ use serde::{Deserialize, Serialize};
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::error::StoreError;
-use super::rows::{integer, number, parsed};
-use super::{Job, Store};
 use crate::job::{JobId, Sha256};
+use crate::store::error::StoreError;
+use crate::store::rows::{integer, number, parsed};
+use crate::store::{Job, Store};
 
 /// The snapshot of files that belong to the whole job.
 const WHOLE_JOB: i64 = -1;
@@ -74,7 +74,7 @@ impl Store {
 }
 
 /// Replaces the list of files of a snapshot (or of the whole job).
-pub(super) async fn record(
+pub(in crate::store) async fn record(
     connection: &mut SqliteConnection,
     job: JobId,
     snapshot: Option<u32>,
