@@ -8,11 +8,11 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
 use rand::{Rng, SeedableRng};
-use sci_recon::recon::denoise::temporal::TemporalVariation;
-use sci_recon::recon::denoise::tv::TotalVariation;
-use sci_recon::recon::gap::reconstruct;
+use sci_recon::recon::prior::temporal::TemporalVariation;
+use sci_recon::recon::prior::tv::TotalVariation;
 use sci_recon::recon::schedule::Schedule;
 use sci_recon::recon::sensing::SensingOperator;
+use sci_recon::recon::solver::reconstruct;
 use std::hint::black_box;
 
 const DIM: (usize, usize, usize) = (8, 256, 256);

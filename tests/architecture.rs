@@ -23,7 +23,7 @@ const RULES: &[(&str, &[&str], &[&str])] = &[
         ],
         &[],
     ),
-    ("src/recon", &["std::path", "std::fs"], &["src/recon/denoise/onnx.rs"]),
+    ("src/recon", &["std::path", "std::fs"], &["src/recon/prior/onnx.rs"]),
     (
         "src/optics",
         &[
@@ -63,7 +63,7 @@ const RULES: &[(&str, &[&str], &[&str])] = &[
     ("src/http", &["sqlx", "ort", "crate::work", "crate::cli"], &[]),
     ("src/store", &["axum", "crate::http", "crate::work", "crate::cli"], &[]),
     ("src/work", &["axum", "sqlx", "crate::http", "crate::cli"], &[]),
-    ("src", &["ort"], &["src/recon/denoise/onnx.rs"]),
+    ("src", &["ort"], &["src/recon/prior/onnx.rs"]),
 ];
 
 fn sources(folder: &Path, found: &mut Vec<PathBuf>) {

@@ -8,7 +8,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
 use crate::job::{Algorithm, InvalidField, ScheduleSpec};
-use crate::recon::denoise::onnx::Device;
+use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
 use crate::work::NetworkSource;
 

@@ -6,7 +6,7 @@ use std::sync::Mutex;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::job::ScheduleSpec;
-use crate::recon::gap::Progress;
+use crate::recon::solver::Progress;
 use crate::recon::tile::Tile;
 use crate::work::{ShareDone, TileProgress};
 

@@ -9,7 +9,7 @@ use tokio_util::sync::CancellationToken;
 use super::{CliError, logging};
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
-use crate::recon::denoise::onnx::Device;
+use crate::recon::prior::onnx::Device;
 use crate::store::Store;
 use crate::work::{NetworkSource, Worker, WorkerError};
 

@@ -14,7 +14,7 @@ use super::pictures::Pictures;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
 use crate::job::Timestamp;
-use crate::recon::denoise::onnx::Device;
+use crate::recon::prior::onnx::Device;
 use crate::store::Store;
 
 /// What all handlers share; cheap to clone.

@@ -11,11 +11,11 @@ use std::ops::Range;
 use ndarray::{ArrayView2, ArrayView3, s};
 use rand::{Rng, SeedableRng};
 
-use super::denoise::Networks;
 use super::error::ReconError;
-use super::gap::{Observer, Run};
+use super::prior::Networks;
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
+use super::solver::{Observer, Run};
 
 /// Side of the piece that the pilot is run on: a tenth of a tile.
 pub const SIDE: usize = 96;
@@ -94,7 +94,7 @@ impl StageEnd {
 /// stage's error is less without.
 ///
 /// # Errors
-/// As [`super::gap::reconstruct`].
+/// As [`super::solver::reconstruct`].
 pub fn run(
     op: SensingOperator,
     y: ArrayView2<'_, f32>,
@@ -245,7 +245,7 @@ mod tests {
     use super::{StageEnd, StageFinding, piece, run};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
-    use crate::recon::denoise::{Denoiser, Networks};
+    use crate::recon::prior::{Denoiser, Networks};
     use crate::recon::schedule::{Network, Schedule, Sigma};
     use crate::recon::sensing::SensingOperator;
     use ndarray::{Array2, Array3, s};

@@ -7,11 +7,11 @@
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 
-use super::denoise::tv::TotalVariation;
 use super::error::{ReconError, shape_text};
-use super::gap;
+use super::prior::tv::TotalVariation;
 use super::schedule::Schedule;
 use super::sensing::SensingOperator;
+use super::solver;
 
 /// Voxels that total variation does in a second or two; pictures of more are done by blocks.
 pub const WHOLE: usize = 8 << 20;
@@ -40,10 +40,10 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
 /// the scene is on \[0,1\].
 ///
 /// # Errors
-/// As [`gap::reconstruct`].
+/// As [`solver::reconstruct`].
 pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>, ReconError> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
-    Ok(gap::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
+    Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
 }
 
 /// Least squares, block by block, for a row of blocks.

@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use crate::recon::gap::Progress;
+use crate::recon::solver::Progress;
 
 /// The most points that are kept, beside the last.
 const POINTS: usize = 128;
@@ -73,8 +73,8 @@ fn rounded(value: f32) -> Value {
 #[cfg(test)]
 mod tests {
     use super::{History, POINTS};
-    use crate::recon::gap::Progress;
     use crate::recon::schedule::Sigma;
+    use crate::recon::solver::Progress;
     use serde_json::Value;
 
     fn after(iterations: usize) -> Vec<Value> {

@@ -9,8 +9,8 @@ use super::network::NetworkError;
 use super::solve::{TileInput, TileOutcome};
 use crate::job::Sha256;
 use crate::recon::ReconError;
-use crate::recon::gap::StopReason;
 use crate::recon::learned::SnapshotNetwork;
+use crate::recon::solver::StopReason;
 
 /// An end-to-end network in its ONNX file.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -11,10 +11,10 @@ use super::manifest::ModelRecord;
 use crate::job::{ScheduleSpec, Sha256};
 use crate::models;
 use crate::recon::ReconError;
-use crate::recon::denoise::fastdvdnet::FastDvdNet;
-use crate::recon::denoise::ffdnet::FfdNet;
-use crate::recon::denoise::onnx::{Device, EndToEndNetwork, Runtime};
-use crate::recon::denoise::{Denoiser, Networks};
+use crate::recon::prior::fastdvdnet::FastDvdNet;
+use crate::recon::prior::ffdnet::FfdNet;
+use crate::recon::prior::onnx::{Device, EndToEndNetwork, Runtime};
+use crate::recon::prior::{Denoiser, Networks};
 use crate::recon::schedule::Network;
 
 /// The library's name beside the executable.
@@ -224,7 +224,7 @@ fn version_in(library: &[u8]) -> Option<String> {
 mod tests {
     use super::{NetworkSource, version_in};
     use crate::job::Algorithm;
-    use crate::recon::denoise::onnx::Device;
+    use crate::recon::prior::onnx::Device;
     use crate::recon::schedule::Network;
 
     #[test]

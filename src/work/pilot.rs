@@ -12,10 +12,10 @@ use crate::formats::Limits;
 use crate::formats::planar::Reader;
 use crate::job::{PriorSpec, ScheduleSpec, StageSpec, TaskProgress};
 use crate::recon::ReconError;
-use crate::recon::denoise::Networks;
-use crate::recon::gap::Observer;
 use crate::recon::pilot::{self, StageFinding};
+use crate::recon::prior::Networks;
 use crate::recon::schedule::Schedule;
+use crate::recon::solver::Observer;
 use crate::store::{ClaimedTask, Completion, Product};
 
 /// What the pilot found, as it stands in manifests.

@@ -1,7 +1,7 @@
 //! How much of a tile's work is done.
 
 use crate::job::ScheduleSpec;
-use crate::recon::gap::Progress;
+use crate::recon::solver::Progress;
 
 /// Turns the solver's progress into the share of the planned cost that is behind it.
 #[derive(Debug, Clone)]
@@ -32,8 +32,8 @@ impl ShareDone {
 mod tests {
     use super::ShareDone;
     use crate::job::ScheduleSpec;
-    use crate::recon::gap::Progress;
     use crate::recon::schedule::Schedule;
+    use crate::recon::solver::Progress;
 
     #[test]
     fn an_early_end_of_a_stage_jumps_to_its_end() {

@@ -11,8 +11,8 @@ use super::learned::{ModelFile, run_network};
 use super::network::{NetworkError, NetworkSource, WarmNetworks};
 use super::pilot::{self, PilotRecord};
 use super::solve::{TileInput, TileOutcome, reconstruct_tile};
-use crate::recon::gap::{Control, Observer, Progress};
 use crate::recon::schedule::Schedule;
+use crate::recon::solver::{Control, Observer, Progress};
 use crate::recon::tile::{Tile, TilePlan};
 use crate::recon::{self, ReconError};
 
@@ -225,7 +225,7 @@ mod tests {
     use super::{SnapshotInput, SolveError, Solver, blended_frame, solve};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
-    use crate::recon::denoise::onnx::Device;
+    use crate::recon::prior::onnx::Device;
     use crate::recon::schedule::Schedule;
     use crate::recon::tile::TilePlan;
     use crate::work::NetworkSource;

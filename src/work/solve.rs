@@ -3,10 +3,10 @@
 use ndarray::{Array2, Array3, ArrayView2};
 
 use crate::recon::ReconError;
-use crate::recon::denoise::Networks;
-use crate::recon::gap::{self, Observer, StopReason};
+use crate::recon::prior::Networks;
 use crate::recon::schedule::Schedule;
 use crate::recon::sensing::SensingOperator;
+use crate::recon::solver::{self, Observer, StopReason};
 
 /// What one tile is made of.
 #[derive(Debug, Clone)]
@@ -79,7 +79,7 @@ pub struct TileOutcome {
 /// Reconstructs one tile: runs the schedule on it, brought to \[0,1\] by its white level.
 ///
 /// # Errors
-/// As [`gap::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
+/// As [`solver::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct_tile(
     input: TileInput,
     schedule: &Schedule,
@@ -88,7 +88,7 @@ pub fn reconstruct_tile(
 ) -> Result<TileOutcome, ReconError> {
     input.solved(|op, measurement| {
         let op = op.with_gamma(schedule.gamma)?;
-        let outcome = gap::reconstruct(&op, measurement, schedule, networks, observer)?;
+        let outcome = solver::reconstruct(&op, measurement, schedule, networks, observer)?;
         Ok(TileOutcome {
             frames: outcome.frames,
             tv_iterations: outcome.tv_iterations,

@@ -11,7 +11,7 @@ use super::{assemble, finish, pilot, prepare, preview, tile};
 use crate::formats::FormatError;
 use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
 use crate::recon::ReconError;
-use crate::recon::gap::Progress;
+use crate::recon::solver::Progress;
 use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};
 
 /// What the computing thread and the heartbeat tell each other.

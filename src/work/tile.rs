@@ -17,7 +17,7 @@ use super::usage::{Usage, peak_rss_bytes};
 use crate::formats::planar::{Reader, Writer};
 use crate::formats::{FormatError, Limits};
 use crate::job::{ScheduleSpec, TaskProgress, TaskStage};
-use crate::recon::gap::{Control, Observer, Progress};
+use crate::recon::solver::{Control, Observer, Progress};
 use crate::store::{ClaimedTask, Completion, Product, StagedBlob, Store};
 
 /// What is remembered of a tile's task.

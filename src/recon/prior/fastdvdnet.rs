@@ -118,8 +118,8 @@ fn reflect(index: isize, length: usize) -> usize {
 mod tests {
     use super::{FastDvdNet, reflect};
     use crate::models;
-    use crate::recon::denoise::Denoiser;
-    use crate::recon::denoise::onnx::{Device, Runtime};
+    use crate::recon::prior::Denoiser;
+    use crate::recon::prior::onnx::{Device, Runtime};
     use crate::recon::schedule::{Network, Sigma};
     use ndarray::{Array3, s};
     use rand::{Rng, SeedableRng};

@@ -1,16 +1,16 @@
 //! Alternating projection with plugged-in priors (Algorithm 1 of the paper).
 
+mod state;
+
 use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
-use super::change::Change;
-use super::denoise::{
-    Networks, nonlocal::Nonlocal, temporal::TemporalVariation, tv::TotalVariation,
-};
 use super::error::{ReconError, shape_text};
+use super::prior::{Networks, nonlocal::Nonlocal, temporal::TemporalVariation, tv::TotalVariation};
 use super::schedule::{Method, Prior, Schedule, Sigma, Stage};
 use super::sensing::SensingOperator;
+use state::Change;
 
 /// Values of a strip of all frames: three arrays of them (frames, masks, projection) stay in a
 /// second-level cache.
