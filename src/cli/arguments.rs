@@ -8,9 +8,9 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
 use crate::job::{Algorithm, InvalidField, ScheduleSpec};
+use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
-use crate::work::NetworkSource;
 
 /// Which algorithm, and how long.
 #[derive(Debug, Args)]

@@ -12,10 +12,10 @@ use rustix::process::{Resource, Rlimit};
 use super::CliError;
 use super::arguments::EngineArguments;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
+use crate::pipeline::{ModelFile, NetworkError, NetworkSource, Usage, peak_rss_bytes};
 use crate::recon::ReconError;
 use crate::recon::learned::{PictureSize, SnapshotNetwork, TensorInfo};
 use crate::recon::tile::TilePlan;
-use crate::work::{ModelFile, NetworkError, NetworkSource, Usage, peak_rss_bytes};
 
 /// How much the check stands back for others.
 const NICE: i32 = 10;

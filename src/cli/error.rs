@@ -6,8 +6,8 @@ use std::process::ExitCode;
 
 use super::serve::ServeError;
 use crate::formats::FormatError;
+use crate::pipeline::{NetworkError, ResultError, SolveError};
 use crate::recon::ReconError;
-use crate::work::{NetworkError, ResultError, SolveError};
 
 /// Why a command failed, as a sentence for the user.
 #[derive(Debug, thiserror::Error)]

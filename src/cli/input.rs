@@ -9,7 +9,7 @@ use super::{CliError, npz};
 use crate::formats::mat::{self, SceneArray};
 use crate::formats::validate::{MaskCheck, MeasurementCheck};
 use crate::formats::{self, FormatError, FrameReader, FullScale, Limits};
-use crate::work::sha256_of;
+use crate::pipeline::sha256_of;
 
 /// An input file, which array of it is meant if it is a .mat scene, and its stated full scale.
 #[derive(Debug, Clone, Copy)]

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use super::CliError;
 use crate::job::{Algorithm, TileSpec};
+use crate::pipeline::manifest::ModelRecord;
+use crate::pipeline::{ModelFile, NetworkSource};
 use crate::recon::learned::{Interface, PictureSize};
 use crate::recon::tile::TilePlan;
-use crate::work::manifest::ModelRecord;
-use crate::work::{ModelFile, NetworkSource};
 
 /// An end-to-end network for one size of masks.
 pub(super) struct Learned {

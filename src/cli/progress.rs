@@ -6,9 +6,9 @@ use std::sync::Mutex;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::job::ScheduleSpec;
+use crate::pipeline::{ShareDone, TileProgress};
 use crate::recon::solver::Progress;
 use crate::recon::tile::Tile;
-use crate::work::{ShareDone, TileProgress};
 
 const STEPS: u64 = 1000;
 

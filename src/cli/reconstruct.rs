@@ -17,18 +17,18 @@ use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
 use crate::job::{Algorithm, ScheduleSpec, Timestamp};
-use crate::recon::metrics;
-use crate::recon::scale::ScaleEstimator;
-use crate::recon::tile::TilePlan;
-use crate::work::manifest::{
+use crate::pipeline::manifest::{
     Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
     frame_attributes, full_schedule,
 };
-use crate::work::pilot::PilotRecord;
-use crate::work::{
+use crate::pipeline::pilot::PilotRecord;
+use crate::pipeline::{
     NetworkSource, ResultSpec, SnapshotInput, Solved, Solver, TileOutcome, Usage, blended_frame,
     check_output, peak_rss_bytes, replace_result, solve, write_result,
 };
+use crate::recon::metrics;
+use crate::recon::scale::ScaleEstimator;
+use crate::recon::tile::TilePlan;
 use report::Report;
 
 /// Reconstruct the frames of one snapshot from files, without a server.

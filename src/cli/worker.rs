@@ -9,9 +9,10 @@ use tokio_util::sync::CancellationToken;
 use super::{CliError, logging};
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
+use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::store::Store;
-use crate::work::{NetworkSource, Worker, WorkerError};
+use crate::worker::{Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
 ///

@@ -4,7 +4,7 @@ use axum::Json;
 use serde::Serialize;
 
 use crate::job::{Algorithm, PriorSpec, ScheduleSpec, TileSpec};
-use crate::models;
+use crate::pipeline::models;
 
 /// An algorithm as it is shown.
 #[derive(Debug, Serialize)]

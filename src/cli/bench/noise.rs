@@ -18,10 +18,10 @@ use crate::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, ProjectedMasks, generator,
     measure, noisy, single_apertures,
 };
+use crate::pipeline::{NetworkSource, SnapshotInput, Solver, blended_frame, solve};
 use crate::recon::metrics;
 use crate::recon::schedule::Schedule;
 use crate::recon::tile::TilePlan;
-use crate::work::{NetworkSource, SnapshotInput, Solver, blended_frame, solve};
 
 /// Compare multiplexed masks with single sub-apertures as noise grows. Masks are normalised by
 /// light throughput, so that a mask through one of twelve sub-apertures is a sixth as bright as one

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::Arguments;
 use crate::cli::CliError;
-use crate::work::pilot::PilotRecord;
+use crate::pipeline::pilot::PilotRecord;
 
 /// What `--json` prints.
 #[derive(Debug, Serialize)]

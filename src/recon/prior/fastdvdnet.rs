@@ -117,7 +117,7 @@ fn reflect(index: isize, length: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::{FastDvdNet, reflect};
-    use crate::models;
+    use crate::pipeline::models;
     use crate::recon::prior::Denoiser;
     use crate::recon::prior::onnx::{Device, Runtime};
     use crate::recon::schedule::{Network, Sigma};

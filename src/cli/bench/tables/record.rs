@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cli::CliError;
 use crate::job::{Algorithm, ScheduleSpec, TileSpec};
-use crate::work::manifest::ModelRecord;
+use crate::pipeline::manifest::ModelRecord;
 
 /// Name and version of this form of record.
 const SCHEMA: &str = "sci-recon/bench-tables/1";

@@ -15,11 +15,13 @@ use crate::cli::learned::{Learned, plan};
 use crate::cli::masks::MaskArguments;
 use crate::job::{Algorithm, TileSpec};
 use crate::optics::{illumination, measure, noisy};
+use crate::pipeline::manifest::{ModelRecord, Summary, TileRecord};
+use crate::pipeline::{
+    NetworkSource, SnapshotInput, Solver, TileOutcome, Usage, blended_frame, solve,
+};
 use crate::recon::metrics;
 use crate::recon::scale::ScaleEstimator;
 use crate::recon::tile::TilePlan;
-use crate::work::manifest::{ModelRecord, Summary, TileRecord};
-use crate::work::{NetworkSource, SnapshotInput, Solver, TileOutcome, Usage, blended_frame, solve};
 
 /// Makes rows.
 pub(super) struct Bench {

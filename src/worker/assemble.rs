@@ -5,17 +5,17 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, Axis};
 use serde::{Deserialize, Serialize};
 
-use super::manifest::{
-    CameraRecord, Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary,
-    frame_attributes,
-};
 use super::prepare::{Prepared, to_record};
-use super::result::{ResultFile, ResultSpec, write_result};
 use super::task::{Shared, TaskError};
 use super::tile::TileTaskRecord;
 use crate::formats::Limits;
 use crate::formats::planar::Reader;
 use crate::job::{Finding, TaskProgress, TaskStage, Timestamp};
+use crate::pipeline::manifest::{
+    CameraRecord, Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary,
+    frame_attributes,
+};
+use crate::pipeline::{ResultFile, ResultSpec, write_result};
 use crate::recon::tile::TilePlan;
 use crate::store::{ClaimedTask, Completion, Product, Store, TileResult, hash_file};
 

@@ -8,8 +8,8 @@ use std::sync::{Arc, OnceLock};
 
 use super::learned::ModelFile;
 use super::manifest::ModelRecord;
+use super::models;
 use crate::job::{ScheduleSpec, Sha256};
-use crate::models;
 use crate::recon::ReconError;
 use crate::recon::prior::fastdvdnet::FastDvdNet;
 use crate::recon::prior::ffdnet::FfdNet;

@@ -9,11 +9,11 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 pub use super::camera::CameraRecord;
+use super::models::{self, Model};
 use super::pilot::PilotRecord;
-use super::result::ResultFile;
+use super::write::ResultFile;
 use crate::formats::exr::Attributes;
 use crate::job::{Algorithm, Finding, InvalidField, JobSpec, Label, ScheduleSpec, TileSpec};
-use crate::models::{self, Model};
 use crate::recon::tile::TilePlan;
 
 /// Name and version of this form of record.

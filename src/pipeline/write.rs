@@ -199,7 +199,7 @@ fn hash(reader: &mut impl Read) -> io::Result<(u64, String)> {
 mod tests {
     use super::{ResultError, ResultSpec, check_output, replace_result, sha256_of, write_result};
     use crate::formats::{FormatError, Limits, exr, read_stack};
-    use crate::work::manifest::{Manifest, sample};
+    use crate::pipeline::manifest::{Manifest, sample};
     use ndarray::{Array2, Array3};
     use std::fs::{self, File};
     use std::path::Path;

@@ -34,9 +34,7 @@ impl TileInput {
     /// The tile with the measurement divided by the white level, so that it is `sum_k C_k x_k` with
     /// frames on \[0,1\]; none if no light reaches it through any mask (a corner outside a round
     /// aperture, say).
-    pub(super) fn on_unit_scale(
-        self,
-    ) -> Result<Option<(SensingOperator, Array2<f32>)>, ReconError> {
+    pub fn on_unit_scale(self) -> Result<Option<(SensingOperator, Array2<f32>)>, ReconError> {
         self.check_white()?;
         let op = match SensingOperator::new(self.masks) {
             Err(ReconError::DarkMasks { .. }) => return Ok(None),

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use ndarray::ArrayView2;
 
-use super::network::NetworkError;
-use super::solve::{TileInput, TileOutcome};
+use super::networks::NetworkError;
+use super::tile::{TileInput, TileOutcome};
 use crate::job::Sha256;
 use crate::recon::ReconError;
 use crate::recon::learned::SnapshotNetwork;
@@ -84,9 +84,9 @@ fn squares(values: ArrayView2<'_, f32>) -> f64 {
 mod tests {
     use super::{ModelFile, run_network};
     use crate::optics::{iid_masks, measure};
+    use crate::pipeline::TileInput;
     use crate::recon::ReconError;
     use crate::recon::learned::SnapshotNetwork;
-    use crate::work::TileInput;
     use ndarray::{Array3, ArrayView2, ArrayView3};
 
     /// Knows the frames already, and what it should be given for them.

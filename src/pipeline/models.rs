@@ -49,29 +49,29 @@ pub const fn of(network: Network) -> Model {
 const FASTDVDNET_GRAY: Model = Model {
     name: "fastdvdnet-gray",
     files: &[
-        ("stage1.onnx", include_bytes!("../models/fastdvdnet-gray/stage1.onnx")),
-        ("stage2.onnx", include_bytes!("../models/fastdvdnet-gray/stage2.onnx")),
+        ("stage1.onnx", include_bytes!("../../models/fastdvdnet-gray/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../../models/fastdvdnet-gray/stage2.onnx")),
     ],
 };
 
 const FASTDVDNET_GRAY_INT8: Model = Model {
     name: "fastdvdnet-gray-int8",
     files: &[
-        ("stage1.onnx", include_bytes!("../models/fastdvdnet-gray-int8/stage1.onnx")),
-        ("stage2.onnx", include_bytes!("../models/fastdvdnet-gray-int8/stage2.onnx")),
+        ("stage1.onnx", include_bytes!("../../models/fastdvdnet-gray-int8/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../../models/fastdvdnet-gray-int8/stage2.onnx")),
     ],
 };
 
 const FFDNET_GRAY: Model = Model {
     name: "ffdnet-gray",
-    files: &[("model.onnx", include_bytes!("../models/ffdnet-gray/model.onnx"))],
+    files: &[("model.onnx", include_bytes!("../../models/ffdnet-gray/model.onnx"))],
 };
 
 #[cfg(test)]
 mod tests {
     use super::of;
+    use crate::pipeline::sha256_of;
     use crate::recon::schedule::Network;
-    use crate::work::sha256_of;
 
     #[test]
     fn the_twin_with_8_bits_was_made_from_these_weights() {

@@ -6,18 +6,18 @@ use std::time::Duration;
 
 use tracing::Instrument;
 
-use super::calibrate::{
-    self, CalibrateError, CaptureFiles, MadeMasks, Report, average_masks, read_patterns,
-    scale_masks,
-};
+use super::run::{HEARTBEAT, LEASE, Worker, WorkerError, said};
 use super::task::Shared;
-use super::worker::{HEARTBEAT, LEASE, Worker, WorkerError, said};
 use crate::formats::planar::{Reader, Writer};
 use crate::formats::{FormatError, Limits};
 use crate::job::{CalibrationReport, Captures, Label, TaskProgress, without_paths};
 use crate::store::{
     CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration, Heartbeat,
     NewCalibration, StagedBlob, Store, StoreError,
+};
+use crate::work::calibrate::{
+    self, CalibrateError, CaptureFiles, MadeMasks, Report, average_masks, read_patterns,
+    scale_masks,
 };
 
 /// How long the thread may take to come to the end of a frame when the worker is to end.

@@ -19,7 +19,7 @@ struct Point {
 /// A record of iterations that is thinned out as it grows: of many, every second, fourth, eighth ...
 /// is kept, and always the last.
 #[derive(Debug, Default)]
-pub(super) struct History {
+pub struct History {
     points: Vec<Point>,
     last: Option<Point>,
     /// Iterations seen, of which each 2^`thinned`-th is kept.
@@ -29,7 +29,7 @@ pub(super) struct History {
 
 impl History {
     /// Takes note of an iteration.
-    pub(super) fn note(&mut self, progress: &Progress) {
+    pub fn note(&mut self, progress: &Progress) {
         let point = Point {
             iteration: progress.done,
             residual: progress.residual,
@@ -52,7 +52,7 @@ impl History {
     }
 
     /// \[\[iteration, residual, change, sigma or null\], ...\] as JSON.
-    pub(super) fn to_json(&self) -> String {
+    pub fn to_json(&self) -> String {
         let kept = self.points.last().map(|point| point.iteration);
         let last = self.last.filter(|last| Some(last.iteration) != kept);
         let show = |point: &Point| {

@@ -2,21 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::manifest::full_schedule;
-use super::network::WarmNetworks;
-use super::prepare::{Prepared, plane, to_record};
-use super::solve::TileInput;
-use super::task::{Shared, TaskError};
-use super::tile::{TaskObserver, window};
-use crate::formats::Limits;
-use crate::formats::planar::Reader;
-use crate::job::{PriorSpec, ScheduleSpec, StageSpec, TaskProgress};
+use super::tile::TileInput;
+use crate::job::{PriorSpec, ScheduleSpec, StageSpec};
 use crate::recon::ReconError;
 use crate::recon::pilot::{self, StageFinding};
 use crate::recon::prior::Networks;
 use crate::recon::schedule::Schedule;
 use crate::recon::solver::Observer;
-use crate::store::{ClaimedTask, Completion, Product};
 
 /// What the pilot found, as it stands in manifests.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -67,42 +59,11 @@ impl StageRecord {
 }
 
 impl PilotRecord {
-    /// The record of the job's pilot; none before it, and for a job without one.
-    pub(super) fn of(task: &ClaimedTask) -> Result<Option<Self>, TaskError> {
-        let record = |error: serde_json::Error| TaskError::Record {
-            what: "pilot",
-            problem: error.to_string(),
-        };
-        let pilot = task.pilot.clone().map(serde_json::from_value::<Option<Self>>);
-        Ok(pilot.transpose().map_err(record)?.flatten())
-    }
-
     /// The schedule for the tiles.
     pub fn decide(&self, schedule: &Schedule) -> Schedule {
         let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
         schedule.decided(&found.collect::<Vec<_>>())
     }
-}
-
-/// The task of the pilot, on the first snapshot of the job.
-pub(super) fn run(
-    task: &ClaimedTask,
-    engine: &mut WarmNetworks,
-    shared: &Shared,
-) -> Result<Completion, TaskError> {
-    let snapshot = task.spec.snapshots.first as usize;
-    let y = plane(&Reader::open(&task.snapshots, &Limits::default())?, snapshot)?;
-    let (rows, columns) = pilot::piece(y.view());
-    let place = (snapshot, rows.start, columns.start);
-    let input = window(task, snapshot, (rows, columns), Prepared::of(task)?.white)?;
-    let spec = &task.spec.schedule;
-    let schedule = spec.to_schedule()?;
-    let mut observer = TaskObserver::new(shared, spec.clone());
-    let record = decide(input, place, &schedule, engine, &mut observer)?;
-    let decided = full_schedule(spec, record.as_ref())?;
-    let share = decided.planned_ns_per_voxel() / spec.planned_ns_per_voxel();
-    let progress = TaskProgress { fraction: 1.0, ..shared.progress() };
-    Ok(Completion { progress, record: to_record(&record)?, product: Product::TileCost(share) })
 }
 
 /// Runs the pilot of an adaptive schedule on a piece of a snapshot; none for a schedule that is

@@ -8,9 +8,9 @@ use std::thread;
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 
 use super::learned::{ModelFile, run_network};
-use super::network::{NetworkError, NetworkSource, WarmNetworks};
+use super::networks::{NetworkError, NetworkSource, WarmNetworks};
 use super::pilot::{self, PilotRecord};
-use super::solve::{TileInput, TileOutcome, reconstruct_tile};
+use super::tile::{TileInput, TileOutcome, reconstruct_tile};
 use crate::recon::schedule::Schedule;
 use crate::recon::solver::{Control, Observer, Progress};
 use crate::recon::tile::{Tile, TilePlan};
@@ -224,11 +224,11 @@ pub fn blended_frame(plan: &TilePlan, tiles: &[TileOutcome], k: usize) -> Array2
 mod tests {
     use super::{SnapshotInput, SolveError, Solver, blended_frame, solve};
     use crate::optics::{iid_masks, measure};
+    use crate::pipeline::NetworkSource;
     use crate::recon::ReconError;
     use crate::recon::prior::onnx::Device;
     use crate::recon::schedule::Schedule;
     use crate::recon::tile::TilePlan;
-    use crate::work::NetworkSource;
     use ndarray::Array3;
 
     fn scene(side: usize) -> (Array3<f32>, Array3<f32>) {

@@ -3,10 +3,10 @@
 use ndarray::{Array3, Axis};
 
 use super::prepare::{Prepared, to_record};
-use super::solve::TileInput;
 use super::task::{Shared, TaskError};
 use super::tile::{window, write};
 use crate::job::{TaskProgress, TaskStage};
+use crate::pipeline::TileInput;
 use crate::recon::preview::{self, Blocks};
 use crate::store::{ClaimedTask, Completion, Product, Store};
 

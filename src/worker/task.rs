@@ -4,12 +4,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::history::History;
-use super::network::{NetworkError, WarmNetworks};
-use super::result::ResultError;
 use super::{assemble, finish, pilot, prepare, preview, tile};
 use crate::formats::FormatError;
 use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
+use crate::pipeline::history::History;
+use crate::pipeline::{NetworkError, ResultError, WarmNetworks};
 use crate::recon::ReconError;
 use crate::recon::solver::Progress;
 use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};

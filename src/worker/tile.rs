@@ -6,17 +6,16 @@ use std::ops::Range;
 use ndarray::{ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 
-use super::learned::{ModelFile, run_network};
-use super::manifest::TileRecord;
-use super::network::WarmNetworks;
 use super::prepare::{Prepared, to_record};
-use super::share::ShareDone;
-use super::solve::{TileInput, TileOutcome, reconstruct_tile};
 use super::task::{Shared, TaskError};
-use super::usage::{Usage, peak_rss_bytes};
 use crate::formats::planar::{Reader, Writer};
 use crate::formats::{FormatError, Limits};
 use crate::job::{ScheduleSpec, TaskProgress, TaskStage};
+use crate::pipeline::manifest::TileRecord;
+use crate::pipeline::{
+    ModelFile, ShareDone, TileInput, TileOutcome, Usage, WarmNetworks, peak_rss_bytes,
+    reconstruct_tile, run_network,
+};
 use crate::recon::solver::{Control, Observer, Progress};
 use crate::store::{ClaimedTask, Completion, Product, StagedBlob, Store};
 

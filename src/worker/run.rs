@@ -13,10 +13,9 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::network::NetworkSource;
-use super::network::WarmNetworks;
 use super::task::{Material, Shared, TaskError, perform};
 use crate::job::{TaskProgress, WorkerId, without_paths};
+use crate::pipeline::{NetworkSource, WarmNetworks};
 use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError};
 
 /// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short

@@ -4,13 +4,13 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::manifest::full_schedule;
-use super::pilot::PilotRecord;
-use super::solve::typical_white;
 use super::task::{Shared, TaskError};
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
 use crate::job::{InvalidField, JobSpec, ScheduleSpec, Sha256, TaskProgress, TaskStage};
+use crate::pipeline::manifest::full_schedule;
+use crate::pipeline::pilot::PilotRecord;
+use crate::pipeline::typical_white;
 use crate::recon::scale::ScaleEstimator;
 use crate::store::{ClaimedTask, Completion, Product, hash_file};
 
@@ -32,7 +32,7 @@ impl Prepared {
         let prepared = task.prepared.clone().ok_or_else(|| record("there is none".into()))?;
         let mut prepared: Self =
             serde_json::from_value(prepared).map_err(|error| record(error.to_string()))?;
-        prepared.pilot = PilotRecord::of(task)?;
+        prepared.pilot = super::pilot::pilot_of(task)?;
         Ok(prepared)
     }
 

@@ -6,14 +6,16 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::assemble::SnapshotRecord;
-use super::manifest::{Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord};
-use super::pilot::PilotRecord;
 use super::prepare::{Prepared, to_record};
-use super::result::ResultFile;
 use super::task::TaskError;
 use crate::job::{
     Algorithm, Finding, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp,
 };
+use crate::pipeline::ResultFile;
+use crate::pipeline::manifest::{
+    Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord,
+};
+use crate::pipeline::pilot::PilotRecord;
 use crate::store::{ClaimedTask, Completion, Product, Store, TaskRecord};
 
 /// Name and version of this form of record.
@@ -85,8 +87,10 @@ pub(super) fn run(
     let text = serde_json::to_string_pretty(&manifest)
         .map_err(|error| TaskError::Record { what: "job", problem: error.to_string() })?;
     let path = staged.path().join("manifest.json");
-    fs::write(&path, text + "\n")
-        .map_err(|source| super::ResultError::File { name: "manifest.json".into(), source })?;
+    fs::write(&path, text + "\n").map_err(|source| crate::pipeline::ResultError::File {
+        name: "manifest.json".into(),
+        source,
+    })?;
     let progress = TaskProgress { stage: TaskStage::Writing, fraction: 1.0, ..TaskProgress::START };
     Ok(Completion { progress, record: to_record(&Value::Null)?, product: Product::Files(staged) })
 }
