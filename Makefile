@@ -32,9 +32,9 @@ $(JUDGES)/.stamp: tests/judges/requirements.txt
 	$(JUDGES)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-faults: runtime ## 200 random kills, faults at many file operations, damaged data, hanging tasks
+faults: runtime ## 200 random kills, pieces sent twice, faults at file operations, damaged data, hanging tasks
 	SCI_RECON_KILLS=200 SCI_RECON_FAULT_POINTS=25 $(PYTHON) scripts/figures.py faults \
-		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs::
+		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable::
 
 load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once (12 GB of disk)
 	$(PYTHON) scripts/figures.py load \

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::{Mutex, Semaphore};
+use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Promises;
@@ -35,7 +35,6 @@ pub struct Shared {
     pub(super) max_jobs: u64,
     pub(super) uploads: Arc<Semaphore>,
     pub(super) promises: Promises,
-    pub(super) finishing: Mutex<()>,
     /// One file is checked at a time: each takes a core and a frame of memory.
     pub(super) intake: Arc<Semaphore>,
     pub(super) checker: Checker,
@@ -91,7 +90,6 @@ impl App {
             max_jobs: settings.max_jobs,
             uploads: Arc::new(Semaphore::new(settings.max_uploads)),
             promises: Promises::default(),
-            finishing: Mutex::new(()),
             intake: Arc::new(Semaphore::new(1)),
             checker: Checker::new(settings),
             metrics,

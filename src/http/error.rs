@@ -29,6 +29,7 @@ pub enum Code {
     OffsetMismatch,
     TusVersion,
     UploadBusy,
+    UploadDamaged,
     ChecksumMismatch,
     InUse,
     IllegalState,
@@ -89,6 +90,9 @@ impl Code {
                 (S::PRECONDITION_FAILED, "tus_version", "Not in this version of tus", false)
             }
             Self::UploadBusy => (S::LOCKED, "upload_busy", "Another request is at it", true),
+            Self::UploadDamaged => {
+                (S::GONE, "upload_damaged", "Bytes of the upload are lost", false)
+            }
             Self::ChecksumMismatch => {
                 (*CHECKSUM_STATUS, "checksum_mismatch", "The piece has come damaged", true)
             }
@@ -253,6 +257,10 @@ impl From<StoreError> for ApiError {
             StoreError::KeyReused { .. } => Code::IdempotencyKeyReused,
             StoreError::HashMismatch { .. } => Code::HashMismatch,
             StoreError::QueueFull { .. } => Code::QueueFull,
+            StoreError::Short { .. } => {
+                tracing::error!(%error, "bytes of an upload are lost");
+                Code::UploadDamaged
+            }
             StoreError::Interrupted => Code::Unavailable,
             full if full.is_disk_full() => return disk_full(full),
             StoreError::Database(_)

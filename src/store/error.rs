@@ -71,6 +71,19 @@ pub enum StoreError {
         /// What came.
         found: crate::job::Sha256,
     },
+    /// Of an upload in pieces, bytes are lost that were on the disk.
+    #[error(
+        "{found} bytes of upload {id} are on the disk, fewer than the {recorded} on record: delete it \
+         and send the file again"
+    )]
+    Short {
+        /// The upload.
+        id: crate::job::PartialId,
+        /// Bytes that are there.
+        found: u64,
+        /// Bytes that should be.
+        recorded: u64,
+    },
     /// No more jobs are taken before some have ended.
     #[error("{jobs} jobs wait or run, and no more than {most} may")]
     QueueFull {

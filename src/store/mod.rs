@@ -36,9 +36,10 @@ pub use queue::{
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
-    Blob, Calibration, Job, JobFilter, Measurement, MeasurementFilter, Model, ModelFilter,
-    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, ResultFile,
-    TileHistory, TileState, Token, Unready, WorkerEnd, WorkerRow, WorkerTask,
+    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model,
+    ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
+    PartialFile, ResultFile, TileHistory, TileState, Token, Unready, WorkerEnd, WorkerRow,
+    WorkerTask,
 };
 
 /// One page of a list, and the identifier to go on after.

@@ -69,14 +69,18 @@ impl Store {
         Ok(StagedPath(Temporary::new(path, lock)?))
     }
 
-    /// A second name for a file that is there, on its way into the store. Blocks on the disk.
+    /// A second name for a file that is there, on its way into the store; `lock` holds the file's lock
+    /// already. Blocks on the disk.
     ///
     /// # Errors
     /// If the file can't be linked.
-    pub(super) fn staged_link(&self, original: &Path) -> Result<StagedPath, StoreError> {
+    pub(super) fn staged_link(
+        &self,
+        original: &Path,
+        lock: File,
+    ) -> Result<StagedPath, StoreError> {
         let path = self.temporary_path();
         fs::hard_link(original, &path).map_err(StoreError::io("link", &path))?;
-        let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
         Ok(StagedPath(Temporary::new(path, lock)?))
     }
 
@@ -187,6 +191,8 @@ impl StagedBlob {
         }
         // Also over a file that is there: it has the same bytes, or is damaged.
         dir::rename_durably(&self.temporary.path, place)?;
+        // Two names of one file stay two: it was stored before, by an attempt that a crash ended.
+        dir::remove(&self.temporary.path)?;
         self.temporary.moved = true;
         Ok(())
     }

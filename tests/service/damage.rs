@@ -36,7 +36,7 @@ impl TestApp {
         files.into_iter().map(|(_, path)| path).collect()
     }
 
-    async fn database(&self) -> sqlx::SqliteConnection {
+    pub async fn database(&self) -> sqlx::SqliteConnection {
         let path = self.data().join("sci-recon.db");
         sqlx::SqliteConnection::connect(path.to_str().unwrap()).await.unwrap()
     }

@@ -63,7 +63,7 @@ impl TestApp {
 }
 
 /// How often to kill: `make faults` says 200.
-fn kills() -> u32 {
+pub fn kills() -> u32 {
     std::env::var("SCI_RECON_KILLS").map_or(10, |text| text.parse().unwrap())
 }
 
@@ -203,7 +203,7 @@ async fn a_killed_worker_is_replaced_and_its_task_taken_up_at_once() {
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 }
 
-fn sha256(bytes: &[u8]) -> String {
+pub fn sha256(bytes: &[u8]) -> String {
     use sha2::Digest;
     sha2::Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }

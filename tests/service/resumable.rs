@@ -4,12 +4,15 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use rand::{Rng, RngCore, SeedableRng};
 use reqwest::{Method, RequestBuilder};
+use sci_recon::store::Store;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::app::{Answer, TestApp};
+use crate::faults::{kills, sha256};
 
 const ABC: &str = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
 const ABC_BASE64: &str =
@@ -227,10 +230,7 @@ async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
     let file = folder.path().join("masks.npy");
     let bytes: Vec<u8> = (0u32..3_000_000).flat_map(u32::to_le_bytes).collect();
     std::fs::write(&file, &bytes).unwrap();
-    let hash: String = {
-        use sha2::Digest;
-        sha2::Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect()
-    };
+    let hash = sha256(&bytes);
     let (proxy, cuts) = cutting(app.address()).await;
     let mut command = tokio::process::Command::new(&python);
     command.arg("tests/judges/tus_upload.py").arg(format!("http://{proxy}/v1/uploads"));
@@ -246,6 +246,158 @@ async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
     assert_eq!(stored.json()["size"], bytes.len());
     let blob = app.data().join("blobs").join(&hash[..2]).join(&hash[2..]);
     assert!(std::fs::read(blob).unwrap() == bytes, "the bytes are those that were sent");
+}
+
+/// Sends `body` of a piece of `announced` bytes over a connection of its own; gives the offset that is
+/// acknowledged, if one is. A body that is shorter is cut.
+async fn raw_piece(
+    address: String,
+    path: String,
+    offset: usize,
+    announced: usize,
+    body: Vec<u8>,
+) -> Option<usize> {
+    let mut socket = TcpStream::connect(&address).await.ok()?;
+    let head = format!(
+        "PATCH {path} HTTP/1.1\r\nHost: {address}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: {offset}\r\n\
+         Content-Type: application/offset+octet-stream\r\nContent-Length: {announced}\r\n\
+         Connection: close\r\n\r\n"
+    );
+    socket.write_all(head.as_bytes()).await.ok()?;
+    socket.write_all(&body).await.ok()?;
+    if body.len() < announced {
+        return None;
+    }
+    let mut answer = String::new();
+    socket.read_to_string(&mut answer).await.ok()?;
+    let rest = answer.strip_prefix("HTTP/1.1 204 ")?.split("upload-offset: ").nth(1)?;
+    rest.split("\r\n").next()?.parse().ok()
+}
+
+/// Each piece is sent again around the moment at which it ends, whole and cut, as clients do that have
+/// lost their connection; every other upload sees the server killed then, too. `make faults` makes 200.
+#[tokio::test]
+async fn pieces_that_come_again_around_their_end_cost_no_byte() {
+    let (rounds, seed) = (kills().max(20), rand::random::<u64>());
+    eprintln!("seed of the repeats: {seed}");
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut app = TestApp::start().await;
+    let (mut repeats, mut servers, mut lost, mut wrong) = (0, 0, 0, 0);
+    for round in 0..rounds {
+        let mut bytes = vec![0; random.random_range(200_000..600_000)];
+        random.fill_bytes(&mut bytes);
+        let path = begin(&app, bytes.len(), "").await;
+        let ends = [bytes.len() / 3, bytes.len() / 3 * 2, bytes.len()];
+        let fatal = (round % 2 == 1).then(|| random.random_range(0..ends.len()));
+        for (number, end) in ends.into_iter().enumerate() {
+            let mut acknowledged = Vec::new();
+            let start: usize = offset(&app, &path).await.parse().unwrap();
+            let piece = bytes[start.min(end)..end].to_vec();
+            let send = |body: Vec<u8>| {
+                let (announced, path) = (piece.len(), path.clone());
+                tokio::spawn(raw_piece(app.address(), path, start, announced, body))
+            };
+            let mut sent = vec![send(piece.clone())];
+            for _ in 0..random.random_range(3..8) {
+                let pause = random.random_range(0..3_000);
+                tokio::time::sleep(std::time::Duration::from_micros(pause)).await;
+                let short = random.random_range(1..2_000).min(piece.len());
+                sent.push(send(if random.random() {
+                    piece.clone()
+                } else {
+                    piece[..short].to_vec()
+                }));
+                repeats += 1;
+            }
+            if fatal == Some(number) {
+                let pause = random.random_range(0..8_000);
+                tokio::time::sleep(std::time::Duration::from_micros(pause)).await;
+                servers += 1;
+                app.restart();
+            }
+            for answer in sent {
+                acknowledged.extend(answer.await.unwrap());
+            }
+            // What was acknowledged is there, and the rest is sent as by any client.
+            let due = acknowledged.into_iter().max().unwrap_or(0);
+            let mut now = offset(&app, &path).await.parse::<usize>().unwrap();
+            lost += usize::from(now < due);
+            let begun = std::time::Instant::now();
+            while now < end && begun.elapsed().as_secs() < 10 {
+                raw_piece(app.address(), path.clone(), now, end - now, bytes[now..end].to_vec())
+                    .await;
+                now = offset(&app, &path).await.parse().unwrap();
+            }
+        }
+        let hash = sha256(&bytes);
+        let start = std::time::Instant::now();
+        let stored = loop {
+            let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
+            let stored = known.header("content-location").to_owned();
+            // A repeat may be at it for a moment more.
+            if !stored.is_empty() || start.elapsed().as_secs() > 10 {
+                break stored;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+        };
+        let blob = app.data().join("blobs").join(&hash[..2]).join(&hash[2..]);
+        let right = std::fs::read(blob).is_ok_and(|stored| stored == bytes);
+        wrong += usize::from(stored != format!("/v1/blobs/{hash}") || !right);
+    }
+    let ok = lost + wrong == 0;
+    println!(
+        "{}",
+        json!({"target": "repeated_pieces", "ok": ok, "uploads": rounds, "repeats": repeats,
+               "kills": servers, "lost_acknowledged": lost, "wrong_blobs": wrong, "seed": seed})
+    );
+    assert!(ok);
+}
+
+/// A file that is shorter than its row is told, not filled up with zeros.
+#[tokio::test]
+async fn an_upload_that_has_lost_bytes_is_refused() {
+    let app = TestApp::start().await;
+    let path = begin(&app, 6, "").await;
+    app.send(piece(&app, &path, 0, b"abcd")).await.expect(204);
+    let file = app.data().join("partial").join(path.rsplit('/').next().unwrap());
+    std::fs::write(&file, b"ab").unwrap();
+    let refused = app.send(piece(&app, &path, 4, b"ef")).await.problem(410, "upload_damaged");
+    assert!(refused.contains("2 bytes") && refused.contains("the 4 on record"), "{refused}");
+    app.send(tus(&app, Method::HEAD, &path)).await.expect(410);
+    assert_eq!(std::fs::read(&file).unwrap(), b"ab");
+    app.send(tus(&app, Method::DELETE, &path)).await.expect(204);
+    assert!(!file.exists());
+}
+
+/// One client with a byte now and then holds up nobody else's end; and its own upload does not expire
+/// under its hands.
+#[tokio::test]
+async fn a_slow_piece_holds_up_nobody_and_does_not_expire() {
+    let app = TestApp::start().await;
+    let path = begin(&app, 1000, "").await;
+    let address = app.address();
+    let mut slow = TcpStream::connect(&address).await.unwrap();
+    let head = format!(
+        "PATCH {path} HTTP/1.1\r\nHost: {address}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n\
+         Content-Type: application/offset+octet-stream\r\nContent-Length: 1000\r\n\
+         Connection: close\r\n\r\n"
+    );
+    slow.write_all(head.as_bytes()).await.unwrap();
+    slow.write_all(&[7; 500]).await.unwrap();
+    let other = begin(&app, 3, "").await;
+    app.send(piece(&app, &other, 0, b"abc")).await.expect(204);
+    assert_eq!(offset(&app, &path).await, "0");
+    app.send(tus(&app, Method::DELETE, &path)).await.problem(423, "upload_busy");
+    // Its time is over; the cleaning lets it be.
+    let store = Store::open(app.data()).await.unwrap();
+    let mut database = app.database().await;
+    sqlx::query("UPDATE partials SET expires_at = 1").execute(&mut database).await.unwrap();
+    assert_eq!(store.expire_partials().await.unwrap(), 1, "the one that is stored");
+    slow.write_all(&[7; 500]).await.unwrap();
+    let mut answer = String::new();
+    slow.read_to_string(&mut answer).await.unwrap();
+    assert!(answer.starts_with("HTTP/1.1 204 "), "{answer}");
+    assert_eq!(offset(&app, &path).await, "1000");
 }
 
 /// A client that is gone in the middle of a piece: what came is kept.

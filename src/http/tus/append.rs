@@ -7,50 +7,49 @@ use super::headers::Checksum;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code};
 use crate::http::upload::{CHUNKS, next};
-use crate::store::{Partial, PartialFile, StoreError};
+use crate::store::{PartialFile, StoreError};
 
 /// Appends what comes. A cut connection keeps what has come before it, unless a checksum was named
-/// for the piece: then all of the piece counts, or nothing.
+/// for the piece: then all of the piece counts, or nothing. The file stays locked until its row says so.
 pub(super) async fn append(
     app: &App,
-    upload: &mut Partial,
     file: PartialFile,
     checksum: Option<Checksum>,
     body: Body,
-) -> Result<(), ApiError> {
+) -> Result<PartialFile, ApiError> {
     let whole = checksum.is_some();
+    let (length, received) = (file.upload().facts.length, file.upload().received);
     let (sender, receiver) = mpsc::channel(CHUNKS);
     let writer = tokio::task::spawn_blocking(move || write(file, receiver, checksum));
-    let received = pump(app, upload, body, sender).await;
-    let written = writer.await.map_err(|_| StoreError::Interrupted)??;
-    match (&received, written.sum_holds) {
+    let pumped = pump(app, length, length - received, body, sender).await;
+    let mut written = writer.await.map_err(|_| StoreError::Interrupted)??;
+    match (&pumped, written.sum_holds) {
         (Err(_), _) if whole => {}
         (Ok(()), Some(false)) => {
             let detail = "the bytes that came have another checksum; send the piece again";
             return Err(ApiError::new(Code::ChecksumMismatch, detail));
         }
         _ => {
-            let end = upload.received + written.bytes;
-            app.store.advance_partial(upload, end, app.upload_age).await?;
+            app.store.advance_partial(&mut written.file, written.bytes, app.upload_age).await?;
             metrics::counter!("sci_recon_upload_bytes_total").increment(written.bytes);
         }
     }
-    received
+    pumped.map(|()| written.file)
 }
 
 /// Hands the chunks of the body on, no more than the upload still wants.
 async fn pump(
     app: &App,
-    upload: &Partial,
+    length: u64,
+    mut left: u64,
     body: Body,
     sender: mpsc::Sender<Bytes>,
 ) -> Result<(), ApiError> {
     let mut stream = body.into_data_stream();
-    let mut left = upload.facts.length - upload.received;
     // What an upload in pieces still wants is promised to it by the database.
     while let Some(chunk) = next(app, &mut stream).await? {
         let Some(rest) = left.checked_sub(chunk.len() as u64) else {
-            let detail = format!("the upload was begun with a length of {}", upload.facts.length);
+            let detail = format!("the upload was begun with a length of {length}");
             return Err(ApiError::new(Code::TooLarge, detail));
         };
         left = rest;
@@ -63,6 +62,7 @@ async fn pump(
 }
 
 struct Written {
+    file: PartialFile,
     bytes: u64,
     sum_holds: Option<bool>,
 }
@@ -81,5 +81,5 @@ fn write(
         }
     }
     file.sync()?;
-    Ok(Written { bytes, sum_holds: checksum.map(Checksum::holds) })
+    Ok(Written { file, bytes, sum_holds: checksum.map(Checksum::holds) })
 }

@@ -18,7 +18,7 @@ use super::app::App;
 use super::error::{ApiError, Code};
 use super::extract::Params;
 use crate::job::{PartialId, Sha256};
-use crate::store::{NewPartial, Partial, StoreError};
+use crate::store::{FoundPartial, NewPartial, Partial, PartialFile};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -92,9 +92,19 @@ pub(super) async fn show(
     Params(id): Params<PartialId>,
 ) -> Result<Response, ApiError> {
     let mut upload = app.store.partial(&access.lab, id).await?;
-    if upload.received == upload.facts.length && upload.result.is_none() {
-        // The last piece came, but not the end of its request.
-        finish(&app, &mut upload).await?;
+    // All has come, but not the end of its request; or bytes on record are lost, which is told here.
+    if upload.result.is_none()
+        && (upload.received == upload.facts.length
+            || app.store.partial_bytes(id).await? < upload.received)
+    {
+        upload = to_the_end(async move {
+            match app.store.open_partial(&access.lab, id).await? {
+                FoundPartial::Open(file) => finish(&app, file).await,
+                FoundPartial::Stored(upload) => Ok(upload),
+                FoundPartial::Busy => Ok(upload),
+            }
+        })
+        .await?;
     }
     let length = upload.facts.length.to_string();
     let about = [(LENGTH, length), (METADATA, upload.facts.metadata.clone())];
@@ -113,20 +123,25 @@ pub(super) async fn patch(
     body: Body,
 ) -> Result<Response, ApiError> {
     let permit = super::upload::place(&app)?;
-    let upload = app.store.partial(&access.lab, id).await?;
-    // A task of its own: what has come is recorded also when the connection, and with it this
-    // request, is gone.
-    let piece = tokio::spawn(async move {
+    let upload = to_the_end(async move {
         let _permit = permit;
-        piece(&app, upload, &headers, body).await
+        piece(&app, &access, id, &headers, body).await
     });
-    let upload = piece.await.map_err(|error| ApiError::internal(&error))??;
-    Ok((StatusCode::NO_CONTENT, state(&upload)).into_response())
+    Ok((StatusCode::NO_CONTENT, state(&upload.await?)).into_response())
+}
+
+/// A task of its own: what has come is recorded also when the connection, and with it the request, is
+/// gone.
+async fn to_the_end<T: Send + 'static>(
+    work: impl Future<Output = Result<T, ApiError>> + Send + 'static,
+) -> Result<T, ApiError> {
+    tokio::spawn(work).await.map_err(|error| ApiError::internal(&error))?
 }
 
 async fn piece(
     app: &App,
-    mut upload: Partial,
+    access: &Access,
+    id: PartialId,
     headers: &HeaderMap,
     body: Body,
 ) -> Result<Partial, ApiError> {
@@ -138,30 +153,26 @@ async fn piece(
     let offset = number(headers, &OFFSET)?;
     let checksum = text(headers, &CHECKSUM)?.map(headers::Checksum::parse).transpose();
     let checksum = checksum.map_err(malformed)?;
+    let (upload, file) = match app.store.open_partial(&access.lab, id).await? {
+        FoundPartial::Open(file) => (file.upload().clone(), Some(file)),
+        FoundPartial::Stored(upload) => (upload, None),
+        FoundPartial::Busy => return Err(busy()),
+    };
     if offset != upload.received {
         let detail = format!("{} bytes are here; the piece begins at {offset}", upload.received);
         return Err(ApiError::new(Code::OffsetMismatch, detail));
     }
-    if upload.result.is_some() {
-        return Ok(upload);
-    }
-    let file = app.store.open_partial(&upload).await?.ok_or_else(busy)?;
-    append::append(app, &mut upload, file, checksum, body).await?;
-    if upload.received == upload.facts.length {
-        finish(app, &mut upload).await?;
-    }
-    Ok(upload)
+    let Some(file) = file else { return Ok(upload) };
+    let file = append::append(app, file, checksum, body).await?;
+    finish(app, file).await
 }
 
-/// Stores a file of which all is there.
-async fn finish(app: &App, upload: &mut Partial) -> Result<(), ApiError> {
-    // One at a time: of two requests that see the last piece, the second finds the first one's work.
-    let _turn = app.finishing.lock().await;
-    *upload = app.store.partial(&upload.facts.lab, upload.id).await?;
-    if upload.result.is_none() {
-        app.store.finish_partial(upload).await?;
+/// Stores the file if all of it is there.
+async fn finish(app: &App, file: PartialFile) -> Result<Partial, ApiError> {
+    if file.is_complete() {
+        return Ok(app.store.finish_partial(file).await?);
     }
-    Ok(())
+    Ok(file.upload().clone())
 }
 
 /// `DELETE /v1/uploads/{upload}`: ends it; what has come goes.
@@ -170,16 +181,9 @@ pub(super) async fn delete(
     access: Access,
     Params(id): Params<PartialId>,
 ) -> Result<StatusCode, ApiError> {
-    let upload = app.store.partial(&access.lab, id).await?;
-    if upload.result.is_none() {
-        match app.store.open_partial(&upload).await {
-            Ok(None) => return Err(busy()),
-            Ok(Some(_)) | Err(StoreError::NotFound { .. }) => {}
-            Err(error) => return Err(error.into()),
-        }
-    }
-    app.store.end_partial(id).await?;
-    Ok(StatusCode::NO_CONTENT)
+    app.store.partial(&access.lab, id).await?;
+    let deleted = to_the_end(async move { Ok(app.store.delete_partial(id).await?) });
+    if deleted.await? { Ok(StatusCode::NO_CONTENT) } else { Err(busy()) }
 }
 
 /// How far the upload is, until when it is kept, and, once it is stored, as what.

@@ -17,7 +17,7 @@ pub use calibrations::{Calibration, NewCalibration};
 pub use jobs::{Job, JobFilter};
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
 pub use models::{Model, ModelFilter, NewModel};
-pub use partials::{NewPartial, Partial, PartialFile};
+pub use partials::{FoundPartial, NewPartial, Partial, PartialFile};
 pub use reports::Unready;
 pub use results::ResultFile;
 pub use tasks::{TileHistory, TileState};

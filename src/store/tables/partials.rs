@@ -2,7 +2,8 @@
 
 use std::fs::{File, TryLockError};
 use std::io::{Seek, SeekFrom, Write};
-use std::path::PathBuf;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use sqlx::Row;
@@ -11,7 +12,7 @@ use sqlx::sqlite::SqliteRow;
 use crate::job::{Lab, PartialId, Sha256, Timestamp, TokenId};
 use crate::store::error::StoreError;
 use crate::store::rows::{integer, number, parsed, parsed_if};
-use crate::store::{Blob, Store, dir, on_files};
+use crate::store::{Store, dir, on_files};
 
 /// An upload to be begun.
 #[derive(Debug, Clone)]
@@ -43,14 +44,53 @@ pub struct Partial {
     pub expires_at: Timestamp,
 }
 
-/// The file of a partial upload, locked: one request writes to it.
+/// The file of a partial upload and its row, for one request alone: the lock of the file is held until
+/// this is dropped, over data and row, so that nobody appends at an offset that is no longer true.
 #[derive(Debug)]
 pub struct PartialFile {
+    upload: Partial,
     file: File,
     path: PathBuf,
 }
 
+/// What a request finds that wants to go on with an upload.
+#[derive(Debug)]
+pub enum FoundPartial {
+    /// The file, behind the last byte on record.
+    Open(PartialFile),
+    /// Another request has it.
+    Busy,
+    /// All has come and is stored.
+    Stored(Partial),
+}
+
 impl PartialFile {
+    /// The row, as it stands under the lock.
+    #[must_use]
+    pub fn upload(&self) -> &Partial {
+        &self.upload
+    }
+
+    /// True if nothing is missing but to store it.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        self.upload.received == self.upload.facts.length
+    }
+
+    /// Drops what was written without being recorded. A file that lacks bytes on record is refused: to
+    /// extend it would make zeros of them.
+    fn ready(mut file: File, path: PathBuf, upload: Partial) -> Result<Self, StoreError> {
+        let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
+        if bytes < upload.received {
+            return Err(short(&upload, bytes));
+        }
+        if bytes > upload.received {
+            file.set_len(upload.received).map_err(StoreError::io("shorten", &path))?;
+        }
+        file.seek(SeekFrom::Start(upload.received)).map_err(StoreError::io("read", &path))?;
+        Ok(Self { upload, file, path })
+    }
+
     /// Appends bytes. Blocks.
     ///
     /// # Errors
@@ -68,6 +108,31 @@ impl PartialFile {
     }
 }
 
+/// The lock of a partial file, which is free again when the file is closed.
+enum Lock {
+    Taken(File),
+    Busy,
+    Gone,
+}
+
+fn lock(path: &Path) -> Result<Lock, StoreError> {
+    let file = match File::options().write(true).open(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Lock::Gone),
+        file => file.map_err(StoreError::io("open", path))?,
+    };
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => return Ok(Lock::Busy),
+        Err(TryLockError::Error(error)) => return Err(StoreError::io("lock", path)(error)),
+    }
+    // Whoever had the lock before may have stored or ended the upload: the file that was opened may be
+    // a blob by now, which nobody may write to.
+    let opened = file.metadata().map_err(StoreError::io("read", path))?;
+    let same = std::fs::metadata(path)
+        .is_ok_and(|now| (now.dev(), now.ino()) == (opened.dev(), opened.ino()));
+    Ok(if same { Lock::Taken(file) } else { Lock::Gone })
+}
+
 impl Store {
     /// Begins an upload, which is given up when nothing more has come for `age`.
     ///
@@ -81,9 +146,12 @@ impl Store {
         let id = PartialId::new();
         let expires_at = after(age);
         let path = self.dir().partial(id);
-        on_files(move || {
-            File::create_new(&path).map_err(StoreError::io("make", &path))?;
-            path.parent().map_or(Ok(()), dir::sync_dir)
+        // Locked until its row is there, so that it is nobody's for no moment.
+        let _lock = on_files(move || {
+            let file = File::create_new(&path).map_err(StoreError::io("make", &path))?;
+            file.lock().map_err(StoreError::io("lock", &path))?;
+            path.parent().map_or(Ok(()), dir::sync_dir)?;
+            Ok(file)
         })
         .await?;
         sqlx::query(
@@ -116,56 +184,66 @@ impl Store {
         row.as_ref().map(partial).transpose()?.ok_or_else(|| not_found(id))
     }
 
-    /// Opens the file of an upload behind the last byte that is known to be on the disk; none if
-    /// another request writes to it.
+    /// Takes an upload for this request alone, unless another one has it.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`] if it is gone; or if it can't be opened.
-    pub async fn open_partial(&self, upload: &Partial) -> Result<Option<PartialFile>, StoreError> {
-        let (path, received, id) = (self.dir().partial(upload.id), upload.received, upload.id);
-        on_files(move || {
-            let file = match File::options().write(true).open(&path) {
-                Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-                    return Err(not_found(id));
-                }
-                file => file.map_err(StoreError::io("open", &path))?,
-            };
-            match file.try_lock() {
-                Ok(()) => {}
-                Err(TryLockError::WouldBlock) => return Ok(None),
-                Err(TryLockError::Error(error)) => {
-                    return Err(StoreError::io("lock", &path)(error));
-                }
-            }
-            let mut partial = PartialFile { file, path };
-            // What an earlier request wrote without the end of it being recorded.
-            partial
-                .file
-                .set_len(received)
-                .and_then(|()| partial.file.seek(SeekFrom::Start(received)))
-                .map_err(StoreError::io("shorten", &partial.path))?;
-            Ok(Some(partial))
+    /// [`StoreError::NotFound`] if it is gone; [`StoreError::Short`] if bytes on record are lost.
+    pub async fn open_partial(&self, lab: &Lab, id: PartialId) -> Result<FoundPartial, StoreError> {
+        let upload = self.partial(lab, id).await?;
+        if upload.result.is_some() {
+            return Ok(FoundPartial::Stored(upload));
+        }
+        let path = self.dir().partial(id);
+        let locked = path.clone();
+        let file = match on_files(move || lock(&locked)).await? {
+            Lock::Taken(file) => Some(file),
+            Lock::Busy => return Ok(FoundPartial::Busy),
+            Lock::Gone => None,
+        };
+        // Again, now that nobody changes it.
+        let upload = self.partial(lab, id).await?;
+        if upload.result.is_some() {
+            return Ok(FoundPartial::Stored(upload));
+        }
+        let file = file.ok_or_else(|| short(&upload, 0))?;
+        let ready = on_files(move || PartialFile::ready(file, path, upload)).await?;
+        Ok(FoundPartial::Open(ready))
+    }
+
+    /// Bytes of an upload's file as it lies on the disk; 0 if there is none.
+    ///
+    /// # Errors
+    /// If the file can't be looked at.
+    pub async fn partial_bytes(&self, id: PartialId) -> Result<u64, StoreError> {
+        let path = self.dir().partial(id);
+        on_files(move || match std::fs::metadata(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(0),
+            meta => Ok(meta.map_err(StoreError::io("read", &path))?.len()),
         })
         .await
     }
 
-    /// Records that so many bytes are on the disk, and puts off the end.
+    /// Records that `bytes` more are on the disk, and puts off the end.
     ///
     /// # Errors
     /// [`StoreError::NotFound`] if the upload was ended meanwhile.
     pub async fn advance_partial(
         &self,
-        upload: &mut Partial,
-        received: u64,
+        partial: &mut PartialFile,
+        bytes: u64,
         age: Duration,
     ) -> Result<(), StoreError> {
-        let expires_at = after(age);
-        let changed = sqlx::query("UPDATE partials SET received = ?, expires_at = ? WHERE id = ?")
-            .bind(integer(received))
-            .bind(expires_at.0)
-            .bind(upload.id.to_string())
-            .execute(&self.writer)
-            .await?;
+        let upload = &mut partial.upload;
+        let (received, expires_at) = (upload.received + bytes, after(age));
+        let changed = sqlx::query(
+            "UPDATE partials SET received = ?, expires_at = ? WHERE id = ? AND received = ?",
+        )
+        .bind(integer(received))
+        .bind(expires_at.0)
+        .bind(upload.id.to_string())
+        .bind(integer(upload.received))
+        .execute(&self.writer)
+        .await?;
         if changed.rows_affected() == 0 {
             return Err(not_found(upload.id));
         }
@@ -178,32 +256,49 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::HashMismatch`] if the client named another hash; the upload is ended then.
-    pub async fn finish_partial(&self, upload: &mut Partial) -> Result<Blob, StoreError> {
-        let (store, path) = (self.clone(), self.dir().partial(upload.id));
+    /// [`StoreError::Short`] if the file has not the length that was announced.
+    pub async fn finish_partial(&self, partial: PartialFile) -> Result<Partial, StoreError> {
+        // The file is open, and so locked, until the upload is stored and its row says so.
+        let PartialFile { mut upload, file, path } = partial;
+        let lock = file.try_clone().map_err(StoreError::io("open", &path))?;
+        let (store, original) = (self.clone(), path.clone());
         // Under a second name, so that the bytes are not lost if the rest fails.
-        let staged = on_files(move || store.staged_link(&path)?.finish()).await?;
+        let staged = on_files(move || store.staged_link(&original, lock)?.finish()).await?;
+        if staged.size() != upload.facts.length {
+            return Err(short(&upload, staged.size()));
+        }
         let found = staged.sha256();
         if let Some(expected) = upload.facts.expected.filter(|expected| *expected != found) {
             self.end_partial(upload.id).await?;
             return Err(StoreError::HashMismatch { expected, found });
         }
-        let (blob, _) = self.store_upload(&upload.facts.lab, upload.facts.token, staged).await?;
+        self.store_upload(&upload.facts.lab, upload.facts.token, staged).await?;
         sqlx::query("UPDATE partials SET result = ? WHERE id = ?")
             .bind(found.to_string())
             .bind(upload.id.to_string())
             .execute(&self.writer)
             .await?;
-        let path = self.dir().partial(upload.id);
         on_files(move || dir::remove(&path)).await?;
         upload.result = Some(found);
-        Ok(blob)
+        Ok(upload)
     }
 
-    /// Ends an upload; what has come of it goes.
+    /// Ends an upload that no other request has; what has come of it goes. False if it is busy.
     ///
     /// # Errors
     /// If the row or the file can't be removed.
-    pub async fn end_partial(&self, id: PartialId) -> Result<(), StoreError> {
+    pub async fn delete_partial(&self, id: PartialId) -> Result<bool, StoreError> {
+        let path = self.dir().partial(id);
+        let lock = on_files(move || lock(&path)).await?;
+        if !matches!(lock, Lock::Busy) {
+            self.end_partial(id).await?;
+            return Ok(true);
+        }
+        Ok(false)
+    }
+
+    /// Removes the row and the file, whose lock must be held.
+    async fn end_partial(&self, id: PartialId) -> Result<(), StoreError> {
         sqlx::query("DELETE FROM partials WHERE id = ?")
             .bind(id.to_string())
             .execute(&self.writer)
@@ -212,7 +307,7 @@ impl Store {
         on_files(move || dir::remove(&path)).await
     }
 
-    /// Ends the uploads that have expired. Says how many.
+    /// Ends the uploads that have expired, but none to which a piece is being written. Says how many.
     ///
     /// # Errors
     /// If a row or a file can't be removed.
@@ -221,10 +316,24 @@ impl Store {
             .bind(Timestamp::now().0)
             .fetch_all(&self.readers)
             .await?;
+        let mut ended = 0;
         for row in &rows {
-            self.end_partial(parsed(row, "id")?).await?;
+            let id: PartialId = parsed(row, "id")?;
+            let path = self.dir().partial(id);
+            let lock = on_files(move || lock(&path)).await?;
+            // A piece may have come before the lock was taken.
+            let is_due = sqlx::query("SELECT 1 FROM partials WHERE id = ? AND expires_at <= ?")
+                .bind(id.to_string())
+                .bind(Timestamp::now().0)
+                .fetch_optional(&self.readers)
+                .await?
+                .is_some();
+            if is_due && !matches!(lock, Lock::Busy) {
+                self.end_partial(id).await?;
+                ended += 1;
+            }
         }
-        Ok(rows.len())
+        Ok(ended)
     }
 
     /// Bytes of the disk that were promised and are not written: the rest of uploads in pieces, and
@@ -267,6 +376,10 @@ fn partial(row: &SqliteRow) -> Result<Partial, StoreError> {
         result: parsed_if(row, "result")?,
         expires_at: Timestamp(row.try_get("expires_at")?),
     })
+}
+
+fn short(upload: &Partial, found: u64) -> StoreError {
+    StoreError::Short { id: upload.id, found, recorded: upload.received }
 }
 
 fn not_found(id: PartialId) -> StoreError {
