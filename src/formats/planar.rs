@@ -13,11 +13,10 @@ use std::path::Path;
 
 use ndarray::{Array3, ArrayView2};
 
+use super::format::PLANAR_MAGIC;
 use super::samples::FrameSink;
 use super::{Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
-/// The first bytes of every prepared array.
-pub(super) const MAGIC: &[u8] = b"SCIPLNR\0";
 const VERSION: u32 = 1;
 const HEADER_BYTES: u64 = 32;
 const SAMPLE_BYTES: u64 = 4;
@@ -37,7 +36,7 @@ impl<W: Write> Writer<W> {
         height: usize,
         width: usize,
     ) -> Result<Self, FormatError> {
-        let mut header = MAGIC.to_vec();
+        let mut header = PLANAR_MAGIC.to_vec();
         header.extend(VERSION.to_le_bytes());
         for axis in [frames, height, width] {
             let axis = u32::try_from(axis)
@@ -135,10 +134,10 @@ pub fn read_window(
 }
 
 fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo, FormatError> {
-    if !header.starts_with(MAGIC) {
+    if !header.starts_with(PLANAR_MAGIC) {
         return Err(FormatError::malformed(Format::Planar, "the signature is wrong"));
     }
-    let (words, _) = header[MAGIC.len()..].as_chunks::<4>();
+    let (words, _) = header[PLANAR_MAGIC.len()..].as_chunks::<4>();
     let word = |i: usize| words.get(i).map_or(0, |w| u32::from_le_bytes(*w));
     if word(0) != VERSION {
         return Err(FormatError::Unsupported {

@@ -11,6 +11,7 @@ use ::tiff::{ColorType, TiffError};
 use ndarray::Array2;
 
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
+use directory::malformed;
 
 const ACCEPTED_SAMPLES: &str =
     "one grey sample a pixel (BlackIsZero): unsigned 8 or 16 bit, or 32-bit float";
@@ -204,10 +205,6 @@ fn chunk_ranges(
         }
         _ => Err(malformed(format!("page {page} does not say where its pixels lie"))),
     }
-}
-
-fn malformed(problem: String) -> FormatError {
-    FormatError::malformed(Format::Tiff, problem)
 }
 
 fn in_page(page: usize, error: TiffError) -> FormatError {

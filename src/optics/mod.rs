@@ -30,10 +30,10 @@ pub use iid::iid_masks;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
 pub use multiplex::{Draw, Multiplexing};
 pub use order::{Expected, Reordered, pattern_likeness, reordered};
-pub use patterns::{Circle, check_patterns, pattern_rank, single_apertures};
+pub use patterns::{ApertureGrid, Circle, check_patterns, pattern_rank, single_apertures};
 pub use projection::{Method, Placement, Projector};
 pub use simulate::{measure, noisy};
-pub use squares::{ApertureGrid, random_squares};
+pub use squares::random_squares;
 pub use study::{MaskFigures, MaskStudy, flatness};
 
 use thiserror::Error;

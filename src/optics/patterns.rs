@@ -6,12 +6,40 @@ use rand::Rng;
 use rand::seq::index;
 
 use super::multiplex::rank;
-use super::{ApertureGrid, Geometry, Multiplexing, OpticsError, check_size};
+use super::{Geometry, Multiplexing, OpticsError, check_size};
 
 /// LCoS pixels along the side of a cell in which a circle is drawn: far below a mask pixel.
 const CIRCLE_CELL: usize = 8;
 /// Points along the side of such a cell by which the circle's share of it is told.
 const CIRCLE_POINTS: usize = 8;
+
+/// A grid of square sub-apertures. Opening one shifts the projected lithography mask by whole
+/// mask pixels, neighbours by one pixel more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ApertureGrid {
+    /// Rows of sub-apertures.
+    pub rows: usize,
+    /// Columns of sub-apertures.
+    pub columns: usize,
+}
+
+impl ApertureGrid {
+    /// The grid for `frames` frames in a snapshot: 3x4 up to 12 frames and 4x5 up to 20, as in
+    /// the paper and its code, and for more the smallest grid of r x (r+1) with at least as many
+    /// sub-apertures as frames (5x6 up to 30), because fewer can't tell the frames apart.
+    pub fn for_frames(frames: usize) -> Self {
+        let mut rows = 3;
+        while rows * (rows + 1) < frames {
+            rows += 1;
+        }
+        Self { rows, columns: rows + 1 }
+    }
+
+    /// Number of sub-apertures.
+    pub fn count(self) -> usize {
+        self.rows * self.columns
+    }
+}
 
 impl Multiplexing {
     /// The patterns on a grid of sub-apertures, row by row.
@@ -186,6 +214,16 @@ mod tests {
 
     use super::{Circle, check_patterns, pattern_rank, single_apertures};
     use crate::optics::{ApertureGrid, Geometry, generator};
+
+    #[test]
+    fn grids_follow_the_stated_rule() {
+        for (frames, rows, columns) in
+            [(1, 3, 4), (10, 3, 4), (12, 3, 4), (13, 4, 5), (20, 4, 5), (21, 5, 6), (30, 5, 6)]
+        {
+            assert_eq!(ApertureGrid::for_frames(frames), ApertureGrid { rows, columns });
+        }
+        assert!(ApertureGrid::for_frames(31).count() >= 31);
+    }
 
     #[test]
     fn circles_have_their_area_and_turn() {

@@ -2,35 +2,7 @@
 
 use ndarray::Array3;
 
-use super::{Draw, HybridAperture, Multiplexing, OpticsError, check_size, generator};
-
-/// A grid of square sub-apertures. Opening one shifts the projected lithography mask by whole
-/// mask pixels, neighbours by one pixel more.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ApertureGrid {
-    /// Rows of sub-apertures.
-    pub rows: usize,
-    /// Columns of sub-apertures.
-    pub columns: usize,
-}
-
-impl ApertureGrid {
-    /// The grid for `frames` frames in a snapshot: 3x4 up to 12 frames and 4x5 up to 20, as in
-    /// the paper and its code, and for more the smallest grid of r x (r+1) with at least as many
-    /// sub-apertures as frames (5x6 up to 30), because fewer can't tell the frames apart.
-    pub fn for_frames(frames: usize) -> Self {
-        let mut rows = 3;
-        while rows * (rows + 1) < frames {
-            rows += 1;
-        }
-        Self { rows, columns: rows + 1 }
-    }
-
-    /// Number of sub-apertures.
-    pub fn count(self) -> usize {
-        self.rows * self.columns
-    }
-}
+use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, OpticsError, check_size, generator};
 
 /// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them: the paper's
 /// simulation.
@@ -60,18 +32,8 @@ pub fn random_squares(
 
 #[cfg(test)]
 mod tests {
-    use super::{ApertureGrid, random_squares};
+    use super::random_squares;
     use ndarray::{Array2, Axis};
-
-    #[test]
-    fn grids_follow_the_stated_rule() {
-        for (frames, rows, columns) in
-            [(1, 3, 4), (10, 3, 4), (12, 3, 4), (13, 4, 5), (20, 4, 5), (21, 5, 6), (30, 5, 6)]
-        {
-            assert_eq!(ApertureGrid::for_frames(frames), ApertureGrid { rows, columns });
-        }
-        assert!(ApertureGrid::for_frames(31).count() >= 31);
-    }
 
     /// Mean, mean over the pixels of the deviation over the frames, mean and largest correlation
     /// between two frames.

@@ -23,5 +23,6 @@ mod pictures;
 mod pipeline;
 mod resumable;
 mod samples;
+mod upgrade;
 mod uploads;
 mod work;

@@ -19,6 +19,7 @@ use ndarray::{Array2, Array3};
 use array::{ArrayHeader, Storage};
 use element::{Content, Elements};
 
+use super::open::open;
 use super::{Format, FormatError, FrameReader, FullScale, Limits, StackInfo, collect, samples};
 
 /// An array of a scene.
@@ -64,7 +65,7 @@ pub struct MatScene {
 
 /// True for a MATLAB level 5 file, told by its first bytes. Errors: I/O.
 pub fn is_mat(path: &Path) -> Result<bool, FormatError> {
-    match super::open(path) {
+    match open(path) {
         Ok((_, _, format)) => Ok(format == Format::Mat),
         Err(FormatError::UnknownFormat { .. }) => Ok(false),
         Err(error) => Err(error),
@@ -82,7 +83,7 @@ pub fn open_array(
     array: SceneArray,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>, FormatError> {
-    let (file, length, format) = super::open(path)?;
+    let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
     if format != Format::Mat {
         return Err(FormatError::UnknownFormat {

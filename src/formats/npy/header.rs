@@ -7,9 +7,6 @@
 use crate::formats::samples::ByteOrder;
 use crate::formats::{Format, FormatError, SampleType};
 
-/// The first bytes of every npy file.
-pub(in crate::formats) const MAGIC: &[u8] = b"\x93NUMPY";
-
 /// NumPy itself refuses to parse headers above 10,000 bytes from strangers.
 pub(super) const MAX_HEADER_BYTES: u64 = 10_000;
 

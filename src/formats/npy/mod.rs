@@ -4,7 +4,6 @@ mod header;
 mod read;
 mod write;
 
-pub(super) use header::MAGIC;
 pub(super) use read::NpyReader;
 pub use read::open_windows;
 pub use write::{F32StackWriter, write_f32, write_image_f32, write_u16};

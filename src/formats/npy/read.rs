@@ -6,7 +6,8 @@ use std::path::Path;
 
 use ndarray::Array2;
 
-use super::header::{Header, MAGIC, MAX_HEADER_BYTES, unsupported};
+use super::header::{Header, MAX_HEADER_BYTES, unsupported};
+use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::{self, ByteOrder};
 use crate::formats::{
     Format, FormatError, FrameReader, Limits, SampleType, StackInfo, WindowReader,
@@ -115,7 +116,7 @@ fn read_header(file: &mut File, length: u64) -> Result<(Header, u64), FormatErro
     let mut start = [0u8; 8];
     fill(file, &mut start)?;
     let [magic @ .., major, minor] = start;
-    if magic != MAGIC {
+    if magic != NPY_MAGIC {
         return Err(FormatError::malformed(Format::Npy, "the signature is wrong"));
     }
     let (header_bytes, prefix) = match major {

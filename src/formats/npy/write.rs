@@ -6,8 +6,8 @@ use std::path::Path;
 
 use ndarray::{Array2, ArrayView2, ArrayView3};
 
-use super::header::MAGIC;
 use crate::formats::FormatError;
+use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::FrameSink;
 
 /// Writes an npy file of shape (frame, row, column), little-endian float32, frame by frame.
@@ -101,12 +101,12 @@ fn header(shape: &str) -> Vec<u8> {
 /// A version 1.0 header, padded as NumPy does so that the data starts at a multiple of 64.
 fn typed_header(sample: &str, shape: &str) -> Vec<u8> {
     let mut text = format!("{{'descr': '{sample}', 'fortran_order': False, 'shape': {shape}, }}");
-    let prefix = MAGIC.len() + 4;
+    let prefix = NPY_MAGIC.len() + 4;
     while !(prefix + text.len() + 1).is_multiple_of(64) {
         text.push(' ');
     }
     text.push('\n');
-    let mut bytes = MAGIC.to_vec();
+    let mut bytes = NPY_MAGIC.to_vec();
     bytes.extend([1, 0]);
     // Three numbers of at most 20 digits: far below the 65535 bytes of version 1.0.
     bytes.extend((text.len() as u16).to_le_bytes());

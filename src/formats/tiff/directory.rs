@@ -7,7 +7,6 @@ use std::collections::HashSet;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 
-use super::malformed;
 use crate::formats::samples::ByteOrder;
 use crate::formats::{Format, FormatError, Limits};
 
@@ -178,4 +177,8 @@ impl<'a> Layout<'a> {
             ByteOrder::Big => bytes.iter().fold(0, shift),
         }
     }
+}
+
+pub(super) fn malformed(problem: String) -> FormatError {
+    FormatError::malformed(Format::Tiff, problem)
 }
