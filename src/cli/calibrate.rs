@@ -8,14 +8,8 @@ use clap::Args;
 use serde::Deserialize;
 
 use super::{CliError, progress};
-use crate::formats::npy::F32StackWriter;
-use crate::formats::planar::{self, Reader};
-use crate::formats::{Limits, StackInfo};
-use crate::http::report_page;
-use crate::work::calibrate::{
-    CalibrateError, CaptureFiles, Progress, Report, average_masks, read_patterns, report,
-    scale_masks,
-};
+use crate::formats::{Limits, StackInfo, npy};
+use crate::intake::{CaptureFiles, Report, calibrate, report_page};
 
 /// Make masks and a report from raw captures, without a server.
 #[derive(Debug, Args)]
@@ -58,45 +52,18 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         progress::show(&bar, share);
         true
     };
-    let limits = Limits::default();
-    let patterns = read_patterns(files.patterns.as_ref(), &limits)?;
     // Beside the result, where there is room for it.
-    let temporary = || {
-        let file = tempfile::Builder::new().prefix(".making-").tempfile_in(out);
-        file.map_err(|error| CliError::file("write", out, &error))
+    let scratch = tempfile::Builder::new().prefix(".making-").tempfile_in(out);
+    let scratch = scratch.map_err(|error| CliError::file("write", out, &error))?;
+    let masks = |info: &StackInfo| {
+        let path = out.join("masks.npy");
+        let file = File::create(&path).map_err(|error| CliError::file("write", &path, &error))?;
+        let StackInfo { frames, height, width, .. } = *info;
+        Ok::<_, CliError>(npy::writer(BufWriter::new(file), frames, height, width)?)
     };
-    let (raw, scaled) = (temporary()?, temporary()?);
-    let made = average_masks(&files, &limits, raw.as_file(), &mut share)?;
-    let raw = Reader::open(raw.path(), &limits)?;
-    write_masks(out, &raw, made.scale, scaled.as_file(), &mut share)?;
-    let scaled = Reader::open(scaled.path(), &limits)?;
-    let report = report(&scaled, Some(&made), patterns.as_ref(), &mut share)?;
+    let (made, _) = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share)?;
     bar.finish_and_clear();
-    write_report(arguments, &report)
-}
-
-/// Writes masks.npy, and the same masks for the report to look at.
-fn write_masks(
-    out: &Path,
-    raw: &Reader,
-    scale: f32,
-    copy: &File,
-    share: &mut Progress<'_>,
-) -> Result<(), CliError> {
-    let path = out.join("masks.npy");
-    let file = File::create(&path).map_err(|error| CliError::file("write", &path, &error))?;
-    let StackInfo { frames, height, width, .. } = *raw.info();
-    let mut masks = F32StackWriter::new(BufWriter::new(file), frames, height, width)?;
-    let mut copy = planar::Writer::new(BufWriter::new(copy), frames, height, width)?;
-    scale_masks(
-        raw,
-        scale,
-        |mask| masks.write_frame(mask).and_then(|()| copy.write_frame(mask)),
-        share,
-    )?;
-    masks.finish()?;
-    copy.finish()?;
-    Ok(())
+    write_report(arguments, &made.report)
 }
 
 fn write_report(arguments: &Arguments, made: &Report) -> Result<(), CliError> {
@@ -119,13 +86,6 @@ fn write_report(arguments: &Arguments, made: &Report) -> Result<(), CliError> {
         println!("masks.npy and report.html are in {}", out.display());
     }
     fs::write(out.join("report.json"), text + "\n").map_err(failed)
-}
-
-impl From<CalibrateError> for CliError {
-    fn from(error: CalibrateError) -> Self {
-        let text = error.to_string();
-        if error.is_retryable() { Self::Failure(text) } else { Self::Input(text) }
-    }
 }
 
 fn read_index(path: &Path) -> Result<CaptureFiles, CliError> {

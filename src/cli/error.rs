@@ -6,6 +6,7 @@ use std::process::ExitCode;
 
 use super::serve::ServeError;
 use crate::formats::FormatError;
+use crate::intake::IntakeError;
 use crate::pipeline::{NetworkError, ResultError, SolveError};
 use crate::recon::ReconError;
 
@@ -87,6 +88,14 @@ impl From<ResultError> for CliError {
             ResultError::Foreign { .. } => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }
+    }
+}
+
+/// For calibrations, which also write.
+impl From<IntakeError> for CliError {
+    fn from(error: IntakeError) -> Self {
+        let text = error.to_string();
+        if error.is_retryable() { Self::Failure(text) } else { Self::Input(text) }
     }
 }
 

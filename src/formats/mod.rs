@@ -29,5 +29,6 @@ pub use error::FormatError;
 pub use format::Format;
 pub use limits::Limits;
 pub use open::{collect, open_stack, read_stack};
+pub use samples::StackWriter;
 pub use stack::{FrameReader, FullScale, SampleType, StackInfo};
 pub use window::WindowReader;

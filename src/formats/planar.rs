@@ -11,52 +11,34 @@ use std::ops::Range;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 
-use ndarray::{Array3, ArrayView2};
+use ndarray::Array3;
 
 use super::format::PLANAR_MAGIC;
-use super::samples::FrameSink;
+use super::samples::StackWriter;
 use super::{Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
 const VERSION: u32 = 1;
 const HEADER_BYTES: u64 = 32;
 const SAMPLE_BYTES: u64 = 4;
 
-/// Writes a prepared array frame by frame.
-#[derive(Debug)]
-pub struct Writer<W> {
-    sink: FrameSink<W>,
-}
-
-impl<W: Write> Writer<W> {
-    /// Writes the header. `writer` should be buffered; it only ever moves forward, so it may hash
-    /// what passes.
-    pub fn new(
-        mut writer: W,
-        frames: usize,
-        height: usize,
-        width: usize,
-    ) -> Result<Self, FormatError> {
-        let mut header = PLANAR_MAGIC.to_vec();
-        header.extend(VERSION.to_le_bytes());
-        for axis in [frames, height, width] {
-            let axis = u32::try_from(axis)
-                .map_err(|_| FormatError::Internal(format!("an axis of {axis}")))?;
-            header.extend(axis.to_le_bytes());
-        }
-        header.extend([0; 8]);
-        writer.write_all(&header).map_err(FormatError::io("write the header"))?;
-        Ok(Self { sink: FrameSink::new(writer, frames, height, width) })
+/// Writes the header of a prepared array; the frames come next. `to` should be buffered; it only ever
+/// moves forward, so it may hash what passes.
+pub fn writer<W: Write>(
+    mut to: W,
+    frames: usize,
+    height: usize,
+    width: usize,
+) -> Result<StackWriter<W>, FormatError> {
+    let mut header = PLANAR_MAGIC.to_vec();
+    header.extend(VERSION.to_le_bytes());
+    for axis in [frames, height, width] {
+        let axis =
+            u32::try_from(axis).map_err(|_| FormatError::Internal(format!("an axis of {axis}")))?;
+        header.extend(axis.to_le_bytes());
     }
-
-    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
-    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
-        self.sink.write_frame(frame)
-    }
-
-    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
-    pub fn finish(self) -> Result<W, FormatError> {
-        self.sink.finish()
-    }
+    header.extend([0; 8]);
+    to.write_all(&header).map_err(FormatError::io("write the header"))?;
+    Ok(StackWriter::new(to, frames, height, width))
 }
 
 /// An open prepared array. Reads at positions, so it may be shared between threads.

@@ -46,9 +46,10 @@ pub(super) fn frame(
     })
 }
 
-/// Writes f32 frames of one size as little-endian rows, and counts them.
+/// Writes the f32 frames of a stack one after another as little-endian rows, behind a header that
+/// [`super::planar::writer`] or [`super::npy::writer`] has written.
 #[derive(Debug)]
-pub(super) struct FrameSink<W> {
+pub struct StackWriter<W> {
     writer: W,
     frames: usize,
     height: usize,
@@ -57,12 +58,13 @@ pub(super) struct FrameSink<W> {
     row: Vec<u8>,
 }
 
-impl<W: Write> FrameSink<W> {
+impl<W: Write> StackWriter<W> {
     pub(super) fn new(writer: W, frames: usize, height: usize, width: usize) -> Self {
         Self { writer, frames, height, width, written: 0, row: Vec::with_capacity(width * 4) }
     }
 
-    pub(super) fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
+    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
         if frame.dim() != (self.height, self.width) || self.written == self.frames {
             return Err(FormatError::Internal(format!(
                 "frame {} of size {:?} written to a stack of {} frames of {}x{}",
@@ -87,7 +89,8 @@ impl<W: Write> FrameSink<W> {
         Ok(())
     }
 
-    pub(super) fn finish(mut self) -> Result<W, FormatError> {
+    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
+    pub fn finish(mut self) -> Result<W, FormatError> {
         if self.written != self.frames {
             return Err(FormatError::Internal(format!(
                 "{} of {} frames written",

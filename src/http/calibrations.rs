@@ -13,6 +13,7 @@ use super::extract::{Body, Params, QueryOf};
 use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody};
 use crate::formats::validate::MaskStatistics;
+use crate::intake::check_sizes;
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
 use crate::store::{Calibration, NewCalibration, Page, Unready};
 
@@ -172,7 +173,7 @@ async fn of_captures(
         app.store.upload(lab, upload).await.map_err(|error| missing(&place, error))?;
     }
     let captures = intake::run(app, move |store, limits| {
-        intake::captures(store, limits, &captures)?;
+        check_sizes(&captures.map(|upload| store.dir().blob(upload)), limits)?;
         Ok(captures)
     })
     .await?;

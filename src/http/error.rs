@@ -8,6 +8,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
 use crate::formats::FormatError;
+use crate::intake::IntakeError;
 use crate::job::InvalidField;
 use crate::store::StoreError;
 
@@ -281,5 +282,19 @@ impl From<FormatError> for ApiError {
             return Self::internal(&error);
         }
         Self { reason: Some(error.code()), ..Self::new(Code::InvalidContent, error.to_string()) }
+    }
+}
+
+impl From<IntakeError> for ApiError {
+    fn from(error: IntakeError) -> Self {
+        let (place, error) = match error {
+            IntakeError::Format { place, source } => (place, source.into()),
+            IntakeError::Size { place, detail } => (place, Self::new(Code::SizeMismatch, detail)),
+            IntakeError::Content { place, detail } => {
+                (place, Self::new(Code::InvalidContent, detail))
+            }
+            IntakeError::Stopped => return StoreError::Interrupted.into(),
+        };
+        if place.is_empty() { error } else { error.at(&place) }
     }
 }

@@ -11,8 +11,10 @@ use crate::formats::mat::{self, SceneArray};
 use crate::formats::validate::{
     MaskCheck, MaskStatistics, MeasurementCheck, MeasurementStatistics,
 };
-use crate::formats::{self, FormatError, FrameReader, FullScale, Limits, StackInfo, planar};
-use crate::job::{Captures, Finding, Sha256};
+use crate::formats::{
+    self, FormatError, FrameReader, FullScale, Limits, StackInfo, StackWriter, planar,
+};
+use crate::job::{Finding, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
 
 /// What is asked of a measurement beyond its data.
@@ -72,32 +74,6 @@ pub(super) fn masks(
     Ok(Prepared { info, statistics, file: finish(writer)? })
 }
 
-/// Looks at the headers of captures: they must be stacks of one size, before a worker averages them.
-pub(super) fn captures(
-    store: &Store,
-    limits: &Limits,
-    captures: &Captures,
-) -> Result<(), ApiError> {
-    let mut first = None;
-    for (place, uploads) in captures.lists() {
-        for (index, upload) in uploads.iter().enumerate() {
-            let place = format!("{place}/{index}");
-            let opened = formats::open_stack(&store.dir().blob(upload), limits);
-            let info = *opened.map_err(|error| ApiError::from(error).at(&place))?.info();
-            let size = (info.height, info.width);
-            let (height, width) = *first.get_or_insert(size);
-            if size != (height, width) {
-                let detail = format!(
-                    "this capture is {}x{} (rows x columns), but those before it are {height}x{width}",
-                    info.height, info.width
-                );
-                return Err(ApiError::new(Code::SizeMismatch, detail).at(&place));
-            }
-        }
-    }
-    Ok(())
-}
-
 /// Writes a measurement with its dark subtracted and its full scale divided out, and checks it
 /// against the masks of its calibration.
 pub(super) fn measurement(
@@ -152,11 +128,11 @@ pub(super) fn open(
     Ok((reader, scale))
 }
 
-type Writer = planar::Writer<BufWriter<BlobWriter>>;
+type Writer = StackWriter<BufWriter<BlobWriter>>;
 
 fn writer(store: &Store, info: &StackInfo) -> Result<Writer, ApiError> {
     let buffered = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
-    Ok(planar::Writer::new(buffered, info.frames, info.height, info.width)?)
+    Ok(planar::writer(buffered, info.frames, info.height, info.width)?)
 }
 
 fn finish(writer: Writer) -> Result<StagedBlob, ApiError> {

@@ -26,7 +26,6 @@ mod models;
 mod page;
 mod pictures;
 mod quality;
-mod report_page;
 mod reports;
 mod results;
 mod router;
@@ -37,5 +36,4 @@ mod upload;
 
 pub use app::App;
 pub use metrics::Metrics;
-pub use report_page::report_page;
 pub use router::{Route, router, routes};

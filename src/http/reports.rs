@@ -9,7 +9,7 @@ use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code};
 use super::extract::Params;
-use super::report_page::report_page;
+use crate::intake::report_page;
 use crate::job::{CalibrationId, CalibrationReport, Lab, Sha256};
 use crate::store::StoreError;
 

@@ -7,31 +7,45 @@ use super::{InvalidField, Sha256};
 /// The most patterns, and the most uploads for each.
 const MOST: usize = 4096;
 
-/// Uploads by what they show. Each upload has one frame or several: all are repeats of the same.
+/// Files by what they show, as uploads or as paths. Each has one frame or several: all are repeats of
+/// the same.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Captures {
+pub struct Captures<T = Sha256> {
     /// For each pattern, in order: the white board through the lithography mask.
-    pub masks: Vec<Vec<Sha256>>,
+    pub masks: Vec<Vec<T>>,
     /// The lithography mask taken out, the LCoS all white.
-    pub white: Vec<Sha256>,
+    pub white: Vec<T>,
     /// The lithography mask taken out, the LCoS all black.
-    pub black: Vec<Sha256>,
+    pub black: Vec<T>,
     /// With the lithography mask, the LCoS all black. Without these, `black` serves for it: Eq. 7 of
     /// the paper.
-    #[serde(default)]
-    pub black_with_mask: Vec<Sha256>,
+    #[serde(default = "Vec::new")]
+    pub black_with_mask: Vec<T>,
     /// The aperture patterns that were shown, one frame each, to tell whether the order is right.
-    #[serde(default)]
-    pub patterns: Option<Sha256>,
+    #[serde(default = "Option::default")]
+    pub patterns: Option<T>,
     /// The stored number from which on a pixel is full; by default the largest of its type.
     #[serde(default)]
     pub saturation: Option<u32>,
 }
 
-impl Captures {
+impl<T> Captures<T> {
+    /// The same captures, each named by what `to` makes of it.
+    pub fn map<U>(&self, to: impl Fn(&T) -> U) -> Captures<U> {
+        let list = |list: &Vec<T>| list.iter().map(&to).collect();
+        Captures {
+            masks: self.masks.iter().map(list).collect(),
+            white: list(&self.white),
+            black: list(&self.black),
+            black_with_mask: list(&self.black_with_mask),
+            patterns: self.patterns.as_ref().map(&to),
+            saturation: self.saturation,
+        }
+    }
+
     /// Each list of repeats with its place in the request.
-    pub fn lists(&self) -> impl Iterator<Item = (String, &[Sha256])> {
+    pub fn lists(&self) -> impl Iterator<Item = (String, &[T])> {
         let masks = self.masks.iter().enumerate();
         let masks = masks.map(|(index, list)| (format!("/captures/masks/{index}"), &list[..]));
         masks.chain([
@@ -40,7 +54,9 @@ impl Captures {
             ("/captures/black_with_mask".to_owned(), &self.black_with_mask[..]),
         ])
     }
+}
 
+impl Captures {
     /// Each upload with its place in the request.
     pub fn uploads(&self) -> impl Iterator<Item = (String, Sha256)> {
         let lists = self.lists().flat_map(|(place, list)| {

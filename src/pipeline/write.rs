@@ -90,8 +90,7 @@ pub fn write_result<E: From<ResultError> + From<FormatError>>(
     }
     let array = File::create(folder.join(ARRAY)).map_err(failed(ARRAY))?;
     let count = spec.attributes.len();
-    let mut array =
-        npy::F32StackWriter::new(BufWriter::new(array), count, spec.height, spec.width)?;
+    let mut array = npy::writer(BufWriter::new(array), count, spec.height, spec.width)?;
     let stack = folder.join(STACK);
     exr::write_stack(&stack, spec.height, spec.width, &spec.attributes, |k| -> Result<_, E> {
         let frame = frame(k)?;

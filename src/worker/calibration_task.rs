@@ -8,16 +8,13 @@ use tracing::Instrument;
 
 use super::run::{HEARTBEAT, LEASE, Worker, WorkerError, said};
 use super::task::Shared;
-use crate::formats::planar::{Reader, Writer};
-use crate::formats::{FormatError, Limits};
-use crate::job::{CalibrationReport, Captures, Label, TaskProgress, without_paths};
+use crate::formats::planar::{self, Reader};
+use crate::formats::{FormatError, Limits, StackInfo};
+use crate::intake::{self, Calibrated, IntakeError, Report, calibrate};
+use crate::job::{Label, TaskProgress, without_paths};
 use crate::store::{
     CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration, Heartbeat,
     NewCalibration, StagedBlob, Store, StoreError,
-};
-use crate::work::calibrate::{
-    self, CalibrateError, CaptureFiles, MadeMasks, Report, average_masks, read_patterns,
-    scale_masks,
 };
 
 /// How long the thread may take to come to the end of a frame when the worker is to end.
@@ -49,7 +46,7 @@ impl Worker {
     /// Waits for the computing thread, with heartbeats, and tells the store how it ended.
     async fn attend(
         &self,
-        mut computing: tokio::task::JoinHandle<Result<CalibrationDone, CalibrateError>>,
+        mut computing: tokio::task::JoinHandle<Result<CalibrationDone, Failure>>,
         lease: &CalibrationLease,
         shared: &Shared,
     ) -> Result<(), WorkerError> {
@@ -80,7 +77,9 @@ impl Worker {
         };
         match outcome {
             Ok(done) => self.calibrated(lease, done).await,
-            Err(CalibrateError::Stopped) => said(self.store().release_calibration(lease).await),
+            Err(Failure::Intake(IntakeError::Stopped)) => {
+                said(self.store().release_calibration(lease).await)
+            }
             Err(error) => self.not_calibrated(lease, &error).await,
         }
         Ok(())
@@ -94,10 +93,31 @@ impl Worker {
         }
     }
 
-    async fn not_calibrated(&self, lease: &CalibrationLease, error: &CalibrateError) {
+    async fn not_calibrated(&self, lease: &CalibrationLease, error: &Failure) {
         tracing::error!(%error, "the calibration failed");
         let reason = without_paths(&error.to_string());
         said(self.store().calibration_failed(lease, &reason, error.is_retryable()).await);
+    }
+}
+
+/// Why a calibration failed.
+#[derive(Debug, thiserror::Error)]
+enum Failure {
+    /// The captures or masks.
+    #[error(transparent)]
+    Intake(#[from] IntakeError),
+    /// The service's disk or database.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+impl Failure {
+    /// Whether another attempt may succeed.
+    fn is_retryable(&self) -> bool {
+        match self {
+            Self::Intake(error) => error.is_retryable(),
+            Self::Store(_) => true,
+        }
     }
 }
 
@@ -106,7 +126,7 @@ fn perform(
     store: &Store,
     claimed: &ClaimedCalibration,
     shared: &Shared,
-) -> Result<CalibrationDone, CalibrateError> {
+) -> Result<CalibrationDone, Failure> {
     let limits = Limits::default();
     let mut progress = |fraction: f64| {
         shared.set_progress(TaskProgress { fraction, ..TaskProgress::START });
@@ -114,65 +134,33 @@ fn perform(
     };
     match &claimed.work {
         CalibrationWork::Report(masks) => {
-            let masks = Reader::open(masks, &limits)?;
-            let Report { report, maps } = calibrate::report(&masks, None, None, &mut progress)?;
+            let masks = Reader::open(masks, &limits).map_err(IntakeError::from)?;
+            let Report { report, maps } = intake::report(&masks, &mut progress)?;
             Ok(CalibrationDone { masks: None, report, maps })
         }
         CalibrationWork::Captures(captures) => {
-            let files = files(store, captures);
-            // Checked before hours of averaging.
-            let patterns = read_patterns(files.patterns.as_ref(), &limits)?;
-            let raw = store.staged_path()?;
-            let file = std::fs::File::options().write(true).open(raw.path());
-            let file = file.map_err(StoreError::io("open", raw.path()))?;
-            let made = average_masks(&files, &limits, file, &mut progress)?;
-            let masks = scaled(store, &Reader::open(raw.path(), &limits)?, &made, &mut progress)?;
-            let reader = Reader::open(masks.path(), &limits)?;
-            let Report { report, maps } =
-                calibrate::report(&reader, Some(&made), patterns.as_ref(), &mut progress)?;
-            let facts = facts(claimed.name.clone(), &made, &report, &masks);
-            Ok(CalibrationDone { masks: Some((facts, masks)), report, maps })
+            let files = captures.map(|upload| store.dir().blob(upload));
+            let scratch = store.staged_path()?;
+            let open = |info: &StackInfo| {
+                let blob = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
+                let masks = planar::writer(blob, info.frames, info.height, info.width);
+                Ok::<_, Failure>(masks.map_err(IntakeError::from)?)
+            };
+            let (made, blob) = calibrate(&files, &limits, scratch.path(), open, &mut progress)?;
+            let blob = blob.into_inner().map_err(|error| FormatError::Io {
+                action: "write the masks",
+                source: error.into_error(),
+            });
+            let blob = blob.map_err(IntakeError::from)?.finish()?;
+            let facts = facts(claimed.name.clone(), &made, &blob);
+            let Report { report, maps } = made.report;
+            Ok(CalibrationDone { masks: Some((facts, blob)), report, maps })
         }
     }
 }
 
-fn files(store: &Store, captures: &Captures) -> CaptureFiles {
-    let list = |uploads: &Vec<_>| uploads.iter().map(|upload| store.dir().blob(upload)).collect();
-    CaptureFiles {
-        masks: captures.masks.iter().map(list).collect(),
-        white: list(&captures.white),
-        black: list(&captures.black),
-        black_with_mask: list(&captures.black_with_mask),
-        patterns: captures.patterns.as_ref().map(|upload| store.dir().blob(upload)),
-        saturation: captures.saturation,
-    }
-}
-
-/// The masks as they are kept.
-fn scaled(
-    store: &Store,
-    raw: &Reader,
-    made: &MadeMasks,
-    progress: &mut calibrate::Progress<'_>,
-) -> Result<StagedBlob, CalibrateError> {
-    let info = raw.info();
-    let blob = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
-    let mut writer = Writer::new(blob, info.frames, info.height, info.width)?;
-    scale_masks(raw, made.scale, |mask| writer.write_frame(mask), progress)?;
-    let blob = writer.finish()?.into_inner();
-    let blob = blob.map_err(|error| FormatError::Io {
-        action: "write the masks",
-        source: error.into_error(),
-    })?;
-    Ok(blob.finish()?)
-}
-
-fn facts(
-    name: Option<Label>,
-    made: &MadeMasks,
-    report: &CalibrationReport,
-    masks: &StagedBlob,
-) -> NewCalibration {
+fn facts(name: Option<Label>, made: &Calibrated, masks: &StagedBlob) -> NewCalibration {
+    let report = &made.report.report;
     NewCalibration {
         name,
         masks: masks.sha256(),

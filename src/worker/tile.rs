@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::prepare::{Prepared, to_record};
 use super::task::{Shared, TaskError};
-use crate::formats::planar::{Reader, Writer};
+use crate::formats::planar::{self, Reader};
 use crate::formats::{FormatError, Limits};
 use crate::job::{ScheduleSpec, TaskProgress, TaskStage};
 use crate::pipeline::manifest::TileRecord;
@@ -119,7 +119,7 @@ pub(super) fn window(
 pub(super) fn write(store: &Store, frames: ArrayView3<'_, f32>) -> Result<StagedBlob, TaskError> {
     let (count, height, width) = frames.dim();
     let blob = BufWriter::new(store.blob_writer()?);
-    let mut writer = Writer::new(blob, count, height, width)?;
+    let mut writer = planar::writer(blob, count, height, width)?;
     frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
     let blob = writer.finish()?.into_inner();
     let blob = blob.map_err(|error| FormatError::Io {

@@ -183,11 +183,11 @@ fn what_is_written_is_read_by_another_library() {
 
 #[test]
 fn a_writer_refuses_frames_that_do_not_fit() {
-    let mut writer = super::F32StackWriter::new(Vec::new(), 1, 2, 2).unwrap();
+    let mut writer = super::writer(Vec::new(), 1, 2, 2).unwrap();
     assert!(writer.write_frame(Array2::zeros((2, 3)).view()).is_err());
     writer.write_frame(Array2::zeros((2, 2)).view()).unwrap();
     assert!(writer.write_frame(Array2::zeros((2, 2)).view()).is_err());
-    let unfinished = super::F32StackWriter::new(Vec::new(), 1, 2, 2).unwrap();
+    let unfinished = super::writer(Vec::new(), 1, 2, 2).unwrap();
     assert!(matches!(unfinished.finish(), Err(FormatError::Internal(_))));
 }
 

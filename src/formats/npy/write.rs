@@ -8,44 +8,26 @@ use ndarray::{Array2, ArrayView2, ArrayView3};
 
 use crate::formats::FormatError;
 use crate::formats::format::NPY_MAGIC;
-use crate::formats::samples::FrameSink;
+use crate::formats::samples::StackWriter;
 
-/// Writes an npy file of shape (frame, row, column), little-endian float32, frame by frame.
-#[derive(Debug)]
-pub struct F32StackWriter<W> {
-    sink: FrameSink<W>,
-}
-
-impl<W: Write> F32StackWriter<W> {
-    /// Writes the header. `writer` should be buffered.
-    pub fn new(
-        mut writer: W,
-        frames: usize,
-        height: usize,
-        width: usize,
-    ) -> Result<Self, FormatError> {
-        writer
-            .write_all(&header(&format!("({frames}, {height}, {width})")))
-            .map_err(FormatError::io("write the npy header"))?;
-        Ok(Self { sink: FrameSink::new(writer, frames, height, width) })
-    }
-
-    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
-    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
-        self.sink.write_frame(frame)
-    }
-
-    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
-    pub fn finish(self) -> Result<W, FormatError> {
-        self.sink.finish()
-    }
+/// Writes the header of an npy file of shape (frame, row, column), little-endian float32; the frames
+/// come next. `to` should be buffered.
+pub fn writer<W: Write>(
+    mut to: W,
+    frames: usize,
+    height: usize,
+    width: usize,
+) -> Result<StackWriter<W>, FormatError> {
+    to.write_all(&header(&format!("({frames}, {height}, {width})")))
+        .map_err(FormatError::io("write the npy header"))?;
+    Ok(StackWriter::new(to, frames, height, width))
 }
 
 /// Writes (or overwrites) the file `path` with `stack`, axes (frame, row, column).
 pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<(), FormatError> {
     let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
     let (frames, height, width) = stack.dim();
-    let mut writer = F32StackWriter::new(BufWriter::new(file), frames, height, width)?;
+    let mut writer = writer(BufWriter::new(file), frames, height, width)?;
     for frame in stack.outer_iter() {
         writer.write_frame(frame)?;
     }
@@ -61,7 +43,7 @@ pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<(), Fo
     writer
         .write_all(&header(&format!("({height}, {width})")))
         .map_err(FormatError::io("write the npy header"))?;
-    let mut sink = FrameSink::new(writer, 1, height, width);
+    let mut sink = StackWriter::new(writer, 1, height, width);
     sink.write_frame(image)?;
     sink.finish()?;
     Ok(())

@@ -1,13 +1,13 @@
 use ndarray::{Array3, s};
 use proptest::prelude::proptest;
 
-use super::{Reader, Writer, read_window};
+use super::{Reader, read_window, writer};
 use crate::formats::test_support::{assert_names, file, ramp};
 use crate::formats::{FormatError, Limits};
 
 fn planar(stack: &Array3<f32>) -> Vec<u8> {
     let (frames, height, width) = stack.dim();
-    let mut writer = Writer::new(Vec::new(), frames, height, width).unwrap();
+    let mut writer = writer(Vec::new(), frames, height, width).unwrap();
     for frame in stack.outer_iter() {
         writer.write_frame(frame).unwrap();
     }

@@ -219,7 +219,7 @@ mod tests {
     use std::sync::Arc;
 
     use super::{Files, Stack, Unfinished};
-    use crate::formats::planar::Writer;
+    use crate::formats::planar;
     use crate::recon::tile::Tile;
     use ndarray::{Array3, s};
 
@@ -227,7 +227,7 @@ mod tests {
         let (frames, height, width) = stack.dim();
         let path = folder.join(name);
         let mut writer =
-            Writer::new(std::fs::File::create(&path).unwrap(), frames, height, width).unwrap();
+            planar::writer(std::fs::File::create(&path).unwrap(), frames, height, width).unwrap();
         stack.outer_iter().for_each(|frame| writer.write_frame(frame).unwrap());
         writer.finish().unwrap();
         path

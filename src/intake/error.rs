@@ -1,0 +1,68 @@
+//! Why a file is not taken in.
+
+use crate::formats::FormatError;
+
+/// Why a file, or what is in it, is refused. Each names the file by its `place`: a JSON pointer into
+/// the request, or a name and path, as the caller has called it; empty where there is but one.
+#[derive(Debug, thiserror::Error)]
+pub enum IntakeError {
+    /// It can't be read, or its values can't be.
+    #[error("{}{source}", prefix(.place))]
+    Format {
+        /// Which file.
+        place: String,
+        /// What is wrong with it.
+        source: FormatError,
+    },
+    /// It has another size than it should.
+    #[error("{}{detail}", prefix(.place))]
+    Size {
+        /// Which file.
+        place: String,
+        /// Both sizes.
+        detail: String,
+    },
+    /// It can be read, but not used.
+    #[error("{}{detail}", prefix(.place))]
+    Content {
+        /// Which file.
+        place: String,
+        /// What is wrong with it.
+        detail: String,
+    },
+    /// The caller has asked to stop.
+    #[error("stopped")]
+    Stopped,
+}
+
+fn prefix(place: &str) -> String {
+    if place.is_empty() { String::new() } else { format!("{place}: ") }
+}
+
+impl IntakeError {
+    /// Whether another attempt may succeed: the machine failed, not the data.
+    #[must_use]
+    pub fn is_retryable(&self) -> bool {
+        match self {
+            Self::Format { source, .. } => !source.is_callers_fault(),
+            Self::Size { .. } | Self::Content { .. } => false,
+            Self::Stopped => true,
+        }
+    }
+
+    /// For `map_err` on what goes wrong with the file called `place`.
+    pub(super) fn format(place: impl Into<String>) -> impl FnOnce(FormatError) -> Self {
+        move |source| Self::Format { place: place.into(), source }
+    }
+
+    pub(super) fn content(place: impl Into<String>, problem: &dyn std::fmt::Display) -> Self {
+        Self::Content { place: place.into(), detail: problem.to_string() }
+    }
+}
+
+/// For results and files of ours, which have no name.
+impl From<FormatError> for IntakeError {
+    fn from(source: FormatError) -> Self {
+        Self::Format { place: String::new(), source }
+    }
+}

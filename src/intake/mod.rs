@@ -1,0 +1,12 @@
+//! From a lab's files to checked arrays: masks, measurements, true frames, captures.
+//!
+//! What the service does with uploads and the commands with paths is the same, and stands here.
+//! Stacks are read frame by frame and handed on to a writer, so that memory holds a few planes.
+
+mod captures;
+mod error;
+mod report_page;
+
+pub use captures::{Calibrated, CaptureFiles, Progress, Report, calibrate, check_sizes, report};
+pub use error::IntakeError;
+pub use report_page::report_page;

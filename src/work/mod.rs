@@ -1,3 +1,0 @@
-//! Masks from raw captures.
-
-pub mod calibrate;
