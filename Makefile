@@ -14,11 +14,11 @@ demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
 
 test: runtime judges $(TRAINING)/.stamp ## all tests
-	SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --release
+	SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test
 	$(TRAINING)/bin/python training/test_pipeline.py
 
-e2e: runtime ## the dashboard in a real browser; ends with one line of JSON
-	@tests/e2e/run.sh
+e2e: runtime ## the dashboard in a real browser; ends with one line of JSON; SHORT=1
+	@SHORT=$(SHORT) tests/e2e/run.sh
 
 serve: runtime ## the service on 127.0.0.1:8080, data in ./data
 	$(CARGO) run --release --quiet -- serve --data data
@@ -115,10 +115,10 @@ fmt:
 	$(CARGO) fmt --check
 
 lint:
-	$(CARGO) clippy --release --all-targets -- -D warnings
+	$(CARGO) clippy --all-targets -- -D warnings
 
 docs:
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --no-deps --document-private-items
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps --document-private-items
 
 clean:
 	$(CARGO) clean

@@ -1,6 +1,6 @@
 """The whole pipeline on tiny settings and footage made here: pack, train every stage, resume, export, read back, evaluate.
 
-    python test_pipeline.py      (or through pytest; four to five minutes on one core)
+    python test_pipeline.py      (or through pytest; a minute or two on one core)
 """
 import json
 import os
@@ -85,10 +85,10 @@ def test_pipeline():
     with tempfile.TemporaryDirectory() as folder:
         data = make_footage(folder)
         out = lambda name: os.path.join(folder, name)
-        common = ('--data', data, '--crop', 32, '--frames', 8, '--steps', 3)
+        common = ('--data', data, '--crop', 32, '--frames', 8, '--steps', 3, '--every', 0)
         run('train.py', *common, '--stage', 'block', '--out', out('block.pt'))
         run('train.py', *common, '--stage', 'full', '--init', out('block.pt'), '--out', out('full.pt'))
-        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2)
+        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2, '--every', 15)   # one run with evaluations
         run('train.py', *common, '--stage', 'ffdnet', '--out', out('white.pt'))
         run('train.py', *common, '--stage', 'ffdnet-loop', '--init', out('white.pt'), '--out', out('ffdnet.pt'), '--runs', 2)
         run('train.py', *common, '--stage', 'loop', '--out', out('loop.pt'), '--runs', 2, '--unroll', 2)

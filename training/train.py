@@ -258,7 +258,7 @@ def main():
     p.add_argument('--workers', type=int, default=1, help='producer processes of each kind')
     p.add_argument('--threads', type=int, default=1)
     p.add_argument('--scene', help='a .mat scene that evaluation also runs')
-    p.add_argument('--every', type=float, default=15, help='minutes between evaluations')
+    p.add_argument('--every', type=float, default=15, help='minutes between evaluations, the first before the first step and one at the end; 0 for none')
     a = p.parse_args()
     if a.unroll < 1:
         p.error(f'--unroll {a.unroll}: a step needs at least 1 pass')
@@ -274,12 +274,14 @@ def main():
     if 'loop' in a.stage:
         snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop)
         loop = Iterates(snapshots, device, a.runs, DEFAULTS[a.stage])
-    if a.stage != 'block':
+    if a.stage != 'block' and a.every:
         scenes = evaluate.LoopScenes(a.data, a.scene, device=device)
         print('TV', json.dumps(scenes.tv()), flush=True)
 
     def report():
         t.save()
+        if not a.every:
+            return
         net = t.averaged()
         row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
         if scenes:
@@ -291,7 +293,7 @@ def main():
     last = t.step + a.steps if a.steps else math.inf
     end = min(60 * a.minutes, t.seconds + 60 * a.run_minutes)
     while t.seconds < end and t.step < last:
-        if t.seconds - evaluated > 60 * a.every:
+        if a.every and t.seconds - evaluated > 60 * a.every:
             evaluated = t.seconds
             report()
         began = time.monotonic()
