@@ -8,7 +8,7 @@ use clap::Args;
 use serde::Deserialize;
 
 use super::{CliError, progress};
-use crate::formats::{Limits, StackInfo, npy};
+use crate::formats::{FormatError, Limits, StackInfo, npy};
 use crate::intake::{CaptureFiles, Report, calibrate, report_page};
 
 /// Make masks and a report from raw captures, without a server.
@@ -56,12 +56,16 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let scratch = tempfile::Builder::new().prefix(".making-").tempfile_in(out);
     let scratch = scratch.map_err(|error| CliError::file("write", out, &error))?;
     let masks = |info: &StackInfo| {
-        let path = out.join("masks.npy");
-        let file = File::create(&path).map_err(|error| CliError::file("write", &path, &error))?;
-        let StackInfo { frames, height, width, .. } = *info;
-        Ok::<_, CliError>(npy::writer(BufWriter::new(file), frames, height, width)?)
+        let file = File::create(out.join("masks.npy"));
+        let file = file.map_err(FormatError::io("write masks.npy"))?;
+        npy::writer(BufWriter::new(file), info.frames, info.height, info.width)
     };
-    let (made, _) = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share)?;
+    let made = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share);
+    let (made, _) = made.map_err(|error| match error.is_retryable() {
+        // Of what is written, too.
+        true => CliError::Failure(error.to_string()),
+        false => error.into(),
+    })?;
     bar.finish_and_clear();
     write_report(arguments, &made.report)
 }

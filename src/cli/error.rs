@@ -30,16 +30,6 @@ impl CliError {
         }
     }
 
-    /// A file of the user that is not what it should be.
-    pub fn format(what: &str, path: &Path, error: &FormatError) -> Self {
-        let text = format!("{what} {}: {error}", path.display());
-        // A file that can't be opened is the user's to mend as well.
-        match error {
-            FormatError::Internal(_) => Self::Failure(text),
-            _ => Self::Input(text),
-        }
-    }
-
     /// A file or folder that can't be read or written.
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
@@ -91,15 +81,18 @@ impl From<ResultError> for CliError {
     }
 }
 
-/// For calibrations, which also write.
+/// For what the user gave: a file that can't be opened is the user's to mend as well.
 impl From<IntakeError> for CliError {
     fn from(error: IntakeError) -> Self {
         let text = error.to_string();
-        if error.is_retryable() { Self::Failure(text) } else { Self::Input(text) }
+        match error {
+            IntakeError::Format { source: FormatError::Internal(_), .. } => Self::Failure(text),
+            _ => Self::Input(text),
+        }
     }
 }
 
-/// For results: files of the user are read through [`CliError::format`], which names them.
+/// For results.
 impl From<FormatError> for CliError {
     fn from(error: FormatError) -> Self {
         Self::Failure(error.to_string())

@@ -7,8 +7,8 @@ use ndarray::{Array2, Array3, Axis};
 use serde::Serialize;
 
 use crate::cli::CliError;
-use crate::cli::input::read_clip;
 use crate::cli::optics::OpticsFile;
+use crate::intake::read_clip;
 use crate::optics::{
     HybridAperture, Method, Multiplexing, Normalisation, Placement, check_patterns, generator,
     iid_masks, pattern_rank, single_apertures,

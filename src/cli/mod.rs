@@ -3,11 +3,9 @@
 mod arguments;
 mod error;
 mod housekeeping;
-mod input;
 mod learned;
 mod logging;
 mod masks;
-mod npz;
 mod progress;
 mod supervisor;
 

@@ -2,7 +2,7 @@
 
 mod report;
 
-use std::fs;
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Instant;
@@ -12,10 +12,10 @@ use ndarray::{Array2, Array3, s};
 
 use super::CliError;
 use super::arguments::{EngineArguments, ScheduleArguments, checked, refused};
-use super::input::{Scaled, Source};
 use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
+use crate::intake::{Scaled, Source, read_masks, read_snapshot, read_truth};
 use crate::job::{Algorithm, ScheduleSpec, Timestamp};
 use crate::pipeline::manifest::{
     Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
@@ -24,7 +24,7 @@ use crate::pipeline::manifest::{
 use crate::pipeline::pilot::PilotRecord;
 use crate::pipeline::{
     NetworkSource, ResultSpec, SnapshotInput, Solved, Solver, TileOutcome, Usage, blended_frame,
-    check_output, peak_rss_bytes, replace_result, solve, write_result,
+    check_output, peak_rss_bytes, replace_result, sha256_of, solve, write_result,
 };
 use crate::recon::metrics;
 use crate::recon::scale::ScaleEstimator;
@@ -188,22 +188,26 @@ impl<'a> Sources<'a> {
         let scene = arguments.scene.as_deref();
         let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
         let missing = || CliError::Input("name --masks and --measurement, or a --scene".into());
-        let source = |path, array, full_scale| Source { path, array, full_scale };
         Ok(Self {
-            masks: source(
+            masks: Source::file(
                 named(&arguments.masks).ok_or_else(missing)?,
                 SceneArray::Masks,
                 arguments.masks_full_scale,
             ),
-            measurement: source(
+            measurement: Source::file(
                 named(&arguments.measurement).ok_or_else(missing)?,
                 SceneArray::Measurements,
                 arguments.measurement_full_scale,
             ),
             truth: named(&arguments.truth)
-                .map(|path| source(path, SceneArray::Truth, arguments.truth_full_scale)),
+                .map(|path| Source::file(path, SceneArray::Truth, arguments.truth_full_scale)),
         })
     }
+}
+
+fn sha256(path: &Path) -> Result<String, CliError> {
+    let hashed = File::open(path).and_then(|mut file| sha256_of(&mut file));
+    hashed.map_err(|error| CliError::file("read", path, &error))
 }
 
 /// The files' content.
@@ -217,8 +221,8 @@ struct Input<'a> {
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self, CliError> {
         let sources = Sources::new(arguments)?;
-        let masks = sources.masks.masks()?;
-        let (measurement, snapshots) = sources.measurement.snapshot(arguments.snapshot)?;
+        let masks = read_masks(&sources.masks)?;
+        let (measurement, snapshots) = read_snapshot(&sources.measurement, arguments.snapshot)?;
         let (frames, height, width) = masks.array.dim();
         if measurement.array.dim() != (height, width) {
             let (rows, columns) = measurement.array.dim();
@@ -230,7 +234,7 @@ impl<'a> Input<'a> {
             )));
         }
         let truth = match &sources.truth {
-            Some(source) => source.truth(masks.array.dim(), arguments.snapshot, snapshots)?,
+            Some(source) => read_truth(source, masks.array.dim(), arguments.snapshot, snapshots)?,
             None => None,
         };
         Ok(Self { sources, masks, measurement, truth })
@@ -342,8 +346,8 @@ impl Solution {
             width,
             snapshot: setup.snapshot,
             inputs: Inputs {
-                masks_sha256: input.sources.masks.sha256()?,
-                measurement_sha256: input.sources.measurement.sha256()?,
+                masks_sha256: sha256(input.sources.masks.path)?,
+                measurement_sha256: sha256(input.sources.measurement.path)?,
             },
             models: setup.models()?,
             scale: ScaleRecord {

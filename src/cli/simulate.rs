@@ -10,10 +10,10 @@ use ndarray::{Array2, Array3, ArrayView3, s};
 use serde::Serialize;
 
 use super::CliError;
-use super::input::read_clip;
 use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
 use crate::formats::npy;
+use crate::intake::read_clip;
 use crate::optics::{OpticsError, illumination, measure, noisy};
 
 /// Simulate a snapshot: make masks and measure known frames through them.

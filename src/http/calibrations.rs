@@ -156,8 +156,8 @@ async fn of_masks(
     app.store.upload(lab, masks).await.map_err(|error| missing("/masks", error))?;
     let prepared =
         intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
-    let Prepared { info, statistics, file } = prepared.await?;
-    let facts = facts(name, masks, &info, &statistics);
+    let Prepared { info, found, file, .. } = prepared.await?;
+    let facts = facts(name, masks, &info, &found);
     Ok(app.store.add_calibration(lab, facts, file).await?.into())
 }
 

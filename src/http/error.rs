@@ -281,7 +281,12 @@ impl From<FormatError> for ApiError {
         if !error.is_callers_fault() {
             return Self::internal(&error);
         }
-        Self { reason: Some(error.code()), ..Self::new(Code::InvalidContent, error.to_string()) }
+        let refused = Self::new(Code::InvalidContent, error.to_string());
+        let refused = Self { reason: Some(error.code()), ..refused };
+        match error {
+            FormatError::FullScale(_) => refused.at("/full_scale"),
+            _ => refused,
+        }
     }
 }
 

@@ -1,43 +1,24 @@
-//! From an upload to a calibration or measurement: the content is checked frame by frame and
+//! Uploads on their way to a calibration or measurement: what passes the checks of [`crate::intake`] is
 //! written as a prepared array. Blocks; one at a time runs, where blocking is allowed.
 
 use std::io::BufWriter;
-use std::path::Path;
 
 use super::app::App;
 use super::error::{ApiError, Code};
-use super::intake_check::{Exposed, average_dark, check};
-use crate::formats::mat::{self, SceneArray};
-use crate::formats::validate::{
-    MaskCheck, MaskStatistics, MeasurementCheck, MeasurementStatistics,
-};
-use crate::formats::{
-    self, FormatError, FrameReader, FullScale, Limits, StackInfo, StackWriter, planar,
-};
+use crate::formats::mat::SceneArray;
+use crate::formats::validate::MaskStatistics;
+use crate::formats::{Limits, StackInfo, StackWriter, planar};
+use crate::intake::{self, Exposure, Source};
 use crate::job::{Finding, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
-
-/// What is asked of a measurement beyond its data.
-#[derive(Debug)]
-pub(super) struct Exposure {
-    /// The stored number that means 1.
-    pub(super) full_scale: Option<f32>,
-    /// Captures of the dark, to be averaged and subtracted.
-    pub(super) dark: Vec<Sha256>,
-    /// The stored number from which on a pixel is full.
-    pub(super) saturation: Option<u32>,
-}
-
-/// A measurement that was taken in, and what was found in it.
-pub(super) struct Measured {
-    pub(super) prepared: Prepared<MeasurementStatistics>,
-    pub(super) findings: Vec<Finding>,
-}
 
 /// What an upload turned out to be.
 pub(super) struct Prepared<T> {
     pub(super) info: StackInfo,
-    pub(super) statistics: T,
+    /// The stored number that means 1.
+    pub(super) full_scale: f32,
+    /// What was found in it.
+    pub(super) found: T,
     pub(super) file: StagedBlob,
 }
 
@@ -66,12 +47,11 @@ pub(super) fn masks(
     full_scale: Option<f32>,
 ) -> Result<Prepared<MaskStatistics>, ApiError> {
     let path = store.dir().blob(upload);
-    let (mut reader, scale) = open(&path, limits, SceneArray::Masks, full_scale)?;
-    let info = *reader.info();
+    let opened = Source::upload(&path, SceneArray::Masks, full_scale, *limits).open()?;
+    let (info, full_scale) = (opened.info, opened.full_scale.value());
     let mut writer = writer(store, &info)?;
-    let statistics =
-        MaskCheck::run(&mut *reader, scale, |mask| writer.write_frame(mask)).map_err(refused)?;
-    Ok(Prepared { info, statistics, file: finish(writer)? })
+    let found = intake::masks(opened, |mask| writer.write_frame(mask))?;
+    Ok(Prepared { info, full_scale, found, file: finish(writer)? })
 }
 
 /// Writes a measurement with its dark subtracted and its full scale divided out, and checks it
@@ -80,12 +60,13 @@ pub(super) fn measurement(
     store: &Store,
     limits: &Limits,
     upload: &Sha256,
+    full_scale: Option<f32>,
     exposure: &Exposure,
     calibration: &Calibration,
-) -> Result<Measured, ApiError> {
+) -> Result<Prepared<Vec<Finding>>, ApiError> {
     let path = store.dir().blob(upload);
-    let (reader, scale) = open(&path, limits, SceneArray::Measurements, exposure.full_scale)?;
-    let info = *reader.info();
+    let opened = Source::upload(&path, SceneArray::Measurements, full_scale, *limits).open()?;
+    let (info, full_scale) = (opened.info, opened.full_scale.value());
     let masks = &calibration.facts;
     if (info.height, info.width) != (masks.height, masks.width) {
         let detail = format!(
@@ -94,38 +75,12 @@ pub(super) fn measurement(
         );
         return Err(ApiError::new(Code::SizeMismatch, detail).at("/data"));
     }
-    let dark = average_dark(store, limits, &exposure.dark, (info.height, info.width))?;
-    let mut reader = Exposed::new(reader, dark, exposure.saturation);
     let mut writer = writer(store, &info)?;
-    let statistics =
-        MeasurementCheck::run(&mut reader, scale, |snapshot| writer.write_frame(snapshot))
-            .map_err(refused)?;
+    let saturated = intake::measurement(opened, exposure, limits, |y| writer.write_frame(y))?;
     let file = finish(writer)?;
-    let masks = planar::Reader::open(&store.dir().blob(&calibration.prepared), limits)?;
-    let snapshots = planar::Reader::open(file.path(), limits)?;
-    let findings = check(&masks, &snapshots, reader.saturated().as_deref())?;
-    Ok(Measured { prepared: Prepared { info, statistics, file }, findings })
-}
-
-/// Opens an upload; of a .mat file this array. Its full scale is the one given, or its type's.
-pub(super) fn open(
-    path: &Path,
-    limits: &Limits,
-    array: SceneArray,
-    full_scale: Option<f32>,
-) -> Result<(Box<dyn FrameReader + Send>, FullScale), ApiError> {
-    let reader = match mat::is_mat(path)? {
-        true => mat::open_array(path, array, limits),
-        false => formats::open_stack(path, limits),
-    };
-    let reader = reader?;
-    let scale = match full_scale {
-        Some(value) => {
-            FullScale::new(value).map_err(|error| ApiError::from(error).at("/full_scale"))?
-        }
-        None => reader.info().default_full_scale,
-    };
-    Ok((reader, scale))
+    let masks = store.dir().blob(&calibration.prepared);
+    let found = intake::judge(&masks, file.path(), saturated.as_deref(), limits)?;
+    Ok(Prepared { info, full_scale, found, file })
 }
 
 type Writer = StackWriter<BufWriter<BlobWriter>>;
@@ -140,8 +95,4 @@ fn finish(writer: Writer) -> Result<StagedBlob, ApiError> {
     // `finish` has flushed, so this only unwraps.
     let inner = buffered.into_inner().map_err(|error| ApiError::internal(error.error()))?;
     Ok(inner.finish()?)
-}
-
-fn refused(error: FormatError) -> ApiError {
-    error.into()
 }

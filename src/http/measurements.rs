@@ -11,9 +11,10 @@ use super::app::App;
 use super::calibrations::missing;
 use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf};
-use super::intake::{self, Exposure, Measured, Prepared};
+use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody};
 use crate::formats::StackInfo;
+use crate::intake::Exposure;
 use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
 use crate::store::{Measurement, MeasurementFilter, NewMeasurement};
 
@@ -57,7 +58,7 @@ pub(super) async fn create(
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response, ApiError> {
     check_times(&request)?;
-    let (data, exposure) = (request.data, exposure(&request));
+    let (data, full_scale) = (request.data, request.full_scale);
     let calibration = app.store.calibration(&access.lab, request.calibration).await;
     let calibration = calibration.map_err(|error| missing("/calibration", error))?;
     app.store.upload(&access.lab, data).await.map_err(|error| missing("/data", error))?;
@@ -65,19 +66,18 @@ pub(super) async fn create(
         let there = app.store.upload(&access.lab, *dark).await;
         there.map_err(|error| missing(&format!("/dark/{index}"), error))?;
     }
-    let measured = intake::run(&app, move |store, limits| {
-        intake::measurement(store, limits, &data, &exposure, &calibration)
+    let exposure = Exposure {
+        dark: request.dark.iter().map(|dark| app.store.dir().blob(dark)).collect(),
+        saturation: request.saturation,
+    };
+    let prepared = intake::run(&app, move |store, limits| {
+        intake::measurement(store, limits, &data, full_scale, &exposure, &calibration)
     });
-    let Measured { prepared: Prepared { info, statistics, file }, findings } = measured.await?;
-    let facts = facts(request, &info, statistics.full_scale.value(), findings);
+    let Prepared { info, full_scale, found, file } = prepared.await?;
+    let facts = facts(request, &info, full_scale, found);
     let measurement = app.store.add_measurement(&access.lab, facts, file).await?;
     let location = [(header::LOCATION, format!("/v1/measurements/{}", measurement.id))];
     Ok((StatusCode::CREATED, location, Json(measurement)).into_response())
-}
-
-fn exposure(request: &MeasurementRequest) -> Exposure {
-    let MeasurementRequest { full_scale, saturation, .. } = *request;
-    Exposure { full_scale, dark: request.dark.clone(), saturation }
 }
 
 /// Refuses times that can't be: they become the times of frames.

@@ -16,7 +16,6 @@ mod events;
 mod extract;
 mod health;
 mod intake;
-mod intake_check;
 mod jobs;
 mod layers;
 mod measurements;

@@ -16,7 +16,8 @@ use super::extract::{Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
 use crate::formats::mat::SceneArray;
-use crate::formats::{FormatError, FrameReader, Limits, npy};
+use crate::formats::{FormatError, Limits, npy};
+use crate::intake::{Opened, Source};
 use crate::job::{JobId, SceneShape, Sha256};
 use crate::recon::metrics;
 use crate::store::{Job, StoreError};
@@ -64,8 +65,8 @@ pub(super) async fn show(
     let (shape, truth) = (job.spec.shape, query.truth);
     let frames = intake::run(&app, move |store, limits| {
         let upload = store.dir().blob(&truth);
-        let opened = intake::open(&upload, limits, SceneArray::Truth, query.full_scale)?;
-        compare(&path, opened.0, opened.1.value(), snapshot as usize, shape)
+        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *limits);
+        compare(&path, truth.open()?, snapshot as usize, shape)
     });
     conditional::json(&summary(truth, frames.await?), &headers)
 }
@@ -92,13 +93,12 @@ fn summary(truth: Sha256, frames: Vec<FrameQuality>) -> QualityBody {
 /// of all snapshots of the measurement. Memory holds a frame of each.
 fn compare(
     path: &Path,
-    mut truth: Box<dyn FrameReader + Send>,
-    full_scale: f32,
+    mut truth: Opened,
     snapshot: usize,
     shape: SceneShape,
 ) -> Result<Vec<FrameQuality>, ApiError> {
     let SceneShape { frames, height, width, snapshots } = shape;
-    let found = *truth.info();
+    let found = truth.info;
     let all = frames * snapshots as usize;
     if (found.height, found.width) != (height, width) || ![frames, all].contains(&found.frames) {
         let detail = format!(
@@ -110,11 +110,11 @@ fn compare(
     }
     let before = if found.frames == all { snapshot * frames } else { 0 };
     for _ in 0..before {
-        next(&mut *truth)?;
+        next(&mut truth)?;
     }
     let result = npy::open_windows(path, &Limits::default())?;
     let figures = |k: usize| -> Result<FrameQuality, ApiError> {
-        let truth = (next(&mut *truth)? / full_scale).insert_axis(Axis(0));
+        let truth = next(&mut truth)?.insert_axis(Axis(0));
         let frame = result.read_window(k..k + 1, 0..height, 0..width)?;
         let psnr = metrics::psnr(frame.view(), truth.view());
         let psnr = psnr.map_err(|error| ApiError::internal(&error))?;
@@ -128,7 +128,7 @@ fn compare(
     (0..frames).map(figures).collect()
 }
 
-fn next(reader: &mut (dyn FrameReader + Send)) -> Result<Array2<f32>, ApiError> {
+fn next(truth: &mut Opened) -> Result<Array2<f32>, ApiError> {
     let missing = || FormatError::Internal("a stack has fewer frames than it says".into());
-    Ok(reader.next_frame()?.ok_or_else(missing)?)
+    Ok(truth.next_frame()?.ok_or_else(missing)?)
 }

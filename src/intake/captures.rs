@@ -63,17 +63,17 @@ pub struct Report {
 ///
 /// # Errors
 /// Captures or patterns that can't be read or used; I/O; a stop; those of `open`.
-pub fn calibrate<W: Write, E: From<IntakeError>>(
+pub fn calibrate<W: Write>(
     files: &CaptureFiles,
     limits: &Limits,
     scratch: &Path,
-    open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, E>,
+    open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, FormatError>,
     progress: &mut Progress<'_>,
-) -> Result<(Calibrated, W), E> {
+) -> Result<(Calibrated, W), IntakeError> {
     // Checked before hours of averaging.
     let patterns = read_patterns(files, limits)?;
     let captured = average_masks(files, limits, scratch, progress)?;
-    let raw = Reader::open(scratch, limits).map_err(IntakeError::from)?;
+    let raw = Reader::open(scratch, limits)?;
     let masks = write_scaled(&raw, captured.scale, open(raw.info())?, progress)?;
     let figures = study(&raw, captured.scale, progress)?;
     let report = tell(&figures, Some(&captured), patterns.as_ref())?;
@@ -136,8 +136,9 @@ fn average_masks(
     let mut done = 0;
     let mut average = |name: &str, paths: &[PathBuf]| {
         let whole = |share: f64| (f64::from(done) + share) / total as f64 * AVERAGING;
-        let averaged =
-            average(name, paths, files.saturation, limits, &mut |share| progress(whole(share)));
+        let place = |index| format!("captures of {name}, file {}", index + 1);
+        let mut heard = |share| progress(whole(share));
+        let averaged = average(paths, files.saturation, limits, place, &mut heard);
         done += 1;
         averaged
     };
@@ -173,34 +174,33 @@ fn average_masks(
     Ok(Captured { scale, figures, illumination, sample, clipped_negatives: clipped })
 }
 
-/// The average of all frames of some files.
-fn average(
-    name: &str,
+/// The average of all frames of some files; `place` is what errors call each.
+pub(super) fn average(
     paths: &[PathBuf],
     saturation: Option<u32>,
     limits: &Limits,
+    place: impl Fn(usize) -> String,
     progress: &mut Progress<'_>,
 ) -> Result<(Average, SampleType), IntakeError> {
     let (mut repeats, mut sample) = (None, SampleType::F32);
     for (index, path) in paths.iter().enumerate() {
-        let place = format!("captures of {name}, file {}", index + 1);
-        let mut reader = formats::open_stack(path, limits).map_err(IntakeError::format(&place))?;
+        let failed = |source| IntakeError::format(place(index))(source);
+        let mut reader = formats::open_stack(path, limits).map_err(failed)?;
         let info = *reader.info();
         sample = info.sample;
         let full = full_number(sample, saturation);
         let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, full));
         let mut frame = 0;
-        while let Some(capture) = reader.next_frame().map_err(IntakeError::format(&place))? {
-            repeats.add(capture.view()).map_err(|error| IntakeError::content(&place, &error))?;
+        while let Some(capture) = reader.next_frame().map_err(failed)? {
+            let added = repeats.add(capture.view());
+            added.map_err(|error| IntakeError::content(place(index), &error))?;
             frame += 1;
             let share = frame as f64 / info.frames as f64;
             go_on(progress, (index as f64 + share) / paths.len() as f64)?;
         }
     }
-    let averaged = repeats.unwrap_or_else(|| Repeats::new(0, 0, None)).average();
-    averaged
-        .map(|average| (average, sample))
-        .map_err(|error| IntakeError::content(format!("captures of {name}"), &error))
+    let average = repeats.unwrap_or_else(|| Repeats::new(0, 0, None)).average();
+    Ok((average.map_err(|error| IntakeError::content(place(0), &error))?, sample))
 }
 
 /// The stored number from which on a pixel is full: the one stated, or the largest of the type.

@@ -4,9 +4,15 @@
 //! Stacks are read frame by frame and handed on to a writer, so that memory holds a few planes.
 
 mod captures;
+mod check;
 mod error;
+mod open;
+mod read;
 mod report_page;
 
 pub use captures::{Calibrated, CaptureFiles, Progress, Report, calibrate, check_sizes, report};
+pub use check::{Exposure, judge, masks, measurement};
 pub use error::IntakeError;
+pub use open::{Opened, Source};
+pub use read::{Scaled, read_clip, read_masks, read_snapshot, read_truth};
 pub use report_page::report_page;

@@ -141,11 +141,9 @@ fn perform(
         CalibrationWork::Captures(captures) => {
             let files = captures.map(|upload| store.dir().blob(upload));
             let scratch = store.staged_path()?;
-            let open = |info: &StackInfo| {
-                let blob = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
-                let masks = planar::writer(blob, info.frames, info.height, info.width);
-                Ok::<_, Failure>(masks.map_err(IntakeError::from)?)
-            };
+            let blob = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
+            let open =
+                |info: &StackInfo| planar::writer(blob, info.frames, info.height, info.width);
             let (made, blob) = calibrate(&files, &limits, scratch.path(), open, &mut progress)?;
             let blob = blob.into_inner().map_err(|error| FormatError::Io {
                 action: "write the masks",

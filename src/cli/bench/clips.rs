@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array3, s};
 
 use crate::cli::CliError;
-use crate::cli::input::read_clip;
+use crate::intake::read_clip;
 
 /// A clip of `frames` frames.
 #[derive(Debug)]

@@ -7,8 +7,8 @@ use std::path::Path;
 use ndarray::Array3;
 
 use crate::cli::CliError;
-use crate::cli::input::read_clip;
 use crate::formats::npy;
+use crate::intake::read_clip;
 use crate::optics::{measure, random_squares};
 
 /// The first frames of `demo/clip` (its README says where they come from), one snapshot's worth.

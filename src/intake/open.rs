@@ -1,0 +1,89 @@
+//! Opening a file: its format is told by its content, its full scale is the one stated or its type's.
+
+use std::path::Path;
+
+use ndarray::Array2;
+
+use super::IntakeError;
+use crate::formats::mat::{self, SceneArray};
+use crate::formats::{self, FrameReader, FullScale, Limits, StackInfo};
+
+/// A file, and which array of it is meant if it is a .mat scene.
+#[derive(Debug, Clone)]
+pub struct Source<'a> {
+    /// Where it is.
+    pub path: &'a Path,
+    /// What it holds.
+    pub array: SceneArray,
+    /// The stored number that means 1; none for the file's own.
+    pub full_scale: Option<f32>,
+    /// How large it may be.
+    pub limits: Limits,
+    /// What errors call it; empty for an upload, of which there is one, and whose path is ours.
+    pub name: String,
+}
+
+/// A stack whose frames are read one at a time.
+pub struct Opened {
+    /// The file's shape and type.
+    pub info: StackInfo,
+    /// The stored number that means 1.
+    pub full_scale: FullScale,
+    pub(super) reader: Box<dyn FrameReader + Send>,
+    pub(super) name: String,
+}
+
+impl<'a> Source<'a> {
+    /// A file that the user has named.
+    #[must_use]
+    pub fn file(path: &'a Path, array: SceneArray, full_scale: Option<f32>) -> Self {
+        let what = match array {
+            SceneArray::Masks => "masks",
+            SceneArray::Measurements => "measurement",
+            SceneArray::Truth => "frames",
+        };
+        let name = format!("{what} {}", path.display());
+        Self { name, ..Self::upload(path, array, full_scale, Limits::default()) }
+    }
+
+    /// A file of the service.
+    #[must_use]
+    pub fn upload(
+        path: &'a Path,
+        array: SceneArray,
+        full_scale: Option<f32>,
+        limits: Limits,
+    ) -> Self {
+        Self { path, array, full_scale, limits, name: String::new() }
+    }
+
+    /// Opens it.
+    ///
+    /// # Errors
+    /// No file, or none of a format that is read; larger than the limits; no such array; no full scale.
+    pub fn open(&self) -> Result<Opened, IntakeError> {
+        let opened = match mat::is_mat(self.path) {
+            Ok(true) => mat::open_array(self.path, self.array, &self.limits),
+            Ok(false) => formats::open_stack(self.path, &self.limits),
+            Err(error) => Err(error),
+        };
+        let reader = opened.map_err(IntakeError::format(&self.name))?;
+        let info = *reader.info();
+        let full_scale = match self.full_scale {
+            Some(value) => FullScale::new(value).map_err(IntakeError::format(&self.name))?,
+            None => info.default_full_scale,
+        };
+        Ok(Opened { info, full_scale, reader, name: self.name.clone() })
+    }
+}
+
+impl Opened {
+    /// The next frame \[H,W\] divided by the full scale; none after the last.
+    ///
+    /// # Errors
+    /// Whatever is wrong with its bytes.
+    pub fn next_frame(&mut self) -> Result<Option<Array2<f32>>, IntakeError> {
+        let frame = self.reader.next_frame().map_err(IntakeError::format(&self.name))?;
+        Ok(frame.map(|frame| frame / self.full_scale.value()))
+    }
+}

@@ -1,0 +1,244 @@
+//! Whole arrays in memory, for commands: a snapshot with its masks, and clips.
+
+use std::fmt::Display;
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use ndarray::{Array2, Array3, ArrayView2, s};
+use tempfile::NamedTempFile;
+use zip::ZipArchive;
+
+use super::IntakeError;
+use super::check::{Exposure, masks, measurement};
+use super::open::Source;
+use crate::formats::mat::SceneArray;
+use crate::formats::{FormatError, Limits};
+
+/// An array on its own scale, and the full scale that brought it there.
+#[derive(Debug)]
+pub struct Scaled<T> {
+    /// The values.
+    pub array: T,
+    /// The stored number that means 1.
+    pub full_scale: f32,
+}
+
+/// Masks \[B,H,W\] on \[0,1\], checked.
+///
+/// # Errors
+/// A file that can't be read, or holds no masks.
+pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>, IntakeError> {
+    let opened = source.open()?;
+    let full_scale = opened.full_scale.value();
+    let mut stack = Stack::default();
+    masks(opened, |mask| stack.push(mask))?;
+    Ok(Scaled { array: stack.into_array()?, full_scale })
+}
+
+/// Snapshot `index` \[H,W\] of a measurement, checked, and how many there are.
+///
+/// # Errors
+/// A file that can't be read, or has no such snapshot.
+pub fn read_snapshot(
+    source: &Source<'_>,
+    index: usize,
+) -> Result<(Scaled<Array2<f32>>, usize), IntakeError> {
+    let opened = source.open()?;
+    let (full_scale, snapshots) = (opened.full_scale.value(), opened.info.frames);
+    let (mut next, mut found) = (0, None);
+    measurement(opened, &Exposure::default(), &source.limits, |snapshot| {
+        if next == index {
+            found = Some(snapshot.to_owned());
+        }
+        next += 1;
+        Ok(())
+    })?;
+    let missing = || {
+        let detail = format!(
+            "{} holds {snapshots} snapshots, counted from 0; there is no snapshot {index}",
+            source.name
+        );
+        IntakeError::content("", &detail)
+    };
+    Ok((Scaled { array: found.ok_or_else(missing)?, full_scale }, snapshots))
+}
+
+/// The true frames \[B,H,W\] of one snapshot, of a file that has those of this snapshot or of all. A .mat
+/// scene may go without; another file may not.
+///
+/// # Errors
+/// A file that can't be read; other sizes.
+pub fn read_truth(
+    source: &Source<'_>,
+    (frames, height, width): (usize, usize, usize),
+    snapshot: usize,
+    snapshots: usize,
+) -> Result<Option<Array3<f32>>, IntakeError> {
+    let truth = match read_frames(source) {
+        Err(IntakeError::Format { source: FormatError::MissingArray { .. }, .. }) => {
+            return Ok(None);
+        }
+        truth => truth?,
+    };
+    let (count, rows, columns) = truth.dim();
+    let first = match count {
+        _ if (rows, columns) != (height, width) => None,
+        _ if count == frames => Some(0),
+        _ if count == frames * snapshots => Some(snapshot * frames),
+        _ => None,
+    };
+    let Some(first) = first else {
+        let detail = format!(
+            "the true frames {} are {count}x{rows}x{columns}; {frames}x{height}x{width} (of the \
+             snapshot) or {}x{height}x{width} (of all snapshots) would fit",
+            source.path.display(),
+            frames * snapshots
+        );
+        return Err(IntakeError::Size { place: String::new(), detail });
+    };
+    Ok(Some(truth.slice(s![first..first + frames, .., ..]).to_owned()))
+}
+
+/// Frames \[T,H,W\] of a file, of an npz archive, or of a folder of pictures in the order of their
+/// names, divided by the full scale; all finite.
+///
+/// # Errors
+/// Files that can't be read; pictures of different sizes.
+pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>, IntakeError> {
+    let source = |path| Source::file(path, SceneArray::Truth, full_scale);
+    if path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("npz")) {
+        return read_frames(&source(extract(path)?.path()));
+    }
+    if !path.is_dir() {
+        return read_frames(&source(path));
+    }
+    let refused = |detail: String| IntakeError::content("", &detail);
+    let unreadable = |error| refused(format!("cannot read {}: {error}", path.display()));
+    let mut files: Vec<PathBuf> = Vec::new();
+    for entry in fs::read_dir(path).map_err(unreadable)? {
+        let file = entry.map_err(unreadable)?.path();
+        if file.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("png")) {
+            files.push(file);
+        }
+    }
+    files.sort();
+    let mut stack = Stack::default();
+    for file in &files {
+        let picture = read_frames(&source(file))?;
+        let (_, rows, columns) = picture.dim();
+        let (height, width) = stack.size;
+        if stack.frames > 0 && (rows, columns) != (height, width) {
+            return Err(refused(format!(
+                "{} is {rows}x{columns}, but the pictures before it are {height}x{width}",
+                file.display(),
+            )));
+        }
+        picture.outer_iter().try_for_each(|frame| stack.push(frame))?;
+    }
+    if files.is_empty() {
+        return Err(refused(format!("the folder {} holds no .png pictures", path.display())));
+    }
+    stack.into_array()
+}
+
+/// Frames \[T,H,W\] divided by the full scale, all finite.
+fn read_frames(source: &Source<'_>) -> Result<Array3<f32>, IntakeError> {
+    let mut opened = source.open()?;
+    let mut stack = Stack::default();
+    while let Some(frame) = opened.next_frame()? {
+        if let Some(((row, column), value)) = frame.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            let problem = format!(
+                "{value} at frame {}, row {row}, column {column} (counted from 0); every value must \
+                 be finite",
+                stack.frames
+            );
+            return Err(IntakeError::content(&source.name, &problem));
+        }
+        stack.push(frame.view())?;
+    }
+    stack.into_array()
+}
+
+/// The only array of an npz archive, or the one called `frames`, as an npy file of its own.
+fn extract(path: &Path) -> Result<NamedTempFile, IntakeError> {
+    let refused =
+        |problem: &dyn Display| IntakeError::content(format!("frames {}", path.display()), problem);
+    let file = File::open(path).map_err(|error| refused(&error))?;
+    let mut archive = ZipArchive::new(file).map_err(|error| refused(&error))?;
+    let names = archive.file_names().map(|name| name.map(std::borrow::Cow::into_owned));
+    let names = names.collect::<Result<Vec<String>, _>>().map_err(|error| refused(&error))?;
+    let name = match names.as_slice() {
+        [only] => only.clone(),
+        several => several.iter().find(|name| *name == "frames.npy").cloned().ok_or_else(|| {
+            refused(&format!("arrays {several:?}; it must hold one, or one called frames"))
+        })?,
+    };
+    let limit = Limits::default().max_file_bytes;
+    let array = archive.by_name(&name).map_err(|error| refused(&error))?;
+    let mut copy = NamedTempFile::new().map_err(|error| refused(&error))?;
+    // A header may promise less than there is: what is read is bounded, too.
+    let read = std::io::copy(&mut array.take(limit + 1), &mut copy);
+    if read.map_err(|error| refused(&error))? > limit {
+        return Err(refused(&format!("array {name} has more than {limit} bytes")));
+    }
+    copy.flush().map_err(|error| refused(&error))?;
+    Ok(copy)
+}
+
+/// Frames of one size as they arrive.
+#[derive(Default)]
+struct Stack {
+    values: Vec<f32>,
+    frames: usize,
+    size: (usize, usize),
+}
+
+impl Stack {
+    fn push(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+        self.values.extend(frame.iter());
+        self.frames += 1;
+        self.size = frame.dim();
+        Ok(())
+    }
+
+    fn into_array(self) -> Result<Array3<f32>, IntakeError> {
+        let shape = (self.frames, self.size.0, self.size.1);
+        Array3::from_shape_vec(shape, self.values)
+            .map_err(|error| FormatError::Internal(error.to_string()).into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use zip::ZipWriter;
+    use zip::write::SimpleFileOptions;
+
+    use super::extract;
+
+    #[test]
+    fn the_only_array_or_the_frames_are_taken() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("clip.npz");
+        let write = |arrays: &[(&str, &[u8])]| {
+            let mut archive = ZipWriter::new(std::fs::File::create(&path).unwrap());
+            for (name, bytes) in arrays {
+                archive.start_file(*name, SimpleFileOptions::default()).unwrap();
+                archive.write_all(bytes).unwrap();
+            }
+            archive.finish().unwrap();
+        };
+        let content = || extract(&path).map(|file| std::fs::read(file.path()).unwrap());
+        write(&[("arr_0.npy", b"one")]);
+        assert_eq!(content().unwrap(), b"one");
+        write(&[("masks.npy", b"one"), ("frames.npy", b"two")]);
+        assert_eq!(content().unwrap(), b"two");
+        write(&[("a.npy", b"one"), ("b.npy", b"two")]);
+        let error = content().unwrap_err().to_string();
+        assert!(error.contains("a.npy") && error.contains("clip.npz"), "{error}");
+        std::fs::write(&path, "no archive").unwrap();
+        assert!(content().is_err());
+    }
+}
