@@ -1,6 +1,18 @@
-//! Tasks: the pieces that a job is cut into.
+//! Tasks: what workers do. A job is cut into many; a calibration is one.
+
+use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+
+use super::request::JobSpec;
+use crate::recon::{ReconError, pilot, preview};
+
+/// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
+const READ_S: f64 = 12e-9;
+const WRITE_S: f64 = 110e-9;
+/// The same of a preview by blocks, and of one that is done whole (measured).
+const PREVIEW_BLOCKS_S: f64 = 10e-9;
+const PREVIEW_WHOLE_S: f64 = 120e-9;
 
 /// What a task does. Snapshots are counted from 0 within the measurement, tiles within the tile plan.
 ///
@@ -32,9 +44,15 @@ pub enum TaskKind {
     },
     /// Write the manifest of the job.
     Manifest,
+    /// Make the masks of a calibration from its captures, and the report on them.
+    Calibration,
 }
 
 impl TaskKind {
+    /// The names of all kinds.
+    pub const NAMES: [&'static str; 7] =
+        ["prepare", "preview", "pilot", "tile", "assemble", "manifest", "calibration"];
+
     /// The kind's name in the database, in metrics and in logs.
     #[must_use]
     pub fn name(self) -> &'static str {
@@ -45,6 +63,7 @@ impl TaskKind {
             Self::Tile { .. } => "tile",
             Self::Assemble { .. } => "assemble",
             Self::Manifest => "manifest",
+            Self::Calibration => "calibration",
         }
     }
 
@@ -55,7 +74,7 @@ impl TaskKind {
             Self::Preview { snapshot }
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
-            Self::Prepare | Self::Pilot | Self::Manifest => None,
+            Self::Prepare | Self::Pilot | Self::Manifest | Self::Calibration => None,
         }
     }
 
@@ -78,13 +97,55 @@ impl TaskKind {
             ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, tile }),
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),
+            ("calibration", None, None) => Some(Self::Calibration),
             _ => None,
         }
     }
 }
 
+impl JobSpec {
+    /// The tasks of the job with their planned CPU-seconds, in the order in which they are handed out.
+    ///
+    /// # Errors
+    /// If the scene can't be cut into tiles.
+    #[allow(clippy::cast_precision_loss)] // counts far below 2^53
+    pub fn tasks(&self) -> Result<Vec<(TaskKind, f64)>, ReconError> {
+        let tiles = self.tile_plan()?;
+        let pixels = (self.shape.height * self.shape.width) as f64;
+        let frames = self.shape.frames as f64;
+        let per_voxel = self.planned_ns_per_voxel() * 1e-9;
+        let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
+        let whole = preview::block(self.shape.frames, self.shape.height, self.shape.width) == 1;
+        let preview = pixels * frames * if whole { PREVIEW_WHOLE_S } else { PREVIEW_BLOCKS_S };
+        let snapshots = self.snapshots.indices();
+        tasks.extend(snapshots.map(|snapshot| (TaskKind::Preview { snapshot }, preview)));
+        if self.schedule.adaptive {
+            let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
+            // The preview of the first snapshot is there at once; the others may wait.
+            tasks.insert(2, (TaskKind::Pilot, voxels * per_voxel));
+        }
+        for snapshot in self.snapshots.indices() {
+            let mut areas: Vec<_> = (0..).zip(tiles.tiles()).collect();
+            areas.sort_by(|(a, _), (b, _)| place(*a).total_cmp(&place(*b)));
+            for (tile, area) in areas {
+                let voxels = (area.height * area.width) as f64 * frames;
+                tasks.push((TaskKind::Tile { snapshot, tile }, voxels * per_voxel));
+            }
+            tasks.push((TaskKind::Assemble { snapshot }, pixels * frames * WRITE_S));
+        }
+        tasks.push((TaskKind::Manifest, 0.01));
+        Ok(tasks)
+    }
+}
+
+/// The place of a tile in the order of work. Multiples of the golden ratio go all over the picture: it
+/// gets sharper everywhere, and the first tiles tell what the others may take.
+fn place(tile: u32) -> f64 {
+    (f64::from(tile) * 0.618_033_988_75).fract()
+}
+
 /// Where a task stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TaskState {
     /// Waits for other tasks of its job.
@@ -95,10 +156,40 @@ pub enum TaskState {
     Running,
     /// Its result is stored.
     Done,
-    /// Given up; the job has failed with it.
+    /// Given up; its job or calibration has failed with it.
     Failed,
     /// The job was cancelled or failed before this task was done.
     Cancelled,
+}
+
+impl TaskState {
+    /// All states, in the order of a task's life.
+    pub const ALL: [Self; 6] =
+        [Self::Blocked, Self::Ready, Self::Running, Self::Done, Self::Failed, Self::Cancelled];
+
+    /// The state's name in JSON, in the database and in metrics.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Blocked => "blocked",
+            Self::Ready => "ready",
+            Self::Running => "running",
+            Self::Done => "done",
+            Self::Failed => "failed",
+            Self::Cancelled => "cancelled",
+        }
+    }
+}
+
+impl FromStr for TaskState {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::ALL
+            .into_iter()
+            .find(|state| state.name() == text)
+            .ok_or_else(|| format!("{text:?} is not a task state"))
+    }
 }
 
 /// The part of its work that a task is in.

@@ -84,8 +84,8 @@ impl Store {
         until_free: u64,
     ) -> Result<usize, StoreError> {
         let rows = sqlx::query(
-            "SELECT id FROM jobs WHERE state IN ('succeeded', 'failed', 'cancelled')
-                 AND finished_at < ? ORDER BY finished_at, id",
+            // A job that has not ended has no time at which it did.
+            "SELECT id FROM jobs WHERE finished_at < ? ORDER BY finished_at, id",
         )
         .bind(before.0)
         .fetch_all(&self.readers)

@@ -114,12 +114,6 @@ fn unready(id: crate::job::CalibrationId, error: Option<&str>) -> String {
     }
 }
 
-impl From<super::Unready> for StoreError {
-    fn from(unready: super::Unready) -> Self {
-        Self::Unready { id: unready.id, error: unready.error }
-    }
-}
-
 impl StoreError {
     /// Wraps an I/O error with what was tried on what.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {

@@ -4,6 +4,13 @@
 //! while the writer's lock of the database is held, so that a file and its row can't part when two
 //! processes work on the same content: the database is the one mutex of the service. No transaction
 //! is open while anything is computed or uploaded.
+//!
+//! What comes in goes through [`submit`] to the [`queue`], and from there to the [`tables`]; nothing
+//! goes the other way.
+//!
+//! # Errors
+//! Every function that asks the database fails if the database does, and every one that changes files
+//! fails if the disk does ([`StoreError`]). Their descriptions name only what else can go wrong.
 
 mod backup;
 mod cleaning;
@@ -36,20 +43,11 @@ pub use queue::{
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
-    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model,
-    ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
-    PartialFile, ResultFile, TileHistory, TileState, Token, Unready, WorkerEnd, WorkerRow,
-    WorkerTask,
+    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model, ModelFilter,
+    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, ResultFile,
+    TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready,
+    WorkerRow, WorkerTask,
 };
-
-/// One page of a list, and the identifier to go on after.
-#[derive(Debug, Clone)]
-pub struct Page<T> {
-    /// The items, newest first.
-    pub items: Vec<T>,
-    /// True if there are more.
-    pub more: bool,
-}
 
 /// The store: a handle that is cheap to clone.
 #[derive(Debug, Clone)]

@@ -1,13 +1,37 @@
-//! From columns to types, with an error that names the column.
+//! From columns to types, with an error that names the column; pages; and what rows refer to.
 
 use std::fmt::Display;
 use std::str::FromStr;
 
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
 
 use super::error::StoreError;
+use crate::job::{CalibrationId, MeasurementId, ModelId, Sha256};
+
+/// One page of a list, and whether to go on after it.
+#[derive(Debug, Clone)]
+pub struct Page<T> {
+    /// The items, newest first.
+    pub items: Vec<T>,
+    /// True if there are more.
+    pub more: bool,
+}
+
+impl<T> Page<T> {
+    /// A page of at most `limit` items from up to `limit + 1` rows.
+    pub(super) fn cut(
+        rows: &[SqliteRow],
+        limit: u32,
+        read: impl Fn(&SqliteRow) -> Result<T, StoreError>,
+    ) -> Result<Self, StoreError> {
+        let limit = usize::try_from(limit).unwrap_or(usize::MAX);
+        let items = rows.iter().take(limit).map(read).collect::<Result<_, _>>()?;
+        Ok(Self { items, more: rows.len() > limit })
+    }
+}
 
 /// The column as text, parsed.
 pub(super) fn parsed<T: FromStr>(row: &SqliteRow, column: &'static str) -> Result<T, StoreError> {
@@ -67,6 +91,11 @@ pub(super) fn json_if<T: DeserializeOwned>(
     value.map(|_| json(row, column)).transpose()
 }
 
+/// A value as a column of JSON.
+pub(super) fn to_json(column: &'static str, value: &impl Serialize) -> Result<String, StoreError> {
+    serde_json::to_string(value).map_err(|error| corrupt(column, error))
+}
+
 fn corrupt(column: &'static str, value: impl Display) -> StoreError {
     StoreError::Corrupt { column, value: value.to_string() }
 }
@@ -75,4 +104,49 @@ fn corrupt(column: &'static str, value: impl Display) -> StoreError {
 pub(super) fn integer(value: impl TryInto<i64>) -> i64 {
     // Every count here is bounded far below this by the limits on uploads.
     value.try_into().unwrap_or(i64::MAX)
+}
+
+/// What a new row refers to.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Reference {
+    Blob(Sha256),
+    Calibration(CalibrationId),
+    Measurement(MeasurementId),
+    Model(ModelId),
+}
+
+/// Refuses a row that refers to what is not there: it may have been deleted a moment ago. SQLite
+/// would refuse it too, but does not say which of its references is broken. With the writer's lock
+/// held, what is there stays there.
+pub(super) async fn require(
+    connection: &mut SqliteConnection,
+    references: &[Reference],
+) -> Result<(), StoreError> {
+    for reference in references {
+        let (what, query, id) = match reference {
+            Reference::Blob(id) => ("blob", "SELECT 1 FROM blobs WHERE sha256 = ?", id.to_string()),
+            Reference::Calibration(id) => {
+                ("calibration", "SELECT 1 FROM calibrations WHERE id = ?", id.to_string())
+            }
+            Reference::Measurement(id) => {
+                ("measurement", "SELECT 1 FROM measurements WHERE id = ?", id.to_string())
+            }
+            Reference::Model(id) => ("model", "SELECT 1 FROM models WHERE id = ?", id.to_string()),
+        };
+        let found = sqlx::query(query).bind(&id).fetch_optional(&mut *connection).await?;
+        found.ok_or(StoreError::NotFound { what, id })?;
+    }
+    Ok(())
+}
+
+/// Refuses to delete what others refer to: kind and identifier of the one, name of the others and
+/// the query that counts them as `users`.
+pub(super) async fn refuse_if_used(
+    connection: &mut SqliteConnection,
+    (what, id): (&'static str, String),
+    (by, query): (&'static str, &'static str),
+) -> Result<(), StoreError> {
+    let row = sqlx::query(query).bind(id).fetch_one(connection).await?;
+    let users = number(&row, "users")?;
+    if users > 0 { Err(StoreError::InUse { what, by, users }) } else { Ok(()) }
 }

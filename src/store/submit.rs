@@ -1,12 +1,19 @@
-//! Table `jobs`: accepting a job, once, if there is a place for it.
+//! What comes in: jobs, calibrations and measurements, each written whole or not at all.
 
 use sqlx::SqliteConnection;
 
 use super::Store;
 use super::error::StoreError;
 use super::queue::graph;
-use super::rows::{integer, number, parsed};
-use crate::job::{JobId, JobSpec, Lab, Label, Sha256, Timestamp};
+use super::rows::{Reference, number, parsed, require};
+use super::staging::StagedBlob;
+use super::tables::blobs::Origin;
+use super::tables::calibrations::{self, Calibration, NewCalibration};
+use super::tables::jobs;
+use super::tables::measurements::{self, Measurement, NewMeasurement};
+use crate::job::{
+    CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp,
+};
 
 /// A job to be accepted.
 #[derive(Debug, Clone)]
@@ -46,45 +53,21 @@ impl Store {
             return Ok(Inserted::Before(job));
         }
         check_queue(&mut transaction, new.most_jobs).await?;
+        let mut references = vec![Reference::Measurement(new.spec.measurement)];
+        references.extend(new.spec.model.as_ref().map(|model| Reference::Model(model.id)));
+        require(&mut transaction, &references).await?;
         let id = JobId::new();
-        let disk_bytes = integer(new.spec.disk_bytes());
-        let spec = serde_json::to_string(&new.spec)
-            .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
-        sqlx::query(
-            "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-                 idempotency_key, request, created_at, lab, disk_bytes, model)
-             VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?)",
-        )
-        .bind(id.to_string())
-        .bind(new.spec.calibration.to_string())
-        .bind(new.spec.measurement.to_string())
-        .bind(new.spec.label.as_ref().map(Label::as_str))
-        .bind(spec)
-        .bind(new.spec.priority)
-        .bind(new.idempotency_key.as_ref().map(|key| key_of(&new.lab, key)))
-        .bind(new.request.to_string())
-        .bind(Timestamp::now().0)
-        .bind(new.lab.as_str())
-        .bind(disk_bytes)
-        .bind(new.spec.model.as_ref().map(|model| model.id.to_string()))
-        .execute(&mut *transaction)
-        .await
-        .map_err(|error| {
-            let mut id = new.spec.measurement.to_string();
-            if let Some(model) = &new.spec.model {
-                id += &format!(" or model {}", model.id);
-            }
-            super::tables::calibrations::gone_if_foreign_key(error, "measurement", id)
-        })?;
+        let key = new.idempotency_key.as_ref().map(|key| key_of(&new.lab, key));
+        jobs::insert(&mut transaction, id, &new.lab, &new.spec, (new.request, key)).await?;
         graph::insert(&mut transaction, id, &new.spec).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
 
-    /// The job that the lab made with this key, if it made one; an error if it asked for another.
+    /// The job that the lab made with this key, if it made one.
     ///
     /// # Errors
-    /// [`StoreError::KeyReused`].
+    /// [`StoreError::KeyReused`] if it asked for another one with it.
     pub async fn job_with_key(
         &self,
         lab: &Lab,
@@ -94,15 +77,85 @@ impl Store {
         let mut connection = self.readers.acquire().await?;
         with_key(&mut connection, lab, key, request).await
     }
+
+    /// Records a calibration and puts its prepared masks in place. Its report is made by a worker.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] if the upload is gone.
+    pub async fn add_calibration(
+        &self,
+        lab: &Lab,
+        facts: NewCalibration,
+        prepared: StagedBlob,
+    ) -> Result<Calibration, StoreError> {
+        let calibration = Calibration {
+            id: CalibrationId::new(),
+            prepared: prepared.sha256(),
+            created_at: Timestamp::now(),
+            facts,
+        };
+        let (id, facts) = (calibration.id, &calibration.facts);
+        let mut transaction = self.write().await?;
+        require(&mut transaction, &[Reference::Blob(facts.masks)]).await?;
+        self.publish(&mut transaction, prepared, Origin::Prepared).await?;
+        calibrations::insert(&mut transaction, lab, &calibration).await?;
+        let name = facts.name.as_ref();
+        calibrations::insert_request(&mut transaction, lab, id, name, None).await?;
+        graph::insert_calibration(&mut transaction, id).await?;
+        transaction.commit().await?;
+        Ok(calibration)
+    }
+
+    /// Records a calibration whose masks, and their report, are to be made of captures.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] if an upload is gone.
+    pub async fn add_captures(
+        &self,
+        lab: &Lab,
+        name: Option<&Label>,
+        captures: &Captures,
+    ) -> Result<CalibrationId, StoreError> {
+        let id = CalibrationId::new();
+        let mut transaction = self.write().await?;
+        calibrations::insert_request(&mut transaction, lab, id, name, Some(captures)).await?;
+        graph::insert_calibration(&mut transaction, id).await?;
+        transaction.commit().await?;
+        Ok(id)
+    }
+
+    /// Records a measurement and puts its prepared snapshots in place.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] if the upload or the calibration is gone.
+    pub async fn add_measurement(
+        &self,
+        lab: &Lab,
+        facts: NewMeasurement,
+        prepared: StagedBlob,
+    ) -> Result<Measurement, StoreError> {
+        let measurement = Measurement {
+            id: MeasurementId::new(),
+            prepared: prepared.sha256(),
+            created_at: Timestamp::now(),
+            facts,
+        };
+        let facts = &measurement.facts;
+        let references = [Reference::Calibration(facts.calibration), Reference::Blob(facts.data)];
+        let mut transaction = self.write().await?;
+        require(&mut transaction, &references).await?;
+        self.publish(&mut transaction, prepared, Origin::Prepared).await?;
+        measurements::insert(&mut transaction, lab, &measurement).await?;
+        transaction.commit().await?;
+        Ok(measurement)
+    }
 }
 
 /// Refuses a job if enough wait and run.
 async fn check_queue(connection: &mut SqliteConnection, most: u64) -> Result<(), StoreError> {
-    let row = sqlx::query(
-        "SELECT count(*) AS jobs FROM jobs WHERE state IN ('queued', 'running', 'cancelling')",
-    )
-    .fetch_one(connection)
-    .await?;
+    let row = sqlx::query("SELECT count(*) AS jobs FROM jobs WHERE finished_at IS NULL")
+        .fetch_one(connection)
+        .await?;
     let jobs = number(&row, "jobs")?;
     if jobs < most { Ok(()) } else { Err(StoreError::QueueFull { jobs, most }) }
 }

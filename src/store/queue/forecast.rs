@@ -3,9 +3,9 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
-use sqlx::Row;
+use sqlx::{AssertSqlSafe, Row};
 
-use crate::job::{JobId, JobState};
+use crate::job::{JobId, JobState, TaskState};
 use crate::store::Store;
 use crate::store::error::StoreError;
 use crate::store::rows::parsed;
@@ -16,11 +16,11 @@ const WORKER_AGE: Duration = Duration::from_secs(15);
 /// What the last tiles took, and what they spent of the plan: they may converge early.
 const LAST_TILES: &str = "SELECT sum(seconds) AS seconds, sum(spent) AS spent FROM (
     SELECT seconds, cost * fraction AS spent FROM tasks
-    WHERE state = 'done' AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)";
+    WHERE state = ? AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)";
 /// The same of tasks that mostly read and write.
 const LAST_OTHERS: &str = "SELECT sum(seconds) AS seconds, sum(cost) AS spent FROM (
     SELECT seconds, cost FROM tasks
-    WHERE state = 'done' AND kind IN ('prepare', 'preview', 'assemble')
+    WHERE state = ? AND kind IN ('prepare', 'preview', 'assemble')
     ORDER BY job DESC, ordinal DESC LIMIT 32)";
 
 /// What is ahead of every unfinished job.
@@ -82,14 +82,17 @@ impl Forecast {
 impl Store {
     /// What is ahead of every unfinished job; none if there is no such job.
     pub(in crate::store) async fn forecast(&self) -> Result<Option<Forecast>, StoreError> {
-        let rows = sqlx::query(
+        // Only states that stand in the text let SQLite see that the index holds all that is asked for.
+        let left = [TaskState::Blocked, TaskState::Ready, TaskState::Running].map(TaskState::name);
+        let query = format!(
             "SELECT job, sum(cost * (1 - fraction)) AS cost,
                  (SELECT state FROM jobs WHERE id = job) AS state
-             FROM tasks WHERE state IN ('blocked', 'ready', 'running')
+             FROM tasks INDEXED BY tasks_left
+             WHERE state IN ('{}') AND job IS NOT NULL
              GROUP BY priority, job ORDER BY priority DESC, job",
-        )
-        .fetch_all(&self.readers)
-        .await?;
+            left.join("', '")
+        );
+        let rows = sqlx::query(AssertSqlSafe(query)).fetch_all(&self.readers).await?;
         if rows.is_empty() {
             return Ok(None);
         }
@@ -113,10 +116,12 @@ impl Store {
     async fn own_rates(&self) -> Result<HashMap<JobId, f64>, StoreError> {
         let rows = sqlx::query(
             "SELECT job, sum(seconds) / sum(cost) AS rate FROM tasks
-             WHERE job IN (SELECT id FROM jobs WHERE state = 'running')
-               AND kind = 'tile' AND state = 'done' AND seconds > 0
+             WHERE job IN (SELECT id FROM jobs WHERE state = ?)
+               AND kind = 'tile' AND state = ? AND seconds > 0
              GROUP BY job HAVING sum(cost) > 0",
         )
+        .bind(JobState::Running.name())
+        .bind(TaskState::Done.name())
         .fetch_all(&self.readers)
         .await?;
         rows.iter().map(|row| Ok((parsed(row, "job")?, row.try_get("rate")?))).collect()
@@ -125,7 +130,10 @@ impl Store {
     /// Seconds that a planned CPU-second takes on this machine: measured on tasks that are done, by what
     /// they really did and not by what was planned; 1 before there are any.
     async fn seconds_per_cost(&self, of_last_tasks: &'static str) -> Result<f64, StoreError> {
-        let row = sqlx::query(of_last_tasks).fetch_one(&self.readers).await?;
+        let row = sqlx::query(of_last_tasks)
+            .bind(TaskState::Done.name())
+            .fetch_one(&self.readers)
+            .await?;
         let seconds: Option<f64> = row.try_get("seconds")?;
         let spent: Option<f64> = row.try_get("spent")?;
         Ok(match (seconds, spent) {

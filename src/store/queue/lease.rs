@@ -1,29 +1,75 @@
-//! How tasks and workers are parted other than by success, and when a task is given up.
+//! How a task is held, and how it and its worker are parted other than by success.
 //!
 //! Two kinds of trouble are counted apart. A *failure* is the task's own doing (an error that the
 //! worker told, a fault that killed it) and a few are enough to give up. A *loss* may be anyone's (a
 //! SIGKILL, a power cut, a lease that ran out) and many are borne before the task is held to be the
 //! cause. Both are bounded, so a task that kills its workers comes to an end.
 
+use std::time::Duration;
+
 use sqlx::SqliteConnection;
 
-use super::claim::Lease;
-use super::complete::held;
-use super::graph;
-use crate::job::{JobId, JobState, TaskId, TaskKind, Timestamp};
+use super::job;
+use crate::job::{JobState, TaskId, TaskKind, TaskProgress, TaskState, Timestamp, WorkerId};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{number, parsed};
-use crate::store::tables::jobs;
+use crate::store::rows::{number, parsed, parsed_if};
+use crate::store::tables::tasks::{self, Owner};
+use crate::store::tables::workers;
 
-/// So many failures of a task, and its job has failed.
+/// So many failures of a task, and it is given up, and its job or calibration with it.
 pub const MAX_FAILURES: u32 = 3;
-/// So many losses of a task, and its job has failed.
+/// So many losses of a task, and it is given up in the same way.
 pub const MAX_LOSSES: u32 = 25;
+/// No lease lasts longer (in milliseconds): one that ends later was given before the clock was set back.
+pub(super) const LONGEST_LEASE: i64 = 600_000;
+
+/// The right to work on a task, until it runs out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Lease {
+    /// The task.
+    pub task: TaskId,
+    /// The number of this attempt, from 1.
+    pub attempt: u32,
+    /// Who holds it.
+    pub worker: WorkerId,
+    /// For how long each heartbeat renews it.
+    pub length: Duration,
+}
+
+impl Lease {
+    /// When it runs out if it is renewed now.
+    pub(super) fn until(length: Duration, now: i64) -> i64 {
+        now + i64::try_from(length.as_millis()).unwrap_or(i64::MAX / 2)
+    }
+}
+
+/// The answer to a heartbeat.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Heartbeat {
+    /// Go on; the lease is renewed.
+    Continue,
+    /// The job is not wanted any more: stop, and call [`Store::cancelled`].
+    Cancelled,
+    /// The task is someone else's, as the lease ran out, or it was deleted with its calibration: stop,
+    /// and drop everything.
+    Lost,
+}
+
+/// How a worker came to its end, as far as the one who watched it can tell.
+#[derive(Debug, Clone)]
+pub enum WorkerEnd {
+    /// It ended by itself and gave its task back, if it had one.
+    Left,
+    /// It was killed from outside (or by the kernel, for memory): the task may be innocent.
+    Killed,
+    /// It died of a fault, such as SIGSEGV or a panic: the task is under suspicion.
+    Crashed(String),
+}
 
 /// How a worker and its task were parted.
 #[derive(Debug)]
-pub(in crate::store) enum Loss {
+pub(super) enum Loss {
     /// Given back unharmed.
     Released,
     /// The worker was killed or fell silent.
@@ -34,12 +80,77 @@ pub(in crate::store) enum Loss {
     Failed(String, bool),
 }
 
+/// How an attempt ended.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Outcome {
+    Done,
+    Failed,
+    Crashed,
+    Lost,
+    Cancelled,
+    Released,
+}
+
+impl Outcome {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Done => "done",
+            Self::Failed => "failed",
+            Self::Crashed => "crashed",
+            Self::Lost => "lost",
+            Self::Cancelled => "cancelled",
+            Self::Released => "released",
+        }
+    }
+}
+
 impl Store {
+    /// Renews a lease, notes the progress, and asks whether to go on.
+    pub async fn heartbeat(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+    ) -> Result<Heartbeat, StoreError> {
+        self.heartbeat_with(lease, progress, None).await
+    }
+
+    /// As [`Store::heartbeat`], and notes how the solver went: JSON as
+    /// [`TileHistory::points`](crate::store::TileHistory) has it. Without one, what was noted stays.
+    pub async fn heartbeat_with(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+        history: Option<&str>,
+    ) -> Result<Heartbeat, StoreError> {
+        let mut transaction = self.write().await?;
+        workers::seen(&mut transaction, lease.worker).await?;
+        let row = sqlx::query(
+            "UPDATE tasks SET lease_until = ?, stage = ?, iterations = ?, passes = ?, fraction = ?,
+                 history = coalesce(?, history)
+             WHERE id = ? AND attempt = ? AND state = ?
+             RETURNING (SELECT state FROM jobs WHERE id = tasks.job) AS job_state",
+        )
+        .bind(Lease::until(lease.length, Timestamp::now().0))
+        .bind(progress.stage.name())
+        .bind(progress.iterations)
+        .bind(progress.passes)
+        .bind(progress.fraction.clamp(0.0, 1.0))
+        .bind(history)
+        .bind(lease.task.to_string())
+        .bind(lease.attempt)
+        .bind(TaskState::Running.name())
+        .fetch_optional(&mut *transaction)
+        .await?;
+        transaction.commit().await?;
+        let Some(row) = row else { return Ok(Heartbeat::Lost) };
+        Ok(match parsed_if(&row, "job_state")? {
+            None | Some(JobState::Queued | JobState::Running) => Heartbeat::Continue,
+            Some(_) => Heartbeat::Cancelled,
+        })
+    }
+
     /// Records that a task could not be done. With `retryable` it is tried again after a pause,
-    /// [`MAX_FAILURES`] times in all; otherwise its job has failed, for this reason.
-    ///
-    /// # Errors
-    /// If the database fails.
+    /// [`MAX_FAILURES`] times in all; otherwise its job or calibration has failed, for this reason.
     pub async fn fail(
         &self,
         lease: &Lease,
@@ -50,22 +161,16 @@ impl Store {
     }
 
     /// Records that the worker has stopped because the job was cancelled.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn cancelled(&self, lease: &Lease) -> Result<(), StoreError> {
         self.part(lease, &Loss::Released).await
     }
 
     /// Gives a task back unharmed, as at a shutdown; the attempt does not count against it.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn release_task(&self, lease: &Lease) -> Result<(), StoreError> {
         self.part(lease, &Loss::Released).await
     }
 
-    async fn part(&self, lease: &Lease, loss: &Loss) -> Result<(), StoreError> {
+    pub(super) async fn part(&self, lease: &Lease, loss: &Loss) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
         if held(&mut transaction, lease).await?.is_some() {
             lose(&mut transaction, lease.task, loss).await?;
@@ -76,12 +181,9 @@ impl Store {
 
     /// Has tiles done again whose stored results turned out to be damaged, and gives the assembly,
     /// which found it, back to wait for them. The damage counts as a failure of each tile.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn redo_tiles(&self, lease: &Lease, damaged: &[u32]) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
-        let Some((job, kind)) = held(&mut transaction, lease).await? else {
+        let Some((Owner::Job(job), kind)) = held(&mut transaction, lease).await? else {
             return Ok(());
         };
         let row = sqlx::query(
@@ -100,37 +202,76 @@ impl Store {
         lose(&mut transaction, lease.task, &Loss::Released).await?;
         for tile in damaged {
             sqlx::query(
-                "UPDATE tasks SET state = 'ready', result = NULL, failures = failures + 1
-                 WHERE job = ? AND kind = 'tile' AND snapshot = ? AND tile = ? AND state = 'done'",
+                "UPDATE tasks SET state = ?, result = NULL, failures = failures + 1
+                 WHERE job = ? AND kind = 'tile' AND snapshot = ? AND tile = ? AND state = ?",
             )
+            .bind(TaskState::Ready.name())
             .bind(job.to_string())
             .bind(kind.snapshot())
             .bind(tile)
+            .bind(TaskState::Done.name())
             .execute(&mut *transaction)
             .await?;
         }
-        sqlx::query("UPDATE tasks SET state = 'blocked' WHERE id = ? AND state = 'ready'")
+        sqlx::query("UPDATE tasks SET state = ? WHERE id = ? AND state = ?")
+            .bind(TaskState::Blocked.name())
             .bind(lease.task.to_string())
+            .bind(TaskState::Ready.name())
             .execute(&mut *transaction)
             .await?;
         transaction.commit().await?;
         Ok(())
     }
+
+    /// Records that a worker has ended, and frees its task at once instead of when its lease runs out.
+    pub async fn worker_ended(&self, id: WorkerId, end: &WorkerEnd) -> Result<(), StoreError> {
+        let loss = match end {
+            WorkerEnd::Left => Loss::Released,
+            WorkerEnd::Killed => Loss::Lost("the worker process was killed".into()),
+            WorkerEnd::Crashed(how) => Loss::Crashed(format!("the worker process died: {how}")),
+        };
+        let mut transaction = self.write().await?;
+        let tasks = sqlx::query("SELECT id FROM tasks WHERE worker = ? AND state = ?")
+            .bind(id.to_string())
+            .bind(TaskState::Running.name())
+            .fetch_all(&mut *transaction)
+            .await?;
+        for row in &tasks {
+            lose(&mut transaction, parsed(row, "id")?, &loss).await?;
+        }
+        workers::remove(&mut transaction, id).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
 }
 
-/// Takes back the tasks of workers that have fallen silent. No lease lasts for ten minutes: one that
-/// ends later was given before the clock was set back.
-pub(in crate::store) async fn reap(
+/// What the task belongs to and its kind, if the lease is still good. A lease that ran out but was not
+/// claimed by anyone else is good: the work is done, so it may as well count.
+pub(super) async fn held(
     connection: &mut SqliteConnection,
-    now: i64,
-) -> Result<(), StoreError> {
-    let rows = sqlx::query(
-        "SELECT id FROM tasks WHERE state = 'running'
-                            AND lease_until NOT BETWEEN ?1 AND ?1 + 600000",
+    lease: &Lease,
+) -> Result<Option<(Owner, TaskKind)>, StoreError> {
+    let row = sqlx::query(
+        "SELECT job, calibration, kind, snapshot, tile FROM tasks
+         WHERE id = ? AND attempt = ? AND state = ?",
     )
-    .bind(now)
-    .fetch_all(&mut *connection)
+    .bind(lease.task.to_string())
+    .bind(lease.attempt)
+    .bind(TaskState::Running.name())
+    .fetch_optional(connection)
     .await?;
+    row.map(|row| Ok((tasks::owner(&row)?, tasks::kind(&row)?))).transpose()
+}
+
+/// Takes back the tasks of workers that have fallen silent.
+pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<(), StoreError> {
+    let rows =
+        sqlx::query("SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?")
+            .bind(TaskState::Running.name())
+            .bind(now)
+            .bind(now + LONGEST_LEASE)
+            .fetch_all(&mut *connection)
+            .await?;
     for row in &rows {
         let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
         lose(connection, parsed(row, "id")?, &silent).await?;
@@ -138,10 +279,11 @@ pub(in crate::store) async fn reap(
     Ok(())
 }
 
-pub(in crate::store) async fn end_attempt(
+/// Closes the record of a task's last attempt.
+pub(super) async fn end_attempt(
     connection: &mut SqliteConnection,
     task: TaskId,
-    outcome: &'static str,
+    outcome: Outcome,
     reason: Option<&str>,
 ) -> Result<(), StoreError> {
     sqlx::query(
@@ -149,7 +291,7 @@ pub(in crate::store) async fn end_attempt(
          WHERE task = ? AND attempt = (SELECT attempt FROM tasks WHERE id = task)",
     )
     .bind(Timestamp::now().0)
-    .bind(outcome)
+    .bind(outcome.name())
     .bind(reason)
     .bind(task.to_string())
     .execute(connection)
@@ -158,28 +300,32 @@ pub(in crate::store) async fn end_attempt(
 }
 
 /// Parts a running task from its worker: it becomes ready again, or is cancelled with its job, or
-/// is given up and its job with it.
-pub(in crate::store) async fn lose(
+/// is given up and its job or calibration with it.
+async fn lose(
     connection: &mut SqliteConnection,
     task: TaskId,
     loss: &Loss,
 ) -> Result<(), StoreError> {
-    let row =
-        sqlx::query("SELECT job, kind, snapshot, tile, failures, losses FROM tasks WHERE id = ?")
-            .bind(task.to_string())
-            .fetch_one(&mut *connection)
-            .await?;
-    let job: JobId = parsed(&row, "job")?;
+    let row = sqlx::query(
+        "SELECT job, calibration, kind, snapshot, tile, failures, losses FROM tasks WHERE id = ?",
+    )
+    .bind(task.to_string())
+    .fetch_one(&mut *connection)
+    .await?;
+    let owner = tasks::owner(&row)?;
     let (mut failures, mut losses): (u32, u32) =
         (number(&row, "failures")?, number(&row, "losses")?);
-    let wanted =
-        matches!(jobs::state(connection, job).await?, JobState::Queued | JobState::Running);
+    let wanted = match owner {
+        Owner::Job(job) => job::is_wanted(connection, job).await?,
+        // Its task would have been deleted with it.
+        Owner::Calibration(_) => true,
+    };
     let (outcome, reason, mut hopeless) = match loss {
-        Loss::Released if wanted => ("released", None, false),
-        Loss::Released => ("cancelled", None, false),
-        Loss::Lost(reason) => ("lost", Some(reason.as_str()), false),
-        Loss::Crashed(reason) => ("crashed", Some(reason.as_str()), false),
-        Loss::Failed(reason, retryable) => ("failed", Some(reason.as_str()), !retryable),
+        Loss::Released if wanted => (Outcome::Released, None, false),
+        Loss::Released => (Outcome::Cancelled, None, false),
+        Loss::Lost(reason) => (Outcome::Lost, Some(reason.as_str()), false),
+        Loss::Crashed(reason) => (Outcome::Crashed, Some(reason.as_str()), false),
+        Loss::Failed(reason, retryable) => (Outcome::Failed, Some(reason.as_str()), !retryable),
     };
     match loss {
         Loss::Released => {}
@@ -189,9 +335,9 @@ pub(in crate::store) async fn lose(
     hopeless |= failures >= MAX_FAILURES || losses >= MAX_LOSSES;
     end_attempt(connection, task, outcome, reason).await?;
     let state = match (wanted, hopeless) {
-        (false, _) => "cancelled",
-        (true, true) => "failed",
-        (true, false) => "ready",
+        (false, _) => TaskState::Cancelled,
+        (true, true) => TaskState::Failed,
+        (true, false) => TaskState::Ready,
     };
     // After its own failure the task waits: 2, then 4 seconds.
     let ready_at = match loss {
@@ -203,20 +349,21 @@ pub(in crate::store) async fn lose(
              iterations = 0, passes = 0, failures = ?, losses = ?, ready_at = ?
          WHERE id = ?",
     )
-    .bind(state)
+    .bind(state.name())
     .bind(failures)
     .bind(losses)
     .bind(ready_at)
     .bind(task.to_string())
     .execute(&mut *connection)
     .await?;
-    if wanted && hopeless {
-        let kind = graph::kind(&row)?;
+    // A calibration has failed when its only task has; the reason is that of the task's last attempt.
+    let Owner::Job(job) = owner else { return Ok(()) };
+    if state == TaskState::Failed {
+        let kind = tasks::kind(&row)?;
         let error = failure_text(kind, failures, losses, reason.unwrap_or("no reason is known"));
-        jobs::set_state(connection, job, JobState::Failed, Some(&error)).await?;
-        jobs::cancel_waiting_tasks(connection, job).await?;
+        job::fail(connection, job, &error).await?;
     }
-    jobs::settle(connection, job).await
+    job::settle(connection, job).await
 }
 
 fn failure_text(kind: TaskKind, failures: u32, losses: u32, reason: &str) -> String {
@@ -227,6 +374,7 @@ fn failure_text(kind: TaskKind, failures: u32, losses: u32, reason: &str) -> Str
         TaskKind::Preview { snapshot } => format!("the preview of snapshot {snapshot}"),
         TaskKind::Pilot => "the pilot".into(),
         TaskKind::Manifest => "writing the manifest".into(),
+        TaskKind::Calibration => "the calibration".into(),
     };
     let attempts = failures + losses;
     let times = if attempts > 1 { format!(" ({attempts} attempts)") } else { String::new() };

@@ -1,17 +1,19 @@
-//! The queue: how tasks get to workers and come back, and what that means for their jobs.
+//! The queue: how tasks get to workers and come back, and what becomes of their jobs.
+//!
+//! A worker *claims* a task and holds it under a *lease* that its heartbeats renew. A lease that
+//! runs out makes the task ready again, so a dead worker costs one attempt. Each claim has a number,
+//! and what an earlier attempt says later is refused: that is the fence. Everything that changes a
+//! task also settles its job, in the same transaction.
 
-pub(super) mod calibrating;
-pub(super) mod claim;
-pub(super) mod complete;
+mod claim;
+mod complete;
 mod forecast;
 pub(super) mod graph;
-pub(super) mod lease;
-mod marks;
+mod job;
+mod lease;
 mod progress;
 
-pub use calibrating::{CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration};
-pub use claim::{ClaimedTask, Completion, Heartbeat, Lease, Product};
-pub use graph::{TaskRecord, TileResult};
-pub use lease::{MAX_FAILURES, MAX_LOSSES};
-pub use marks::JobMark;
-pub use progress::{JobProgress, ProgressStage, TaskCounts, TaskTotals};
+pub use claim::{CalibrationInputs, CalibrationTask, ClaimedTask, JobTask, Step, Work};
+pub use complete::{CalibrationDone, Completion, Product};
+pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, WorkerEnd};
+pub use progress::{JobMark, JobProgress, ProgressStage};

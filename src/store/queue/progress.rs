@@ -1,9 +1,10 @@
-//! How far jobs are and how long they may still take, from what their tasks have reported.
+//! How far jobs are, what of them has changed, and how long they may still take, from what their tasks
+//! have reported.
 //!
 //! All shares are by planned cost. For the time left, `m` workers need at most `work / m + (1 - 1/m) *
 //! longest task` (Graham); tiles are taken to cost what those of the same job that are done did.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
 use serde::Serialize;
 use serde_json::Value;
@@ -11,10 +12,11 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::forecast::{Forecast, Left};
-use crate::job::{JobId, JobState};
+use crate::job::{JobId, JobState, Lab, TaskStage, TaskState};
+use crate::store::Store;
 use crate::store::error::StoreError;
 use crate::store::rows::{number, parsed};
-use crate::store::{Job, Store};
+use crate::store::tables::jobs::Job;
 
 /// What a job is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -64,23 +66,14 @@ pub struct JobProgress {
     pub passes_done: u64,
 }
 
-/// What has been done in all by tasks of a kind, those of deleted jobs with them.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TaskTotals {
-    /// The kind of task.
-    pub kind: String,
-    /// Tasks done.
-    pub tasks: u64,
-    /// Seconds of their successful attempts.
-    pub seconds: f64,
-    /// Solver iterations.
-    pub iterations: u64,
-    /// Passes of the deep denoiser.
-    pub passes: u64,
+/// The mark of a job: it differs when the job's state or what its workers have told differs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JobMark {
+    state: JobState,
+    tasks: i64,
+    iterations: i64,
+    fraction: f64,
 }
-
-/// Numbers of tasks by kind and state.
-pub type TaskCounts = BTreeMap<(String, String), u64>;
 
 impl Store {
     /// How far a job is.
@@ -100,26 +93,29 @@ impl Store {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
         let rows = sqlx::query(
             "SELECT job, sum(cost) AS cost,
-                 sum(CASE state WHEN 'done' THEN cost WHEN 'running' THEN cost * fraction
-                                ELSE 0.0 END) AS cost_done,
+                 sum(CASE state WHEN ?2 THEN cost WHEN ?3 THEN cost * fraction ELSE 0.0 END) AS cost_done,
                  sum(left) FILTER (WHERE kind = 'tile') AS tiles_left,
                  max(left) FILTER (WHERE kind = 'tile') AS tiles_longest,
                  sum(left) FILTER (WHERE kind <> 'tile') AS others_left,
                  max(left) FILTER (WHERE kind <> 'tile') AS others_longest,
                  count(*) FILTER (WHERE kind = 'tile') AS tiles_total,
-                 count(*) FILTER (WHERE kind = 'tile' AND state = 'done') AS tiles_done,
-                 count(*) FILTER (WHERE kind = 'tile' AND state = 'running') AS tiles_running,
-                 count(*) FILTER (WHERE kind = 'assemble' AND state = 'done') AS snapshots_done,
+                 count(*) FILTER (WHERE kind = 'tile' AND state = ?2) AS tiles_done,
+                 count(*) FILTER (WHERE kind = 'tile' AND state = ?3) AS tiles_running,
+                 count(*) FILTER (WHERE kind = 'assemble' AND state = ?2) AS snapshots_done,
                  count(*) FILTER (WHERE kind = 'preview' AND result IS NOT NULL) AS previews_done,
-                 count(*) FILTER (WHERE kind = 'prepare' AND state = 'done') AS prepared,
-                 count(*) FILTER (WHERE state = 'running' AND stage = 'deep') AS deep,
-                 count(*) FILTER (WHERE state = 'running' AND stage = 'nonlocal') AS nonlocal,
+                 count(*) FILTER (WHERE kind = 'prepare' AND state = ?2) AS prepared,
+                 count(*) FILTER (WHERE state = ?3 AND stage = ?4) AS deep,
+                 count(*) FILTER (WHERE state = ?3 AND stage = ?5) AS nonlocal,
                  sum(iterations) AS iterations, sum(passes) AS passes
-             FROM (SELECT *, CASE state WHEN 'done' THEN 0.0 ELSE cost * (1 - fraction) END AS left
-                   FROM tasks WHERE job IN (SELECT value FROM json_each(?)))
+             FROM (SELECT *, CASE state WHEN ?2 THEN 0.0 ELSE cost * (1 - fraction) END AS left
+                   FROM tasks WHERE job IN (SELECT value FROM json_each(?1)))
              GROUP BY job",
         )
         .bind(Value::from(ids).to_string())
+        .bind(TaskState::Done.name())
+        .bind(TaskState::Running.name())
+        .bind(TaskStage::Deep.name())
+        .bind(TaskStage::Nonlocal.name())
         .fetch_all(&self.readers)
         .await?;
         let by_job: Result<HashMap<JobId, &SqliteRow>, StoreError> =
@@ -135,43 +131,35 @@ impl Store {
             .collect()
     }
 
-    /// What has been done in all, by kind of task.
-    ///
-    /// # Errors
-    /// If the database fails.
-    pub async fn totals(&self) -> Result<Vec<TaskTotals>, StoreError> {
-        let rows =
-            sqlx::query("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await?;
-        let read = |row: &SqliteRow| {
-            Ok(TaskTotals {
-                kind: row.try_get("kind")?,
-                tasks: number(row, "tasks")?,
-                seconds: row.try_get("seconds")?,
-                iterations: number(row, "iterations")?,
-                passes: number(row, "passes")?,
-            })
-        };
-        rows.iter().map(read).collect()
-    }
-
-    /// The number of tasks by kind and state, with zeros for what there is none of.
-    ///
-    /// # Errors
-    /// If the database fails.
-    pub async fn task_counts(&self) -> Result<TaskCounts, StoreError> {
-        let rows = sqlx::query("SELECT kind, state, count(*) AS n FROM tasks GROUP BY kind, state")
-            .fetch_all(&self.readers)
-            .await?;
-        let mut counts = TaskCounts::new();
-        for kind in ["prepare", "preview", "pilot", "tile", "assemble", "manifest"] {
-            for state in ["blocked", "ready", "running", "done", "failed", "cancelled"] {
-                counts.insert((kind.to_owned(), state.to_owned()), 0);
+    /// The marks of all jobs, and whose they are. Reads indexes and the tasks that run.
+    pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>, StoreError> {
+        let rows = sqlx::query("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
+        let mut marks = HashMap::with_capacity(rows.len());
+        for row in &rows {
+            let state = parsed(row, "state")?;
+            marks.insert(
+                (parsed(row, "lab")?, parsed(row, "id")?),
+                JobMark { state, tasks: 0, iterations: 0, fraction: 0.0 },
+            );
+        }
+        let rows = sqlx::query(
+            "SELECT job, (SELECT lab FROM jobs WHERE id = job) AS lab, count(*) AS tasks,
+                 sum(ordinal) AS ordinals, sum(iterations) AS iterations, sum(fraction) AS fraction
+             FROM tasks WHERE state = ? AND job IS NOT NULL GROUP BY job",
+        )
+        .bind(TaskState::Running.name())
+        .fetch_all(&self.readers)
+        .await?;
+        for row in &rows {
+            if let Some(mark) = marks.get_mut(&(parsed(row, "lab")?, parsed(row, "job")?)) {
+                // Which tasks run, and not only how many: one may have ended and another begun.
+                mark.tasks =
+                    row.try_get::<i64, _>("tasks")? << 32 ^ row.try_get::<i64, _>("ordinals")?;
+                mark.iterations = row.try_get("iterations")?;
+                mark.fraction = row.try_get("fraction")?;
             }
         }
-        for row in &rows {
-            counts.insert((row.try_get("kind")?, row.try_get("state")?), number(row, "n")?);
-        }
-        Ok(counts)
+        Ok(marks)
     }
 }
 

@@ -1,15 +1,19 @@
-//! Table `calibrations`.
+//! Tables `calibrations`, and `calibration_requests`: masks that are there, and what was asked for.
+//!
+//! Every calibration has a row of what was asked for, captures or only a report, and a task that does
+//! it. It has one in `calibrations` from when its masks are there.
 
 use serde::Serialize;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::blobs::Origin;
-use crate::job::{CalibrationId, Lab, Label, Sha256, Timestamp};
+use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timestamp};
+use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::queue::calibrating;
-use crate::store::rows::{integer, number, parsed, parsed_if, single};
-use crate::store::{Page, StagedBlob, Store};
+use crate::store::rows::{
+    Page, Reference, integer, json, number, parsed, parsed_if, refuse_if_used, require, single,
+    to_json,
+};
 
 /// What is known of a calibration when its masks have been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,33 +57,24 @@ pub struct Calibration {
     pub facts: NewCalibration,
 }
 
-impl Store {
-    /// Records a calibration and puts its prepared masks in place.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the upload is gone; or if the file or the row can't be written.
-    pub async fn add_calibration(
-        &self,
-        lab: &Lab,
-        facts: NewCalibration,
-        prepared: StagedBlob,
-    ) -> Result<Calibration, StoreError> {
-        let calibration = Calibration {
-            id: CalibrationId::new(),
-            prepared: prepared.sha256(),
-            created_at: Timestamp::now(),
-            facts,
-        };
-        let mut transaction = self.write().await?;
-        self.publish(&mut transaction, prepared, Origin::Prepared).await?;
-        insert(&mut transaction, lab, &calibration).await?;
-        // Its report is made by a worker.
-        let name = calibration.facts.name.as_ref();
-        calibrating::insert(&mut transaction, lab, calibration.id, name, None).await?;
-        transaction.commit().await?;
-        Ok(calibration)
-    }
+/// A calibration whose masks are not there.
+#[derive(Debug, Clone)]
+pub struct Unready {
+    /// Its identifier.
+    pub id: CalibrationId,
+    /// The user's name for it.
+    pub name: Option<Label>,
+    /// Its patterns.
+    pub frames: usize,
+    /// How much of the work is done, on \[0,1\].
+    pub fraction: f64,
+    /// Why there will be no masks; none while they are made.
+    pub error: Option<String>,
+    /// When it was asked for.
+    pub created_at: Timestamp,
+}
 
+impl Store {
     /// The lab's calibration with this identifier.
     ///
     /// # Errors
@@ -90,9 +85,9 @@ impl Store {
         id: CalibrationId,
     ) -> Result<Calibration, StoreError> {
         match self.find_calibration(Some(lab), id).await {
-            Err(missing @ StoreError::NotFound { .. }) => match self.unready(lab, id).await {
-                Ok(Some(unready)) => Err(unready.into()),
-                _ => Err(missing),
+            Err(missing @ StoreError::NotFound { .. }) => match self.unready(lab, id).await? {
+                Some(Unready { id, error, .. }) => Err(StoreError::Unready { id, error }),
+                None => Err(missing),
             },
             found => found,
         }
@@ -111,6 +106,50 @@ impl Store {
                 .fetch_optional(&self.readers)
                 .await?;
         row.as_ref().map(calibration).transpose()?.ok_or_else(|| not_found(id))
+    }
+
+    /// The lab's calibration with this identifier if its masks are not there; none otherwise.
+    pub async fn unready(
+        &self,
+        lab: &Lab,
+        id: CalibrationId,
+    ) -> Result<Option<Unready>, StoreError> {
+        Ok(self.find_unready(lab, Some(id), None, 1).await?.items.pop())
+    }
+
+    /// A page of the lab's calibrations whose masks are not there, newest first, older than `after`.
+    pub async fn all_unready(
+        &self,
+        lab: &Lab,
+        after: Option<CalibrationId>,
+        limit: u32,
+    ) -> Result<Page<Unready>, StoreError> {
+        self.find_unready(lab, None, after, limit).await
+    }
+
+    async fn find_unready(
+        &self,
+        lab: &Lab,
+        only: Option<CalibrationId>,
+        after: Option<CalibrationId>,
+        limit: u32,
+    ) -> Result<Page<Unready>, StoreError> {
+        let rows = sqlx::query(
+            "SELECT calibration, name, captures, created_at, state, fraction,
+                 (SELECT reason FROM attempts WHERE task = tasks.id AND attempt = tasks.attempt) AS reason
+             FROM calibration_requests JOIN tasks USING (calibration)
+             WHERE lab = ?1 AND captures IS NOT NULL AND state <> ?2
+               AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR calibration < ?4)
+             ORDER BY calibration DESC LIMIT ?5",
+        )
+        .bind(lab.as_str())
+        .bind(TaskState::Done.name())
+        .bind(only.map(|id| id.to_string()))
+        .bind(after.map(|id| id.to_string()))
+        .bind(i64::from(limit) + 1)
+        .fetch_all(&self.readers)
+        .await?;
+        Page::cut(&rows, limit, unready)
     }
 
     /// A page of the lab's calibrations, newest first, older than `after`.
@@ -140,8 +179,17 @@ impl Store {
     /// # Errors
     /// [`StoreError::NotFound`], [`StoreError::InUse`].
     pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
-        let unready = self.unready(lab, id).await?.is_some();
         let mut transaction = self.write().await?;
+        // Its task goes with it: a worker that has it in hand finds that nobody wants it any more.
+        let asked =
+            sqlx::query("DELETE FROM calibration_requests WHERE calibration = ? AND lab = ?")
+                .bind(id.to_string())
+                .bind(lab.as_str())
+                .execute(&mut *transaction)
+                .await?;
+        if asked.rows_affected() == 0 {
+            return Err(not_found(id));
+        }
         for users in [
             ("measurements", "SELECT count(*) AS users FROM measurements WHERE calibration = ?"),
             ("models", "SELECT count(*) AS users FROM models WHERE calibration = ?"),
@@ -152,19 +200,66 @@ impl Store {
             .bind(id.to_string())
             .fetch_optional(&mut *transaction)
             .await?;
-        sqlx::query("DELETE FROM calibration_tasks WHERE calibration = ?")
-            .bind(id.to_string())
-            .execute(&mut *transaction)
-            .await?;
-        match row {
-            Some(row) => self.release(&mut transaction, parsed(&row, "prepared")?).await?,
-            // A worker that has its captures in hand finds that nobody wants them any more.
-            None if unready => {}
-            None => return Err(not_found(id)),
+        if let Some(row) = row {
+            self.release(&mut transaction, parsed(&row, "prepared")?).await?;
         }
         transaction.commit().await?;
         Ok(())
     }
+}
+
+/// Writes the row of a calibration whose masks were made of its captures, which it needs no more.
+pub(in crate::store) async fn insert_made(
+    connection: &mut SqliteConnection,
+    id: CalibrationId,
+    prepared: Sha256,
+    facts: NewCalibration,
+) -> Result<(), StoreError> {
+    let row = sqlx::query("SELECT lab, created_at FROM calibration_requests WHERE calibration = ?")
+        .bind(id.to_string())
+        .fetch_one(&mut *connection)
+        .await?;
+    let created_at = Timestamp(row.try_get("created_at")?);
+    let calibration = Calibration { id, prepared, created_at, facts };
+    insert(connection, &parsed(&row, "lab")?, &calibration).await?;
+    sqlx::query("DELETE FROM calibration_captures WHERE calibration = ?")
+        .bind(id.to_string())
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+/// Writes down what is asked for: masks of captures (as JSON), or without them a report.
+pub(in crate::store) async fn insert_request(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+    id: CalibrationId,
+    name: Option<&Label>,
+    captures: Option<&Captures>,
+) -> Result<(), StoreError> {
+    sqlx::query(
+        "INSERT INTO calibration_requests (calibration, lab, name, captures, created_at)
+         VALUES (?, ?, ?, ?, ?)",
+    )
+    .bind(id.to_string())
+    .bind(lab.as_str())
+    .bind(name.map(Label::as_str))
+    .bind(captures.map(|captures| to_json("captures", captures)).transpose()?)
+    .bind(Timestamp::now().0)
+    .execute(&mut *connection)
+    .await?;
+    for (_, upload) in captures.iter().flat_map(|captures| captures.uploads()) {
+        require(connection, &[Reference::Blob(upload)]).await?;
+        sqlx::query(
+            "INSERT INTO calibration_captures (calibration, sha256) VALUES (?, ?)
+             ON CONFLICT DO NOTHING",
+        )
+        .bind(id.to_string())
+        .bind(upload.to_string())
+        .execute(&mut *connection)
+        .await?;
+    }
+    Ok(())
 }
 
 /// Writes the row of a calibration whose masks are there.
@@ -195,48 +290,8 @@ pub(in crate::store) async fn insert(
     .bind(integer(facts.clipped_negatives))
     .bind(calibration.created_at.0)
     .execute(connection)
-    .await
-    .map_err(|error| gone_if_foreign_key(error, "blob", facts.masks.to_string()))?;
+    .await?;
     Ok(())
-}
-
-impl<T> Page<T> {
-    /// A page of at most `limit` items from up to `limit + 1` rows.
-    pub(in crate::store) fn cut(
-        rows: &[SqliteRow],
-        limit: u32,
-        read: impl Fn(&SqliteRow) -> Result<T, StoreError>,
-    ) -> Result<Self, StoreError> {
-        let limit = usize::try_from(limit).unwrap_or(usize::MAX);
-        let items = rows.iter().take(limit).map(read).collect::<Result<_, _>>()?;
-        Ok(Self { items, more: rows.len() > limit })
-    }
-}
-
-/// Refuses to delete what others refer to: kind and identifier of the one, name of the others and
-/// the query that counts them as `users`.
-pub(in crate::store) async fn refuse_if_used(
-    connection: &mut SqliteConnection,
-    (what, id): (&'static str, String),
-    (by, query): (&'static str, &'static str),
-) -> Result<(), StoreError> {
-    let row = sqlx::query(query).bind(id).fetch_one(connection).await?;
-    let users = number(&row, "users")?;
-    if users > 0 { Err(StoreError::InUse { what, by, users }) } else { Ok(()) }
-}
-
-/// What a foreign key refers to was deleted a moment ago: for the user, it is not there.
-pub(in crate::store) fn gone_if_foreign_key(
-    error: sqlx::Error,
-    what: &'static str,
-    id: String,
-) -> StoreError {
-    match &error {
-        sqlx::Error::Database(inner) if inner.is_foreign_key_violation() => {
-            StoreError::NotFound { what, id }
-        }
-        _ => error.into(),
-    }
 }
 
 fn calibration(row: &SqliteRow) -> Result<Calibration, StoreError> {
@@ -245,7 +300,7 @@ fn calibration(row: &SqliteRow) -> Result<Calibration, StoreError> {
         prepared: parsed(row, "prepared")?,
         created_at: Timestamp(row.try_get("created_at")?),
         facts: NewCalibration {
-            name: label(row, "name")?,
+            name: parsed_if(row, "name")?,
             masks: parsed(row, "masks")?,
             format: row.try_get("format")?,
             sample: row.try_get("sample")?,
@@ -260,12 +315,18 @@ fn calibration(row: &SqliteRow) -> Result<Calibration, StoreError> {
     })
 }
 
-/// The column as a label, if there is one.
-pub(in crate::store) fn label(
-    row: &SqliteRow,
-    column: &'static str,
-) -> Result<Option<Label>, StoreError> {
-    parsed_if(row, column)
+fn unready(row: &SqliteRow) -> Result<Unready, StoreError> {
+    let captures: Captures = json(row, "captures")?;
+    let failed = parsed::<TaskState>(row, "state")? == TaskState::Failed;
+    Ok(Unready {
+        id: parsed(row, "calibration")?,
+        name: parsed_if(row, "name")?,
+        frames: captures.masks.len(),
+        fraction: row.try_get("fraction")?,
+        // The reason of the last attempt; one that is tried again is none for a user.
+        error: if failed { row.try_get("reason")? } else { None },
+        created_at: Timestamp(row.try_get("created_at")?),
+    })
 }
 
 fn not_found(id: CalibrationId) -> StoreError {

@@ -1,15 +1,14 @@
-//! Table `jobs`: accepting, listing, cancelling, retrying and deleting.
+//! Table `jobs`. What becomes of a job is the queue's business.
 
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use crate::job::{
-    CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, TaskKind, Timestamp,
+    CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, Timestamp,
 };
+use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::queue::graph;
-use crate::store::rows::{json, number, parsed};
-use crate::store::{Page, Store, dir, on_files};
+use crate::store::rows::{Page, integer, json, number, parsed, to_json};
 
 /// A job on record.
 #[derive(Debug, Clone, PartialEq)]
@@ -95,83 +94,6 @@ impl Store {
         Page::cut(&rows, limit, job)
     }
 
-    /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
-    /// Cancelling twice is no error.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has succeeded or failed.
-    pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
-        self.job(lab, id).await?;
-        let mut transaction = self.write().await?;
-        let before = state(&mut transaction, id).await?;
-        if matches!(before, JobState::Cancelling | JobState::Cancelled) {
-            return Ok(());
-        }
-        let running = running_tasks(&mut transaction, id).await? > 0;
-        let to = if running { JobState::Cancelling } else { JobState::Cancelled };
-        set_state(&mut transaction, id, to, None).await?;
-        cancel_waiting_tasks(&mut transaction, id).await?;
-        transaction.commit().await?;
-        Ok(())
-    }
-
-    /// Takes up a failed or cancelled job again. What is done stays done.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has not failed or been cancelled.
-    pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
-        self.job(lab, id).await?;
-        let mut transaction = self.write().await?;
-        set_state(&mut transaction, id, JobState::Queued, None).await?;
-        sqlx::query(
-            "UPDATE tasks SET failures = 0, losses = 0, ready_at = 0,
-                 state = CASE kind WHEN 'prepare' THEN 'ready' ELSE 'blocked' END
-             WHERE job = ? AND state IN ('failed', 'cancelled')",
-        )
-        .bind(id.to_string())
-        .execute(&mut *transaction)
-        .await?;
-        if prepared(&mut transaction, id).await? {
-            graph::unblock(&mut transaction, id, TaskKind::Prepare).await?;
-        }
-        for snapshot in snapshots(&mut transaction, id).await? {
-            let tile = TaskKind::Tile { snapshot, tile: 0 };
-            graph::unblock(&mut transaction, id, tile).await?;
-        }
-        graph::unblock(&mut transaction, id, TaskKind::Assemble { snapshot: 0 }).await?;
-        transaction.commit().await?;
-        Ok(())
-    }
-
-    /// Deletes a job that has come to its end, with all that it has made.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::NotFinal`] if it still runs or waits.
-    pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
-        self.job(lab, id).await?;
-        self.remove_job(id).await
-    }
-
-    /// As [`Self::delete_job`], whosever it is.
-    pub(in crate::store) async fn remove_job(&self, id: JobId) -> Result<(), StoreError> {
-        let mut transaction = self.write().await?;
-        let state = state(&mut transaction, id).await?;
-        if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
-            return Err(StoreError::NotFinal(state));
-        }
-        self.drop_tiles(&mut transaction, id).await?;
-        sqlx::query("DELETE FROM jobs WHERE id = ?")
-            .bind(id.to_string())
-            .execute(&mut *transaction)
-            .await?;
-        let folder = self.dir().results(id);
-        // Under the lock and before the commit, so that no row is left whose files are gone for
-        // longer than a crash takes; a second DELETE then removes the row.
-        on_files(move || dir::remove(&folder)).await?;
-        transaction.commit().await?;
-        Ok(())
-    }
-
     /// The number of jobs in each state.
     ///
     /// # Errors
@@ -182,6 +104,37 @@ impl Store {
             .await?;
         rows.iter().map(|row| Ok((parsed(row, "state")?, number(row, "jobs")?))).collect()
     }
+}
+
+/// Writes the row of a job with the hash of its request, and the user's key if there is one.
+pub(in crate::store) async fn insert(
+    connection: &mut SqliteConnection,
+    id: JobId,
+    lab: &Lab,
+    spec: &JobSpec,
+    (request, key): (Sha256, Option<String>),
+) -> Result<(), StoreError> {
+    sqlx::query(
+        "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
+             idempotency_key, request, created_at, lab, disk_bytes, model)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+    )
+    .bind(id.to_string())
+    .bind(spec.calibration.to_string())
+    .bind(spec.measurement.to_string())
+    .bind(spec.label.as_ref().map(Label::as_str))
+    .bind(to_json("spec", spec)?)
+    .bind(JobState::Queued.name())
+    .bind(spec.priority)
+    .bind(key)
+    .bind(request.to_string())
+    .bind(Timestamp::now().0)
+    .bind(lab.as_str())
+    .bind(integer(spec.disk_bytes()))
+    .bind(spec.model.as_ref().map(|model| model.id.to_string()))
+    .execute(connection)
+    .await?;
+    Ok(())
 }
 
 /// The job's state.
@@ -208,75 +161,18 @@ pub(in crate::store) async fn set_state(
     let now = Timestamp::now().0;
     sqlx::query(
         "UPDATE jobs SET state = ?1, error = ?2,
-             started_at = CASE ?1 WHEN 'running' THEN coalesce(started_at, ?3) ELSE started_at END,
-             finished_at = CASE WHEN ?1 IN ('succeeded', 'failed', 'cancelled') THEN ?3 END
-         WHERE id = ?4",
+             started_at = coalesce(started_at, ?3),
+             finished_at = ?4
+         WHERE id = ?5",
     )
     .bind(to.name())
     .bind(error)
-    .bind(now)
+    .bind((to == JobState::Running).then_some(now))
+    .bind(to.is_final().then_some(now))
     .bind(id.to_string())
     .execute(connection)
     .await?;
     Ok(())
-}
-
-/// Cancels the tasks of a job that no worker has.
-pub(in crate::store) async fn cancel_waiting_tasks(
-    connection: &mut SqliteConnection,
-    id: JobId,
-) -> Result<(), StoreError> {
-    sqlx::query(
-        "UPDATE tasks SET state = 'cancelled' WHERE job = ? AND state IN ('blocked', 'ready')",
-    )
-    .bind(id.to_string())
-    .execute(connection)
-    .await?;
-    Ok(())
-}
-
-/// Ends a job that was being cancelled, once no worker is at it any more.
-pub(in crate::store) async fn settle(
-    connection: &mut SqliteConnection,
-    id: JobId,
-) -> Result<(), StoreError> {
-    if state(connection, id).await? != JobState::Cancelling {
-        return Ok(());
-    }
-    // A task that was completed a moment ago has made others ready: they are not wanted.
-    cancel_waiting_tasks(connection, id).await?;
-    if running_tasks(connection, id).await? == 0 {
-        set_state(connection, id, JobState::Cancelled, None).await?;
-    }
-    Ok(())
-}
-
-async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64, StoreError> {
-    let row = sqlx::query("SELECT count(*) AS n FROM tasks WHERE job = ? AND state = 'running'")
-        .bind(id.to_string())
-        .fetch_one(connection)
-        .await?;
-    number(&row, "n")
-}
-
-async fn prepared(connection: &mut SqliteConnection, id: JobId) -> Result<bool, StoreError> {
-    let row =
-        sqlx::query("SELECT 1 FROM tasks WHERE job = ? AND kind = 'prepare' AND state = 'done'")
-            .bind(id.to_string())
-            .fetch_optional(connection)
-            .await?;
-    Ok(row.is_some())
-}
-
-/// The snapshots of a job that are not assembled.
-async fn snapshots(connection: &mut SqliteConnection, id: JobId) -> Result<Vec<u32>, StoreError> {
-    let rows = sqlx::query(
-        "SELECT snapshot FROM tasks WHERE job = ? AND kind = 'assemble' AND state = 'blocked'",
-    )
-    .bind(id.to_string())
-    .fetch_all(connection)
-    .await?;
-    rows.iter().map(|row| number(row, "snapshot")).collect()
 }
 
 fn job(row: &SqliteRow) -> Result<Job, StoreError> {

@@ -1,15 +1,15 @@
 //! Table `measurements`.
 
 use serde::Serialize;
-use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
 
-use super::blobs::Origin;
-use super::calibrations::{gone_if_foreign_key, label, refuse_if_used};
 use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
 use crate::store::error::StoreError;
-use crate::store::rows::{integer, json_if, number, parsed, single};
-use crate::store::{Page, StagedBlob, Store};
+use crate::store::rows::{
+    integer, json_if, number, parsed, parsed_if, refuse_if_used, single, to_json,
+};
+use crate::store::{Page, Store};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -67,58 +67,6 @@ pub struct MeasurementFilter {
 }
 
 impl Store {
-    /// Records a measurement and puts its prepared snapshots in place.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the upload or the calibration is gone; or if the file or the
-    /// row can't be written.
-    pub async fn add_measurement(
-        &self,
-        lab: &Lab,
-        facts: NewMeasurement,
-        prepared: StagedBlob,
-    ) -> Result<Measurement, StoreError> {
-        let measurement = Measurement {
-            id: MeasurementId::new(),
-            prepared: prepared.sha256(),
-            created_at: Timestamp::now(),
-            facts,
-        };
-        let facts = &measurement.facts;
-        let mut transaction = self.write().await?;
-        self.publish(&mut transaction, prepared, Origin::Prepared).await?;
-        sqlx::query(
-            "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
-                 snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings, created_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        )
-        .bind(lab.as_str())
-        .bind(measurement.id.to_string())
-        .bind(facts.name.as_ref().map(Label::as_str))
-        .bind(facts.calibration.to_string())
-        .bind(facts.data.to_string())
-        .bind(measurement.prepared.to_string())
-        .bind(&facts.format)
-        .bind(&facts.sample)
-        .bind(i64::from(facts.snapshots))
-        .bind(integer(facts.height))
-        .bind(integer(facts.width))
-        .bind(f64::from(facts.full_scale))
-        .bind(facts.camera_fps)
-        .bind(facts.exposure_s)
-        .bind(serde_json::json!(facts.dark).to_string())
-        .bind(serde_json::json!(facts.warnings).to_string())
-        .bind(measurement.created_at.0)
-        .execute(&mut *transaction)
-        .await
-        .map_err(|error| {
-            let id = format!("{} or blob {}", facts.calibration, facts.data);
-            gone_if_foreign_key(error, "calibration", id)
-        })?;
-        transaction.commit().await?;
-        Ok(measurement)
-    }
-
     /// The lab's measurement with this identifier.
     ///
     /// # Errors
@@ -190,13 +138,47 @@ impl Store {
     }
 }
 
+/// Writes the row of a measurement.
+pub(in crate::store) async fn insert(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+    measurement: &Measurement,
+) -> Result<(), StoreError> {
+    let facts = &measurement.facts;
+    sqlx::query(
+        "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
+             snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings, created_at)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+    )
+    .bind(lab.as_str())
+    .bind(measurement.id.to_string())
+    .bind(facts.name.as_ref().map(Label::as_str))
+    .bind(facts.calibration.to_string())
+    .bind(facts.data.to_string())
+    .bind(measurement.prepared.to_string())
+    .bind(&facts.format)
+    .bind(&facts.sample)
+    .bind(i64::from(facts.snapshots))
+    .bind(integer(facts.height))
+    .bind(integer(facts.width))
+    .bind(f64::from(facts.full_scale))
+    .bind(facts.camera_fps)
+    .bind(facts.exposure_s)
+    .bind(to_json("dark", &facts.dark)?)
+    .bind(to_json("warnings", &facts.warnings)?)
+    .bind(measurement.created_at.0)
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
 fn measurement(row: &SqliteRow) -> Result<Measurement, StoreError> {
     Ok(Measurement {
         id: parsed(row, "id")?,
         prepared: parsed(row, "prepared")?,
         created_at: Timestamp(row.try_get("created_at")?),
         facts: NewMeasurement {
-            name: label(row, "name")?,
+            name: parsed_if(row, "name")?,
             calibration: parsed(row, "calibration")?,
             data: parsed(row, "data")?,
             format: row.try_get("format")?,

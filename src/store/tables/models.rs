@@ -4,10 +4,9 @@ use serde::Serialize;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::calibrations::{gone_if_foreign_key, label, refuse_if_used};
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 use crate::store::error::StoreError;
-use crate::store::rows::{json, parsed};
+use crate::store::rows::{Reference, json, parsed, parsed_if, refuse_if_used, require};
 use crate::store::{Page, Store};
 
 /// What is known of an end-to-end network when it has been checked.
@@ -62,6 +61,8 @@ impl Store {
         let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
         let NewModel { name, calibration, file, facts } = &model.content;
         let mut transaction = self.write().await?;
+        let references = [Reference::Calibration(*calibration), Reference::Blob(*file)];
+        require(&mut transaction, &references).await?;
         sqlx::query(
             "INSERT INTO models (id, lab, name, calibration, file, facts, created_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -74,10 +75,7 @@ impl Store {
         .bind(serde_json::json!(facts).to_string())
         .bind(model.created_at.0)
         .execute(&mut *transaction)
-        .await
-        .map_err(|error| {
-            gone_if_foreign_key(error, "calibration", format!("{calibration} or blob {file}"))
-        })?;
+        .await?;
         transaction.commit().await?;
         Ok(model)
     }
@@ -145,7 +143,7 @@ fn model(row: &SqliteRow) -> Result<Model, StoreError> {
         id: parsed(row, "id")?,
         created_at: Timestamp(row.try_get("created_at")?),
         content: NewModel {
-            name: label(row, "name")?,
+            name: parsed_if(row, "name")?,
             calibration: parsed(row, "calibration")?,
             file: parsed(row, "file")?,
             facts: json(row, "facts")?,

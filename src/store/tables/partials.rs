@@ -9,7 +9,7 @@ use std::time::Duration;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use crate::job::{Lab, PartialId, Sha256, Timestamp, TokenId};
+use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::error::StoreError;
 use crate::store::rows::{integer, number, parsed, parsed_if};
 use crate::store::{Store, dir, on_files};
@@ -345,10 +345,11 @@ impl Store {
         let row = sqlx::query(
             "SELECT (SELECT coalesce(sum(length - received), 0) FROM partials WHERE result IS NULL)
                   + (SELECT coalesce(sum(disk_bytes * (
-                         SELECT count(*) FILTER (WHERE state <> 'done') * 1.0 / count(*)
+                         SELECT count(*) FILTER (WHERE state <> ?) * 1.0 / count(*)
                          FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
-                     FROM jobs WHERE state IN ('queued', 'running', 'cancelling')) AS bytes",
+                     FROM jobs WHERE finished_at IS NULL) AS bytes",
         )
+        .bind(TaskState::Done.name())
         .fetch_one(&self.readers)
         .await?;
         let bytes: f64 = row.try_get("bytes")?;

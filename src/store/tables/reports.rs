@@ -1,78 +1,13 @@
-//! Calibrations as users see them while their masks are made, and the reports and pictures of those whose
-//! are.
+//! Tables `calibration_reports` and `calibration_maps`: what is told of masks, and its pictures.
 
-use sqlx::Row;
-use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
 
-use super::calibrations::label;
-use crate::job::{CalibrationId, CalibrationReport, Captures, Lab, Label, Timestamp};
+use crate::job::{CalibrationId, CalibrationReport};
+use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{json, parsed};
-use crate::store::{Page, Store};
-
-/// A calibration whose masks are not there.
-#[derive(Debug, Clone)]
-pub struct Unready {
-    /// Its identifier.
-    pub id: CalibrationId,
-    /// The user's name for it.
-    pub name: Option<Label>,
-    /// Its patterns.
-    pub frames: usize,
-    /// How much of the work is done, on \[0,1\].
-    pub fraction: f64,
-    /// Why there will be no masks; none while they are made.
-    pub error: Option<String>,
-    /// When it was asked for.
-    pub created_at: Timestamp,
-}
+use crate::store::rows::{json, to_json};
 
 impl Store {
-    /// The lab's calibration if its masks are not there; none if they are.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if there is no such calibration at all.
-    pub async fn unready(
-        &self,
-        lab: &Lab,
-        id: CalibrationId,
-    ) -> Result<Option<Unready>, StoreError> {
-        let row = sqlx::query("SELECT * FROM calibration_tasks WHERE calibration = ? AND lab = ?")
-            .bind(id.to_string())
-            .bind(lab.as_str())
-            .fetch_optional(&self.readers)
-            .await?;
-        let row =
-            row.ok_or_else(|| StoreError::NotFound { what: "calibration", id: id.to_string() })?;
-        let state: String = row.try_get("state")?;
-        let captures: Option<String> = row.try_get("captures")?;
-        if captures.is_none() || state == "done" { Ok(None) } else { unready(&row).map(Some) }
-    }
-
-    /// A page of the lab's calibrations whose masks are not there, newest first, older than `after`.
-    ///
-    /// # Errors
-    /// If the database fails.
-    pub async fn all_unready(
-        &self,
-        lab: &Lab,
-        after: Option<CalibrationId>,
-        limit: u32,
-    ) -> Result<Page<Unready>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT * FROM calibration_tasks
-             WHERE lab = ?1 AND captures IS NOT NULL AND state <> 'done'
-               AND (?2 IS NULL OR calibration < ?2)
-             ORDER BY calibration DESC LIMIT ?3",
-        )
-        .bind(lab.as_str())
-        .bind(after.map(|id| id.to_string()))
-        .bind(i64::from(limit) + 1)
-        .fetch_all(&self.readers)
-        .await?;
-        Page::cut(&rows, limit, unready)
-    }
-
     /// The report of a calibration; none if it is not made yet.
     ///
     /// # Errors
@@ -100,16 +35,27 @@ impl Store {
     }
 }
 
-fn unready(row: &SqliteRow) -> Result<Unready, StoreError> {
-    let captures: Captures = json(row, "captures")?;
-    let state: String = row.try_get("state")?;
-    let error: Option<String> = row.try_get("error")?;
-    Ok(Unready {
-        id: parsed(row, "calibration")?,
-        name: label(row, "name")?,
-        frames: captures.masks.len(),
-        fraction: row.try_get("fraction")?,
-        error: if state == "failed" { error } else { None },
-        created_at: Timestamp(row.try_get("created_at")?),
-    })
+/// Writes a report with its pictures, which are PNGs by name.
+pub(in crate::store) async fn insert(
+    connection: &mut SqliteConnection,
+    id: CalibrationId,
+    report: &CalibrationReport,
+    maps: Vec<(String, Vec<u8>)>,
+) -> Result<(), StoreError> {
+    sqlx::query("INSERT OR REPLACE INTO calibration_reports (calibration, report) VALUES (?, ?)")
+        .bind(id.to_string())
+        .bind(to_json("report", report)?)
+        .execute(&mut *connection)
+        .await?;
+    for (name, png) in maps {
+        sqlx::query(
+            "INSERT OR REPLACE INTO calibration_maps (calibration, name, png) VALUES (?, ?, ?)",
+        )
+        .bind(id.to_string())
+        .bind(name)
+        .bind(png)
+        .execute(&mut *connection)
+        .await?;
+    }
+    Ok(())
 }

@@ -3,13 +3,12 @@
 use std::time::Duration;
 
 use serde::Serialize;
+use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use crate::job::{JobId, Timestamp, WorkerId};
+use crate::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::queue::calibrating;
-use crate::store::queue::lease::{self, Loss};
 use crate::store::rows::{number, number_if, parsed, parsed_if};
 
 /// A worker process on record.
@@ -32,8 +31,10 @@ pub struct WorkerRow {
 /// A task in a worker's hands.
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerTask {
-    /// The job.
-    pub job: JobId,
+    /// The job; none for a calibration's.
+    pub job: Option<JobId>,
+    /// The calibration; none for a job's.
+    pub calibration: Option<CalibrationId>,
     /// The kind of task.
     pub kind: String,
     /// The snapshot, if it is about one.
@@ -42,17 +43,6 @@ pub struct WorkerTask {
     pub tile: Option<u32>,
     /// What it is doing.
     pub stage: Option<String>,
-}
-
-/// How a worker came to its end, as far as the one who watched it can tell.
-#[derive(Debug, Clone)]
-pub enum WorkerEnd {
-    /// It ended by itself and gave its task back, if it had one.
-    Left,
-    /// It was killed from outside (or by the kernel, for memory): the task may be innocent.
-    Killed,
-    /// It died of a fault, such as SIGSEGV or a panic: the task is under suspicion.
-    Crashed(String),
 }
 
 impl Store {
@@ -84,62 +74,21 @@ impl Store {
         seen(&mut *self.writer.acquire().await?, id).await
     }
 
-    /// Records that a worker has ended, and frees its task at once instead of when its lease runs out.
-    ///
-    /// # Errors
-    /// If the database fails.
-    pub async fn worker_ended(&self, id: WorkerId, end: &WorkerEnd) -> Result<(), StoreError> {
-        let loss = match end {
-            WorkerEnd::Left => Loss::Released,
-            WorkerEnd::Killed => Loss::Lost("the worker process was killed".into()),
-            WorkerEnd::Crashed(how) => Loss::Crashed(format!("the worker process died: {how}")),
-        };
-        let mut transaction = self.write().await?;
-        let tasks = sqlx::query("SELECT id FROM tasks WHERE worker = ? AND state = 'running'")
-            .bind(id.to_string())
-            .fetch_all(&mut *transaction)
-            .await?;
-        for row in &tasks {
-            lease::lose(&mut transaction, parsed(row, "id")?, &loss).await?;
-        }
-        calibrating::worker_ended(&mut transaction, id, &loss).await?;
-        sqlx::query("DELETE FROM workers WHERE id = ?")
-            .bind(id.to_string())
-            .execute(&mut *transaction)
-            .await?;
-        transaction.commit().await?;
-        Ok(())
-    }
-
     /// The workers that gave a sign of life within `age`.
     ///
     /// # Errors
     /// If the database fails.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>, StoreError> {
         let rows = sqlx::query(
-            "SELECT workers.id, pid, version, started_at, seen_at, job, kind, snapshot, tile, stage
-             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = 'running'
+            "SELECT workers.id, pid, version, started_at, seen_at, job, calibration, kind, snapshot, tile, stage
+             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
              WHERE seen_at >= ? ORDER BY workers.id",
         )
+        .bind(TaskState::Running.name())
         .bind(since(age))
         .fetch_all(&self.readers)
         .await?;
         rows.iter().map(worker).collect()
-    }
-
-    /// Version of ONNX Runtime that the last worker told that finished a tile with it; none before.
-    ///
-    /// # Errors
-    /// If the database fails.
-    pub async fn last_onnxruntime(&self) -> Result<Option<String>, StoreError> {
-        let row = sqlx::query(
-            "SELECT record ->> 'onnxruntime' AS version FROM tasks
-             WHERE state = 'done' AND kind = 'tile' AND record ->> 'onnxruntime' IS NOT NULL
-             ORDER BY job DESC LIMIT 1",
-        )
-        .fetch_optional(&self.readers)
-        .await?;
-        row.map(|row| row.try_get("version").map_err(StoreError::from)).transpose()
     }
 
     /// The last sign of life of a worker; none if it is not on record.
@@ -167,6 +116,18 @@ impl Store {
     }
 }
 
+/// Forgets a worker that has ended.
+pub(in crate::store) async fn remove(
+    connection: &mut SqliteConnection,
+    id: WorkerId,
+) -> Result<(), StoreError> {
+    sqlx::query("DELETE FROM workers WHERE id = ?")
+        .bind(id.to_string())
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
 /// Notes a sign of life.
 pub(in crate::store) async fn seen(
     connection: &mut SqliteConnection,
@@ -184,21 +145,22 @@ fn since(age: Duration) -> i64 {
     Timestamp::now().0 - i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2)
 }
 
-fn worker(row: &sqlx::sqlite::SqliteRow) -> Result<WorkerRow, StoreError> {
+fn worker(row: &SqliteRow) -> Result<WorkerRow, StoreError> {
     Ok(WorkerRow {
         id: parsed(row, "id")?,
         pid: number(row, "pid")?,
         version: row.try_get("version")?,
         started_at: Timestamp(row.try_get("started_at")?),
         seen_at: Timestamp(row.try_get("seen_at")?),
-        task: parsed_if(row, "job")?.map(|job| worker_task(row, job)).transpose()?,
+        task: row.try_get::<Option<_>, _>("kind")?.map(|kind| task(row, kind)).transpose()?,
     })
 }
 
-fn worker_task(row: &sqlx::sqlite::SqliteRow, job: JobId) -> Result<WorkerTask, StoreError> {
+fn task(row: &SqliteRow, kind: String) -> Result<WorkerTask, StoreError> {
     Ok(WorkerTask {
-        job,
-        kind: row.try_get("kind")?,
+        job: parsed_if(row, "job")?,
+        calibration: parsed_if(row, "calibration")?,
+        kind,
         snapshot: number_if(row, "snapshot")?,
         tile: number_if(row, "tile")?,
         stage: row.try_get("stage")?,

@@ -1,0 +1,148 @@
+//! What users do with a job in the queue: cancel it, take it up again, delete it; and how it ends.
+
+use sqlx::SqliteConnection;
+
+use super::graph;
+use crate::job::{JobId, JobState, Lab, TaskState};
+use crate::store::error::StoreError;
+use crate::store::rows::{number, parsed};
+use crate::store::tables::jobs;
+use crate::store::{Store, dir, on_files};
+
+impl Store {
+    /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
+    /// Cancelling twice is no error.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has succeeded or failed.
+    pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+        self.job(lab, id).await?;
+        let mut transaction = self.write().await?;
+        let before = jobs::state(&mut transaction, id).await?;
+        if matches!(before, JobState::Cancelling | JobState::Cancelled) {
+            return Ok(());
+        }
+        let running = running_tasks(&mut transaction, id).await? > 0;
+        let to = if running { JobState::Cancelling } else { JobState::Cancelled };
+        jobs::set_state(&mut transaction, id, to, None).await?;
+        graph::cancel_waiting(&mut transaction, id).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+
+    /// Takes up a failed or cancelled job again. What is done stays done.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has not failed or been cancelled.
+    pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+        self.job(lab, id).await?;
+        let mut transaction = self.write().await?;
+        jobs::set_state(&mut transaction, id, JobState::Queued, None).await?;
+        graph::restart(&mut transaction, id).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+
+    /// Deletes a job that has come to its end, with all that it has made.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`]; [`StoreError::NotFinal`] if it still runs or waits.
+    pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+        self.job(lab, id).await?;
+        self.remove_job(id).await
+    }
+
+    /// As [`Self::delete_job`], whosever it is.
+    pub(in crate::store) async fn remove_job(&self, id: JobId) -> Result<(), StoreError> {
+        let mut transaction = self.write().await?;
+        let state = jobs::state(&mut transaction, id).await?;
+        if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
+            return Err(StoreError::NotFinal(state));
+        }
+        self.drop_tiles(&mut transaction, id).await?;
+        sqlx::query("DELETE FROM jobs WHERE id = ?")
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await?;
+        let folder = self.dir().results(id);
+        // Under the lock and before the commit, so that no row is left whose files are gone for
+        // longer than a crash takes; a second DELETE then removes the row.
+        on_files(move || dir::remove(&folder)).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+
+    /// Marks a job as succeeded, unless it is being cancelled. Its tiles are needed no more.
+    pub(super) async fn succeed(
+        &self,
+        transaction: &mut SqliteConnection,
+        id: JobId,
+    ) -> Result<(), StoreError> {
+        if jobs::state(transaction, id).await? == JobState::Running {
+            jobs::set_state(transaction, id, JobState::Succeeded, None).await?;
+            self.drop_tiles(transaction, id).await?;
+        }
+        Ok(())
+    }
+
+    /// Removes the tiles and previews of a job.
+    async fn drop_tiles(
+        &self,
+        transaction: &mut SqliteConnection,
+        id: JobId,
+    ) -> Result<(), StoreError> {
+        let rows =
+            sqlx::query("SELECT DISTINCT result FROM tasks WHERE job = ? AND result IS NOT NULL")
+                .bind(id.to_string())
+                .fetch_all(&mut *transaction)
+                .await?;
+        sqlx::query("UPDATE tasks SET result = NULL WHERE job = ?")
+            .bind(id.to_string())
+            .execute(&mut *transaction)
+            .await?;
+        for row in &rows {
+            self.release(transaction, parsed(row, "result")?).await?;
+        }
+        Ok(())
+    }
+}
+
+/// True if the job's tasks are still to be done.
+pub(super) async fn is_wanted(
+    connection: &mut SqliteConnection,
+    id: JobId,
+) -> Result<bool, StoreError> {
+    Ok(matches!(jobs::state(connection, id).await?, JobState::Queued | JobState::Running))
+}
+
+/// Marks a job as failed for this reason.
+pub(super) async fn fail(
+    connection: &mut SqliteConnection,
+    id: JobId,
+    reason: &str,
+) -> Result<(), StoreError> {
+    jobs::set_state(connection, id, JobState::Failed, Some(reason)).await?;
+    graph::cancel_waiting(connection, id).await
+}
+
+/// Ends a job that was being cancelled, once no worker is at it any more.
+pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Result<(), StoreError> {
+    if jobs::state(connection, id).await? != JobState::Cancelling {
+        return Ok(());
+    }
+    // A task that was completed a moment ago has made others ready: they are not wanted.
+    graph::cancel_waiting(connection, id).await?;
+    if running_tasks(connection, id).await? == 0 {
+        jobs::set_state(connection, id, JobState::Cancelled, None).await?;
+    }
+    Ok(())
+}
+
+async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64, StoreError> {
+    let row = sqlx::query("SELECT count(*) AS n FROM tasks WHERE job = ? AND state = ?")
+        .bind(id.to_string())
+        .bind(TaskState::Running.name())
+        .fetch_one(connection)
+        .await?;
+    number(&row, "n")
+}
