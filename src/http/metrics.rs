@@ -87,7 +87,7 @@ pub(super) async fn show(State(app): State<App>) -> Result<Response, ApiError> {
         gauge!("sci_recon_jobs", "state" => state.name()).set(jobs as f64);
     }
     for ((kind, state), count) in app.store.task_counts().await? {
-        gauge!("sci_recon_tasks", "kind" => kind, "state" => state).set(count as f64);
+        gauge!("sci_recon_tasks", "kind" => kind, "state" => state.name()).set(count as f64);
     }
     for done in app.store.totals().await? {
         let kind = || done.kind.clone();

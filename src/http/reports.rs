@@ -11,7 +11,6 @@ use super::error::{ApiError, Code};
 use super::extract::Params;
 use crate::intake::report_page;
 use crate::job::{CalibrationId, CalibrationReport, Lab, Sha256};
-use crate::store::StoreError;
 
 /// What the browser may load: our own style and pictures, and no script at all.
 const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
@@ -67,9 +66,7 @@ pub(super) async fn map(
 /// The report, if it is made.
 async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport, ApiError> {
     // Whose it is, before what it holds.
-    if let Some(unready) = app.store.unready(lab, id).await? {
-        return Err(StoreError::from(unready).into());
-    }
+    app.store.calibration(lab, id).await?;
     let not_yet =
         || ApiError::new(Code::NotReady, "the report is not made yet; ask again in a moment");
     app.store.report(id).await?.ok_or_else(not_yet)

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::app::App;
 use super::error::ApiError;
-use crate::job::{JobState, Timestamp};
+use crate::job::{JobState, TaskState, Timestamp};
 use crate::store::WorkerRow;
 
 /// Workers that were silent for longer are not shown.
@@ -91,10 +91,14 @@ async fn jobs(app: &App) -> Result<BTreeMap<&'static str, u64>, ApiError> {
 
 async fn queue(app: &App) -> Result<QueueBody, ApiError> {
     let tasks = app.store.task_counts().await?;
-    let count = |state: &str| {
-        tasks.iter().filter(|((_, found), _)| found == state).map(|(_, count)| count).sum()
+    let count = |state: TaskState| {
+        tasks.iter().filter(|((_, found), _)| *found == state).map(|(_, count)| count).sum()
     };
-    Ok(QueueBody { ready: count("ready"), blocked: count("blocked"), running: count("running") })
+    Ok(QueueBody {
+        ready: count(TaskState::Ready),
+        blocked: count(TaskState::Blocked),
+        running: count(TaskState::Running),
+    })
 }
 
 async fn disk(app: &App) -> Result<DiskBody, ApiError> {

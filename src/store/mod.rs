@@ -36,17 +36,18 @@ pub use backup::Backup;
 pub use dir::DataDir;
 pub use error::StoreError;
 pub use queue::{
-    CalibrationDone, CalibrationLease, CalibrationWork, ClaimedCalibration, ClaimedTask,
-    Completion, Heartbeat, JobMark, JobProgress, Lease, MAX_FAILURES, MAX_LOSSES, Product,
-    ProgressStage, TaskCounts, TaskRecord, TaskTotals, TileResult,
+    CalibrationDone, CalibrationInputs, CalibrationTask, ClaimedTask, Completion, Heartbeat,
+    JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Step,
+    Work, WorkerEnd,
 };
+pub use rows::Page;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
-    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model, ModelFilter,
-    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, ResultFile,
-    TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready,
-    WorkerRow, WorkerTask,
+    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model,
+    ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
+    PartialFile, ResultFile, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
+    TileState, Token, Unready, WorkerRow, WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.

@@ -1,7 +1,9 @@
 //! The queue as workers see it: the whole life of a job, and every way in which it can be disturbed.
 
+mod calibrations;
 mod failures;
 mod keeping;
+mod migration;
 
 use std::io::Write;
 use std::time::Duration;
@@ -10,8 +12,8 @@ use serde_json::json;
 use tempfile::TempDir;
 
 use super::{
-    ClaimedTask, Completion, Heartbeat, Inserted, NewCalibration, NewJob, NewMeasurement, Product,
-    Store, StoreError, WorkerEnd,
+    ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
+    Product, Store, StoreError, Work, WorkerEnd,
 };
 use crate::job::{
     Algorithm, JobId, JobRequest, JobState, MeasurementId, Sha256, SnapshotSelection, TaskKind,
@@ -19,6 +21,14 @@ use crate::job::{
 };
 
 const LEASE: Duration = Duration::from_secs(60);
+
+impl ClaimedTask {
+    /// The step of a job.
+    fn step(&self) -> &JobTask {
+        let Work::Job(task) = &self.work else { panic!("{:?}", self.work) };
+        task
+    }
+}
 
 struct Lab {
     store: Store,
@@ -74,7 +84,9 @@ impl Lab {
             store.add_measurement(&local, facts, upload(b"prepared data")).await.unwrap();
         let worker = WorkerId::new();
         store.worker_started(worker, 1).await.unwrap();
-        Self { store, measurement: measurement.id, worker, _folder: folder }
+        let lab = Self { store, measurement: measurement.id, worker, _folder: folder };
+        assert_eq!(lab.work_off().await, [TaskKind::Calibration], "its report");
+        lab
     }
 
     /// A job with two tiles in each of two snapshots.
@@ -154,6 +166,7 @@ impl Lab {
                 std::fs::write(folder.path().join("frames/frame_0001.exr"), "pixels").unwrap();
                 Product::Files(folder)
             }
+            TaskKind::Calibration => Product::Calibration(Box::new(calibrations::report())),
             TaskKind::Manifest => {
                 let folder = self.store.staged_dir().unwrap();
                 std::fs::write(folder.path().join("manifest.json"), "{}").unwrap();
@@ -173,6 +186,20 @@ impl Lab {
             done.push(task.kind);
         }
         done
+    }
+
+    /// Puts an upload in the store.
+    async fn upload(&self, content: &[u8]) -> Sha256 {
+        let mut writer = self.store.blob_writer().unwrap();
+        writer.write_all(content).unwrap();
+        let staged = writer.finish().unwrap();
+        let local = crate::job::Lab::local();
+        self.store.store_upload(&local, None, staged).await.unwrap().0.sha256
+    }
+
+    /// Lets the pauses after failures pass.
+    async fn skip_pauses(&self) {
+        sqlx::query("UPDATE tasks SET ready_at = 0").execute(&self.store.writer).await.unwrap();
     }
 
     /// Does so many tasks.
@@ -234,8 +261,8 @@ async fn a_job_runs_in_order_and_leaves_its_results_and_no_tiles() {
 async fn priority_comes_before_age() {
     let lab = Lab::new().await;
     let (old, urgent) = (lab.submit(0).await, lab.submit(5).await);
-    assert_eq!(lab.claim().await.unwrap().job, urgent);
-    assert_eq!(lab.claim().await.unwrap().job, old);
+    assert_eq!(lab.claim().await.unwrap().step().job, urgent);
+    assert_eq!(lab.claim().await.unwrap().step().job, old);
     assert!(lab.claim().await.is_none(), "the tiles wait for the scale");
 }
 
@@ -352,13 +379,14 @@ async fn tiles_wait_for_the_pilot_and_cost_what_it_leaves_of_them() {
     let planned = cost().await;
     lab.work_on(2).await;
     let (pilot, preview) = (lab.claim().await.unwrap(), lab.claim().await.unwrap());
-    assert_eq!((pilot.kind, pilot.pilot.clone()), (TaskKind::Pilot, None));
+    assert_eq!((pilot.kind, pilot.step().pilot.clone()), (TaskKind::Pilot, None));
     assert_eq!(preview.kind, TaskKind::Preview { snapshot: 1 });
     assert!(lab.claim().await.is_none(), "the tiles wait");
     lab.work(&pilot).await;
     assert!((cost().await - 0.5 * planned).abs() < 1e-9 * planned);
     let task = lab.claim().await.unwrap();
-    assert_eq!((task.kind, task.pilot), (tile(0, 0), Some(json!({"kind": "pilot"}))));
+    let pilot = task.step().pilot.clone();
+    assert_eq!((task.kind, pilot), (tile(0, 0), Some(json!({"kind": "pilot"}))));
     lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
     lab.store.cancelled(&task.lease).await.unwrap();
     lab.store.cancelled(&preview.lease).await.unwrap();
@@ -375,5 +403,5 @@ async fn a_second_process_sees_the_same_store() {
     let job = lab.submit(0).await;
     let other = Store::open(lab.store.dir().root()).await.unwrap();
     let task = other.claim(WorkerId::new(), LEASE).await.unwrap().unwrap();
-    assert_eq!((task.job, lab.state(job).await), (job, JobState::Running));
+    assert_eq!((task.step().job, lab.state(job).await), (job, JobState::Running));
 }

@@ -17,7 +17,7 @@ use crate::pipeline::manifest::{
 };
 use crate::pipeline::{ResultFile, ResultSpec, write_result};
 use crate::recon::tile::TilePlan;
-use crate::store::{ClaimedTask, Completion, Product, Store, TileResult, hash_file};
+use crate::store::{Completion, JobTask, Product, Store, TileResult, hash_file};
 
 /// What is remembered of a snapshot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -30,7 +30,7 @@ pub(super) struct SnapshotRecord {
 /// Checks the tiles, blends them frame by frame, and writes the snapshot's folder.
 pub(super) fn run(
     store: &Store,
-    task: &ClaimedTask,
+    task: &JobTask,
     snapshot: u32,
     tiles: &[TileResult],
     shared: &Shared,
@@ -109,7 +109,7 @@ fn part(path: &Path, k: usize, height: usize, width: usize) -> Result<Array2<f32
 }
 
 fn manifest(
-    task: &ClaimedTask,
+    task: &JobTask,
     snapshot: u32,
     plan: &TilePlan,
     records: &[TileTaskRecord],

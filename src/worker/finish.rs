@@ -16,7 +16,7 @@ use crate::pipeline::manifest::{
     Inputs, ModelRecord, RunRecord, ScaleRecord, Summary, TilePlanRecord,
 };
 use crate::pipeline::pilot::PilotRecord;
-use crate::store::{ClaimedTask, Completion, Product, Store, TaskRecord};
+use crate::store::{Completion, JobTask, Product, Store, TaskRecord};
 
 /// Name and version of this form of record.
 const SCHEMA: &str = "sci-recon/job/1";
@@ -71,16 +71,17 @@ struct JobRun {
     seconds_by_task: std::collections::BTreeMap<String, f64>,
 }
 
-/// Writes the job's manifest.
+/// Writes the job's manifest, at the task's attempt of this number.
 pub(super) fn run(
     store: &Store,
-    task: &ClaimedTask,
+    task: &JobTask,
+    attempt: u32,
     records: &[TaskRecord],
 ) -> Result<Completion, TaskError> {
     let snapshots = records.iter().filter_map(snapshot).collect::<Result<Vec<_>, _>>()?;
     let manifest = JobManifest {
         schema: SCHEMA.into(),
-        run: job_run(task, records, &snapshots),
+        run: job_run(task, attempt, records, &snapshots),
         content: content(task, snapshots)?,
     };
     let staged = store.staged_dir()?;
@@ -103,10 +104,7 @@ fn snapshot(task: &TaskRecord) -> Option<Result<(u32, SnapshotRecord), TaskError
     Some(record.map(|record| (snapshot, record)))
 }
 
-fn content(
-    task: &ClaimedTask,
-    snapshots: Vec<(u32, SnapshotRecord)>,
-) -> Result<JobContent, TaskError> {
+fn content(task: &JobTask, snapshots: Vec<(u32, SnapshotRecord)>) -> Result<JobContent, TaskError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);
     let entry = |(snapshot, record): (u32, SnapshotRecord)| {
@@ -137,7 +135,8 @@ fn content(
 }
 
 fn job_run(
-    task: &ClaimedTask,
+    task: &JobTask,
+    attempt: u32,
     records: &[TaskRecord],
     snapshots: &[(u32, SnapshotRecord)],
 ) -> JobRun {
@@ -161,7 +160,7 @@ fn job_run(
         measurement: task.spec.measurement.to_string(),
         tasks: records.len() + 1,
         attempts: records.iter().map(|record| u64::from(record.attempt)).sum::<u64>()
-            + u64::from(task.lease.attempt),
+            + u64::from(attempt),
         seconds_by_task,
     }
 }

@@ -10,10 +10,10 @@ use crate::pipeline::WarmNetworks;
 use crate::pipeline::manifest::full_schedule;
 use crate::pipeline::pilot::{PilotRecord, decide};
 use crate::recon::pilot;
-use crate::store::{ClaimedTask, Completion, Product};
+use crate::store::{Completion, JobTask, Product};
 
 /// The record of the job's pilot; none before it, and for a job without one.
-pub(super) fn pilot_of(task: &ClaimedTask) -> Result<Option<PilotRecord>, TaskError> {
+pub(super) fn pilot_of(task: &JobTask) -> Result<Option<PilotRecord>, TaskError> {
     let record =
         |error: serde_json::Error| TaskError::Record { what: "pilot", problem: error.to_string() };
     let pilot = task.pilot.clone().map(serde_json::from_value::<Option<PilotRecord>>);
@@ -22,7 +22,7 @@ pub(super) fn pilot_of(task: &ClaimedTask) -> Result<Option<PilotRecord>, TaskEr
 
 /// The task of the pilot, on the first snapshot of the job.
 pub(super) fn run(
-    task: &ClaimedTask,
+    task: &JobTask,
     engine: &mut WarmNetworks,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {

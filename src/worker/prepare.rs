@@ -12,7 +12,7 @@ use crate::pipeline::manifest::full_schedule;
 use crate::pipeline::pilot::PilotRecord;
 use crate::pipeline::typical_white;
 use crate::recon::scale::ScaleEstimator;
-use crate::store::{ClaimedTask, Completion, Product, hash_file};
+use crate::store::{Completion, JobTask, Product, hash_file};
 
 /// What the other tasks of the job learn from this one, and from the pilot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -27,7 +27,7 @@ pub(super) struct Prepared {
 
 impl Prepared {
     /// The records of the job's first tasks.
-    pub(super) fn of(task: &ClaimedTask) -> Result<Self, TaskError> {
+    pub(super) fn of(task: &JobTask) -> Result<Self, TaskError> {
         let record = |problem: String| TaskError::Record { what: "prepare task", problem };
         let prepared = task.prepared.clone().ok_or_else(|| record("there is none".into()))?;
         let mut prepared: Self =
@@ -43,7 +43,7 @@ impl Prepared {
 }
 
 /// Estimates the white level; memory holds a few planes, whatever the number of frames.
-pub(super) fn run(task: &ClaimedTask, shared: &Shared) -> Result<Completion, TaskError> {
+pub(super) fn run(task: &JobTask, shared: &Shared) -> Result<Completion, TaskError> {
     check("masks", &task.masks, task.calibration.prepared)?;
     check("snapshots", &task.snapshots, task.measurement.prepared)?;
     shared.check()?;

@@ -8,12 +8,12 @@ use super::tile::{window, write};
 use crate::job::{TaskProgress, TaskStage};
 use crate::pipeline::TileInput;
 use crate::recon::preview::{self, Blocks};
-use crate::store::{ClaimedTask, Completion, Product, Store};
+use crate::store::{Completion, JobTask, Product, Store};
 
 /// Makes the preview and writes it as a prepared array \[B,h,w\], on the scale of the measurement.
 pub(super) fn run(
     store: &Store,
-    task: &ClaimedTask,
+    task: &JobTask,
     snapshot: u32,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {
@@ -28,7 +28,7 @@ pub(super) fn run(
     Ok(Completion { progress, record: to_record(&())?, product: Product::Tile(blob) })
 }
 
-fn whole(task: &ClaimedTask, snapshot: u32, shared: &Shared) -> Result<Array3<f32>, TaskError> {
+fn whole(task: &JobTask, snapshot: u32, shared: &Shared) -> Result<Array3<f32>, TaskError> {
     let (shape, white) = (task.spec.shape, Prepared::of(task)?.white);
     let place = (0..shape.height, 0..shape.width);
     let input: TileInput = window(task, snapshot as usize, place, white)?;
@@ -40,7 +40,7 @@ fn whole(task: &ClaimedTask, snapshot: u32, shared: &Shared) -> Result<Array3<f3
 }
 
 fn by_blocks(
-    task: &ClaimedTask,
+    task: &JobTask,
     snapshot: u32,
     side: usize,
     shared: &Shared,

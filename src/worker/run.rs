@@ -13,16 +13,18 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::task::{Material, Shared, TaskError, perform};
+use super::task::{Shared, TaskError, perform};
 use crate::job::{TaskProgress, WorkerId, without_paths};
 use crate::pipeline::{NetworkSource, WarmNetworks};
-use crate::store::{ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError};
+use crate::store::{
+    CalibrationTask, ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError, Work,
+};
 
 /// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
 /// against a lab's patience.
-pub(super) const LEASE: Duration = Duration::from_secs(20);
+const LEASE: Duration = Duration::from_secs(20);
 /// Time between heartbeats, and so the longest time until a cancel is heard of.
-pub(super) const HEARTBEAT: Duration = Duration::from_secs(1);
+const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Time between looks for a task.
 const POLL: Duration = Duration::from_millis(200);
 /// Looks without a task between two signs of life.
@@ -100,10 +102,6 @@ impl Worker {
         tracing::info!(worker = %self.id, "waiting for tasks");
         let mut looks = 0;
         while !self.stop.is_cancelled() {
-            // Calibrations come first: people wait for them before they measure.
-            if self.calibrate().await? {
-                continue;
-            }
             match self.store.claim(self.id, LEASE).await {
                 Ok(Some(task)) => {
                     self.work(task).await?;
@@ -125,19 +123,6 @@ impl Worker {
         Ok(())
     }
 
-    pub(super) fn store(&self) -> &Store {
-        &self.store
-    }
-
-    pub(super) fn id(&self) -> WorkerId {
-        self.id
-    }
-
-    /// Waits until the worker is told to stop.
-    pub(super) async fn stopped(&self) {
-        self.stop.cancelled().await;
-    }
-
     async fn sign_of_life(&self) {
         if let Err(error) = self.store.worker_seen(self.id).await {
             tracing::warn!(%error, "the worker's sign of life is not recorded");
@@ -154,18 +139,16 @@ impl Worker {
     /// Does one task and tells the store how it ended.
     async fn work(&mut self, task: ClaimedTask) -> Result<(), WorkerError> {
         let lease = task.lease;
-        let name = task.kind.name();
-        let span = tracing::info_span!("task", job = %task.job, kind = name, task = %lease.task);
-        let material = match Material::of(&self.store, &task).await {
-            Ok(material) => material,
-            Err(error) => {
-                self.failed(&lease, &error.into()).instrument(span).await;
-                return Ok(());
+        let (kind, id) = (task.kind.name(), lease.task);
+        let span = match &task.work {
+            Work::Job(job) => tracing::info_span!("task", job = %job.job, kind, task = %id),
+            Work::Calibration(CalibrationTask { calibration, .. }) => {
+                tracing::info_span!("task", %calibration, kind, task = %id)
             }
         };
         let shared = Arc::new(Shared::new());
         let patience = self.stall + Duration::from_secs_f64(SLOWNESS * task.cost);
-        let computing = self.start(task, material, &shared, span.clone());
+        let computing = self.start(task, &shared, span.clone());
         let watching = self.watch(computing, &lease, &shared, patience).instrument(span.clone());
         match watching.await {
             Ok(((engine, outcome), reason)) => {
@@ -211,7 +194,7 @@ impl Worker {
                 said(self.store.release_task(lease).await);
             }
             (Err(TaskError::Stopped), Some(Reason::Lost)) => {
-                tracing::warn!("the lease ran out and the task is another worker's now");
+                tracing::warn!("the task is another worker's now, or nobody's");
             }
             (Err(TaskError::Damaged(tiles)), _) => {
                 tracing::error!(?tiles, "stored tiles are damaged and will be done again");
@@ -224,7 +207,6 @@ impl Worker {
     fn start(
         &mut self,
         task: ClaimedTask,
-        material: Material,
         shared: &Arc<Shared>,
         span: tracing::Span,
     ) -> JoinHandle<Computed> {
@@ -233,7 +215,7 @@ impl Worker {
         let (store, shared) = (self.store.clone(), shared.clone());
         tokio::task::spawn_blocking(move || {
             let _entered = span.enter();
-            let outcome = perform(&store, &task, material, &mut engine, &shared);
+            let outcome = perform(&store, &task, &mut engine, &shared);
             (engine, outcome)
         })
     }
@@ -328,7 +310,7 @@ impl Worker {
 }
 
 /// Logs that the store could not be told; the lease runs out then.
-pub(super) fn said(told: Result<(), StoreError>) {
+fn said(told: Result<(), StoreError>) {
     if let Err(error) = told {
         tracing::error!(%error, "the end of the task is not recorded");
     }

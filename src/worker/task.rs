@@ -4,14 +4,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::{assemble, finish, pilot, prepare, preview, tile};
+use super::{assemble, calibration_task, finish, pilot, prepare, preview, tile};
 use crate::formats::FormatError;
-use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
+use crate::intake::IntakeError;
+use crate::job::{InvalidField, Sha256, TaskProgress};
 use crate::pipeline::history::History;
 use crate::pipeline::{NetworkError, ResultError, WarmNetworks};
 use crate::recon::ReconError;
 use crate::recon::solver::Progress;
-use crate::store::{ClaimedTask, Completion, Store, StoreError, TaskRecord, TileResult};
+use crate::store::{ClaimedTask, Completion, Step, Store, StoreError, Work};
 
 /// What the computing thread and the heartbeat tell each other.
 #[derive(Debug)]
@@ -95,6 +96,9 @@ pub(super) enum TaskError {
     /// A result can't be written.
     #[error(transparent)]
     Result(#[from] ResultError),
+    /// Captures or masks that can't be used.
+    #[error(transparent)]
+    Intake(IntakeError),
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -136,6 +140,7 @@ impl TaskError {
         match self {
             Self::Recon(error) => matches!(error, ReconError::Runtime(_)),
             Self::Format(error) => !error.is_callers_fault(),
+            Self::Intake(error) => error.is_retryable(),
             Self::Snapshot { .. } | Self::Record { .. } | Self::Corrupt { .. } => false,
             _ => true,
         }
@@ -151,6 +156,15 @@ impl From<ReconError> for TaskError {
     }
 }
 
+impl From<IntakeError> for TaskError {
+    fn from(error: IntakeError) -> Self {
+        match error {
+            IntakeError::Stopped => Self::Stopped,
+            other => Self::Intake(other),
+        }
+    }
+}
+
 /// Errors of a stored schedule, which was checked before it was stored.
 impl From<Vec<InvalidField>> for TaskError {
     fn from(errors: Vec<InvalidField>) -> Self {
@@ -159,46 +173,23 @@ impl From<Vec<InvalidField>> for TaskError {
     }
 }
 
-/// What a task needs from the database beside its own row; fetched before the blocking part.
-pub(super) enum Material {
-    None,
-    Tiles(Vec<TileResult>),
-    Records(Vec<TaskRecord>),
-}
-
-impl Material {
-    pub(super) async fn of(store: &Store, task: &ClaimedTask) -> Result<Self, StoreError> {
-        Ok(match task.kind {
-            TaskKind::Prepare
-            | TaskKind::Preview { .. }
-            | TaskKind::Pilot
-            | TaskKind::Tile { .. } => Self::None,
-            TaskKind::Assemble { snapshot } => {
-                Self::Tiles(store.tile_results(task.job, snapshot).await?)
-            }
-            TaskKind::Manifest => Self::Records(store.task_records(task.job).await?),
-        })
-    }
-}
-
 /// Does a task. Blocks for as long as it takes.
 pub(super) fn perform(
     store: &Store,
     task: &ClaimedTask,
-    material: Material,
     engine: &mut WarmNetworks,
     shared: &Shared,
 ) -> Result<Completion, TaskError> {
-    match (task.kind, material) {
-        (TaskKind::Tile { snapshot, tile }, _) => {
-            tile::run(store, task, (snapshot, tile), engine, shared)
-        }
-        (TaskKind::Assemble { snapshot }, Material::Tiles(tiles)) => {
-            assemble::run(store, task, snapshot, &tiles, shared)
-        }
-        (TaskKind::Manifest, Material::Records(records)) => finish::run(store, task, &records),
-        (TaskKind::Preview { snapshot }, _) => preview::run(store, task, snapshot, shared),
-        (TaskKind::Pilot, _) => pilot::run(task, engine, shared),
-        _ => prepare::run(task, shared),
+    let job = match &task.work {
+        Work::Calibration(calibration) => return calibration_task::run(store, calibration, shared),
+        Work::Job(job) => job,
+    };
+    match &job.step {
+        Step::Prepare => prepare::run(job, shared),
+        Step::Preview { snapshot } => preview::run(store, job, *snapshot, shared),
+        Step::Pilot => pilot::run(job, engine, shared),
+        Step::Tile { snapshot, tile } => tile::run(store, job, (*snapshot, *tile), engine, shared),
+        Step::Assemble { snapshot, tiles } => assemble::run(store, job, *snapshot, tiles, shared),
+        Step::Manifest { records } => finish::run(store, job, task.lease.attempt, records),
     }
 }

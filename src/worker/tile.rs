@@ -17,7 +17,7 @@ use crate::pipeline::{
     reconstruct_tile, run_network,
 };
 use crate::recon::solver::{Control, Observer, Progress};
-use crate::store::{ClaimedTask, Completion, Product, StagedBlob, Store};
+use crate::store::{Completion, JobTask, Product, StagedBlob, Store};
 
 /// What is remembered of a tile's task.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -37,7 +37,7 @@ pub(super) struct TileTaskRecord {
 /// Reads a tile's window, reconstructs it, and writes its frames as a prepared array.
 pub(super) fn run(
     store: &Store,
-    task: &ClaimedTask,
+    task: &JobTask,
     (snapshot, index): (u32, u32),
     engine: &mut WarmNetworks,
     shared: &Shared,
@@ -95,7 +95,7 @@ fn by_network(
 
 /// A piece of a snapshot, by rows and columns.
 pub(super) fn window(
-    task: &ClaimedTask,
+    task: &JobTask,
     snapshot: usize,
     (rows, columns): (Range<usize>, Range<usize>),
     white: f32,

@@ -74,5 +74,6 @@ function task(work) {
   if (!work) return "waiting";
   const place = work.tile === null ? "" : ` ${work.tile + 1}`;
   const snapshot = work.snapshot === null ? "" : `, snapshot ${work.snapshot}`;
+  if (work.calibration) return h("a", { href: `#/calibrations/${work.calibration}` }, `calibration ${short(work.calibration)}`);
   return [h("a", { href: `#/jobs/${work.job}` }, `job ${short(work.job)}`), `: ${work.kind}${place}${snapshot}${work.stage ? ` (${work.stage})` : ""}`];
 }

@@ -5,11 +5,11 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
+use crate::store::Store;
 use crate::store::error::StoreError;
 use crate::store::rows::{
-    integer, json_if, number, parsed, parsed_if, refuse_if_used, single, to_json,
+    Page, integer, json_if, number, parsed, parsed_if, refuse_if_used, single, to_json,
 };
-use crate::store::{Page, Store};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]

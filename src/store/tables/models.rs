@@ -5,9 +5,9 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
+use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{Reference, json, parsed, parsed_if, refuse_if_used, require};
-use crate::store::{Page, Store};
+use crate::store::rows::{Page, Reference, json, parsed, parsed_if, refuse_if_used, require};
 
 /// What is known of an end-to-end network when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]

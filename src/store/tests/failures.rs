@@ -67,10 +67,3 @@ async fn damaged_tiles_are_done_again() {
     assert_eq!(done[..2], [tile(0, 1), TaskKind::Assemble { snapshot: 0 }]);
     assert_eq!(lab.state(job).await, JobState::Succeeded);
 }
-
-impl Lab {
-    /// Lets the pauses after failures pass.
-    async fn skip_pauses(&self) {
-        sqlx::query("UPDATE tasks SET ready_at = 0").execute(&self.store.writer).await.unwrap();
-    }
-}
