@@ -25,9 +25,6 @@ enum Candidate {
 impl Store {
     /// Removes temporary files of dead processes, and blobs, results and partial uploads that no row
     /// knows of. Says how many.
-    ///
-    /// # Errors
-    /// If the database or a folder fails.
     pub async fn remove_orphans(&self) -> Result<usize, StoreError> {
         let root = self.dir().clone();
         let (mut removed, candidates) = on_files(move || {
@@ -75,9 +72,6 @@ impl Store {
 
     /// Deletes jobs that ended before `before`, oldest first, until so many bytes of the disk are
     /// free. Says how many.
-    ///
-    /// # Errors
-    /// If the database or a file fails.
     pub async fn remove_jobs(
         &self,
         before: Timestamp,

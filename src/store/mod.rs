@@ -116,9 +116,6 @@ impl Store {
     }
 
     /// Asks the database for an answer.
-    ///
-    /// # Errors
-    /// If there is none.
     pub async fn ping(&self) -> Result<(), StoreError> {
         sqlx::query("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
         Ok(())

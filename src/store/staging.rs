@@ -48,9 +48,6 @@ impl Store {
     }
 
     /// A new file that is hashed while it is written. Blocks on the disk.
-    ///
-    /// # Errors
-    /// If the file can't be made.
     pub fn blob_writer(&self) -> Result<BlobWriter, StoreError> {
         let staged = self.staged_path()?;
         let path = &staged.0.path;
@@ -60,9 +57,6 @@ impl Store {
     }
 
     /// A new empty file for a writer that wants a path. Blocks on the disk.
-    ///
-    /// # Errors
-    /// If the file can't be made.
     pub fn staged_path(&self) -> Result<StagedPath, StoreError> {
         let path = self.temporary_path();
         let lock = File::create_new(&path).map_err(StoreError::io("make", &path))?;
@@ -71,9 +65,6 @@ impl Store {
 
     /// A second name for a file that is there, on its way into the store; `lock` holds the file's lock
     /// already. Blocks on the disk.
-    ///
-    /// # Errors
-    /// If the file can't be linked.
     pub(super) fn staged_link(
         &self,
         original: &Path,
@@ -85,9 +76,6 @@ impl Store {
     }
 
     /// A new empty folder for the results of a task. Blocks on the disk.
-    ///
-    /// # Errors
-    /// If the folder can't be made.
     pub fn staged_dir(&self) -> Result<StagedDir, StoreError> {
         let path = self.temporary_path();
         fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
@@ -273,9 +261,6 @@ fn hash_and_sync(path: &Path) -> Result<(Sha256, u64), StoreError> {
 }
 
 /// The hash of the file's bytes, to compare it with the one on record.
-///
-/// # Errors
-/// If the file can't be read.
 pub fn hash_file(path: &Path) -> Result<Sha256, StoreError> {
     hash_and_sync(path).map(|(sha256, _)| sha256)
 }

@@ -77,18 +77,12 @@ pub struct JobMark {
 
 impl Store {
     /// How far a job is.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn progress(&self, job: &Job) -> Result<JobProgress, StoreError> {
         let mut all = self.progress_of(std::slice::from_ref(job)).await?;
         all.pop().ok_or(StoreError::NotFound { what: "job", id: job.id.to_string() })
     }
 
     /// How far each of these jobs is, in their order: a whole page costs as many statements as one.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>, StoreError> {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
         let rows = sqlx::query(

@@ -44,9 +44,6 @@ impl Origin {
 impl Store {
     /// Stores an upload of a lab. Says whether it is new to the lab: that another one has it shows
     /// nowhere. It counts against the limit of the token that sent it first.
-    ///
-    /// # Errors
-    /// If the file or its row can't be written.
     pub async fn store_upload(
         &self,
         lab: &Lab,
@@ -138,9 +135,6 @@ impl Store {
     }
 
     /// Removes the uploads that nothing refers to and nobody has sent since `before`. Says how many.
-    ///
-    /// # Errors
-    /// If the database or a file can't be written.
     pub async fn collect(&self, before: Timestamp) -> Result<usize, StoreError> {
         let mut transaction = self.write().await?;
         sqlx::query(
@@ -175,9 +169,6 @@ impl Store {
     }
 
     /// Number and bytes of all stored files.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn blob_totals(&self) -> Result<(u64, u64), StoreError> {
         let row =
             sqlx::query("SELECT count(*) AS files, coalesce(sum(size), 0) AS bytes FROM blobs")

@@ -153,9 +153,6 @@ impl Store {
     }
 
     /// A page of the lab's calibrations, newest first, older than `after`.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn calibrations(
         &self,
         lab: &Lab,

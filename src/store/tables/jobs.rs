@@ -63,9 +63,6 @@ impl Store {
     }
 
     /// A page of the lab's jobs, newest first.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn jobs(
         &self,
         lab: &Lab,
@@ -95,9 +92,6 @@ impl Store {
     }
 
     /// The number of jobs in each state.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>, StoreError> {
         let rows = sqlx::query("SELECT state, count(*) AS jobs FROM jobs GROUP BY state")
             .fetch_all(&self.readers)

@@ -95,9 +95,6 @@ impl Store {
     }
 
     /// A page of the lab's measurements, newest first.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn measurements(
         &self,
         lab: &Lab,

@@ -94,9 +94,6 @@ impl Store {
     }
 
     /// A page of the lab's models, newest first.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn models(
         &self,
         lab: &Lab,

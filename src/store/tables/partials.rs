@@ -92,17 +92,11 @@ impl PartialFile {
     }
 
     /// Appends bytes. Blocks.
-    ///
-    /// # Errors
-    /// If they can't be written.
     pub fn append(&mut self, bytes: &[u8]) -> Result<(), StoreError> {
         self.file.write_all(bytes).map_err(StoreError::io("write", &self.path))
     }
 
     /// Brings all to the disk. Blocks.
-    ///
-    /// # Errors
-    /// If that fails.
     pub fn sync(&self) -> Result<(), StoreError> {
         self.file.sync_data().map_err(StoreError::io("write to the disk", &self.path))
     }
@@ -135,9 +129,6 @@ fn lock(path: &Path) -> Result<Lock, StoreError> {
 
 impl Store {
     /// Begins an upload, which is given up when nothing more has come for `age`.
-    ///
-    /// # Errors
-    /// If the file or its row can't be written.
     pub async fn begin_partial(
         &self,
         facts: NewPartial,
@@ -284,9 +275,6 @@ impl Store {
     }
 
     /// Ends an upload that no other request has; what has come of it goes. False if it is busy.
-    ///
-    /// # Errors
-    /// If the row or the file can't be removed.
     pub async fn delete_partial(&self, id: PartialId) -> Result<bool, StoreError> {
         let path = self.dir().partial(id);
         let lock = on_files(move || lock(&path)).await?;
@@ -308,9 +296,6 @@ impl Store {
     }
 
     /// Ends the uploads that have expired, but none to which a piece is being written. Says how many.
-    ///
-    /// # Errors
-    /// If a row or a file can't be removed.
     pub async fn expire_partials(&self) -> Result<usize, StoreError> {
         let rows = sqlx::query("SELECT id FROM partials WHERE expires_at <= ?")
             .bind(Timestamp::now().0)
@@ -338,9 +323,6 @@ impl Store {
 
     /// Bytes of the disk that were promised and are not written: the rest of uploads in pieces, and
     /// of jobs what is not assembled.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn promised_bytes(&self) -> Result<u64, StoreError> {
         let row = sqlx::query(
             "SELECT (SELECT coalesce(sum(length - received), 0) FROM partials WHERE result IS NULL)

@@ -9,9 +9,6 @@ use crate::store::rows::{json, to_json};
 
 impl Store {
     /// The report of a calibration; none if it is not made yet.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn report(&self, id: CalibrationId) -> Result<Option<CalibrationReport>, StoreError> {
         let row = sqlx::query("SELECT report FROM calibration_reports WHERE calibration = ?")
             .bind(id.to_string())
@@ -21,9 +18,6 @@ impl Store {
     }
 
     /// A picture of a report, as PNG; none if there is none of this name.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn map(&self, id: CalibrationId, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let row =
             sqlx::query("SELECT png FROM calibration_maps WHERE calibration = ? AND name = ?")

@@ -55,9 +55,6 @@ impl Store {
     }
 
     /// The result files of a snapshot (or, with none, of the whole job), by name.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn result_files(
         &self,
         job: &Job,

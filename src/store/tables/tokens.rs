@@ -29,9 +29,6 @@ pub struct Token {
 
 impl Store {
     /// Records a token by the hash of its secret.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn add_token(&self, token: &Token, secret: &Secret) -> Result<(), StoreError> {
         sqlx::query(
             "INSERT INTO tokens (id, hash, lab, role, note, max_bytes, created_at)
@@ -50,9 +47,6 @@ impl Store {
     }
 
     /// The token with this secret, unless it was revoked.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn token(&self, secret: &Secret) -> Result<Option<Token>, StoreError> {
         let row = sqlx::query("SELECT * FROM tokens WHERE hash = ? AND revoked_at IS NULL")
             .bind(secret.hash().to_string())
@@ -62,9 +56,6 @@ impl Store {
     }
 
     /// All tokens, oldest first, each with the bytes that it keeps here.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn tokens(&self) -> Result<Vec<(Token, u64)>, StoreError> {
         let rows = sqlx::query(
             "SELECT *, (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
@@ -97,18 +88,12 @@ impl Store {
 
     /// True if no token was ever made: everyone may do everything then. Revoking the last one does
     /// not open the service again.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn is_open(&self) -> Result<bool, StoreError> {
         let row = sqlx::query("SELECT 1 FROM tokens LIMIT 1").fetch_optional(&self.readers).await?;
         Ok(row.is_none())
     }
 
     /// Bytes of uploads that a token keeps here, or has begun.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn token_bytes(&self, id: TokenId) -> Result<u64, StoreError> {
         let row = sqlx::query(
             "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)

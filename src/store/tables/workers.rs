@@ -47,9 +47,6 @@ pub struct WorkerTask {
 
 impl Store {
     /// Records that a worker has started.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<(), StoreError> {
         let now = Timestamp::now().0;
         sqlx::query(
@@ -67,17 +64,11 @@ impl Store {
     }
 
     /// Records that a worker lives though it has no task; a heartbeat says the same of one that has.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn worker_seen(&self, id: WorkerId) -> Result<(), StoreError> {
         seen(&mut *self.writer.acquire().await?, id).await
     }
 
     /// The workers that gave a sign of life within `age`.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>, StoreError> {
         let rows = sqlx::query(
             "SELECT workers.id, pid, version, started_at, seen_at, job, calibration, kind, snapshot, tile, stage
@@ -92,9 +83,6 @@ impl Store {
     }
 
     /// The last sign of life of a worker; none if it is not on record.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>, StoreError> {
         let row = sqlx::query("SELECT seen_at FROM workers WHERE id = ?")
             .bind(id.to_string())
@@ -104,9 +92,6 @@ impl Store {
     }
 
     /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
-    ///
-    /// # Errors
-    /// If the database fails.
     pub async fn forget_workers(&self, age: Duration) -> Result<(), StoreError> {
         sqlx::query("DELETE FROM workers WHERE seen_at < ?")
             .bind(since(age))
