@@ -81,7 +81,7 @@ pub fn calibrate<W: Write>(
     Ok((Calibrated { report, sample, clipped_negatives }, masks))
 }
 
-/// The report on masks \[B,H,W\] on \[0,1\] that nobody's captures are known of.
+/// The report on masks \[B,H,W\] on \[0,1\] that were sent as such.
 ///
 /// # Errors
 /// Masks that can't be read; a stop.
