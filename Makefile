@@ -34,7 +34,7 @@ $(JUDGES)/.stamp: tests/judges/requirements.txt
 
 faults: runtime ## 200 random kills, pieces sent twice, faults at file operations, damaged data, hanging tasks
 	SCI_RECON_KILLS=200 SCI_RECON_FAULT_POINTS=25 $(PYTHON) scripts/figures.py faults \
-		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable::
+		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable:: identity::
 
 load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once (12 GB of disk)
 	$(PYTHON) scripts/figures.py load \

@@ -80,6 +80,15 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_JOB_DAYS", value_name = "DAYS")]
     pub job_days: Option<u32>,
 
+    /// Days for which files are kept in quarantine/ that no record knows of, as a crash may leave them.
+    #[arg(long, env = "SCI_RECON_QUARANTINE_DAYS", value_name = "DAYS", default_value_t = 7)]
+    pub quarantine_days: u32,
+
+    /// Goes on where database and folder do not belong together: takes the database for right, and moves
+    /// files that it does not know to quarantine/. For one start, after the reason has been understood.
+    #[arg(long)]
+    pub accept_database: bool,
+
     /// Free bytes of the disk below which unused uploads and the oldest ended jobs go before their
     /// time; those of the last hour stay. 0: never.
     #[arg(long, env = "SCI_RECON_LOW_WATER_BYTES", value_name = "BYTES", default_value_t = 0)]

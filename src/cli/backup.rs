@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::CliError;
-use crate::store::Store;
+use crate::store::{Purpose, Store};
 
 /// Copies a data folder while the service runs, and checks the hash of every file. To restore it,
 /// serve the copy (or a copy of it).
@@ -24,10 +24,6 @@ pub struct Arguments {
 /// # Errors
 /// If a folder can't be used, or files are damaged: their names are in the text.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
-    if !arguments.data.join("sci-recon.db").is_file() {
-        let text = format!("{} is no data folder of a service", arguments.data.display());
-        return Err(CliError::Input(text));
-    }
     if arguments.out.exists() {
         let text = format!("{} is there already; name a new folder", arguments.out.display());
         return Err(CliError::Input(text));
@@ -35,7 +31,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
     let backup = runtime.block_on(async {
-        let store = Store::open(&arguments.data).await?;
+        let store = Store::open(&arguments.data, Purpose::Use).await?;
         let backup = store.backup(&arguments.out).await?;
         store.close().await;
         Ok::<_, CliError>(backup)

@@ -13,6 +13,7 @@ const TICK: Duration = Duration::from_secs(5);
 const TICKS_PER_CLEANING: u64 = 120;
 /// What is younger stays, however full the disk is.
 const HOUR: Duration = Duration::from_secs(3600);
+const DAY: Duration = Duration::from_secs(86_400);
 
 /// Every few seconds: figures; at the start and every ten minutes: cleaning.
 pub(super) async fn keep_house(store: Store, metrics: Metrics, settings: ServeArguments) {
@@ -31,15 +32,15 @@ pub(super) async fn keep_house(store: Store, metrics: Metrics, settings: ServeAr
 
 async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreError> {
     // 1. What crashes have left.
-    let orphans = store.remove_orphans().await?;
+    store.advance_generation().await?;
+    store.dir().sweep_tmp()?;
+    let orphans = store.quarantine_orphans(false).await?;
+    store.empty_quarantine(ago(DAY * settings.quarantine_days)).await?;
     // 2. What is older than it may get.
     let uploads =
         store.expire_partials().await? + store.collect(ago(settings.upload_age())).await?;
     let mut jobs = match settings.job_days {
-        Some(days) => {
-            let age = Duration::from_secs(u64::from(days) * 86_400);
-            store.remove_jobs(ago(age), u64::MAX).await?
-        }
+        Some(days) => store.remove_jobs(ago(DAY * days), u64::MAX).await?,
         None => 0,
     };
     // 3. If the disk is nearly full: what nobody uses, then the oldest jobs.

@@ -15,7 +15,7 @@ use super::logging;
 use super::supervisor::Supervisor;
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, router};
-use crate::store::{Store, StoreError};
+use crate::store::{Purpose, Store, StoreError};
 
 /// How long open requests may take to end at a shutdown.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -31,9 +31,6 @@ pub enum ServeError {
     /// The store can't be opened.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// Another server has the folder.
-    #[error("another server uses {0}; stop it first, or give this one its own --data")]
-    Taken(String),
     /// The address can't be had.
     #[error("can't listen at {address}: {source}")]
     Listen {
@@ -70,12 +67,12 @@ pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
 
 async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     // 1. The store, for this server alone.
-    let store = Store::open(&settings.data).await?;
-    let taken = || ServeError::Taken(store.dir().root().display().to_string());
-    let _lock = store.dir().try_lock_server()?.ok_or_else(taken)?;
+    let accept_database = settings.accept_database;
+    let store = Store::open(&settings.data, Purpose::Serve { accept_database }).await?;
     settings.check(store.is_open().await?)?;
     // 2. What an earlier server left.
     let swept = store.dir().sweep_tmp()?;
+    store.quarantine_orphans(accept_database).await?;
     store.forget_workers(Duration::from_secs(60)).await?;
     // 3. The address, for those who wait for it; who has it may send a signal.
     let signal = stop_signal().map_err(io("listen for signals"))?;
@@ -110,6 +107,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     }
     // 6. The end: workers give their tasks back.
     supervisor.ended().await;
+    store.advance_generation().await?;
     // It only tells where the service was.
     let _ = std::fs::remove_file(store.dir().root().join(ADDRESS_FILE));
     store.close().await;

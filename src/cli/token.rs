@@ -8,7 +8,7 @@ use rand::TryRngCore;
 
 use super::CliError;
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
-use crate::store::{Store, StoreError, Token};
+use crate::store::{Purpose, Store, StoreError, Token};
 
 /// Makes, lists and revokes tokens. With the first one the service is closed to all without one.
 #[derive(Debug, Args)]
@@ -45,6 +45,9 @@ struct Create {
     /// Bytes of uploads that it may keep here [default: no limit].
     #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u64).range(..1 << 53))]
     max_bytes: Option<u64>,
+    /// Makes the data folder, if there is none yet.
+    #[arg(long)]
+    new: bool,
     /// Whom it is for.
     #[arg(long, value_name = "TEXT")]
     note: Option<Label>,
@@ -55,21 +58,35 @@ struct Create {
 /// # Errors
 /// If there is no such token, or the store can't be used.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
-    if !arguments.data.join("sci-recon.db").is_file()
-        && !matches!(arguments.action, Action::Create(_))
-    {
-        let text = format!("{} is no data folder of a service", arguments.data.display());
-        return Err(CliError::Input(text));
-    }
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
     runtime.block_on(async {
-        let store = Store::open(&arguments.data).await?;
+        let store = open(arguments).await?;
         let text = act(&store, &arguments.action).await?;
+        // A copy of the database from before has other tokens, or none, and is known by this.
+        if !matches!(arguments.action, Action::List) {
+            store.advance_generation().await?;
+        }
         store.close().await;
         let mut stdout = std::io::stdout();
         writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
     })
+}
+
+async fn open(arguments: &Arguments) -> Result<Store, CliError> {
+    let create = match &arguments.action {
+        Action::Create(create) => Some(create.new),
+        _ => None,
+    };
+    match (Store::open(&arguments.data, Purpose::Use).await, create) {
+        (Err(StoreError::NoFolder(_)), Some(true)) => {
+            Ok(Store::open(&arguments.data, Purpose::Serve { accept_database: false }).await?)
+        }
+        (Err(error @ StoreError::NoFolder(_)), Some(false)) => {
+            Err(CliError::Input(format!("{error}; --new makes one")))
+        }
+        (opened, _) => Ok(opened?),
+    }
 }
 
 async fn act(store: &Store, action: &Action) -> Result<String, CliError> {
@@ -125,7 +142,7 @@ fn table(tokens: &[(Token, u64)]) -> String {
 impl From<StoreError> for CliError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::NotFound { .. } => Self::Input(error.to_string()),
+            StoreError::NotFound { .. } | StoreError::NoFolder(_) => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }
     }

@@ -11,7 +11,7 @@ use crate::config::WorkerArguments;
 use crate::job::WorkerId;
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
-use crate::store::Store;
+use crate::store::{Purpose, Store};
 use crate::worker::{Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
@@ -30,7 +30,7 @@ pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
         .build()
         .map_err(|error| failed(&error))?;
     let ended = runtime.block_on(async {
-        let store = Store::open(&settings.data).await.map_err(|error| failed(&error))?;
+        let store = Store::open(&settings.data, Purpose::Use).await?;
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
         let id = settings.id.unwrap_or_else(WorkerId::new);

@@ -267,6 +267,9 @@ impl From<StoreError> for ApiError {
             StoreError::Database(_)
             | StoreError::Migrate(_)
             | StoreError::Io { .. }
+            | StoreError::NoFolder(_)
+            | StoreError::Taken(_)
+            | StoreError::Refused { .. }
             | StoreError::Corrupt { .. } => return Self::internal(&error),
         };
         Self::new(code, error.to_string())

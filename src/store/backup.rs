@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use sha2::Digest;
 
 use super::error::StoreError;
-use super::{Store, dir, on_files};
+use super::{Store, dir, identity, on_files};
 use crate::job::Sha256;
 
 /// What a backup holds.
@@ -50,11 +50,14 @@ impl Store {
             .execute(&self.readers)
             .await?;
         let expected = self.expected_hashes().await?;
+        let marker = identity::marker(&mut *self.readers.acquire().await?, super::schema()).await?;
         lock.rollback().await?;
         // 2. The bytes.
         let backup = on_files(move || {
             let mut backup = Backup::default();
             copy_all(&frozen, Path::new(""), &to, &expected, &mut backup)?;
+            // Last: a copy that was broken off is no data folder.
+            identity::write(&to, &to.join("sci-recon.json.new"), &marker)?;
             Ok(backup)
         })
         .await?;

@@ -1,73 +1,105 @@
-//! Removing what nobody needs: old jobs, and files that no row knows of.
+//! Putting away what nobody needs: old jobs, and files that no row knows of.
 //!
 //! A crash between a file's move and the commit of its row leaves a file without a row. Nothing is
 //! removed that a row refers to, and rows and files change together under the writer's lock.
 
+use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+use futures_util::TryStreamExt;
+
 use super::error::StoreError;
 use super::rows::parsed;
-use super::{Store, dir, on_files};
+use super::{DataDir, Store, dir, on_files};
 use crate::job::{JobId, PartialId, Sha256, Timestamp};
 
 /// An upload in pieces is a file first and a row a moment later.
 const YOUNG: Duration = Duration::from_secs(60);
 
-/// A file or folder and the row that should know of it.
-enum Candidate {
-    Blob(Sha256, PathBuf),
-    Results(JobId, PathBuf),
-    Partial(PartialId, PathBuf),
+/// A crash leaves one or two things without a row. Above this number, and above this share of all files or
+/// of their bytes, the database is not the folder's, or has lost records.
+const FEW: usize = 3;
+const SHARE: f64 = 0.2;
+
+/// What a row should know of.
+#[derive(Debug, PartialEq, Eq, Hash)]
+enum Thing {
+    Blob(Sha256),
+    Results(JobId),
+    Partial(PartialId),
 }
 
 impl Store {
-    /// Removes temporary files of dead processes, and blobs, results and partial uploads that no row
-    /// knows of. Says how many.
-    pub async fn remove_orphans(&self) -> Result<usize, StoreError> {
+    /// Moves blobs, results and partial uploads that no row knows of to `quarantine/TIME`. Says how many.
+    ///
+    /// # Errors
+    /// [`StoreError::Refused`] if they are too many, unless `all` is set: nothing is moved then.
+    pub async fn quarantine_orphans(&self, all: bool) -> Result<usize, StoreError> {
+        // 1. Without the lock: nearly all are known.
+        let known = self.known_things().await?;
         let root = self.dir().clone();
-        let (mut removed, candidates) = on_files(move || {
-            let swept = root.sweep_tmp()?;
-            let mut found = Vec::new();
-            for folder in children(&root.blobs())? {
-                for path in children(&folder)? {
-                    let hex = format!("{}{}", name(&folder), name(&path));
-                    found.extend(hex.parse().ok().map(|sha256| Candidate::Blob(sha256, path)));
-                }
-            }
-            for path in children(&root.all_results())? {
-                found.extend(name(&path).parse().ok().map(|job| Candidate::Results(job, path)));
-            }
-            for path in children(&root.partials())?.into_iter().filter(|path| is_settled(path)) {
-                found.extend(name(&path).parse().ok().map(|id| Candidate::Partial(id, path)));
-            }
-            Ok((swept, found))
+        let unknown = on_files(move || {
+            let mut things = things(&root)?;
+            things.retain(|(thing, _)| !known.contains(thing));
+            Ok(things)
         })
         .await?;
-        for candidate in candidates {
-            // Without the lock first: nearly all are known.
-            if !self.is_known(&candidate).await? && self.remove_orphan(candidate).await? {
-                removed += 1;
+        // 2. With it: files change together with their rows.
+        let mut orphans = Vec::new();
+        if !unknown.is_empty() {
+            let mut transaction = self.write().await?;
+            for (thing, path) in unknown {
+                if path.exists() && !is_known(&mut transaction, &thing).await? {
+                    orphans.push((thing, path));
+                }
             }
         }
-        Ok(removed)
-    }
-
-    async fn is_known(&self, candidate: &Candidate) -> Result<bool, StoreError> {
-        let mut connection = self.readers.acquire().await?;
-        known(&mut connection, candidate).await
-    }
-
-    async fn remove_orphan(&self, candidate: Candidate) -> Result<bool, StoreError> {
-        let mut transaction = self.write().await?;
-        if known(&mut transaction, &candidate).await? {
-            return Ok(false);
+        if orphans.len() > FEW && !all {
+            let (root, paths) = (self.dir().clone(), paths(&orphans));
+            on_files(move || refuse_too_many(&root, &paths)).await?;
         }
-        let (Candidate::Blob(_, path) | Candidate::Results(_, path) | Candidate::Partial(_, path)) =
-            candidate;
-        on_files(move || dir::remove(&path)).await?;
-        Ok(true)
+        let place = self.dir().quarantine().join(folder_name(Timestamp::now()));
+        let count = orphans.len();
+        for (thing, path) in orphans {
+            let mut transaction = self.write().await?;
+            if is_known(&mut transaction, &thing).await? {
+                continue;
+            }
+            tracing::warn!(file = %path.display(), "no record knows of it: moved to the quarantine");
+            let (root, place) = (self.dir().root().to_owned(), place.clone());
+            on_files(move || quarantine(&root, &path, &place)).await?;
+        }
+        Ok(count)
+    }
+
+    /// Removes what came into the quarantine before `before`.
+    pub async fn empty_quarantine(&self, before: Timestamp) -> Result<(), StoreError> {
+        let (quarantine, before) = (self.dir().quarantine(), folder_name(before));
+        on_files(move || {
+            let old = dir::children(&quarantine)?.into_iter().filter(|path| name(path) < before);
+            old.into_iter().try_for_each(|path| dir::remove(&path))
+        })
+        .await
+    }
+
+    async fn known_things(&self) -> Result<HashSet<Thing>, StoreError> {
+        let mut known = HashSet::new();
+        let mut rows = sqlx::query("SELECT sha256 FROM blobs").fetch(&self.readers);
+        while let Some(row) = rows.try_next().await? {
+            known.insert(Thing::Blob(parsed(&row, "sha256")?));
+        }
+        let mut rows = sqlx::query("SELECT id FROM jobs").fetch(&self.readers);
+        while let Some(row) = rows.try_next().await? {
+            known.insert(Thing::Results(parsed(&row, "id")?));
+        }
+        let mut rows =
+            sqlx::query("SELECT id FROM partials WHERE result IS NULL").fetch(&self.readers);
+        while let Some(row) = rows.try_next().await? {
+            known.insert(Thing::Partial(parsed(&row, "id")?));
+        }
+        Ok(known)
     }
 
     /// Deletes jobs that ended before `before`, oldest first, until so many bytes of the disk are
@@ -100,18 +132,16 @@ impl Store {
     }
 }
 
-async fn known(
+async fn is_known(
     connection: &mut sqlx::SqliteConnection,
-    candidate: &Candidate,
+    thing: &Thing,
 ) -> Result<bool, StoreError> {
-    let query = match candidate {
-        Candidate::Blob(sha256, _) => {
+    let query = match thing {
+        Thing::Blob(sha256) => {
             sqlx::query("SELECT 1 FROM blobs WHERE sha256 = ?").bind(sha256.to_string())
         }
-        Candidate::Results(job, _) => {
-            sqlx::query("SELECT 1 FROM jobs WHERE id = ?").bind(job.to_string())
-        }
-        Candidate::Partial(id, _) => {
+        Thing::Results(job) => sqlx::query("SELECT 1 FROM jobs WHERE id = ?").bind(job.to_string()),
+        Thing::Partial(id) => {
             let query = "SELECT 1 FROM partials WHERE id = ? AND result IS NULL";
             sqlx::query(query).bind(id.to_string())
         }
@@ -119,14 +149,71 @@ async fn known(
     Ok(query.fetch_optional(connection).await?.is_some())
 }
 
-fn children(folder: &Path) -> Result<Vec<PathBuf>, StoreError> {
-    let entries = match fs::read_dir(folder) {
-        // Not a folder, or gone meanwhile.
-        Err(_) if !folder.is_dir() => return Ok(Vec::new()),
-        entries => entries.map_err(StoreError::io("read the folder", folder))?,
-    };
-    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
-    paths.collect::<Result<_, _>>().map_err(StoreError::io("read the folder", folder))
+/// All that lies in the folder.
+fn things(root: &DataDir) -> Result<Vec<(Thing, PathBuf)>, StoreError> {
+    let mut found = Vec::new();
+    for folder in dir::children(&root.blobs())? {
+        for path in dir::children(&folder)? {
+            let hex = format!("{}{}", name(&folder), name(&path));
+            found.extend(hex.parse().ok().map(|sha256| (Thing::Blob(sha256), path)));
+        }
+    }
+    for path in dir::children(&root.all_results())? {
+        found.extend(name(&path).parse().ok().map(|job| (Thing::Results(job), path)));
+    }
+    for path in dir::children(&root.partials())?.into_iter().filter(|path| is_settled(path)) {
+        found.extend(name(&path).parse().ok().map(|id| (Thing::Partial(id), path)));
+    }
+    Ok(found)
+}
+
+fn paths(things: &[(Thing, PathBuf)]) -> Vec<PathBuf> {
+    things.iter().map(|(_, path)| path.clone()).collect()
+}
+
+fn refuse_too_many(root: &DataDir, orphans: &[PathBuf]) -> Result<(), StoreError> {
+    let (files, bytes) = measure(orphans)?;
+    let (all, all_bytes) = measure(&[root.blobs(), root.all_results(), root.partials()])?;
+    #[allow(clippy::cast_precision_loss)] // a share
+    let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
+    if share(files, all).max(share(bytes, all_bytes)) <= SHARE {
+        return Ok(());
+    }
+    let found = "the database does not know of";
+    Err(StoreError::Refused {
+        folder: root.root().to_owned(),
+        found: format!("{found} {files} of the {all} files ({bytes} of {all_bytes} bytes)"),
+        remedy: super::identity::ACCEPT,
+    })
+}
+
+/// Number and bytes of the files at and below these paths.
+fn measure(paths: &[PathBuf]) -> Result<(u64, u64), StoreError> {
+    let (mut files, mut bytes) = (0, 0);
+    for path in paths {
+        let (more, more_bytes) = if path.is_dir() {
+            measure(&dir::children(path)?)?
+        } else {
+            // It may be gone meanwhile.
+            (1, fs::metadata(path).map_or(0, |meta| meta.len()))
+        };
+        files += more;
+        bytes += more_bytes;
+    }
+    Ok((files, bytes))
+}
+
+fn quarantine(root: &Path, path: &Path, place: &Path) -> Result<(), StoreError> {
+    let to = place.join(path.strip_prefix(root).unwrap_or(path));
+    if let Some(folder) = to.parent() {
+        fs::create_dir_all(folder).map_err(StoreError::io("make the folder", folder))?;
+    }
+    dir::rename_durably(path, &to)
+}
+
+/// A name that sorts by time.
+fn folder_name(time: Timestamp) -> String {
+    time.to_string().replace(':', "-")
 }
 
 fn name(path: &Path) -> String {

@@ -13,9 +13,11 @@ use crate::job::{JobId, PartialId, Sha256};
 ///
 /// ```text
 /// sci-recon.db          records
+/// sci-recon.json        the marker: which folder this is, for the database to be compared with
 /// blobs/ab/cdef...      files by the SHA-256 of their bytes
 /// results/JOB/          manifest.json and one folder for each snapshot
 /// partial/ID            uploads that come in pieces
+/// quarantine/TIME/      what no record knows of, for some days
 /// tmp/                  files that are being written, locked by their writers
 /// ```
 #[derive(Debug, Clone)]
@@ -24,16 +26,28 @@ pub struct DataDir {
 }
 
 impl DataDir {
-    /// Makes the folder and those in it, where they are missing.
+    /// Makes the folder where it is missing.
     pub(crate) fn create(root: &Path) -> Result<Self, StoreError> {
         fs::create_dir_all(root).map_err(StoreError::io("make the folder", root))?;
-        let root = root.canonicalize().map_err(StoreError::io("find", root))?;
-        for name in ["blobs", "results", "partial", "tmp"] {
-            let path = root.join(name);
+        Self::find(root)
+    }
+
+    /// The folder, which must be there.
+    pub(crate) fn find(root: &Path) -> Result<Self, StoreError> {
+        match root.canonicalize() {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                Err(StoreError::NoFolder(root.to_owned()))
+            }
+            path => Ok(Self { root: path.map_err(StoreError::io("find", root))?.into() }),
+        }
+    }
+
+    /// Makes the folders in it, where they are missing.
+    pub(crate) fn fill(&self) -> Result<(), StoreError> {
+        for path in [self.blobs(), self.all_results(), self.partials(), self.tmp()] {
             fs::create_dir_all(&path).map_err(StoreError::io("make the folder", &path))?;
         }
-        sync_dir(&root)?;
-        Ok(Self { root: root.into() })
+        sync_dir(&self.root)
     }
 
     /// The folder itself.
@@ -85,27 +99,18 @@ impl DataDir {
         self.root.join("tmp")
     }
 
-    /// Waits for the lock file `name` and holds it until the file is dropped.
-    pub(crate) async fn lock_blocking(&self, name: &str) -> Result<File, StoreError> {
-        let path = self.root.join(name);
-        super::on_files(move || {
-            let file = File::create(&path).map_err(StoreError::io("make", &path))?;
-            file.lock().map_err(StoreError::io("lock", &path))?;
-            Ok(file)
-        })
-        .await
+    /// What no row knows of is kept here for some days.
+    pub(crate) fn quarantine(&self) -> PathBuf {
+        self.root.join("quarantine")
     }
 
-    /// Takes the lock of the server, of which there is one for each folder; none if it is taken.
-    ///
-    /// # Errors
-    /// If the lock file can't be made.
-    pub fn try_lock_server(&self) -> Result<Option<File>, StoreError> {
+    /// Takes the lock of the server, of which there is one for each folder.
+    pub(crate) fn lock_server(&self) -> Result<File, StoreError> {
         let path = self.root.join("server.lock");
         let file = File::create(&path).map_err(StoreError::io("make", &path))?;
         match file.try_lock() {
-            Ok(()) => Ok(Some(file)),
-            Err(TryLockError::WouldBlock) => Ok(None),
+            Ok(()) => Ok(file),
+            Err(TryLockError::WouldBlock) => Err(StoreError::Taken(self.root.to_path_buf())),
             Err(TryLockError::Error(error)) => Err(StoreError::io("lock", &path)(error)),
         }
     }
@@ -146,6 +151,25 @@ impl DataDir {
 fn is_young(file: &File, age: Duration) -> bool {
     let modified = file.metadata().and_then(|meta| meta.modified());
     modified.is_ok_and(|at| SystemTime::now().duration_since(at).is_ok_and(|past| past < age))
+}
+
+/// Runs work on files, which blocks, where it may block.
+pub(crate) async fn on_files<T, F>(work: F) -> Result<T, StoreError>
+where
+    T: Send + 'static,
+    F: FnOnce() -> Result<T, StoreError> + Send + 'static,
+{
+    tokio::task::spawn_blocking(work).await.map_err(|_| StoreError::Interrupted)?
+}
+
+/// The paths in a folder; none if it is no folder, or gone.
+pub(crate) fn children(folder: &Path) -> Result<Vec<PathBuf>, StoreError> {
+    let entries = match fs::read_dir(folder) {
+        Err(_) if !folder.is_dir() => return Ok(Vec::new()),
+        entries => entries.map_err(StoreError::io("read the folder", folder))?,
+    };
+    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+    paths.collect::<Result<_, _>>().map_err(StoreError::io("read the folder", folder))
 }
 
 /// Writes a folder's entries to the disk: without it a rename may be forgotten in a power cut.

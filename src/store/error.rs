@@ -31,6 +31,25 @@ pub enum StoreError {
         /// The value, as text.
         value: String,
     },
+    /// There is no data folder.
+    #[error("{path} is no data folder of a service", path = .0.display())]
+    NoFolder(PathBuf),
+    /// Another server has the folder.
+    #[error(
+        "another server uses {path}; stop it first, or give this one its own --data",
+        path = .0.display()
+    )]
+    Taken(PathBuf),
+    /// Database and folder do not belong together, or files are too many for the records.
+    #[error("{folder}: {found}. Nothing was changed. To go on, {remedy}", folder = folder.display())]
+    Refused {
+        /// The folder.
+        folder: PathBuf,
+        /// What was found.
+        found: String,
+        /// What to do.
+        remedy: &'static str,
+    },
     /// There is no such thing.
     #[error("there is no {what} {id}")]
     NotFound {

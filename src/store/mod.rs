@@ -16,6 +16,7 @@ mod backup;
 mod cleaning;
 mod dir;
 mod error;
+mod identity;
 mod queue;
 mod rows;
 mod staging;
@@ -24,7 +25,9 @@ mod tables;
 #[cfg(test)]
 mod tests;
 
+use std::fs::File;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::sqlite::{
@@ -34,7 +37,9 @@ use sqlx::{Connection, SqlitePool};
 
 pub use backup::Backup;
 pub use dir::DataDir;
+pub(crate) use dir::on_files;
 pub use error::StoreError;
+pub use identity::Purpose;
 pub use queue::{
     CalibrationDone, CalibrationInputs, CalibrationTask, ClaimedTask, Completion, Heartbeat,
     JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Step,
@@ -57,6 +62,15 @@ pub struct Store {
     /// One connection: within a process, writers wait for each other here and not in SQLite.
     writer: SqlitePool,
     readers: SqlitePool,
+    /// The lock of the server, if this is its store.
+    _server: Option<Arc<File>>,
+}
+
+static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!();
+
+/// The number of the newest migration.
+fn schema() -> i64 {
+    MIGRATIONS.iter().map(|migration| migration.version).max().unwrap_or_default()
 }
 
 /// A transaction that holds the writer's lock from its start, so that it can't fail half-way
@@ -64,16 +78,20 @@ pub struct Store {
 pub(crate) type WriteTransaction = sqlx::Transaction<'static, Sqlite>;
 
 impl Store {
-    /// Opens the store in `root`, makes what is missing, and brings the database up to date.
+    /// Opens the store in `root`.
     ///
     /// # Errors
-    /// If the folder can't be written, the database can't be opened, or a newer version of this
-    /// program has changed it.
-    pub async fn open(root: &Path) -> Result<Self, StoreError> {
-        let dir = DataDir::create(root)?;
+    /// If the folder is none, is another server's, or does not belong to its database; if it can't be
+    /// written; or if a newer version of this program has changed the database.
+    pub async fn open(root: &Path, purpose: Purpose) -> Result<Self, StoreError> {
+        let serves = purpose != Purpose::Use;
+        let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
+        let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
+        identity::check(&dir, purpose, schema()).await?;
+        dir.fill()?;
         let options = SqliteConnectOptions::new()
             .filename(dir.database())
-            .create_if_missing(true)
+            .create_if_missing(serves)
             .foreign_keys(true)
             .busy_timeout(Duration::from_secs(15))
             .journal_mode(SqliteJournalMode::Wal)
@@ -89,18 +107,34 @@ impl Store {
             // fails to roll back again and holds the transaction to be open for ever.
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
-        // Two processes that start together must not both make the tables.
-        let lock = dir.lock_blocking("migrate.lock").await?;
         let writer = writer.await?;
-        sqlx::migrate!().run(&writer).await?;
-        drop(lock);
+        // Where the folder is only used, nothing is left to do: this refuses a newer database.
+        MIGRATIONS.run(&writer).await?;
         let readers = SqlitePoolOptions::new()
             .max_connections(4)
             .idle_timeout(None)
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
-        Ok(Self { dir, writer, readers })
+        let store = Self { dir, writer, readers, _server: server };
+        if serves {
+            identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
+            store.write_marker().await?;
+            store.advance_generation().await?;
+        }
+        Ok(store)
+    }
+
+    /// Lets the database and the marker be newer than all copies of them; see [`identity`].
+    pub async fn advance_generation(&self) -> Result<(), StoreError> {
+        sqlx::query("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
+        self.write_marker().await
+    }
+
+    async fn write_marker(&self) -> Result<(), StoreError> {
+        let marker = identity::marker(&mut *self.writer.acquire().await?, schema()).await?;
+        let (root, draft) = (self.dir.root().to_owned(), self.temporary_path());
+        on_files(move || identity::write(&root, &draft, &marker)).await
     }
 
     /// Where the files are.
@@ -124,13 +158,4 @@ impl Store {
     pub(crate) async fn write(&self) -> Result<WriteTransaction, StoreError> {
         Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
     }
-}
-
-/// Runs work on files, which blocks, where it may block.
-pub(crate) async fn on_files<T, F>(work: F) -> Result<T, StoreError>
-where
-    T: Send + 'static,
-    F: FnOnce() -> Result<T, StoreError> + Send + 'static,
-{
-    tokio::task::spawn_blocking(work).await.map_err(|_| StoreError::Interrupted)?
 }

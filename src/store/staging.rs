@@ -43,7 +43,7 @@ impl Drop for Temporary {
 }
 
 impl Store {
-    fn temporary_path(&self) -> PathBuf {
+    pub(super) fn temporary_path(&self) -> PathBuf {
         self.dir().tmp().join(Uuid::now_v7().to_string())
     }
 

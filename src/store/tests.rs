@@ -13,7 +13,7 @@ use tempfile::TempDir;
 
 use super::{
     ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
-    Product, Store, StoreError, Work, WorkerEnd,
+    Product, Purpose, Store, StoreError, Work, WorkerEnd,
 };
 use crate::job::{
     Algorithm, JobId, JobRequest, JobState, MeasurementId, Sha256, SnapshotSelection, TaskKind,
@@ -41,7 +41,8 @@ impl Lab {
     /// A store with a calibration of 64x96 pixels and a measurement of two snapshots.
     async fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let store = Store::open(folder.path()).await.unwrap();
+        let store =
+            Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
         let upload = |bytes: &[u8]| {
             let mut writer = store.blob_writer().unwrap();
             writer.write_all(bytes).unwrap();
@@ -401,7 +402,7 @@ async fn tiles_wait_for_the_pilot_and_cost_what_it_leaves_of_them() {
 async fn a_second_process_sees_the_same_store() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    let other = Store::open(lab.store.dir().root()).await.unwrap();
+    let other = Store::open(lab.store.dir().root(), Purpose::Use).await.unwrap();
     let task = other.claim(WorkerId::new(), LEASE).await.unwrap().unwrap();
     assert_eq!((task.step().job, lab.state(job).await), (job, JobState::Running));
 }

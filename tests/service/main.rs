@@ -15,6 +15,7 @@ mod deep;
 mod faults;
 mod hangs;
 mod hostile;
+mod identity;
 mod jobs;
 mod learned;
 mod load;

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use rand::{Rng, RngCore, SeedableRng};
 use reqwest::{Method, RequestBuilder};
-use sci_recon::store::Store;
+use sci_recon::store::{Purpose, Store};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -389,7 +389,7 @@ async fn a_slow_piece_holds_up_nobody_and_does_not_expire() {
     assert_eq!(offset(&app, &path).await, "0");
     app.send(tus(&app, Method::DELETE, &path)).await.problem(423, "upload_busy");
     // Its time is over; the cleaning lets it be.
-    let store = Store::open(app.data()).await.unwrap();
+    let store = Store::open(app.data(), Purpose::Use).await.unwrap();
     let mut database = app.database().await;
     sqlx::query("UPDATE partials SET expires_at = 1").execute(&mut database).await.unwrap();
     assert_eq!(store.expire_partials().await.unwrap(), 1, "the one that is stored");

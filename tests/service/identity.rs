@@ -1,0 +1,263 @@
+//! A data folder whose database is missing, empty, older or another one's: the start is refused with the
+//! reason, and every file is still there.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use crate::app::TestApp;
+use crate::faults::sha256;
+
+fn run(arguments: &[&str], data: &Path) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
+    command.env("RUST_LOG", "error").output().unwrap()
+}
+
+/// All files of users, by their hashes.
+fn files(data: &Path) -> BTreeMap<String, String> {
+    let (mut found, mut folders) = (BTreeMap::new(), Vec::new());
+    folders.extend(["blobs", "results", "partial"].map(|name| data.join(name)));
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(data).unwrap().display().to_string();
+                found.insert(name, sha256(&std::fs::read(&path).unwrap()));
+            }
+        }
+    }
+    found
+}
+
+/// Files as they come in, none of which is like another one.
+async fn send(app: &TestApp, count: usize, seed: &str) {
+    for number in 0..count {
+        app.upload(format!("{seed} {number}").into_bytes()).await;
+    }
+}
+
+/// The folder is refused by the server, and by all who only use one, and is as it was.
+fn refused(data: &Path, sentence: &str) {
+    let before = files(data);
+    let serve = ["serve", "--listen", "127.0.0.1:0", "--workers", "0", "--min-free-bytes", "0"];
+    let copy = data.join("copy").display().to_string();
+    for arguments in [
+        &serve[..],
+        &["worker"],
+        &["backup", "--out", &copy],
+        &["token", "list"],
+        &["token", "create", "--lab", "a", "--new"],
+    ] {
+        let output = run(arguments, data);
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success(), "{arguments:?}");
+        assert!(output.stdout.is_empty(), "{arguments:?} announces something");
+        assert!(text.contains(sentence), "{arguments:?}: {text}");
+        assert!(text.contains("Nothing was changed. To go on, "), "{arguments:?}: {text}");
+        assert_eq!(files(data), before, "{arguments:?}");
+        assert!(!data.join("quarantine").exists());
+    }
+}
+
+fn database(data: &Path) -> std::path::PathBuf {
+    data.join("sci-recon.db")
+}
+
+fn remove_log(data: &Path) {
+    for name in ["sci-recon.db-wal", "sci-recon.db-shm"] {
+        // Gone already after a clean end.
+        let _ = std::fs::remove_file(data.join(name));
+    }
+}
+
+#[tokio::test]
+async fn a_folder_without_its_database_is_refused() {
+    let mut app = TestApp::start().await;
+    send(&app, 2, "a").await;
+    app.stop();
+    let data = app.data().to_owned();
+    let whole = std::fs::read(database(&data)).unwrap();
+    let marker = data.join("sci-recon.json");
+    // Missing, with and without the marker.
+    std::fs::remove_file(database(&data)).unwrap();
+    refused(
+        &data,
+        "the database sci-recon.db is missing, though there are a marker and files here",
+    );
+    let mark = std::fs::read(&marker).unwrap();
+    std::fs::remove_file(&marker).unwrap();
+    refused(&data, "the database sci-recon.db is missing, though there are files here");
+    assert!(!database(&data).exists(), "nobody has made one");
+    // Empty.
+    std::fs::write(&marker, mark).unwrap();
+    std::fs::write(database(&data), b"").unwrap();
+    refused(&data, "the database sci-recon.db is empty, though there are a marker and files here");
+    // The marker alone.
+    std::fs::write(database(&data), whole).unwrap();
+    std::fs::remove_file(&marker).unwrap();
+    refused(&data, "the marker sci-recon.json is missing");
+    // Who says so may go on.
+    let app = app.again(&["--workers", "0", "--accept-database"]).await;
+    assert_eq!(files(&data).len(), 2);
+    app.get("/v1/jobs").await.expect(200);
+    assert!(marker.exists());
+}
+
+#[tokio::test]
+async fn another_or_an_older_database_is_refused() {
+    let mut app = TestApp::start().await;
+    send(&app, 2, "a").await;
+    app.stop();
+    let data = app.data().to_owned();
+    let older = std::fs::read(database(&data)).unwrap();
+    app.restart();
+    send(&app, 2, "b").await;
+    app.stop();
+    let newer = std::fs::read(database(&data)).unwrap();
+    std::fs::write(database(&data), older).unwrap();
+    refused(&data, "the database is older than the folder");
+    // That of another service.
+    let mut other = TestApp::start().await;
+    other.stop();
+    std::fs::copy(database(other.data()), database(&data)).unwrap();
+    refused(&data, "the database belongs to another folder");
+    // Its own one is taken again.
+    std::fs::write(database(&data), newer).unwrap();
+    app.restart();
+    assert_eq!(files(&data).len(), 4);
+    // A lost write-ahead log: after a kill the last records are there alone.
+    send(&app, 1, "c").await;
+    app.kill();
+    remove_log(&data);
+    refused(&data, "the database is older than the folder, or has lost its -wal file");
+    let app = app.again(&["--workers", "0", "--accept-database"]).await;
+    assert_eq!((files(&data).len(), app.blobs_in("quarantine")), (4, 1));
+}
+
+/// A token changes the generation: a copy of the database from before it does not open the service.
+#[tokio::test]
+async fn a_database_from_before_the_tokens_does_not_open_the_service() {
+    let mut app = TestApp::start().await;
+    app.kill();
+    let older = ["sci-recon.db", "sci-recon.db-wal"].map(|name| (name, app.data().join(name)));
+    let older = older.map(|(name, path)| (name, std::fs::read(path).unwrap()));
+    app.token(&["create", "--lab", "a"]);
+    remove_log(app.data());
+    for (name, bytes) in older {
+        std::fs::write(app.data().join(name), bytes).unwrap();
+    }
+    refused(app.data(), "the database is older than the folder");
+}
+
+/// A database that is behind within one generation shows by what it does not know.
+#[tokio::test]
+async fn too_many_orphans_are_refused_and_few_wait_in_the_quarantine() {
+    let mut app = TestApp::start().await;
+    send(&app, 10, "a").await;
+    let mut connection = app.database().await;
+    let mut forget = async |count: i64| {
+        for sql in [
+            "DELETE FROM holdings WHERE sha256 IN (SELECT sha256 FROM blobs ORDER BY sha256 LIMIT ?)",
+            "DELETE FROM blobs WHERE sha256 IN (SELECT sha256 FROM blobs ORDER BY sha256 LIMIT ?)",
+        ] {
+            sqlx::query(sql).bind(count).execute(&mut connection).await.unwrap();
+        }
+    };
+    // One, as after a crash.
+    forget(1).await;
+    app.restart();
+    assert_eq!((app.blobs_in("blobs"), app.blobs_in("quarantine")), (9, 1));
+    // Many.
+    forget(4).await;
+    app.kill();
+    let data = app.data().to_owned();
+    let before = files(&data);
+    let output = run(&["serve", "--listen", "127.0.0.1:0", "--workers", "0"], &data);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && output.stdout.is_empty());
+    assert!(text.contains("the database does not know of 4 of the 9 files"), "{text}");
+    assert_eq!(files(&data), before);
+    let app = app.again(&["--workers", "0", "--accept-database"]).await;
+    assert_eq!((app.blobs_in("blobs"), app.blobs_in("quarantine")), (5, 5));
+    // They stay for days, and go then.
+    let old = data.join("quarantine/2020-01-01T00-00-00.000Z");
+    std::fs::create_dir_all(&old).unwrap();
+    std::fs::write(old.join("something"), b"old").unwrap();
+    let app = app.again(&["--workers", "0"]).await;
+    let start = std::time::Instant::now();
+    while old.exists() {
+        assert!(start.elapsed().as_secs() < 10, "the quarantine has an end");
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+    assert_eq!(app.blobs_in("quarantine"), 5);
+}
+
+#[tokio::test]
+async fn a_folder_from_before_is_adopted_and_a_copy_of_it_starts() {
+    let mut app = TestApp::start().await;
+    send(&app, 5, "a").await;
+    app.stop();
+    // As an earlier version has left it.
+    std::fs::remove_file(app.data().join("sci-recon.json")).unwrap();
+    let mut connection = app.database().await;
+    for sql in ["DROP TABLE folder", "DELETE FROM _sqlx_migrations WHERE version >= 80"] {
+        sqlx::query(sql).execute(&mut connection).await.unwrap();
+    }
+    drop(connection);
+    let output = run(&["token", "list"], app.data());
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(text.contains("older version of this program. Nothing was changed"), "{text}");
+    app.restart();
+    assert_eq!(app.blobs_in("blobs"), 5);
+    assert!(app.data().join("sci-recon.json").exists());
+    // A copy is an older state together with its files.
+    let folder = tempfile::tempdir().unwrap();
+    let copy = folder.path().join("copy").display().to_string();
+    assert!(run(&["backup", "--out", &copy], app.data()).status.success());
+    app.restart();
+    let mut restored = TestApp::on(folder, "copy", &["--workers", "0"]).await;
+    assert_eq!(restored.blobs_in("blobs"), 5);
+    restored.restart();
+    // And a copy that was broken off is none.
+    restored.stop();
+    std::fs::remove_file(restored.data().join("sci-recon.json")).unwrap();
+    refused(restored.data(), "the marker sci-recon.json is missing");
+}
+
+#[test]
+fn only_the_server_makes_a_folder_unless_it_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data");
+    for path in [folder.path(), &data] {
+        for arguments in [
+            &["worker"][..],
+            &["backup", "--out", "/nowhere/copy"],
+            &["token", "list"],
+            &["token", "create", "--lab", "a"],
+        ] {
+            let output = run(arguments, path);
+            let text = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert_eq!(output.status.code(), Some(2), "{arguments:?}: {text}");
+            assert!(text.contains("is no data folder of a service"), "{arguments:?}: {text}");
+        }
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    assert!(run(&["token", "create", "--lab", "a", "--new"], &data).status.success());
+    assert!(run(&["token", "list"], &data).status.success());
+}
+
+impl TestApp {
+    fn blobs_in(&self, folder: &str) -> usize {
+        let (mut count, mut folders) = (0, vec![self.data().join(folder)]);
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() { folders.push(path) } else { count += 1 }
+            }
+        }
+        count
+    }
+}
