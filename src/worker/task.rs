@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::{assemble, finish, pilot, prepare, preview, tile};
 use crate::formats::FormatError;
-use crate::job::{InvalidField, Sha256, TaskKind, TaskProgress};
+use crate::job::{Sha256, TaskKind, TaskProgress};
 use crate::pipeline::history::History;
 use crate::pipeline::{NetworkError, ResultError, WarmNetworks};
 use crate::recon::ReconError;
@@ -148,14 +148,6 @@ impl From<ReconError> for TaskError {
             ReconError::Cancelled => Self::Stopped,
             other => Self::Recon(other),
         }
-    }
-}
-
-/// Errors of a stored schedule, which was checked before it was stored.
-impl From<Vec<InvalidField>> for TaskError {
-    fn from(errors: Vec<InvalidField>) -> Self {
-        let problem = errors.first().map_or_else(String::new, |error| error.detail.clone());
-        Self::Record { what: "schedule", problem }
     }
 }
 

@@ -7,10 +7,61 @@
 //! `G^2 (G^2 + tau^2)^-1` with `G = Y Y^T`: nearly as sharp (of second order in the eigenvalues),
 //! and one Cholesky factorisation instead of an eigenvalue problem.
 
+use std::ops::Range;
+
 use multiversion::multiversion;
 use ndarray::Array3;
 
-use crate::recon::schedule::Sigma;
+use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
+use crate::recon::error::ReconError;
+
+/// Groups of similar patches, filtered by their own covariance.
+pub const NONLOCAL: NonlocalPrior = NonlocalPrior;
+
+/// See [`NONLOCAL`].
+pub struct NonlocalPrior;
+
+impl Prior for NonlocalPrior {
+    fn name(&self) -> &'static str {
+        "nonlocal"
+    }
+
+    fn summary(&self) -> &'static str {
+        "groups of similar patches, filtered by their own covariance"
+    }
+
+    fn parameters(&self) -> Vec<&'static Parameter> {
+        vec![&SIGMA]
+    }
+
+    fn cost(&self, _: &Settings) -> f64 {
+        1_700.0
+    }
+
+    /// Four clips with margins, and 40 indices for each 16 pixels.
+    fn memory(&self) -> Memory {
+        Memory { per_voxel: 30, per_network_pixel: 0 }
+    }
+
+    fn begin(&self, size: (usize, usize, usize)) -> Box<dyn Pass> {
+        Box::new(Nonlocal::new(size))
+    }
+}
+
+impl Pass for Nonlocal {
+    fn apply(
+        &mut self,
+        x: &mut Array3<f32>,
+        rows: Range<usize>,
+        settings: &Settings,
+        _: &mut dyn Networks,
+        ready: &mut Ready<'_>,
+    ) -> Result<(), ReconError> {
+        self.denoise(x, settings.sigma);
+        (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
+        Ok(())
+    }
+}
 
 /// Height and width of a patch, pixels.
 const SIDE: usize = 6;
@@ -76,7 +127,7 @@ impl Nonlocal {
     ///
     /// Passes of one object belong to one clip: patches are compared in the result of the pass
     /// before, and the groups are kept for a few passes.
-    pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: Sigma) {
+    pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) {
         debug_assert_eq!(frames.dim(), (self.frames, self.height, self.width));
         if self.height < SIDE || self.width < SIDE {
             return;
@@ -145,10 +196,10 @@ impl Nonlocal {
         }
     }
 
-    fn filter_groups(&mut self, sigma: Sigma) {
+    fn filter_groups(&mut self, sigma: f32) {
         let Self { noisy, sum, groups, filter, width, .. } = self;
         let row_length = row_length(*width);
-        let tau = STRENGTH * PATCHES as f32 * sigma.value() * sigma.value();
+        let tau = STRENGTH * PATCHES as f32 * sigma * sigma;
         sum.fill(0.0);
         for batch in groups.chunks(LANES * PATCHES) {
             for (index, &place) in batch.iter().enumerate() {
@@ -188,7 +239,7 @@ fn positions(length: usize) -> Vec<usize> {
 }
 
 /// Positions that are searched around `at`.
-fn window(at: usize, length: usize) -> std::ops::Range<usize> {
+fn window(at: usize, length: usize) -> Range<usize> {
     let count = length - SIDE + 1;
     let start = at.saturating_sub(WINDOW / 2).min(count.saturating_sub(WINDOW));
     start..(start + WINDOW).min(count)
@@ -322,7 +373,6 @@ fn subtract(row: &mut [Lanes], other: &[Lanes], factor: &Lanes) {
 #[cfg(test)]
 mod tests {
     use super::{Nonlocal, PATCHES, PIXELS, positions, window};
-    use crate::recon::schedule::Sigma;
     use ndarray::Array3;
     use rand::{Rng, SeedableRng};
 
@@ -347,7 +397,7 @@ mod tests {
             let (clean, mut video) = noisy(size, 0.1);
             let before = mean_square(&video, &clean);
             let mut prior = Nonlocal::new(size);
-            prior.denoise(&mut video, Sigma::new(0.1).unwrap());
+            prior.denoise(&mut video, 0.1);
             let after = mean_square(&video, &clean);
             // A handful of patches tells little.
             let least = if size.1 < 10 { 1.0 } else { 0.25 };
@@ -362,7 +412,7 @@ mod tests {
         let mut video = clean.clone();
         let mut prior = Nonlocal::new(size);
         for _ in 0..6 {
-            prior.denoise(&mut video, Sigma::new(0.01).unwrap());
+            prior.denoise(&mut video, 0.01);
         }
         assert!(mean_square(&video, &clean) < 1e-4, "{}", mean_square(&video, &clean));
     }
@@ -371,7 +421,7 @@ mod tests {
     fn frames_smaller_than_a_patch_and_frames_without_contrast_stay() {
         for size in [(2, 5, 30), (3, 30, 30)] {
             let mut video = Array3::from_elem(size, 0.25f32);
-            Nonlocal::new(size).denoise(&mut video, Sigma::new(0.05).unwrap());
+            Nonlocal::new(size).denoise(&mut video, 0.05);
             assert!(video.iter().all(|&x| (x - 0.25).abs() < 1e-5), "{size:?}");
         }
     }
