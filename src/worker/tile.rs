@@ -163,3 +163,23 @@ fn stage(progress: &Progress) -> TaskStage {
         (false, None) => TaskStage::Tv,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::stage;
+    use crate::recon::prior::SIGMA;
+    use crate::recon::prior::registry::PRIORS;
+    use crate::recon::solver::Progress;
+
+    #[test]
+    fn a_job_tells_which_prior_is_at_work() {
+        for prior in PRIORS {
+            let (deep, sigma) = (prior.network().is_some(), prior.takes(&SIGMA).then_some(0.1));
+            let (residual, change) = (0.1, 0.1);
+            let progress =
+                Progress { stage: 0, done: 1, planned: 2, residual, change, sigma, deep };
+            let expected = if deep { "deep" } else { prior.name() };
+            assert_eq!(stage(&progress).name(), expected);
+        }
+    }
+}

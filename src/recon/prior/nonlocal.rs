@@ -372,7 +372,7 @@ fn subtract(row: &mut [Lanes], other: &[Lanes], factor: &Lanes) {
 
 #[cfg(test)]
 mod tests {
-    use super::{Nonlocal, PATCHES, PIXELS, positions, window};
+    use super::{Filter, LANES, Nonlocal, PATCHES, PIXELS, low_rank, positions, window};
     use ndarray::Array3;
     use rand::{Rng, SeedableRng};
 
@@ -402,6 +402,73 @@ mod tests {
             // A handful of patches tells little.
             let least = if size.1 < 10 { 1.0 } else { 0.25 };
             assert!(after < least * before, "{size:?}: {before} to {after}");
+        }
+    }
+
+    /// Eigenvalues and eigenvectors (rows) of a symmetric matrix, by Jacobi's rotations.
+    #[allow(clippy::needless_range_loop)] // the indices of the algebra
+    fn eigen(mut a: Vec<Vec<f64>>) -> (Vec<f64>, Vec<Vec<f64>>) {
+        let n = a.len();
+        let mut vectors: Vec<Vec<f64>> =
+            (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect();
+        for (p, q) in (0..12).flat_map(|_| (0..n).flat_map(|q| (0..q).map(move |p| (p, q)))) {
+            let angle = 0.5 * (2.0 * a[p][q]).atan2(a[q][q] - a[p][p]);
+            let (s, c) = angle.sin_cos();
+            for k in 0..n {
+                (a[k][p], a[k][q]) = (c * a[k][p] - s * a[k][q], s * a[k][p] + c * a[k][q]);
+            }
+            for rows in [&mut a, &mut vectors] {
+                for k in 0..n {
+                    let (x, y) = (rows[p][k], rows[q][k]);
+                    (rows[p][k], rows[q][k]) = (c * x - s * y, s * x + c * y);
+                }
+            }
+        }
+        ((0..n).map(|i| a[i][i]).collect(), vectors)
+    }
+
+    /// Each eigenvector `e` of `G = Y Y^T` with the eigenvalue `l` keeps the share `l^2 / (l^2 + tau^2)`.
+    #[test]
+    fn the_filter_is_that_of_the_eigenvalues() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+        let (mut filter, tau) = (Box::<Filter>::default(), 0.9);
+        for lane in 0..LANES {
+            // Few directions and noise, as in a group of similar patches.
+            let directions: Vec<f32> = (0..3 * PIXELS).map(|_| rng.random::<f32>() - 0.5).collect();
+            for patch in 0..PATCHES {
+                let shares: [f32; 3] = rng.random();
+                for i in 0..PIXELS {
+                    let signal: f32 = (0..3).map(|d| shares[d] * directions[d * PIXELS + i]).sum();
+                    let noise = 0.3 * (rng.random::<f32>() - 0.5);
+                    filter.patches[i][patch][lane] = 0.5 + signal + noise;
+                }
+            }
+        }
+        let before = filter.patches;
+        low_rank(&mut filter, tau);
+        for lane in [0, 5, LANES - 1] {
+            let mean = |i: usize| {
+                (0..PATCHES).map(|k| f64::from(before[i][k][lane])).sum::<f64>() / PATCHES as f64
+            };
+            let centred: Vec<Vec<f64>> = (0..PIXELS)
+                .map(|i| (0..PATCHES).map(|k| f64::from(before[i][k][lane]) - mean(i)).collect())
+                .collect();
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let gram = centred.iter().map(|a| centred.iter().map(|b| dot(a, b)).collect());
+            let (values, vectors) = eigen(gram.collect());
+            assert!(values.iter().any(|l| *l > 2.0) && values.iter().any(|l| *l < 0.5));
+            for k in 0..PATCHES {
+                let patch: Vec<f64> = centred.iter().map(|row| row[k]).collect();
+                for i in 0..PIXELS {
+                    let kept = values.iter().zip(&vectors).map(|(value, vector)| {
+                        let square = value * value;
+                        square / (square + f64::from(tau * tau)) * dot(vector, &patch) * vector[i]
+                    });
+                    let expected = mean(i) + kept.sum::<f64>();
+                    let found = f64::from(filter.patches[i][k][lane]);
+                    assert!((found - expected).abs() < 1e-4, "{lane} {k} {i}: {found} {expected}");
+                }
+            }
         }
     }
 

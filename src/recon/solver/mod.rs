@@ -305,3 +305,155 @@ impl<'a> Run<'a> {
         (squares.sqrt() / self.y_norm) as f32
     }
 }
+
+/// A slow, readable solver's parts, for the tests of GAP and ADMM.
+#[cfg(test)]
+mod reference {
+    use super::{Observer, Outcome};
+    use crate::recon::ReconError;
+    use crate::recon::prior::{Denoiser, Network, Networks};
+    use crate::recon::schedule::Schedule;
+    use crate::recon::sensing::SensingOperator;
+    use ndarray::{Array2, Array3, ArrayView2};
+    use rand::{Rng, SeedableRng};
+    use serde_json::json;
+
+    /// A small random problem, with a denoiser that pulls every voxel towards a grey.
+    pub(super) struct Problem {
+        pub(super) schedule: Schedule,
+        masks: Array3<f32>,
+        y: Array2<f32>,
+    }
+
+    const GREY: f64 = 0.4;
+    const PULL: f64 = 0.25;
+
+    struct Pull;
+
+    impl Denoiser for Pull {
+        fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
+            frames.mapv_inplace(|x| x + PULL as f32 * (GREY as f32 - x));
+            Ok(())
+        }
+    }
+
+    impl Networks for Pull {
+        fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
+            Ok(self)
+        }
+    }
+
+    type Solver = fn(
+        &SensingOperator,
+        ArrayView2<'_, f32>,
+        &Schedule,
+        &mut dyn Networks,
+        &mut dyn Observer,
+    ) -> Result<Outcome, ReconError>;
+
+    impl Problem {
+        pub(super) fn random(seed: u64, method: &str) -> Self {
+            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+            let size = (rng.random_range(1..5), rng.random_range(1..8), rng.random_range(1..40));
+            let masks = Array3::from_shape_simple_fn(size, || 0.2 + 0.8 * rng.random::<f32>());
+            let y = Array2::from_shape_simple_fn((size.1, size.2), || 2.0 * rng.random::<f32>());
+            let memory: f32 = rng.random();
+            let stage = json!({"prior": "ffdnet", "iterations": 7, "sigma": [0.1, 0.1],
+                "memory": memory, "momentum": 0.5 * rng.random::<f32>()});
+            let schedule = json!({"method": method, "accelerated": rng.random::<bool>(),
+                "gamma": 0.3 * rng.random::<f32>(), "stages": [stage]});
+            Self { schedule: serde_json::from_value(schedule).unwrap(), masks, y }
+        }
+
+        pub(super) fn solve(&self, solver: Solver) -> Outcome {
+            let op = SensingOperator::new(self.masks.clone()).unwrap();
+            let op = op.with_gamma(self.schedule.gamma).unwrap();
+            solver(&op, self.y.view(), &self.schedule, &mut Pull, &mut ()).unwrap()
+        }
+
+        pub(super) fn pixels(&self) -> usize {
+            self.y.len()
+        }
+
+        pub(super) fn zeros(&self) -> Vec<f64> {
+            vec![0.0; self.masks.len()]
+        }
+
+        pub(super) fn denoise(&self, x: &mut [f64]) {
+            x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
+        }
+
+        /// `P(w)`, with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
+        pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
+            let pixels = self.pixels();
+            let (gamma, memory) = (self.schedule.gamma, self.schedule.stages[0].memory);
+            let mask: Vec<f64> = self.masks.iter().map(|&c| f64::from(c)).collect();
+            let mut x = w.to_vec();
+            for (p, &y) in self.y.iter().enumerate() {
+                let voxels = || (p..w.len()).step_by(pixels);
+                let seen: f64 = voxels().map(|voxel| mask[voxel] * w[voxel]).sum();
+                let gram: f64 = voxels().map(|voxel| mask[voxel].powi(2)).sum();
+                let mut target = f64::from(y);
+                if self.schedule.accelerated {
+                    y1[p] = target + f64::from(memory) * (y1[p] - seen);
+                    target = y1[p];
+                }
+                for voxel in voxels() {
+                    x[voxel] += mask[voxel] * (target - seen) / (gram + f64::from(gamma));
+                }
+            }
+            x
+        }
+    }
+
+    /// The largest difference of two clips.
+    pub(super) fn furthest(frames: &Array3<f32>, reference: &[f64]) -> f64 {
+        let pairs = frames.iter().zip(reference);
+        pairs.map(|(&a, b)| (f64::from(a) - b).abs()).fold(0.0, f64::max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Run;
+    use crate::recon::prior::temporal::TemporalVariation;
+    use crate::recon::prior::tv::TotalVariation;
+    use crate::recon::schedule::Schedule;
+    use crate::recon::sensing::SensingOperator;
+    use ndarray::{Array2, Array3};
+    use rand::{Rng, SeedableRng};
+
+    /// Strip by strip is what projection, total variation along time and that of each frame do one after
+    /// the other.
+    #[test]
+    fn the_sweep_by_strips_is_that_of_whole_frames_bit_by_bit() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let size = (3, 37, 21);
+        let mut random = || Array3::from_shape_simple_fn(size, || rng.random::<f32>());
+        let (masks, v) = (random(), random());
+        let op = SensingOperator::new(masks).unwrap();
+        let y = op.forward(random().view()).unwrap();
+        let schedule = Schedule::gap_tv3d();
+        let stage = &schedule.stages[0];
+        let settings = stage.settings(0);
+
+        let (mut expected, mut y1) = (Array3::zeros(size), Array2::zeros(y.raw_dim()));
+        op.project(0..size.1, &y, Some((&mut y1, stage.memory)), &v, &mut expected);
+        let (weight, updates) = (settings.temporal_weight, settings.tv_updates);
+        let mut temporal = TemporalVariation::new(size.0);
+        temporal.denoise(&mut expected, 0..size.1, weight, updates);
+        TotalVariation::new(size).denoise(&mut expected, settings.tv_weight, updates);
+        let difference = (&expected - &v).mapv(|d| d * d).sum() / expected.mapv(|x| x * x).sum();
+
+        for rows in [1, 2, 5, 16, 36, 37] {
+            let mut networks = ();
+            let mut run = Run::new(&op, y.view(), &schedule, &mut networks);
+            run.state.v.assign(&v);
+            let (squares, change) = run.sweep(stage, &settings, rows).unwrap();
+            assert_eq!(run.x, expected, "{rows} rows");
+            let residual = (&y - &op.forward(v.view()).unwrap()).mapv(|r| r * r).sum();
+            assert!((squares / f64::from(residual) - 1.0).abs() < 1e-4, "{rows} rows: {squares}");
+            assert!((change.relative() / difference.sqrt() - 1.0).abs() < 1e-4, "{rows} rows");
+        }
+    }
+}
