@@ -107,7 +107,12 @@ impl JsonSchema for dyn Prior {
     }
 
     fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "type": "string", "enum": *NAMES })
+        let one = |prior: &dyn Prior| {
+            json_schema!({
+                "type": "string", "const": prior.name(), "description": prior.summary(),
+            })
+        };
+        json_schema!({ "oneOf": PRIORS.map(one) })
     }
 }
 
