@@ -13,7 +13,6 @@ const RULES: &[(&str, &[&str], &[&str])] = &[
             "axum",
             "sqlx",
             "tokio",
-            "serde",
             "crate::http",
             "crate::store",
             "crate::pipeline",

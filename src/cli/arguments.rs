@@ -7,7 +7,7 @@ use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
-use crate::job::{Algorithm, InvalidField, ScheduleSpec};
+use crate::job::{Algorithm, InvalidField};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
@@ -41,7 +41,7 @@ pub(super) struct EngineArguments {
 
 impl ScheduleArguments {
     /// The schedule, checked; without stages for an algorithm that has none.
-    pub(super) fn resolve(&self) -> Result<ScheduleSpec, CliError> {
+    pub(super) fn resolve(&self) -> Result<Schedule, CliError> {
         if self.algorithm == Algorithm::Learned {
             if self.schedule.is_some() || self.iterations.is_some() {
                 let text = "learned runs one network once: it takes no --schedule or --iterations";
@@ -49,7 +49,7 @@ impl ScheduleArguments {
             }
             return Ok(self.algorithm.default_schedule());
         }
-        let spec = match &self.schedule {
+        let schedule: Schedule = match &self.schedule {
             None => self.algorithm.default_schedule(),
             Some(path) => {
                 let refused = |error: &dyn std::fmt::Display| {
@@ -59,13 +59,19 @@ impl ScheduleArguments {
                 serde_json::from_str(&text).map_err(|error| refused(&error))?
             }
         };
-        let schedule = checked(&spec)?;
-        if let Some(misfit) = self.algorithm.misfit(&spec) {
+        let faults = InvalidField::of_schedule(&schedule);
+        if !faults.is_empty() {
+            let line = |fault: InvalidField| format!("{}: {}", fault.pointer, fault.detail);
+            let lines: Vec<String> = faults.into_iter().map(line).collect();
+            let text = format!("the schedule can't be used: {}", lines.join("; "));
+            return Err(CliError::Input(text));
+        }
+        if let Some(misfit) = self.algorithm.misfit(&schedule) {
             return Err(CliError::Input(format!("the schedule does not fit: {misfit}")));
         }
         Ok(match self.iterations {
-            Some(count) => ScheduleSpec::from(&schedule.with_iterations(count as usize)),
-            None => spec,
+            Some(count) => schedule.filled().with_iterations(count as usize),
+            None => schedule,
         })
     }
 }
@@ -77,18 +83,6 @@ impl EngineArguments {
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
         Ok(NetworkSource::new(library, Device::parse(&self.device)?))
     }
-}
-
-/// The schedule as the solver takes it; all that is wrong with it in one message.
-pub(super) fn checked(spec: &ScheduleSpec) -> Result<Schedule, CliError> {
-    spec.to_schedule().map_err(|errors| refused(&errors))
-}
-
-/// All that is wrong with a schedule in one message.
-pub(super) fn refused(errors: &[InvalidField]) -> CliError {
-    let line = |error: &InvalidField| format!("{}: {}", error.pointer, error.detail);
-    let lines: Vec<String> = errors.iter().map(line).collect();
-    CliError::Input(format!("the schedule can't be used: {}", lines.join("; ")))
 }
 
 /// Names of algorithms that need no network of the user's.

@@ -5,7 +5,7 @@ use std::sync::Mutex;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::job::ScheduleSpec;
+use crate::job::Schedule;
 use crate::pipeline::{ShareDone, TileProgress};
 use crate::recon::solver::Progress;
 use crate::recon::tile::Tile;
@@ -40,7 +40,7 @@ pub(super) struct SnapshotBar {
 }
 
 impl SnapshotBar {
-    pub(super) fn new(schedule: &ScheduleSpec, tiles: usize) -> Self {
+    pub(super) fn new(schedule: &Schedule, tiles: usize) -> Self {
         let tile = (ShareDone::new(schedule.clone()), 0.0);
         Self { bar: bar("reconstructing"), tiles: Mutex::new(vec![tile; tiles]) }
     }

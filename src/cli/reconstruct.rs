@@ -11,12 +11,12 @@ use clap::Args;
 use ndarray::{Array2, Array3, s};
 
 use super::CliError;
-use super::arguments::{EngineArguments, ScheduleArguments, checked, refused};
+use super::arguments::{EngineArguments, ScheduleArguments};
 use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
 use crate::intake::{Scaled, Source, read_masks, read_snapshot, read_truth};
-use crate::job::{Algorithm, ScheduleSpec, Timestamp};
+use crate::job::{Algorithm, Schedule, Timestamp};
 use crate::pipeline::manifest::{
     Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
     frame_attributes, full_schedule,
@@ -96,7 +96,7 @@ pub struct Arguments {
 /// What is to be done with the input.
 struct Setup {
     algorithm: Algorithm,
-    schedule: ScheduleSpec,
+    schedule: Schedule,
     snapshot: usize,
     plan: TilePlan,
     network: NetworkSource,
@@ -245,13 +245,9 @@ impl<'a> Input<'a> {
         let mut estimator = ScaleEstimator::new(height, width);
         self.masks.array.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
         let white = estimator.white(self.measurement.array.view())?;
-        let schedule;
         let solver = match &setup.model {
             Some(model) => Solver::Network(&model.file),
-            None => {
-                schedule = checked(&setup.schedule)?;
-                Solver::Schedule(&schedule)
-            }
+            None => Solver::Schedule(&setup.schedule),
         };
         let input = SnapshotInput {
             snapshot: setup.snapshot,
@@ -338,8 +334,7 @@ impl Solution {
         let content = Content {
             program_version: env!("CARGO_PKG_VERSION").into(),
             algorithm: setup.algorithm,
-            schedule: full_schedule(&setup.schedule, self.pilot.as_ref())
-                .map_err(|errors| refused(&errors))?,
+            schedule: full_schedule(&setup.schedule, self.pilot.as_ref()),
             pilot: self.pilot.clone(),
             frames,
             height,

@@ -3,7 +3,7 @@
 use axum::Json;
 use serde::Serialize;
 
-use crate::job::{Algorithm, PriorSpec, ScheduleSpec, TileSpec};
+use crate::job::{Algorithm, Schedule, TileSpec};
 use crate::pipeline::models;
 
 /// An algorithm as it is shown.
@@ -12,8 +12,8 @@ pub(super) struct AlgorithmBody {
     name: Algorithm,
     summary: &'static str,
     networks: Vec<&'static str>,
-    priors: Vec<PriorSpec>,
-    schedule: ScheduleSpec,
+    priors: Vec<&'static str>,
+    schedule: Schedule,
     planned_iterations: usize,
     planned_passes: usize,
     tile: TileSpec,
@@ -33,7 +33,7 @@ pub(super) async fn list() -> Json<ListBody> {
             name,
             summary: name.summary(),
             networks: schedule.networks().into_iter().map(|which| models::of(which).name).collect(),
-            priors: name.priors(),
+            priors: name.priors().iter().map(|prior| prior.name()).collect(),
             planned_iterations: schedule.planned_iterations(),
             planned_passes: schedule.planned_passes(),
             schedule,

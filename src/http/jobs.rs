@@ -16,7 +16,7 @@ use super::extract::{Body, Params, QueryOf, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
     Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
-    MeasurementId, ModelId, SceneShape, ScheduleSpec, Sha256, SnapshotRange, TileSpec, Timestamp,
+    MeasurementId, ModelId, SceneShape, Schedule, Sha256, SnapshotRange, TileSpec, Timestamp,
 };
 use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
 
@@ -33,7 +33,7 @@ pub(super) struct JobBody {
     algorithm: Algorithm,
     /// The network of `learned`; null for all others.
     model: Option<ModelId>,
-    schedule: ScheduleSpec,
+    schedule: Schedule,
     tile: TileSpec,
     priority: i32,
     /// What the check of the measurement found.

@@ -3,7 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::request::TileSpec;
-use super::schedule::{PriorSpec, ScheduleSpec};
+use crate::recon::prior::Prior;
+use crate::recon::prior::network::{FASTDVDNET, FASTDVDNET_INT8, FFDNET};
+use crate::recon::prior::nonlocal::NONLOCAL;
+use crate::recon::prior::registry::TV_FASTDVDNET;
+use crate::recon::prior::tv::TV;
 use crate::recon::schedule::Schedule;
 
 /// The algorithms.
@@ -95,8 +99,8 @@ impl Algorithm {
 
     /// The schedule of a job that names none; without stages for [`Self::Learned`], which has none.
     #[must_use]
-    pub fn default_schedule(self) -> ScheduleSpec {
-        ScheduleSpec::from(&match self {
+    pub fn default_schedule(self) -> Schedule {
+        match self {
             Self::GapTv => Schedule::gap_tv(),
             Self::GapTv3d => Schedule::gap_tv3d(),
             Self::AdmmTv => Schedule::admm_tv(),
@@ -104,8 +108,8 @@ impl Algorithm {
             Self::PnpFfdNet => Schedule::pnp_ffdnet(),
             Self::PnpFastDvdNet => Schedule::pnp_fastdvdnet(),
             Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
-            Self::Learned => return ScheduleSpec::without_stages(),
-        })
+            Self::Learned => Schedule::none(),
+        }
     }
 
     /// The tiles of a job that names none. Larger ones share less with their neighbours and are as fast
@@ -121,24 +125,23 @@ impl Algorithm {
 
     /// The priors that a schedule of this algorithm may name.
     #[must_use]
-    pub fn priors(self) -> Vec<PriorSpec> {
-        use PriorSpec as P;
+    pub fn priors(self) -> &'static [&'static dyn Prior] {
         match self {
-            Self::GapTv | Self::GapTv3d | Self::AdmmTv => vec![P::Tv],
-            Self::PnpNonlocal => vec![P::Tv, P::Nonlocal],
-            Self::PnpFfdNet => vec![P::Tv, P::FfdNet],
-            Self::PnpFastDvdNet => vec![P::Tv, P::FastDvdNetInt8, P::FastDvdNet],
+            Self::GapTv | Self::GapTv3d | Self::AdmmTv => &[&TV],
+            Self::PnpNonlocal => &[&TV, &NONLOCAL],
+            Self::PnpFfdNet => &[&TV, &FFDNET],
+            Self::PnpFastDvdNet => &[&TV, &FASTDVDNET_INT8, &FASTDVDNET],
             Self::PnpTvFastDvdNet => {
-                vec![P::Tv, P::FastDvdNetInt8, P::FastDvdNet, P::TvFastDvdNet, P::Nonlocal]
+                &[&TV, &FASTDVDNET_INT8, &FASTDVDNET, &TV_FASTDVDNET, &NONLOCAL]
             }
-            Self::Learned => Vec::new(),
+            Self::Learned => &[],
         }
     }
 
     /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
     /// what the stages don't do.
     #[must_use]
-    pub fn misfit(self, schedule: &ScheduleSpec) -> Option<String> {
+    pub fn misfit(self, schedule: &Schedule) -> Option<String> {
         let own = self.priors();
         let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;
         let taken = |other: &&Self| other.misfit(schedule).is_none();

@@ -1,8 +1,9 @@
 //! How much memory a worker needs for a job: planned when the job is asked for, not hoped for.
 
-use super::schedule::{MethodSpec, PriorSpec};
 use super::{JobModel, JobSpec};
 use crate::recon::preview;
+use crate::recon::prior::Memory;
+use crate::recon::schedule::Method;
 
 /// The program, its thread stacks and, with the deep denoiser, ONNX Runtime and the network.
 const BASE_BYTES: u64 = 128 << 20;
@@ -10,15 +11,6 @@ const BASE_BYTES: u64 = 128 << 20;
 const SOLVER_BYTES_PER_VOXEL: u64 = 24;
 /// The solver's start of a projection, with momentum or ADMM; and ADMM's multiplier.
 const START_BYTES_PER_VOXEL: u64 = 4;
-/// Clips and groups of the nonlocal prior for each voxel of a tile: four clips with margins, and 40
-/// indices for each 16 pixels.
-const NONLOCAL_BYTES_PER_VOXEL: u64 = 30;
-/// Arrays around the denoiser for each voxel of a tile: padded input, middle and output.
-const DENOISER_BYTES_PER_VOXEL: u64 = 24;
-/// Activations of the network for each pixel of the frames that it takes at once (measured).
-const NETWORK_BYTES_PER_PIXEL: u64 = 2600;
-/// The same for its twin of 8 bits, which stays loaded beside it (measured).
-const INT8_BYTES_PER_PIXEL: u64 = 2000;
 /// Pixels that the network takes at once, or one frame of the tile if that is larger.
 const NETWORK_PIXELS: u64 = 1 << 17;
 
@@ -57,25 +49,21 @@ impl JobSpec {
             return BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL + network;
         }
         let mut per_voxel = SOLVER_BYTES_PER_VOXEL;
-        if self.schedule.method == MethodSpec::Admm {
+        if self.schedule.method == Method::Admm {
             per_voxel += START_BYTES_PER_VOXEL;
         }
         if self.schedule.stages.iter().any(|stage| stage.momentum > 0.0) {
             per_voxel += START_BYTES_PER_VOXEL;
         }
-        if self.schedule.stages.iter().any(|stage| stage.prior == PriorSpec::Nonlocal) {
-            per_voxel += NONLOCAL_BYTES_PER_VOXEL;
-        }
-        let solver = BASE_BYTES + voxels * per_voxel;
-        if !self.schedule.needs_network() {
-            return solver;
-        }
-        let mut per_pixel = NETWORK_BYTES_PER_PIXEL;
-        if self.schedule.stages.iter().any(|stage| stage.prior == PriorSpec::FastDvdNetInt8) {
-            per_pixel += INT8_BYTES_PER_PIXEL;
-        }
-        let network = per_pixel * pixels.max(NETWORK_PIXELS);
-        solver + voxels * DENOISER_BYTES_PER_VOXEL + network
+        // A prior's arrays go with its stage, but networks stay loaded.
+        let most = |with_network: bool| {
+            let priors = self.schedule.stages.iter().map(|stage| stage.prior);
+            let needs = priors.filter(|prior| prior.network().is_some() == with_network);
+            needs.map(|prior| prior.memory()).fold(Memory::default(), Memory::most)
+        };
+        let (plain, network) = (most(false), most(true));
+        per_voxel += plain.per_voxel + network.per_voxel;
+        BASE_BYTES + voxels * per_voxel + network.per_network_pixel * pixels.max(NETWORK_PIXELS)
     }
 }
 

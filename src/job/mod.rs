@@ -3,7 +3,6 @@
 mod access;
 mod algorithm;
 mod captures;
-mod cost;
 mod disk;
 mod finding;
 mod ids;
@@ -12,11 +11,11 @@ mod model;
 mod reason;
 mod report;
 mod request;
-mod schedule;
 mod state;
 mod task;
 mod text;
 
+pub use crate::recon::schedule::Schedule;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
 pub use captures::Captures;
@@ -31,7 +30,6 @@ pub use request::{
     InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange, SnapshotSelection,
     TileSpec,
 };
-pub use schedule::{MethodSpec, PriorSpec, ScheduleSpec, StageSpec};
 pub use state::{IllegalTransition, JobState};
 pub use task::{TaskKind, TaskProgress, TaskStage, TaskState};
 pub use text::{InvalidText, Label, Sha256, Timestamp};

@@ -2,10 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{
-    Algorithm, CalibrationId, InvalidField, Label, ModelId, SceneShape, ScheduleSpec, Sha256,
-    TileSpec,
-};
+use super::{Algorithm, CalibrationId, InvalidField, Label, ModelId, SceneShape, Sha256, TileSpec};
+use crate::recon::schedule::Schedule;
 
 /// A tensor that a network takes or gives.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -82,7 +80,7 @@ impl ModelTrial {
 pub(super) struct ModelChoice<'a> {
     pub(super) algorithm: Algorithm,
     pub(super) model: Option<&'a JobModel>,
-    pub(super) schedule: Option<&'a ScheduleSpec>,
+    pub(super) schedule: Option<&'a Schedule>,
     pub(super) tile: Option<TileSpec>,
 }
 

@@ -6,8 +6,8 @@ use super::Finding;
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
-use super::schedule::ScheduleSpec;
 use super::text::Label;
+use crate::recon::schedule::Schedule;
 use crate::recon::tile::TilePlan;
 
 /// The most tasks of one job; a larger one should be sent as several ranges of snapshots.
@@ -26,6 +26,12 @@ impl InvalidField {
     /// `detail` is wrong at `pointer`.
     pub fn new(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
         Self { pointer: pointer.into(), detail: detail.into() }
+    }
+
+    /// All that is wrong with a schedule, with places in it.
+    pub fn of_schedule(schedule: &Schedule) -> Vec<Self> {
+        let faults = schedule.faults().into_iter();
+        faults.map(|(pointer, error)| Self::new(pointer, error.to_string())).collect()
     }
 
     /// The same error seen from one level further up.
@@ -154,7 +160,7 @@ pub struct JobRequest {
     pub model: Option<ModelId>,
     /// The schedule; the algorithm's own where it is left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub schedule: Option<ScheduleSpec>,
+    pub schedule: Option<Schedule>,
     /// The tiles; [`Algorithm::default_tile`] where it is left out, or the whole picture for a network
     /// that takes no other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -184,7 +190,7 @@ pub struct JobSpec {
     #[serde(default)]
     pub model: Option<JobModel>,
     /// The schedule; without stages for [`Algorithm::Learned`].
-    pub schedule: ScheduleSpec,
+    pub schedule: Schedule,
     /// The tiles.
     pub tile: TileSpec,
     /// The priority.
@@ -226,13 +232,13 @@ impl JobRequest {
         errors.extend(choice.errors(calibration, shape));
         let tile = choice.tile(shape);
         let schedule = self.schedule.unwrap_or_else(|| self.algorithm.default_schedule());
-        match schedule.to_schedule() {
-            _ if self.algorithm == Algorithm::Learned => {}
-            Err(wrong) => errors.extend(wrong.into_iter().map(|error| error.under("/schedule"))),
-            Ok(_) => {
+        if self.algorithm != Algorithm::Learned {
+            let faults = InvalidField::of_schedule(&schedule);
+            if faults.is_empty() {
                 let misfit = self.algorithm.misfit(&schedule);
                 errors.extend(misfit.map(|detail| InvalidField::new("/algorithm", detail)));
             }
+            errors.extend(faults.into_iter().map(|fault| fault.under("/schedule")));
         }
         match TilePlan::new(shape.height, shape.width, tile.size, tile.overlap) {
             Ok(plan) => errors.extend(too_many(plan.len(), snapshots)),

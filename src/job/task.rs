@@ -232,7 +232,7 @@ pub struct TaskProgress {
     /// Passes of the deep denoiser done so far.
     pub passes: u32,
     /// The share of the planned work that is done, on [0, 1], by cost and not by count: one deep
-    /// pass costs as much as thousands of TV iterations ([`super::ScheduleSpec::share_done`]).
+    /// pass costs as much as thousands of TV iterations ([`super::Schedule::share_done`]).
     pub fraction: f64,
 }
 

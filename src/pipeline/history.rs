@@ -34,7 +34,7 @@ impl History {
             iteration: progress.done,
             residual: progress.residual,
             change: progress.change,
-            sigma: progress.sigma.map(|sigma| sigma.value()),
+            sigma: progress.sigma,
         };
         if self.points.len() == POINTS {
             let mut index = 0;
@@ -73,7 +73,6 @@ fn rounded(value: f32) -> Value {
 #[cfg(test)]
 mod tests {
     use super::{History, POINTS};
-    use crate::recon::schedule::Sigma;
     use crate::recon::solver::Progress;
     use serde_json::Value;
 
@@ -81,7 +80,7 @@ mod tests {
         let mut history = History::default();
         for done in 1..=iterations {
             let (residual, change) = (1.0 / done as f32, f32::INFINITY);
-            let sigma = (done % 2 == 0).then(|| Sigma::new(0.1).unwrap());
+            let sigma = (done % 2 == 0).then(|| 0.1);
             history.note(&Progress {
                 stage: 0,
                 done,

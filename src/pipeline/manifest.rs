@@ -13,7 +13,7 @@ use super::models::{self, Model};
 use super::pilot::PilotRecord;
 use super::write::ResultFile;
 use crate::formats::exr::Attributes;
-use crate::job::{Algorithm, Finding, InvalidField, JobSpec, Label, ScheduleSpec, TileSpec};
+use crate::job::{Algorithm, Finding, JobSpec, Label, Schedule, TileSpec};
 use crate::recon::tile::TilePlan;
 
 /// Name and version of this form of record.
@@ -50,7 +50,7 @@ pub struct Content {
     pub algorithm: Algorithm,
     /// The schedule of the tiles in full, defaults included; without stages for an end-to-end
     /// network.
-    pub schedule: ScheduleSpec,
+    pub schedule: Schedule,
     /// How an adaptive schedule became this one.
     #[serde(default)]
     pub pilot: Option<PilotRecord>,
@@ -103,7 +103,7 @@ pub struct ModelRecord {
 
 impl ModelRecord {
     /// Those of a schedule that the program carries, in a fixed order.
-    pub fn of(schedule: &ScheduleSpec) -> Vec<Self> {
+    pub fn of(schedule: &Schedule) -> Vec<Self> {
         let record = |network| {
             let model = models::of(network);
             Self::new(&model, model.files.iter().map(|(_, content)| *content))
@@ -128,16 +128,9 @@ impl ModelRecord {
     }
 }
 
-/// A schedule as the tiles run it, with all defaults filled in; one without stages as it is.
-pub fn full_schedule(
-    schedule: &ScheduleSpec,
-    pilot: Option<&PilotRecord>,
-) -> Result<ScheduleSpec, Vec<InvalidField>> {
-    if schedule.stages.is_empty() {
-        return Ok(schedule.clone());
-    }
-    let schedule = schedule.to_schedule()?;
-    Ok(ScheduleSpec::from(&pilot.map_or(schedule.clone(), |pilot| pilot.decide(&schedule))))
+/// A schedule as the tiles run it, with all defaults filled in.
+pub fn full_schedule(schedule: &Schedule, pilot: Option<&PilotRecord>) -> Schedule {
+    pilot.map_or_else(|| schedule.clone(), |pilot| pilot.decide(schedule)).filled()
 }
 
 /// Every factor between the stored numbers and the solver's \[0,1\]. All are undone in the
@@ -282,7 +275,7 @@ pub(super) fn sample() -> Manifest {
     let content = Content {
         program_version: "0.0.0".into(),
         algorithm,
-        schedule: ScheduleSpec::from(&Schedule::gap_tv()),
+        schedule: Schedule::gap_tv(),
         pilot: None,
         frames: 3,
         height: 20,

@@ -5,7 +5,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::recon::schedule::Network;
+use crate::recon::prior::Network;
 
 /// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
 #[derive(Debug, Clone, Copy)]
@@ -71,7 +71,7 @@ const FFDNET_GRAY: Model = Model {
 mod tests {
     use super::of;
     use crate::pipeline::sha256_of;
-    use crate::recon::schedule::Network;
+    use crate::recon::prior::Network;
 
     #[test]
     fn the_twin_with_8_bits_was_made_from_these_weights() {

@@ -9,13 +9,11 @@ use std::sync::{Arc, OnceLock};
 use super::learned::ModelFile;
 use super::manifest::ModelRecord;
 use super::models;
-use crate::job::{ScheduleSpec, Sha256};
+use crate::job::{Schedule, Sha256};
 use crate::recon::ReconError;
-use crate::recon::prior::fastdvdnet::FastDvdNet;
-use crate::recon::prior::ffdnet::FfdNet;
+use crate::recon::prior::network::ClipDenoiser;
 use crate::recon::prior::onnx::{Device, EndToEndNetwork, Runtime};
-use crate::recon::prior::{Denoiser, Networks};
-use crate::recon::schedule::Network;
+use crate::recon::prior::{Denoiser, Network, Networks};
 
 /// The library's name beside the executable.
 const LIBRARY: &str = "libonnxruntime.so";
@@ -76,7 +74,7 @@ impl NetworkSource {
     ///
     /// # Errors
     /// A file of the folder of models can't be read.
-    pub fn records(&self, schedule: &ScheduleSpec) -> Result<Vec<ModelRecord>, NetworkError> {
+    pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;
             Ok(ModelRecord::new(&models::of(network), contents.iter().map(AsRef::as_ref)))
@@ -118,15 +116,8 @@ impl NetworkSource {
     }
 
     /// A network with sessions of its own, for one thread.
-    fn load(&self, which: Network) -> Result<Box<dyn Denoiser + Send>, NetworkError> {
-        let (runtime, files) = (self.runtime()?, self.contents(which)?);
-        Ok(match (which, files.as_slice()) {
-            (Network::FastDvdNet | Network::FastDvdNetInt8, [first, second]) => {
-                Box::new(FastDvdNet::load(&runtime, first, second)?)
-            }
-            (_, [model, ..]) => Box::new(FfdNet::load(&runtime, model)?),
-            (_, []) => return Err(NetworkError::Missing("the program carries no network".into())),
-        })
+    fn load(&self, which: Network) -> Result<ClipDenoiser, NetworkError> {
+        Ok(ClipDenoiser::load(&self.runtime()?, which, &self.contents(which)?)?)
     }
 
     /// An end-to-end network with a session of its own, for one thread.
@@ -159,7 +150,7 @@ impl NetworkSource {
 /// Networks of one thread: each is loaded at its first use and stays warm.
 pub struct WarmNetworks {
     source: NetworkSource,
-    loaded: Vec<(Network, Box<dyn Denoiser + Send>)>,
+    loaded: Vec<(Network, ClipDenoiser)>,
     /// The last end-to-end network.
     end_to_end: Option<(Sha256, EndToEndNetwork)>,
 }
@@ -201,7 +192,7 @@ impl Networks for WarmNetworks {
                 self.loaded.len() - 1
             }
         };
-        Ok(self.loaded[index].1.as_mut())
+        Ok(&mut self.loaded[index].1)
     }
 }
 
@@ -224,8 +215,8 @@ fn version_in(library: &[u8]) -> Option<String> {
 mod tests {
     use super::{NetworkSource, version_in};
     use crate::job::Algorithm;
+    use crate::recon::prior::Network;
     use crate::recon::prior::onnx::Device;
-    use crate::recon::schedule::Network;
 
     #[test]
     fn the_version_is_that_of_the_symbols() {

@@ -3,11 +3,10 @@
 use serde::{Deserialize, Serialize};
 
 use super::tile::TileInput;
-use crate::job::{PriorSpec, ScheduleSpec, StageSpec};
 use crate::recon::ReconError;
 use crate::recon::pilot::{self, StageFinding};
-use crate::recon::prior::Networks;
-use crate::recon::schedule::Schedule;
+use crate::recon::prior::{Networks, Prior};
+use crate::recon::schedule::{Schedule, Stage};
 use crate::recon::solver::Observer;
 
 /// What the pilot found, as it stands in manifests.
@@ -31,7 +30,7 @@ pub struct PilotRecord {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageRecord {
     /// Its prior.
-    pub prior: PriorSpec,
+    pub prior: &'static dyn Prior,
     /// The most iterations that might have been.
     pub planned: usize,
     /// Those that pay.
@@ -85,7 +84,7 @@ pub fn decide(
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
     let op = op.with_gamma(schedule.gamma)?;
     let findings = pilot::run(op, y.view(), schedule, networks, observer)?;
-    let record = |(stage, finding): (&StageSpec, StageFinding)| StageRecord {
+    let record = |(stage, finding): (&Stage, StageFinding)| StageRecord {
         prior: stage.prior,
         planned: stage.iterations,
         iterations: finding.iterations,
@@ -95,7 +94,6 @@ pub fn decide(
         error_before: finding.before,
         error_after: finding.after,
     };
-    let spec = ScheduleSpec::from(schedule);
-    let stages = spec.stages.iter().zip(findings).map(record).collect();
+    let stages = schedule.stages.iter().zip(findings).map(record).collect();
     Ok(Some(PilotRecord { snapshot, row, column, height, width, stages }))
 }

@@ -1,19 +1,19 @@
 //! How much of a tile's work is done.
 
-use crate::job::ScheduleSpec;
+use crate::job::Schedule;
 use crate::recon::solver::Progress;
 
 /// Turns the solver's progress into the share of the planned cost that is behind it.
 #[derive(Debug, Clone)]
 pub struct ShareDone {
-    schedule: ScheduleSpec,
+    schedule: Schedule,
     stage: usize,
     iterations: usize,
 }
 
 impl ShareDone {
     /// For one run of `schedule`.
-    pub fn new(schedule: ScheduleSpec) -> Self {
+    pub fn new(schedule: Schedule) -> Self {
         Self { schedule, stage: 0, iterations: 0 }
     }
 
@@ -31,7 +31,6 @@ impl ShareDone {
 #[cfg(test)]
 mod tests {
     use super::ShareDone;
-    use crate::job::ScheduleSpec;
     use crate::recon::schedule::Schedule;
     use crate::recon::solver::Progress;
 
@@ -39,7 +38,7 @@ mod tests {
     fn an_early_end_of_a_stage_jumps_to_its_end() {
         let schedule = Schedule::pnp_ffdnet();
         let passes = schedule.stages[1].iterations;
-        let mut share = ShareDone::new(ScheduleSpec::from(&schedule));
+        let mut share = ShareDone::new(schedule);
         let at = |stage, done| Progress {
             stage,
             done,

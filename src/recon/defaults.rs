@@ -2,7 +2,11 @@
 
 use std::ops::Range;
 
-use super::schedule::{Method, Network, Prior, Schedule, Sigma, Stage};
+use super::prior::Prior;
+use super::prior::network::{FASTDVDNET, FASTDVDNET_INT8, FFDNET};
+use super::prior::nonlocal::NONLOCAL;
+use super::prior::tv::TV;
+use super::schedule::{Method, Schedule, Stage};
 
 impl Schedule {
     /// GAP-TV.
@@ -12,7 +16,7 @@ impl Schedule {
 
     /// GAP-TV with total variation along time, too, where it pays.
     pub fn gap_tv3d() -> Self {
-        let stage = Stage { temporal_weight: TEMPORAL_WEIGHT, ..tv_stage(150, 3e-4) };
+        let stage = Stage { temporal_weight: Some(TEMPORAL_WEIGHT), ..tv_stage(150, 3e-4) };
         Self { adaptive: true, ..Self::gap(vec![stage]) }
     }
 
@@ -25,7 +29,7 @@ impl Schedule {
     /// PnP-FFDNet: total variation, then the image denoiser, frame by frame. Behind correlated masks
     /// it stays above total variation only with a long memory, no momentum and low levels.
     pub fn pnp_ffdnet() -> Self {
-        let deep = deep_stage(Network::FfdNet, 30, 15.0, 3.0);
+        let deep = level_stage(&FFDNET, 30, 15.0, 3.0);
         let patient = Stage { memory: 0.95, momentum: 0.0, ..deep };
         Self::gap(vec![first_stage(), patient])
     }
@@ -65,17 +69,17 @@ const TEMPORAL_WEIGHT: f32 = 0.004;
 
 /// What comes before the plugged-in priors.
 fn first_stage() -> Stage {
-    Stage { temporal_weight: TEMPORAL_WEIGHT, ..tv_stage(60, 0.0) }
+    Stage { temporal_weight: Some(TEMPORAL_WEIGHT), ..tv_stage(60, 0.0) }
 }
 
 fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
     Stage {
-        prior: Prior::Tv,
+        prior: &TV,
         iterations,
         sigma: None,
-        tv_weight: 0.15,
-        tv_updates: 4,
-        temporal_weight: 0.0,
+        tv_weight: Some(0.15),
+        tv_updates: Some(4),
+        temporal_weight: None,
         memory: 1.0,
         momentum: 0.0,
         tolerance,
@@ -83,38 +87,36 @@ fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
 }
 
 /// Levels in units of 255 grey values.
-fn deep_stage(network: Network, iterations: usize, first: f32, last: f32) -> Stage {
+fn level_stage(prior: &'static dyn Prior, iterations: usize, first: f32, last: f32) -> Stage {
     Stage {
-        prior: Prior::Deep(network),
-        sigma: Some((Sigma::of_grey(first), Sigma::of_grey(last))),
-        tv_weight: 0.0,
+        prior,
+        iterations,
+        sigma: Some([first / 255.0, last / 255.0]),
+        tv_weight: None,
+        tv_updates: None,
+        temporal_weight: None,
         memory: 0.85,
         momentum: 0.5,
-        ..tv_stage(iterations, 0.0)
+        tolerance: 0.0,
     }
 }
 
 /// The video denoiser with 8 bits for as many iterations as that costs nothing, then with floating point: the
 /// levels fall through both as through one. Levels in units of 255 grey values.
 fn fastdvdnet_stages(quick: usize, exact: usize, first: f32, last: f32) -> [Stage; 2] {
-    let whole = deep_stage(Network::FastDvdNet, quick + exact, first, last);
-    let part = |network, range: Range<usize>| Stage {
-        prior: Prior::Deep(network),
+    let whole = level_stage(&FASTDVDNET, quick + exact, first, last);
+    let level = |index| whole.sigma_at(index);
+    let part = |prior: &'static dyn Prior, range: Range<usize>| Stage {
+        prior,
         iterations: range.len(),
-        sigma: whole.sigma_at(range.start).zip(whole.sigma_at(range.end - 1)),
+        sigma: level(range.start).zip(level(range.end - 1)).map(<[f32; 2]>::from),
         ..whole.clone()
     };
-    [part(Network::FastDvdNetInt8, 0..quick), part(Network::FastDvdNet, quick..quick + exact)]
+    [part(&FASTDVDNET_INT8, 0..quick), part(&FASTDVDNET, quick..quick + exact)]
 }
 
-/// Levels in units of 255 grey values.
 fn nonlocal_stage(iterations: usize, first: f32, last: f32) -> Stage {
-    Stage {
-        prior: Prior::Nonlocal,
-        memory: 0.6,
-        momentum: 0.8,
-        ..deep_stage(Network::FastDvdNet, iterations, first, last)
-    }
+    Stage { memory: 0.6, momentum: 0.8, ..level_stage(&NONLOCAL, iterations, first, last) }
 }
 
 #[cfg(test)]

@@ -110,17 +110,17 @@ pub fn run(
     let mut before = 1.0;
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
-        let start = (stage.temporal_weight > 0.0).then(|| run.state());
+        let start = stage.temporal_weight.filter(|weight| *weight > 0.0).map(|_| run.state());
         let mut finding = watch.stage(stage, &mut run, before)?;
         if let Some(start) = start {
             let with = run.state();
-            run.restore(&start);
-            let without = Stage { temporal_weight: 0.0, ..stage.clone() };
+            run.restore(start);
+            let without = Stage { temporal_weight: None, ..stage.clone() };
             let other = watch.stage(&without, &mut run, before)?;
             if other.after < finding.after {
                 finding = other;
             } else {
-                run.restore(&with);
+                run.restore(with);
             }
         }
         before = finding.after;
@@ -136,7 +136,8 @@ impl Schedule {
     pub fn decided(&self, findings: &[(usize, f32)]) -> Self {
         let stage = |(stage, &(iterations, temporal_weight)): (&Stage, &(usize, f32))| {
             let last = stage.sigma_at(iterations.checked_sub(1)?);
-            let sigma = stage.sigma.zip(last).map(|((first, _), last)| (first, last));
+            let sigma = stage.sigma.zip(last).map(|([first, _], last)| [first, last]);
+            let temporal_weight = (temporal_weight > 0.0).then_some(temporal_weight);
             Some(Stage { iterations, temporal_weight, sigma, ..stage.clone() })
         };
         let mut stages: Vec<Stage> = self.stages.iter().zip(findings).filter_map(stage).collect();
@@ -167,7 +168,7 @@ impl Watch<'_, '_> {
         before: f64,
     ) -> Result<StageFinding, ReconError> {
         let fixed = stage.sigma.is_none();
-        let temporal_weight = stage.temporal_weight;
+        let temporal_weight = stage.temporal_weight.unwrap_or(0.0);
         let mut end = if fixed { StageEnd::Fixed } else { StageEnd::Planned };
         let mut best = (0, before, run.state());
         let mut least = f64::INFINITY;
@@ -180,7 +181,7 @@ impl Watch<'_, '_> {
                 }
                 other => other?,
             };
-            run.tell(self.index, stage, &step, &mut *self.observer)?;
+            run.tell((self.index, stage), done - 1, &step, &mut *self.observer)?;
             if fixed {
                 if done == stage.iterations || step.change < stage.tolerance {
                     let after = self.error(run);
@@ -206,7 +207,7 @@ impl Watch<'_, '_> {
         if end == StageEnd::Planned && iterations < stage.iterations {
             end = StageEnd::Converged;
         }
-        run.restore(&state);
+        run.restore(state);
         Ok(StageFinding { iterations, temporal_weight, before, after, end })
     }
 }
@@ -245,8 +246,8 @@ mod tests {
     use super::{StageEnd, StageFinding, piece, run};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
-    use crate::recon::prior::{Denoiser, Networks};
-    use crate::recon::schedule::{Network, Schedule, Sigma};
+    use crate::recon::prior::{Denoiser, Network, Networks};
+    use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
     use ndarray::{Array2, Array3, s};
 
@@ -260,7 +261,7 @@ mod tests {
     }
 
     impl Denoiser for Tiring {
-        fn denoise(&mut self, frames: &mut Array3<f32>, _: Sigma) -> Result<(), ReconError> {
+        fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
             self.passes += 1;
             match self.passes <= self.good {
                 true => frames.zip_mut_with(&self.truth, |x, &truth| *x += 0.3 * (truth - *x)),
@@ -304,7 +305,7 @@ mod tests {
         let level = |schedule: &Schedule, index| schedule.stages[1].sigma_at(index);
         assert_eq!(level(&decided, 0), level(&schedule, 0));
         let (last, planned) = (level(&decided, 8).unwrap(), level(&schedule, 8).unwrap());
-        assert!((last.value() - planned.value()).abs() < 1e-6, "levels fall as they were planned");
+        assert!((last - planned).abs() < 1e-6, "levels fall as they were planned");
     }
 
     #[test]
@@ -326,7 +327,7 @@ mod tests {
             run(op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap()[0].temporal_weight
         };
         let asked = Schedule::gap_tv3d().stages[0].temporal_weight;
-        assert_eq!((weight(false), weight(true)), (asked, 0.0));
+        assert_eq!((Some(weight(false)), weight(true)), (asked, 0.0));
     }
 
     #[test]

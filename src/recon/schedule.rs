@@ -1,205 +1,211 @@
-//! Sigma schedules: which prior runs how often, and how strongly.
+//! The schedule of a reconstruction: which prior runs how often, and how strongly.
+//!
+//! It is told here once, as it stands in jobs, in `--schedule FILE` and in manifests;
+//! `docs/schedule.schema.json` is made from these types.
+
+use std::ops::Bound;
+
+use schemars::{JsonSchema, Schema, json_schema};
+use serde::{Deserialize, Serialize};
 
 use super::error::ReconError;
+use super::prior::registry::PRIORS;
+use super::prior::{
+    Network, Parameter, Prior, SIGMA, Settings, TEMPORAL_WEIGHT, TV_UPDATES, TV_WEIGHT,
+};
 
-/// A noise level: the standard deviation on the \[0,1\] scale of the frames.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
-pub struct Sigma(f32);
-
-impl Sigma {
-    /// A level in (0,1].
-    pub fn new(value: f32) -> Result<Self, ReconError> {
-        if value > 0.0 && value <= 1.0 {
-            return Ok(Self(value));
-        }
-        Err(ReconError::Parameter {
-            name: "sigma",
-            value: value.to_string(),
-            range: "above 0 and at most 1 (a level of 25 grey values is 25/255 = 0.098)",
-        })
-    }
-
-    /// A level given in grey values of 255.
-    pub(super) fn of_grey(level: f32) -> Self {
-        Self(level / 255.0)
-    }
-
-    /// The level on \[0,1\].
-    pub fn value(self) -> f32 {
-        self.0
-    }
+/// The stages of the solver, one after the other (Algorithm 1 of the paper is two).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+#[schemars(title = "Schedule of a reconstruction", extend("$id" = "urn:sci-recon:schema:schedule"))]
+pub struct Schedule {
+    /// How projection and prior alternate.
+    #[serde(default)]
+    pub method: Method,
+    /// Accelerated GAP: the residuals add up, through all stages, as far as each stage's memory keeps them.
+    #[serde(default = "yes")]
+    pub accelerated: bool,
+    /// Noise term added to the gram diagonal; 0 forces y = Hx.
+    #[serde(default)]
+    #[schemars(transform = GAMMA.bounds())]
+    pub gamma: f32,
+    /// Find out on a piece of the measurement, once for all tiles, how many iterations of the stages with a
+    /// level pay (hold-out validation with early stopping); iterations is then the most that there will be.
+    #[serde(default)]
+    pub adaptive: bool,
+    /// The stages.
+    #[schemars(length(min = 1, max = MAX_STAGES))]
+    pub stages: Vec<Stage>,
 }
 
-/// A learned denoiser.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Network {
-    /// FFDNet, frame by frame.
-    FfdNet,
-    /// FastDVDNet, five frames at a time.
-    FastDvdNet,
-    /// The same with weights and activations of 8 bits: about three times as fast on a CPU, and a little
-    /// less exact.
-    FastDvdNetInt8,
-}
-
-/// What stands for `D` in `v = D(x)`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Prior {
-    /// Total variation, frame by frame.
-    Tv,
-    /// Groups of similar patches, filtered by their own covariance.
-    Nonlocal,
-    /// A network alone.
-    Deep(Network),
-    /// Total variation, then the video denoiser: the second period of Algorithm 1.
-    TvFastDvdNet,
-}
-
-impl Prior {
-    /// Whether the prior has a total-variation part.
-    pub fn uses_tv(self) -> bool {
-        matches!(self, Self::Tv | Self::TvFastDvdNet)
-    }
-
-    /// Whether the prior is told a noise level.
-    pub fn has_level(self) -> bool {
-        self != Self::Tv
-    }
-
-    /// The network of the prior, if it has one.
-    pub fn network(self) -> Option<Network> {
-        match self {
-            Self::Tv | Self::Nonlocal => None,
-            Self::Deep(network) => Some(network),
-            Self::TvFastDvdNet => Some(Network::FastDvdNet),
-        }
-    }
-}
-
-/// How projection and prior alternate. `P(w) = w + H^T (H H^T + gamma)^-1 (y - H w)`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// How projection and prior alternate. P(w) = w + H^T (H H^T + gamma)^-1 (y - H w).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
 pub enum Method {
-    /// Generalized alternating projection: `x = P(v)`, `v = D(x)`.
+    /// Generalized alternating projection: x = P(v), v = D(x).
+    #[default]
     Gap,
-    /// Alternating direction method of multipliers: `x = P(v + u)`, `v = D(x - u)`,
-    /// `u <- u - (x - v)`.
+    /// Alternating direction method of multipliers: x = P(v + u), v = D(x - u), u becomes u - (x - v).
     Admm,
 }
 
 /// A run of iterations with one prior.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+#[schemars(transform = tell_who_takes_what)]
 pub struct Stage {
-    /// The prior.
-    pub prior: Prior,
-    /// Most iterations of the stage, at least 1.
+    /// The prior: what stands for D in v = D(x).
+    pub prior: &'static dyn Prior,
+    /// The most iterations; over all stages at most 10000.
+    #[schemars(transform = ITERATIONS.bounds())]
     pub iterations: usize,
-    /// First and last noise level of the prior, falling (or rising) geometrically; none for total
-    /// variation alone.
-    pub sigma: Option<(Sigma, Sigma)>,
-    /// Weight of the total variation, on the \[0,1\] scale; 0 for none.
-    pub tv_weight: f32,
-    /// Dual updates of the total variation in each iteration.
-    pub tv_updates: usize,
-    /// Weight of the total variation along time, which comes before that of each frame and makes as
-    /// many updates; 0 for none. In an adaptive schedule it is left out where it does not pay.
-    pub temporal_weight: f32,
-    /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the
-    /// next, on \[0,1\]: 1 is accelerated GAP, 0 is plain GAP. A learned denoiser never explains
-    /// the measurement fully, so with 1 the residual winds up in its stages.
+    /// Noise level on [0, 1] at the first and the last iteration, geometric between them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = SIGMA.bounds())]
+    pub sigma: Option<[f32; 2]>,
+    /// Weight of the total variation on the [0, 1] scale; 0 for none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = TV_WEIGHT.bounds())]
+    pub tv_weight: Option<f32>,
+    /// Dual (Chambolle) updates of each step of total variation; 4 where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = TV_UPDATES.bounds())]
+    pub tv_updates: Option<usize>,
+    /// Weight of the total variation along time, pixel by pixel, which comes before that of each frame and
+    /// makes as many updates; none where it is left out. An adaptive schedule leaves it out where it does not
+    /// pay.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = TEMPORAL_WEIGHT.bounds())]
+    pub temporal_weight: Option<f32>,
+    /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the next: 1 is
+    /// accelerated GAP, 0 plain GAP. A learned denoiser never explains the measurement fully, so with 1 the
+    /// residual winds up in its stages.
+    #[serde(default = "one")]
+    #[schemars(transform = MEMORY.bounds())]
     pub memory: f32,
-    /// Extrapolation of the iterates, on \[0,1): the projection starts from
-    /// `v_k + momentum (v_k - v_(k-1))`. It makes fewer passes do. Where the
-    /// prior passes everything (even brightness), an error `e` follows `e_(k+1) =
-    /// -memory momentum (e_k - e_(k-1))`: it grows if the product is above 1/2, so that is refused.
+    /// Extrapolation of the iterates: the projection starts from v_k + momentum (v_k - v_(k-1)), which makes
+    /// fewer passes do. Momentum times memory is at most 0.5.
+    #[serde(default)]
+    #[schemars(transform = MOMENTUM.bounds())]
     pub momentum: f32,
-    /// The stage ends early once `||v_k - v_(k-1)|| / ||v_k||` falls below this; 0 never.
+    /// The stage ends early once ||v_k - v_(k-1)|| / ||v_k|| is below this; 0 never does.
+    #[serde(default)]
+    #[schemars(transform = TOLERANCE.bounds())]
     pub tolerance: f32,
 }
 
+fn yes() -> bool {
+    true
+}
+
+fn one() -> f32 {
+    1.0
+}
+
+/// Dual updates where the schedule does not say.
+const DEFAULT_TV_UPDATES: usize = 4;
+/// The most stages of a schedule.
+const MAX_STAGES: usize = 32;
+/// The most iterations of a schedule; with more, a job would look hung.
+const MAX_ITERATIONS: usize = 10_000;
+/// Cost of a projection with its update, CPU-nanoseconds per voxel (see [`Prior::cost`]).
+const PROJECTION_NS: f64 = 0.7;
+
+const GAMMA: Parameter = Parameter::not_negative("gamma");
+const ITERATIONS: Parameter = Parameter {
+    name: "iterations",
+    needed: true,
+    range: (Bound::Included(1.0), Bound::Included(MAX_ITERATIONS as f64)),
+    words: "from 1 to 10000",
+};
+const MEMORY: Parameter = Parameter {
+    name: "memory",
+    needed: false,
+    range: (Bound::Included(0.0), Bound::Included(1.0)),
+    words: "from 0 to 1",
+};
+const MOMENTUM: Parameter = Parameter::share("momentum");
+const TOLERANCE: Parameter = Parameter::share("tolerance");
+
 impl Stage {
     /// The noise level of iteration `index` (from 0) of the stage.
-    pub fn sigma_at(&self, index: usize) -> Option<Sigma> {
-        let (first, last) = self.sigma?;
+    pub fn sigma_at(&self, index: usize) -> Option<f32> {
+        let [first, last] = self.sigma?;
         let share = index as f32 / (self.iterations.max(2) - 1) as f32;
-        Some(Sigma(first.0 * (last.0 / first.0).powf(share)))
+        Some(first * (last / first).powf(share))
     }
 
-    fn validate(&self) -> Result<(), ReconError> {
-        let parameter =
-            |name, value: String, range| Err(ReconError::Parameter { name, value, range });
-        if self.iterations == 0 || self.iterations > 100_000 {
-            return parameter("iterations", self.iterations.to_string(), "from 1 to 100000");
+    /// What the prior is told in iteration `index` (from 0).
+    pub(super) fn settings(&self, index: usize) -> Settings {
+        Settings {
+            sigma: self.sigma_at(index).unwrap_or(0.0),
+            tv_weight: self.tv_weight.unwrap_or(0.0),
+            tv_updates: self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES),
+            temporal_weight: self.temporal_weight.unwrap_or(0.0),
         }
-        if !self.tv_weight.is_finite() || self.tv_weight < 0.0 {
-            return parameter("tv_weight", self.tv_weight.to_string(), "a number of at least 0");
+    }
+
+    /// The parameters that belong to a prior, as far as they are given.
+    fn given(&self) -> [(&'static Parameter, Option<Vec<f32>>); 4] {
+        let one = |value: Option<f32>| value.map(|value| vec![value]);
+        // Without total variation it does no harm.
+        let updates = self.tv_updates.filter(|_| self.prior.takes(&TV_UPDATES));
+        [
+            (&SIGMA, self.sigma.map(Vec::from)),
+            (&TV_WEIGHT, one(self.tv_weight)),
+            (&TEMPORAL_WEIGHT, one(self.temporal_weight)),
+            (&TV_UPDATES, one(updates.map(|updates| updates as f32))),
+        ]
+    }
+
+    fn check(&self) -> Result<(), ReconError> {
+        ITERATIONS.check(self.iterations as f32)?;
+        for (parameter, given) in self.given() {
+            match (self.prior.takes(parameter), given) {
+                (false, Some(_)) => {
+                    return Err(parameter.refused("given", "left out: this prior takes none"));
+                }
+                (true, None) if parameter.needed => {
+                    return Err(parameter.refused("missing", "given: this prior needs it"));
+                }
+                (_, values) => {
+                    values.iter().flatten().try_for_each(|&value| parameter.check(value))?;
+                }
+            }
         }
-        if !self.temporal_weight.is_finite() || self.temporal_weight < 0.0 {
-            let value = self.temporal_weight.to_string();
-            return parameter("temporal_weight", value, "a number of at least 0");
-        }
-        let updated = self.prior.uses_tv() && self.tv_weight.max(self.temporal_weight) > 0.0;
-        if updated && !(1..=1000).contains(&self.tv_updates) {
-            return parameter("tv_updates", self.tv_updates.to_string(), "from 1 to 1000");
-        }
-        if !self.tolerance.is_finite() || !(0.0..1.0).contains(&self.tolerance) {
-            return parameter("tolerance", self.tolerance.to_string(), "at least 0 and below 1");
-        }
-        if !(0.0..=1.0).contains(&self.memory) {
-            return parameter("memory", self.memory.to_string(), "from 0 to 1");
-        }
-        if !(0.0..1.0).contains(&self.momentum) {
-            return parameter("momentum", self.momentum.to_string(), "at least 0 and below 1");
-        }
-        let product = self.memory * self.momentum;
-        if product > 0.5 {
-            return parameter(
-                "momentum",
+        TOLERANCE.check(self.tolerance)?;
+        MEMORY.check(self.memory)?;
+        MOMENTUM.check(self.momentum)?;
+        // Where the prior passes everything (even brightness), an error `e` follows
+        // `e_(k+1) = -memory momentum (e_k - e_(k-1))`.
+        if self.memory * self.momentum > 0.5 {
+            return Err(MOMENTUM.refused(
                 format!("{} with memory {}", self.momentum, self.memory),
                 "such that momentum times memory is at most 0.5; above, the brightness diverges",
-            );
-        }
-        if self.prior.has_level() && self.sigma.is_none() {
-            return parameter(
-                "sigma",
-                "missing".into(),
-                "given as first and last level in a stage with another prior than total variation",
-            );
-        }
-        if !self.prior.has_level() && self.sigma.is_some() {
-            return parameter(
-                "sigma",
-                "given".into(),
-                "left out in a stage of total variation alone",
-            );
+            ));
         }
         Ok(())
     }
-}
 
-/// The plan of a reconstruction (Algorithm 1 of the paper is two stages).
-#[derive(Debug, Clone, PartialEq)]
-pub struct Schedule {
-    /// How projection and prior alternate.
-    pub method: Method,
-    /// Accelerated GAP: the residuals add up in `y1`, through all stages, as far as each stage's
-    /// `memory` keeps them.
-    pub accelerated: bool,
-    /// Noise term added to the gram diagonal, >= 0.
-    pub gamma: f32,
-    /// The iterations of stages with a level are the most that may be: how many pay is found out
-    /// on a piece of the measurement ([`super::pilot`]), once for all tiles.
-    pub adaptive: bool,
-    /// The stages, one after the other ("in cascade").
-    pub stages: Vec<Stage>,
+    /// Cost of one iteration, CPU-nanoseconds per voxel.
+    fn iteration_ns(&self) -> f64 {
+        PROJECTION_NS + self.prior.cost(&self.settings(0))
+    }
 }
 
 impl Schedule {
-    /// Most iterations of all stages together.
-    pub fn planned_iterations(&self) -> usize {
-        self.stages.iter().map(|stage| stage.iterations).sum()
+    /// One without stages, of an algorithm that does not iterate.
+    pub fn none() -> Self {
+        let (method, gamma, stages) = (Method::Gap, 0.0, Vec::new());
+        Self { method, accelerated: false, gamma, adaptive: false, stages }
     }
 
-    /// Most passes of the learned denoisers.
+    /// Most iterations of all stages together.
+    pub fn planned_iterations(&self) -> usize {
+        self.stages.iter().fold(0, |sum, stage| sum.saturating_add(stage.iterations))
+    }
+
+    /// Most passes of networks.
     pub fn planned_passes(&self) -> usize {
         let deep = self.stages.iter().filter(|stage| stage.prior.network().is_some());
         deep.map(|stage| stage.iterations).sum()
@@ -219,6 +225,11 @@ impl Schedule {
         networks
     }
 
+    /// Whether a stage runs a network.
+    pub fn needs_network(&self) -> bool {
+        self.stages.iter().any(|stage| stage.prior.network().is_some())
+    }
+
     /// Fixes the total number of iterations and switches the convergence tests off: earlier
     /// stages keep their length as far as it goes, the last one takes the rest.
     pub fn with_iterations(mut self, total: usize) -> Self {
@@ -235,34 +246,108 @@ impl Schedule {
         self
     }
 
-    /// Checks every parameter; the error names the first that is out of range.
-    pub fn validate(&self) -> Result<(), ReconError> {
-        if self.stages.is_empty() {
-            return Err(ReconError::Parameter {
-                name: "stages",
-                value: "empty".into(),
-                range: "at least one stage of at least one iteration",
-            });
+    /// The same with nothing left to a default: what is recorded of a run.
+    pub fn filled(mut self) -> Self {
+        for stage in &mut self.stages {
+            let updates = stage.settings(0).tv_updates;
+            stage.tv_updates = stage.prior.takes(&TV_UPDATES).then_some(updates);
+            stage.temporal_weight = stage.temporal_weight.filter(|weight| *weight > 0.0);
         }
-        if !self.gamma.is_finite() || self.gamma < 0.0 {
-            return Err(ReconError::Parameter {
-                name: "gamma",
-                value: self.gamma.to_string(),
-                range: "a finite number of at least 0",
-            });
-        }
-        self.stages.iter().try_for_each(Stage::validate)
+        self
     }
+
+    /// What is wrong with it: for each stage the first fault, with a JSON pointer relative to the schedule.
+    pub fn faults(&self) -> Vec<(String, ReconError)> {
+        let parameter = |name, value, range| ReconError::Parameter { name, value, range };
+        let count = self.stages.len();
+        if !(1..=MAX_STAGES).contains(&count) {
+            let error = parameter("stages", format!("a list of {count}"), "one of 1 to 32 stages");
+            return vec![("/stages".into(), error)];
+        }
+        let fault = |place: String, error: ReconError| match &error {
+            ReconError::Parameter { name, .. } => (format!("{place}/{name}"), error),
+            _ => (place, error),
+        };
+        let mut faults: Vec<_> = (0..)
+            .zip(&self.stages)
+            .filter_map(|(index, stage)| {
+                Some(fault(format!("/stages/{index}"), stage.check().err()?))
+            })
+            .collect();
+        let planned = self.planned_iterations();
+        if planned > MAX_ITERATIONS {
+            let error = parameter(
+                "iterations",
+                format!("{planned} in all"),
+                "at most 10000 over all stages",
+            );
+            faults.push(("/stages".into(), error));
+        }
+        faults.extend(GAMMA.check(self.gamma).err().map(|error| fault(String::new(), error)));
+        faults
+    }
+
+    /// Refuses a schedule with a fault: the first is told.
+    pub fn validate(&self) -> Result<(), ReconError> {
+        self.faults().into_iter().next().map_or(Ok(()), |(_, error)| Err(error))
+    }
+
+    /// The planned cost, CPU-nanoseconds per voxel: the weight behind percent, remaining time and fair sharing.
+    pub fn planned_ns_per_voxel(&self) -> f64 {
+        self.stages.iter().map(|stage| stage.iteration_ns() * stage.iterations as f64).sum()
+    }
+
+    /// The share of the planned cost, on \[0,1\], that is behind a run which has done `iteration` iterations of
+    /// the stage with index `stage` and has left all stages before it.
+    pub fn share_done(&self, stage: usize, iteration: usize) -> f64 {
+        let cost =
+            |stage: &Stage, done: usize| stage.iteration_ns() * done.min(stage.iterations) as f64;
+        let before: f64 = self.stages.iter().take(stage).map(|s| cost(s, s.iterations)).sum();
+        let here = self.stages.get(stage).map_or(0.0, |stage| cost(stage, iteration));
+        let planned = self.planned_ns_per_voxel();
+        if planned > 0.0 { ((before + here) / planned).clamp(0.0, 1.0) } else { 0.0 }
+    }
+}
+
+/// Writes into the schema of a stage which priors take which parameters.
+fn tell_who_takes_what(schema: &mut Schema) {
+    let rule = |parameter: &Parameter| {
+        let takers = PRIORS.iter().filter(|prior| prior.takes(parameter));
+        let takers: Vec<&str> = takers.map(|prior| prior.name()).collect();
+        let name = parameter.name;
+        let given = json_schema!({ "required": [name], "properties": { name: { "not": { "type": "null" } } } });
+        json_schema!({
+            "if": { "properties": { "prior": { "enum": takers } } },
+            "then": if parameter.needed { given } else { true.into() },
+            "else": { "properties": { name: { "type": "null" } } },
+        })
+    };
+    schema.insert(
+        "allOf".into(),
+        [&SIGMA, &TV_WEIGHT, &TEMPORAL_WEIGHT].map(rule).map(Schema::to_value).to_vec().into(),
+    );
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Network, Schedule, Sigma};
+    use super::Schedule;
+    use crate::recon::prior::Network;
+    use crate::recon::prior::registry::PRIORS;
+    use serde_json::{Value, json};
+    use std::path::Path;
+
+    fn pointers(schedule: Value) -> Vec<String> {
+        let schedule: Schedule = serde_json::from_value(schedule).unwrap();
+        schedule.faults().into_iter().map(|(pointer, _)| pointer).collect()
+    }
 
     #[test]
-    fn defaults_are_valid() {
+    fn defaults_are_valid_and_survive_the_way_through_json() {
         for schedule in Schedule::defaults() {
             schedule.validate().unwrap();
+            let text = serde_json::to_string(&schedule).unwrap();
+            assert_eq!(serde_json::from_str::<Schedule>(&text).unwrap(), schedule);
+            assert_eq!(schedule.clone().filled(), schedule);
         }
         assert!(Schedule::pnp_tv_fastdvdnet().planned_passes() <= 24);
         let both = [Network::FastDvdNet, Network::FastDvdNetInt8];
@@ -274,14 +359,14 @@ mod tests {
     fn sigma_falls_geometrically_from_first_to_last() {
         let schedule = Schedule::pnp_tv_fastdvdnet();
         let stage = &schedule.stages[1];
-        let (first, last) = stage.sigma.unwrap();
-        let at = |index| stage.sigma_at(index).unwrap().value();
-        assert_eq!(at(0), first.value());
-        assert!((at(stage.iterations - 1) - last.value()).abs() < 1e-6);
+        let [first, last] = stage.sigma.unwrap();
+        let at = |index| stage.sigma_at(index).unwrap();
+        assert_eq!(at(0), first);
+        assert!((at(stage.iterations - 1) - last).abs() < 1e-6);
         assert!((at(2) / at(1) - at(1) / at(0)).abs() < 1e-5);
         // From 8 bits to floating point as from one iteration to the next.
-        let next = schedule.stages[2].sigma_at(0).unwrap().value();
-        assert!((next / last.value() - at(1) / at(0)).abs() < 1e-5);
+        let next = schedule.stages[2].sigma_at(0).unwrap();
+        assert!((next / last - at(1) / at(0)).abs() < 1e-5);
     }
 
     #[test]
@@ -303,7 +388,114 @@ mod tests {
     #[test]
     fn levels_outside_the_unit_interval_are_refused() {
         for value in [0.0, -0.1, 25.0, f32::NAN] {
-            assert!(Sigma::new(value).unwrap_err().to_string().contains("25/255"));
+            let mut schedule = Schedule::pnp_nonlocal();
+            schedule.stages[1].sigma = Some([value, 0.1]);
+            assert!(schedule.validate().unwrap_err().to_string().contains("25/255"));
         }
+    }
+
+    #[test]
+    fn errors_point_at_their_place() {
+        let tv = json!({"prior": "tv", "iterations": 5, "tv_weight": 0.1});
+        let deep = json!({"prior": "fastdvdnet", "iterations": 5});
+        let zero = json!({"prior": "tv", "iterations": 0, "tv_weight": 0.1});
+        let bare = json!({"prior": "tv", "iterations": 3});
+        let timed = json!({"prior": "nonlocal", "iterations": 3, "sigma": [0.1, 0.1], "temporal_weight": 0.1});
+        let negative =
+            json!({"prior": "tv", "iterations": 3, "tv_weight": 0.1, "temporal_weight": -0.1});
+        let idle = json!({"prior": "tv", "iterations": 3, "tv_weight": 0.0, "temporal_weight": 0.1, "tv_updates": 0});
+        let stages = json!({"stages": [tv, deep, zero, bare, timed, negative, idle]});
+        let expected = [
+            "/stages/1/sigma",
+            "/stages/2/iterations",
+            "/stages/3/tv_weight",
+            "/stages/4/temporal_weight",
+            "/stages/5/temporal_weight",
+            "/stages/6/tv_updates",
+        ];
+        assert_eq!(pointers(stages), expected);
+        assert_eq!(pointers(json!({"stages": []})), ["/stages"]);
+        assert_eq!(pointers(json!({"gamma": -1.0, "stages": [tv]})), ["/gamma"]);
+        let long = json!({"prior": "tv", "iterations": 6000, "tv_weight": 0.1});
+        assert_eq!(pointers(json!({"stages": [long, long]})), ["/stages"]);
+    }
+
+    #[test]
+    fn unknown_fields_and_priors_are_refused() {
+        let error = |stage: Value| {
+            serde_json::from_value::<Schedule>(json!({"stages": [stage]})).unwrap_err().to_string()
+        };
+        assert!(
+            error(json!({"prior": "tv", "iteration": 5})).contains("unknown field `iteration`")
+        );
+        let text = error(json!({"prior": "median", "iterations": 5}));
+        assert!(
+            text.contains("unknown variant `median`, expected one of `tv`, `nonlocal`"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn one_deep_pass_weighs_as_thousands_of_tv_iterations() {
+        let schedule = Schedule::pnp_ffdnet();
+        assert_eq!(schedule.share_done(0, 0), 0.0);
+        assert!(schedule.share_done(1, 0) < 0.01, "after all TV iterations");
+        let half = schedule.stages[1].iterations / 2;
+        assert!((schedule.share_done(1, half) - 0.5).abs() < 0.01, "half of the deep passes");
+        assert_eq!(schedule.share_done(2, 0), 1.0);
+    }
+
+    fn text(path: &str) -> String {
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+    }
+
+    #[test]
+    fn the_published_schema_is_that_of_the_type() {
+        let schema = format!("{:#}\n", schemars::schema_for!(Schedule).to_value());
+        if std::env::var_os("SCI_RECON_WRITE_SCHEMA").is_some() {
+            std::fs::write("docs/schedule.schema.json", &schema).unwrap();
+        }
+        assert!(
+            text("docs/schedule.schema.json") == schema,
+            "docs/schedule.schema.json is not up to date: run this test with SCI_RECON_WRITE_SCHEMA=1"
+        );
+    }
+
+    /// What a schema says of names and numbers, without its prose; references are followed.
+    fn facts(schema: &Value, root: &Value) -> Value {
+        let place = schema["$ref"].as_str().map(|place| place.trim_start_matches('#'));
+        let mut found = place.map_or(json!({}), |place| facts(root.pointer(place).unwrap(), root));
+        for (key, value) in schema.as_object().unwrap() {
+            let plain = || value.as_f64().map_or(value.clone(), Value::from);
+            let (key, value) = match key.as_str() {
+                "properties" => {
+                    let all = value.as_object().unwrap().iter();
+                    (key.as_str(), all.map(|(name, of)| (name.clone(), facts(of, root))).collect())
+                }
+                "items" => ("items", facts(value, root)),
+                "oneOf" => {
+                    let names = value.as_array().unwrap().iter().map(|one| one["const"].clone());
+                    ("enum", names.collect())
+                }
+                // The contract bounds what has no bound, and takes the empty schedule of `learned`.
+                "maximum" if value.as_f64() >= Some(1e30) => continue,
+                "minItems" if value.as_f64() == Some(1.0) => continue,
+                "required" | "enum" | "default" | "minimum" | "maximum" | "exclusiveMinimum"
+                | "exclusiveMaximum" | "minItems" | "maxItems" => (key.as_str(), plain()),
+                _ => continue,
+            };
+            found[key] = value;
+        }
+        found
+    }
+
+    #[test]
+    fn the_contract_says_the_same() {
+        let contract: Value = serde_yaml_ng::from_str(&text("openapi.yaml")).unwrap();
+        let schemas = &contract["components"]["schemas"];
+        let schema = schemars::schema_for!(Schedule).to_value();
+        assert_eq!(facts(&schemas["Schedule"], &contract), facts(&schema, &schema));
+        let names: Vec<_> = PRIORS.iter().map(|prior| prior.name()).collect();
+        assert_eq!(schemas["AlgorithmInfo"]["properties"]["priors"]["items"]["enum"], json!(names));
     }
 }

@@ -122,7 +122,7 @@ fn manifest(
     let content = Content {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: prepared.schedule(spec)?,
+        schedule: prepared.schedule(spec),
         pilot: prepared.pilot,
         frames,
         height: spec.shape.height,

@@ -9,7 +9,7 @@ use super::assemble::SnapshotRecord;
 use super::prepare::{Prepared, to_record};
 use super::task::TaskError;
 use crate::job::{
-    Algorithm, Finding, SceneShape, ScheduleSpec, TaskKind, TaskProgress, TaskStage, Timestamp,
+    Algorithm, Finding, SceneShape, Schedule, TaskKind, TaskProgress, TaskStage, Timestamp,
 };
 use crate::pipeline::ResultFile;
 use crate::pipeline::manifest::{
@@ -34,7 +34,7 @@ struct JobManifest {
 struct JobContent {
     program_version: String,
     algorithm: Algorithm,
-    schedule: ScheduleSpec,
+    schedule: Schedule,
     /// How an adaptive schedule became this one.
     #[serde(default)]
     pilot: Option<PilotRecord>,
@@ -115,7 +115,7 @@ fn content(task: &JobTask, snapshots: Vec<(u32, SnapshotRecord)>) -> Result<JobC
     Ok(JobContent {
         program_version: env!("CARGO_PKG_VERSION").into(),
         algorithm: spec.algorithm,
-        schedule: prepared.schedule(spec)?,
+        schedule: prepared.schedule(spec),
         pilot: prepared.pilot,
         shape: spec.shape,
         inputs: Inputs {

@@ -31,12 +31,11 @@ pub(super) fn run(
     let (rows, columns) = pilot::piece(y.view());
     let place = (snapshot, rows.start, columns.start);
     let input = window(task, snapshot, (rows, columns), Prepared::of(task)?.white)?;
-    let spec = &task.spec.schedule;
-    let schedule = spec.to_schedule()?;
-    let mut observer = TaskObserver::new(shared, spec.clone());
-    let record = decide(input, place, &schedule, engine, &mut observer)?;
-    let decided = full_schedule(spec, record.as_ref())?;
-    let share = decided.planned_ns_per_voxel() / spec.planned_ns_per_voxel();
+    let schedule = &task.spec.schedule;
+    let mut observer = TaskObserver::new(shared, schedule.clone());
+    let record = decide(input, place, schedule, engine, &mut observer)?;
+    let decided = full_schedule(schedule, record.as_ref());
+    let share = decided.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
     let progress = TaskProgress { fraction: 1.0, ..shared.progress() };
     Ok(Completion { progress, record: to_record(&record)?, product: Product::TileCost(share) })
 }

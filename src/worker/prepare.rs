@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::task::{Shared, TaskError};
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
-use crate::job::{InvalidField, JobSpec, ScheduleSpec, Sha256, TaskProgress, TaskStage};
+use crate::job::{JobSpec, Schedule, Sha256, TaskProgress, TaskStage};
 use crate::pipeline::manifest::full_schedule;
 use crate::pipeline::pilot::PilotRecord;
 use crate::pipeline::typical_white;
@@ -37,7 +37,7 @@ impl Prepared {
     }
 
     /// The schedule of the job's tiles.
-    pub(super) fn schedule(&self, spec: &JobSpec) -> Result<ScheduleSpec, Vec<InvalidField>> {
+    pub(super) fn schedule(&self, spec: &JobSpec) -> Schedule {
         full_schedule(&spec.schedule, self.pilot.as_ref())
     }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::{assemble, calibration_task, finish, pilot, prepare, preview, tile};
 use crate::formats::FormatError;
 use crate::intake::IntakeError;
-use crate::job::{InvalidField, Sha256, TaskProgress};
+use crate::job::{Sha256, TaskProgress};
 use crate::pipeline::history::History;
 use crate::pipeline::{NetworkError, ResultError, WarmNetworks};
 use crate::recon::ReconError;
@@ -162,14 +162,6 @@ impl From<IntakeError> for TaskError {
             IntakeError::Stopped => Self::Stopped,
             other => Self::Intake(other),
         }
-    }
-}
-
-/// Errors of a stored schedule, which was checked before it was stored.
-impl From<Vec<InvalidField>> for TaskError {
-    fn from(errors: Vec<InvalidField>) -> Self {
-        let problem = errors.first().map_or_else(String::new, |error| error.detail.clone());
-        Self::Record { what: "schedule", problem }
     }
 }
 

@@ -10,7 +10,7 @@ use super::prepare::{Prepared, to_record};
 use super::task::{Shared, TaskError};
 use crate::formats::planar::{self, Reader};
 use crate::formats::{FormatError, Limits};
-use crate::job::{ScheduleSpec, TaskProgress, TaskStage};
+use crate::job::{Schedule, TaskProgress, TaskStage};
 use crate::pipeline::manifest::TileRecord;
 use crate::pipeline::{
     ModelFile, ShareDone, TileInput, TileOutcome, Usage, WarmNetworks, peak_rss_bytes,
@@ -57,11 +57,10 @@ pub(super) fn run(
             (by_network(input, &file, engine, shared)?, true)
         }
         _ => {
-            let spec = prepared.schedule(&task.spec)?;
-            let schedule = spec.to_schedule()?;
-            let mut observer = TaskObserver::new(shared, spec);
+            let schedule = prepared.schedule(&task.spec);
+            let mut observer = TaskObserver::new(shared, schedule.clone());
             let outcome = reconstruct_tile(input, &schedule, engine, &mut observer)?;
-            (outcome, !schedule.networks().is_empty())
+            (outcome, schedule.needs_network())
         }
     };
     let progress = shared.progress();
@@ -138,7 +137,7 @@ pub(super) struct TaskObserver<'a> {
 
 impl<'a> TaskObserver<'a> {
     /// For one run of a schedule.
-    pub(super) fn new(shared: &'a Shared, schedule: ScheduleSpec) -> Self {
+    pub(super) fn new(shared: &'a Shared, schedule: Schedule) -> Self {
         Self { shared, share: ShareDone::new(schedule), passes: 0 }
     }
 }
@@ -162,5 +161,25 @@ fn stage(progress: &Progress) -> TaskStage {
         (true, _) => TaskStage::Deep,
         (false, Some(_)) => TaskStage::Nonlocal,
         (false, None) => TaskStage::Tv,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::stage;
+    use crate::recon::prior::SIGMA;
+    use crate::recon::prior::registry::PRIORS;
+    use crate::recon::solver::Progress;
+
+    #[test]
+    fn a_job_tells_which_prior_is_at_work() {
+        for prior in PRIORS {
+            let (deep, sigma) = (prior.network().is_some(), prior.takes(&SIGMA).then_some(0.1));
+            let (residual, change) = (0.1, 0.1);
+            let progress =
+                Progress { stage: 0, done: 1, planned: 2, residual, change, sigma, deep };
+            let expected = if deep { "deep" } else { prior.name() };
+            assert_eq!(stage(&progress).name(), expected);
+        }
     }
 }

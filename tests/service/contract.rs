@@ -20,6 +20,22 @@ async fn the_contract_is_served_and_every_status_of_the_code_stands_in_it() {
     }
 }
 
+#[test]
+fn the_dashboard_has_words_for_every_stage_of_the_contract() {
+    let read = |path: &str| {
+        std::fs::read_to_string(format!("{}/{path}", env!("CARGO_MANIFEST_DIR"))).unwrap()
+    };
+    let contract: Value = serde_yaml_ng::from_str(&read("openapi.yaml")).unwrap();
+    let stages = &contract["components"]["schemas"]["Progress"]["properties"]["stage"]["enum"];
+    let script = read("src/http/dashboard/format.js");
+    let (_, words) = script.split_once("const words = {").unwrap();
+    let (words, _) = words.split_once('}').unwrap();
+    for stage in stages.as_array().unwrap() {
+        let key = format!("{}: \"", stage.as_str().unwrap());
+        assert!(words.lines().any(|line| line.trim().starts_with(&key)), "no words for {stage}");
+    }
+}
+
 #[tokio::test]
 async fn health_says_what_is_missing() {
     let app = TestApp::start().await;

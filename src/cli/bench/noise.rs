@@ -12,7 +12,7 @@ use serde::Serialize;
 use super::clips::{Clip, read_clips};
 use super::noise_chart;
 use crate::cli::CliError;
-use crate::cli::arguments::{EngineArguments, algorithms, checked};
+use crate::cli::arguments::{EngineArguments, algorithms};
 use crate::job::{Algorithm, TileSpec};
 use crate::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, ProjectedMasks, generator,
@@ -93,7 +93,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
     let frames = usize::from(arguments.cr);
     let clips = read_clips(&arguments.clips, frames, arguments.scale)?;
     let bench = Bench {
-        schedule: checked(&arguments.algorithm.default_schedule())?,
+        schedule: arguments.algorithm.default_schedule(),
         network: arguments.engine.network()?,
         sigmas: &arguments.sigmas,
         seed: arguments.seed,

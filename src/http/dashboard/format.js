@@ -69,6 +69,7 @@ export function stageOf(job) {
     preparing: "measuring the scale",
     tv: "total variation",
     deep: "deep denoiser",
+    nonlocal: "nonlocal prior",
     assembling: "writing frames",
     ended: "",
   };

@@ -7,10 +7,61 @@
 //! `G^2 (G^2 + tau^2)^-1` with `G = Y Y^T`: nearly as sharp (of second order in the eigenvalues),
 //! and one Cholesky factorisation instead of an eigenvalue problem.
 
+use std::ops::Range;
+
 use multiversion::multiversion;
 use ndarray::Array3;
 
-use crate::recon::schedule::Sigma;
+use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
+use crate::recon::error::ReconError;
+
+/// Groups of similar patches, filtered by their own covariance.
+pub const NONLOCAL: NonlocalPrior = NonlocalPrior;
+
+/// See [`NONLOCAL`].
+pub struct NonlocalPrior;
+
+impl Prior for NonlocalPrior {
+    fn name(&self) -> &'static str {
+        "nonlocal"
+    }
+
+    fn summary(&self) -> &'static str {
+        "groups of similar patches, filtered by their own covariance"
+    }
+
+    fn parameters(&self) -> Vec<&'static Parameter> {
+        vec![&SIGMA]
+    }
+
+    fn cost(&self, _: &Settings) -> f64 {
+        1_700.0
+    }
+
+    /// Four clips with margins, and 40 indices for each 16 pixels.
+    fn memory(&self) -> Memory {
+        Memory { per_voxel: 30, per_network_pixel: 0 }
+    }
+
+    fn begin(&self, size: (usize, usize, usize)) -> Box<dyn Pass> {
+        Box::new(Nonlocal::new(size))
+    }
+}
+
+impl Pass for Nonlocal {
+    fn apply(
+        &mut self,
+        x: &mut Array3<f32>,
+        rows: Range<usize>,
+        settings: &Settings,
+        _: &mut dyn Networks,
+        ready: &mut Ready<'_>,
+    ) -> Result<(), ReconError> {
+        self.denoise(x, settings.sigma);
+        (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
+        Ok(())
+    }
+}
 
 /// Height and width of a patch, pixels.
 const SIDE: usize = 6;
@@ -76,7 +127,7 @@ impl Nonlocal {
     ///
     /// Passes of one object belong to one clip: patches are compared in the result of the pass
     /// before, and the groups are kept for a few passes.
-    pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: Sigma) {
+    pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) {
         debug_assert_eq!(frames.dim(), (self.frames, self.height, self.width));
         if self.height < SIDE || self.width < SIDE {
             return;
@@ -145,10 +196,10 @@ impl Nonlocal {
         }
     }
 
-    fn filter_groups(&mut self, sigma: Sigma) {
+    fn filter_groups(&mut self, sigma: f32) {
         let Self { noisy, sum, groups, filter, width, .. } = self;
         let row_length = row_length(*width);
-        let tau = STRENGTH * PATCHES as f32 * sigma.value() * sigma.value();
+        let tau = STRENGTH * PATCHES as f32 * sigma * sigma;
         sum.fill(0.0);
         for batch in groups.chunks(LANES * PATCHES) {
             for (index, &place) in batch.iter().enumerate() {
@@ -188,7 +239,7 @@ fn positions(length: usize) -> Vec<usize> {
 }
 
 /// Positions that are searched around `at`.
-fn window(at: usize, length: usize) -> std::ops::Range<usize> {
+fn window(at: usize, length: usize) -> Range<usize> {
     let count = length - SIDE + 1;
     let start = at.saturating_sub(WINDOW / 2).min(count.saturating_sub(WINDOW));
     start..(start + WINDOW).min(count)
@@ -321,8 +372,7 @@ fn subtract(row: &mut [Lanes], other: &[Lanes], factor: &Lanes) {
 
 #[cfg(test)]
 mod tests {
-    use super::{Nonlocal, PATCHES, PIXELS, positions, window};
-    use crate::recon::schedule::Sigma;
+    use super::{Filter, LANES, Nonlocal, PATCHES, PIXELS, low_rank, positions, window};
     use ndarray::Array3;
     use rand::{Rng, SeedableRng};
 
@@ -347,11 +397,78 @@ mod tests {
             let (clean, mut video) = noisy(size, 0.1);
             let before = mean_square(&video, &clean);
             let mut prior = Nonlocal::new(size);
-            prior.denoise(&mut video, Sigma::new(0.1).unwrap());
+            prior.denoise(&mut video, 0.1);
             let after = mean_square(&video, &clean);
             // A handful of patches tells little.
             let least = if size.1 < 10 { 1.0 } else { 0.25 };
             assert!(after < least * before, "{size:?}: {before} to {after}");
+        }
+    }
+
+    /// Eigenvalues and eigenvectors (rows) of a symmetric matrix, by Jacobi's rotations.
+    #[allow(clippy::needless_range_loop)] // the indices of the algebra
+    fn eigen(mut a: Vec<Vec<f64>>) -> (Vec<f64>, Vec<Vec<f64>>) {
+        let n = a.len();
+        let mut vectors: Vec<Vec<f64>> =
+            (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect();
+        for (p, q) in (0..12).flat_map(|_| (0..n).flat_map(|q| (0..q).map(move |p| (p, q)))) {
+            let angle = 0.5 * (2.0 * a[p][q]).atan2(a[q][q] - a[p][p]);
+            let (s, c) = angle.sin_cos();
+            for k in 0..n {
+                (a[k][p], a[k][q]) = (c * a[k][p] - s * a[k][q], s * a[k][p] + c * a[k][q]);
+            }
+            for rows in [&mut a, &mut vectors] {
+                for k in 0..n {
+                    let (x, y) = (rows[p][k], rows[q][k]);
+                    (rows[p][k], rows[q][k]) = (c * x - s * y, s * x + c * y);
+                }
+            }
+        }
+        ((0..n).map(|i| a[i][i]).collect(), vectors)
+    }
+
+    /// Each eigenvector `e` of `G = Y Y^T` with the eigenvalue `l` keeps the share `l^2 / (l^2 + tau^2)`.
+    #[test]
+    fn the_filter_is_that_of_the_eigenvalues() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+        let (mut filter, tau) = (Box::<Filter>::default(), 0.9);
+        for lane in 0..LANES {
+            // Few directions and noise, as in a group of similar patches.
+            let directions: Vec<f32> = (0..3 * PIXELS).map(|_| rng.random::<f32>() - 0.5).collect();
+            for patch in 0..PATCHES {
+                let shares: [f32; 3] = rng.random();
+                for i in 0..PIXELS {
+                    let signal: f32 = (0..3).map(|d| shares[d] * directions[d * PIXELS + i]).sum();
+                    let noise = 0.3 * (rng.random::<f32>() - 0.5);
+                    filter.patches[i][patch][lane] = 0.5 + signal + noise;
+                }
+            }
+        }
+        let before = filter.patches;
+        low_rank(&mut filter, tau);
+        for lane in [0, 5, LANES - 1] {
+            let mean = |i: usize| {
+                (0..PATCHES).map(|k| f64::from(before[i][k][lane])).sum::<f64>() / PATCHES as f64
+            };
+            let centred: Vec<Vec<f64>> = (0..PIXELS)
+                .map(|i| (0..PATCHES).map(|k| f64::from(before[i][k][lane]) - mean(i)).collect())
+                .collect();
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let gram = centred.iter().map(|a| centred.iter().map(|b| dot(a, b)).collect());
+            let (values, vectors) = eigen(gram.collect());
+            assert!(values.iter().any(|l| *l > 2.0) && values.iter().any(|l| *l < 0.5));
+            for k in 0..PATCHES {
+                let patch: Vec<f64> = centred.iter().map(|row| row[k]).collect();
+                for i in 0..PIXELS {
+                    let kept = values.iter().zip(&vectors).map(|(value, vector)| {
+                        let square = value * value;
+                        square / (square + f64::from(tau * tau)) * dot(vector, &patch) * vector[i]
+                    });
+                    let expected = mean(i) + kept.sum::<f64>();
+                    let found = f64::from(filter.patches[i][k][lane]);
+                    assert!((found - expected).abs() < 1e-4, "{lane} {k} {i}: {found} {expected}");
+                }
+            }
         }
     }
 
@@ -362,7 +479,7 @@ mod tests {
         let mut video = clean.clone();
         let mut prior = Nonlocal::new(size);
         for _ in 0..6 {
-            prior.denoise(&mut video, Sigma::new(0.01).unwrap());
+            prior.denoise(&mut video, 0.01);
         }
         assert!(mean_square(&video, &clean) < 1e-4, "{}", mean_square(&video, &clean));
     }
@@ -371,7 +488,7 @@ mod tests {
     fn frames_smaller_than_a_patch_and_frames_without_contrast_stay() {
         for size in [(2, 5, 30), (3, 30, 30)] {
             let mut video = Array3::from_elem(size, 0.25f32);
-            Nonlocal::new(size).denoise(&mut video, Sigma::new(0.05).unwrap());
+            Nonlocal::new(size).denoise(&mut video, 0.05);
             assert!(video.iter().all(|&x| (x - 0.25).abs() < 1e-5), "{size:?}");
         }
     }

@@ -5,6 +5,8 @@ use std::ops::Range;
 use multiversion::multiversion;
 use ndarray::{Array3, Axis};
 
+/// Cost of one dual update, CPU-nanoseconds per voxel: 0.37 of one of each frame.
+pub(super) const UPDATE_NS: f64 = 0.21;
 /// Step of the dual ascent: `1 / ||D||^2`, and the difference `D` along one dimension has a squared norm
 /// below 4 for any number of frames.
 const TAU: f32 = 0.25;

@@ -1,16 +1,16 @@
 //! Alternating projection with plugged-in priors (Algorithm 1 of the paper).
 
+mod admm;
+mod gap;
 mod state;
-
-use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
 use super::error::{ReconError, shape_text};
-use super::prior::{Networks, nonlocal::Nonlocal, temporal::TemporalVariation, tv::TotalVariation};
-use super::schedule::{Method, Prior, Schedule, Sigma, Stage};
+use super::prior::{Networks, Pass, Settings};
+use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
-use state::Change;
+use state::{Change, State};
 
 /// Values of a strip of all frames: three arrays of them (frames, masks, projection) stay in a
 /// second-level cache.
@@ -32,7 +32,7 @@ pub struct Progress {
     /// `||v_k - v_(k-1)|| / ||v_k||`.
     pub change: f32,
     /// Level of the prior in this iteration; none for total variation.
-    pub sigma: Option<Sigma>,
+    pub sigma: Option<f32>,
     /// Whether a network was run.
     pub deep: bool,
 }
@@ -127,7 +127,7 @@ pub fn reconstruct(
     }
     let residual = run.residual();
     Ok(Outcome {
-        frames: run.v,
+        frames: run.state.v,
         tv_iterations: run.tv_iterations,
         denoiser_passes: run.denoiser_passes,
         residual,
@@ -137,17 +137,8 @@ pub fn reconstruct(
 
 /// What an iteration tells: see [`Progress`].
 pub(super) struct Step {
-    pub(super) sigma: Option<Sigma>,
     pub(super) residual: f32,
     pub(super) change: f32,
-}
-
-/// What an iteration starts from.
-pub(super) struct State {
-    v: Array3<f32>,
-    y1: Option<Array2<f32>>,
-    start: Option<Array3<f32>>,
-    multiplier: Option<Array3<f32>>,
 }
 
 /// A reconstruction on its way.
@@ -155,16 +146,10 @@ pub(super) struct Run<'a> {
     op: &'a SensingOperator,
     y: Array2<f32>,
     y_norm: f64,
-    y1: Option<Array2<f32>>,
-    v: Array3<f32>,
+    state: State,
     x: Array3<f32>,
-    /// What is projected, where it is not `v`: extrapolated, or with ADMM's multiplier.
-    start: Option<Array3<f32>>,
-    /// ADMM's multiplier `u`.
-    multiplier: Option<Array3<f32>>,
-    tv: TotalVariation,
-    temporal: TemporalVariation,
-    nonlocal: Option<Nonlocal>,
+    /// The prior of the stage, at work.
+    pass: Option<Box<dyn Pass>>,
     networks: &'a mut dyn Networks,
     done: usize,
     planned: usize,
@@ -181,19 +166,13 @@ impl<'a> Run<'a> {
     ) -> Self {
         let y = y.as_standard_layout().into_owned();
         let squares: f64 = y.iter().map(|&value| f64::from(value) * f64::from(value)).sum();
-        let zeros = || Array3::zeros(op.dim());
         Self {
             op,
             y_norm: squares.sqrt().max(f64::MIN_POSITIVE),
-            y1: schedule.accelerated.then(|| Array2::zeros(y.raw_dim())),
             y,
-            v: zeros(),
-            x: zeros(),
-            start: schedule.has_own_start().then(zeros),
-            multiplier: (schedule.method == Method::Admm).then(zeros),
-            tv: TotalVariation::new(op.dim()),
-            temporal: TemporalVariation::new(op.dim().0),
-            nonlocal: None,
+            state: State::new(op.dim(), schedule),
+            x: Array3::zeros(op.dim()),
+            pass: None,
             networks,
             done: 0,
             planned: schedule.planned_iterations(),
@@ -216,7 +195,7 @@ impl<'a> Run<'a> {
             if converged {
                 self.planned -= left;
             }
-            self.tell(index, stage, &step, observer)?;
+            self.tell((index, stage), iteration, &step, observer)?;
             if converged {
                 return Ok(StopReason::Converged);
             }
@@ -226,31 +205,23 @@ impl<'a> Run<'a> {
 
     /// To be called before the first iteration of a stage.
     pub(super) fn enter(&mut self) {
-        // Its groups belong to the iterates of one stage.
-        self.nonlocal = None;
+        // What a prior remembers belongs to the iterates of one stage.
+        self.pass = None;
     }
 
     /// What the next iteration starts from.
     pub(super) fn state(&self) -> State {
-        State {
-            v: self.v.clone(),
-            y1: self.y1.clone(),
-            start: self.start.clone(),
-            multiplier: self.multiplier.clone(),
-        }
+        self.state.clone()
     }
 
     /// Goes back to where [`Run::state`] was called.
-    pub(super) fn restore(&mut self, state: &State) {
-        self.v.clone_from(&state.v);
-        self.y1.clone_from(&state.y1);
-        self.start.clone_from(&state.start);
-        self.multiplier.clone_from(&state.multiplier);
+    pub(super) fn restore(&mut self, state: State) {
+        self.state = state;
     }
 
     /// The frames as they stand \[B,H,W\].
     pub(super) fn frames(&self) -> ArrayView3<'_, f32> {
-        self.v.view()
+        self.state.v.view()
     }
 
     /// Tells the observer of an iteration of the stage with this index.
@@ -259,8 +230,8 @@ impl<'a> Run<'a> {
     /// [`ReconError::Cancelled`] if it says so.
     pub(super) fn tell(
         &self,
-        index: usize,
-        stage: &Stage,
+        (index, stage): (usize, &Stage),
+        iteration: usize,
         step: &Step,
         observer: &mut dyn Observer,
     ) -> Result<(), ReconError> {
@@ -270,7 +241,7 @@ impl<'a> Run<'a> {
             planned: self.planned,
             residual: step.residual,
             change: step.change,
-            sigma: step.sigma,
+            sigma: stage.sigma_at(iteration),
             deep: stage.prior.network().is_some(),
         };
         match observer.iteration(&progress) {
@@ -284,106 +255,205 @@ impl<'a> Run<'a> {
     /// # Errors
     /// A network that fails, or values that are no numbers any more.
     pub(super) fn iterate(&mut self, stage: &Stage, iteration: usize) -> Result<Step, ReconError> {
-        let sigma = stage.sigma_at(iteration);
-        let (squares, change) = if stage.prior == Prior::Tv && self.multiplier.is_none() {
-            self.project_and_smooth(stage)
-        } else {
-            let squares = self.project(stage.memory, 0..self.y.nrows());
-            if let (Some(u), Some(z)) = (&self.multiplier, &mut self.start) {
-                self.x -= u;
-                z.assign(&self.x);
-            }
-            self.apply(stage, sigma)?;
-            (squares, self.change(0..self.y.nrows()))
-        };
-        let change = change.relative();
-        self.prepare_start(stage.momentum);
-        std::mem::swap(&mut self.v, &mut self.x);
+        let (frames, height, width) = self.op.dim();
+        let admm = self.state.multiplier.is_some();
+        let strips = stage.prior.by_strips() && !admm;
+        let strip = (STRIP_VALUES / (frames * width)).max(LEAST_ROWS);
+        let settings = stage.settings(iteration);
+        let (squares, change) =
+            self.sweep(stage, &settings, if strips { strip } else { height })?;
+        self.tv_iterations += usize::from(settings.tv_weight > 0.0);
+        self.denoiser_passes += usize::from(stage.prior.network().is_some());
+        let prepare_start = if admm { admm::prepare_start } else { gap::prepare_start };
+        prepare_start(&mut self.state, &self.x, stage.momentum);
+        std::mem::swap(&mut self.state.v, &mut self.x);
         self.done += 1;
+        let change = change.relative();
         if !change.is_finite() {
             let (iteration, planned) = (self.done, self.planned);
             return Err(ReconError::Diverged { iteration, planned });
         }
-        Ok(Step { sigma, residual: (squares.sqrt() / self.y_norm) as f32, change })
+        Ok(Step { residual: (squares.sqrt() / self.y_norm) as f32, change })
     }
 
-    /// Projection, total variation and the change, strip by strip, so that what the memory hands
-    /// over is used for all three while it is in cache.
-    fn project_and_smooth(&mut self, stage: &Stage) -> (f64, Change) {
-        let (frames, height, width) = self.op.dim();
-        let rows = (STRIP_VALUES / (frames * width)).max(LEAST_ROWS);
+    /// Projection, prior and the change, in strips of so many rows: what the memory hands over is used for all
+    /// three while it is in cache. The new iterate is then in `x`. Returns `||y - H v||^2` of what the
+    /// iteration started from.
+    fn sweep(
+        &mut self,
+        stage: &Stage,
+        settings: &Settings,
+        rows: usize,
+    ) -> Result<(f64, Change), ReconError> {
+        let Self { op, y, state, x, networks, .. } = self;
+        let pass = self.pass.get_or_insert_with(|| stage.prior.begin(op.dim()));
         let (mut squares, mut change) = (0.0, Change::default());
-        for start in (0..height).step_by(rows) {
-            let strip = start..height.min(start + rows);
-            squares += self.project(stage.memory, strip.clone());
-            self.smooth_in_time(stage, strip.clone());
-            let (weight, updates) = (stage.tv_weight, stage.tv_updates);
-            for k in 0..frames {
-                let done = self.tv.advance(k, &mut self.x, strip.clone(), weight, updates);
-                change.add(&self.x, &self.v, k, done);
-            }
+        for first in (0..y.nrows()).step_by(rows) {
+            let strip = first..y.nrows().min(first + rows);
+            squares += state.project(op, strip.clone(), y, stage.memory, x);
+            admm::shift(state, x);
+            pass.apply(x, strip, settings, &mut **networks, &mut |x, k, done| {
+                change.add(x, &state.v, k, done);
+            })?;
         }
-        self.tv_iterations += usize::from(stage.tv_weight > 0.0);
-        (squares, change)
-    }
-
-    /// Projects some rows into `x`; `||y - H v||^2` of them.
-    fn project(&mut self, memory: f32, rows: Range<usize>) -> f64 {
-        let y1 = self.y1.as_mut().map(|y1| (y1, memory));
-        let start = self.start.as_ref().unwrap_or(&self.v);
-        self.op.project(rows, &self.y, y1, start, &mut self.x)
-    }
-
-    fn smooth_in_time(&mut self, stage: &Stage, rows: Range<usize>) {
-        if stage.temporal_weight > 0.0 {
-            self.temporal.denoise(&mut self.x, rows, stage.temporal_weight, stage.tv_updates);
-        }
-    }
-
-    fn change(&self, rows: Range<usize>) -> Change {
-        let mut change = Change::default();
-        (0..self.op.dim().0).for_each(|k| change.add(&self.x, &self.v, k, rows.clone()));
-        change
-    }
-
-    /// `v = D(x)`, in place.
-    fn apply(&mut self, stage: &Stage, sigma: Option<Sigma>) -> Result<(), ReconError> {
-        if stage.prior.uses_tv() {
-            self.smooth_in_time(stage, 0..self.y.nrows());
-        }
-        if stage.prior.uses_tv() && stage.tv_weight > 0.0 {
-            self.tv.denoise(&mut self.x, stage.tv_weight, stage.tv_updates);
-            self.tv_iterations += 1;
-        }
-        let Some(sigma) = sigma else { return Ok(()) };
-        if stage.prior == Prior::Nonlocal {
-            let size = self.x.dim();
-            let nonlocal = self.nonlocal.get_or_insert_with(|| Nonlocal::new(size));
-            nonlocal.denoise(&mut self.x, sigma);
-        }
-        if let Some(network) = stage.prior.network() {
-            self.networks.network(network)?.denoise(&mut self.x, sigma)?;
-            self.denoiser_passes += 1;
-        }
-        Ok(())
-    }
-
-    /// What is projected next, from the new iterate in `x` and the old one in `v`. For ADMM
-    /// `start` holds `z`, what went into the denoiser, so that `u = v - z`.
-    fn prepare_start(&mut self, momentum: f32) {
-        let Some(start) = &mut self.start else { return };
-        if let Some(u) = &mut self.multiplier {
-            ndarray::azip!((u in &mut *u, &new in &self.x, &z in &*start) *u = new - z);
-            ndarray::azip!((start in start, &new in &self.x, &old in &self.v, &u in &*u)
-                *start = new + momentum * (new - old) + u);
-        } else {
-            ndarray::azip!((start in start, &new in &self.x, &old in &self.v)
-                *start = new + momentum * (new - old));
-        }
+        Ok((squares, change))
     }
 
     fn residual(&mut self) -> f32 {
-        let squares = self.op.project(0..self.y.nrows(), &self.y, None, &self.v, &mut self.x);
+        let rows = 0..self.y.nrows();
+        let squares = self.op.project(rows, &self.y, None, &self.state.v, &mut self.x);
         (squares.sqrt() / self.y_norm) as f32
+    }
+}
+
+/// A slow, readable solver's parts, for the tests of GAP and ADMM.
+#[cfg(test)]
+mod reference {
+    use super::{Observer, Outcome};
+    use crate::recon::ReconError;
+    use crate::recon::prior::{Denoiser, Network, Networks};
+    use crate::recon::schedule::Schedule;
+    use crate::recon::sensing::SensingOperator;
+    use ndarray::{Array2, Array3, ArrayView2};
+    use rand::{Rng, SeedableRng};
+    use serde_json::json;
+
+    /// A small random problem, with a denoiser that pulls every voxel towards a grey.
+    pub(super) struct Problem {
+        pub(super) schedule: Schedule,
+        masks: Array3<f32>,
+        y: Array2<f32>,
+    }
+
+    const GREY: f64 = 0.4;
+    const PULL: f64 = 0.25;
+
+    struct Pull;
+
+    impl Denoiser for Pull {
+        fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
+            frames.mapv_inplace(|x| x + PULL as f32 * (GREY as f32 - x));
+            Ok(())
+        }
+    }
+
+    impl Networks for Pull {
+        fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
+            Ok(self)
+        }
+    }
+
+    type Solver = fn(
+        &SensingOperator,
+        ArrayView2<'_, f32>,
+        &Schedule,
+        &mut dyn Networks,
+        &mut dyn Observer,
+    ) -> Result<Outcome, ReconError>;
+
+    impl Problem {
+        pub(super) fn random(seed: u64, method: &str) -> Self {
+            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+            let size = (rng.random_range(1..5), rng.random_range(1..8), rng.random_range(1..40));
+            let masks = Array3::from_shape_simple_fn(size, || 0.2 + 0.8 * rng.random::<f32>());
+            let y = Array2::from_shape_simple_fn((size.1, size.2), || 2.0 * rng.random::<f32>());
+            let memory: f32 = rng.random();
+            let stage = json!({"prior": "ffdnet", "iterations": 7, "sigma": [0.1, 0.1],
+                "memory": memory, "momentum": 0.5 * rng.random::<f32>()});
+            let schedule = json!({"method": method, "accelerated": rng.random::<bool>(),
+                "gamma": 0.3 * rng.random::<f32>(), "stages": [stage]});
+            Self { schedule: serde_json::from_value(schedule).unwrap(), masks, y }
+        }
+
+        pub(super) fn solve(&self, solver: Solver) -> Outcome {
+            let op = SensingOperator::new(self.masks.clone()).unwrap();
+            let op = op.with_gamma(self.schedule.gamma).unwrap();
+            solver(&op, self.y.view(), &self.schedule, &mut Pull, &mut ()).unwrap()
+        }
+
+        pub(super) fn pixels(&self) -> usize {
+            self.y.len()
+        }
+
+        pub(super) fn zeros(&self) -> Vec<f64> {
+            vec![0.0; self.masks.len()]
+        }
+
+        pub(super) fn denoise(&self, x: &mut [f64]) {
+            x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
+        }
+
+        /// `P(w)`, with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
+        pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
+            let pixels = self.pixels();
+            let (gamma, memory) = (self.schedule.gamma, self.schedule.stages[0].memory);
+            let mask: Vec<f64> = self.masks.iter().map(|&c| f64::from(c)).collect();
+            let mut x = w.to_vec();
+            for (p, &y) in self.y.iter().enumerate() {
+                let voxels = || (p..w.len()).step_by(pixels);
+                let seen: f64 = voxels().map(|voxel| mask[voxel] * w[voxel]).sum();
+                let gram: f64 = voxels().map(|voxel| mask[voxel].powi(2)).sum();
+                let mut target = f64::from(y);
+                if self.schedule.accelerated {
+                    y1[p] = target + f64::from(memory) * (y1[p] - seen);
+                    target = y1[p];
+                }
+                for voxel in voxels() {
+                    x[voxel] += mask[voxel] * (target - seen) / (gram + f64::from(gamma));
+                }
+            }
+            x
+        }
+    }
+
+    /// The largest difference of two clips.
+    pub(super) fn furthest(frames: &Array3<f32>, reference: &[f64]) -> f64 {
+        let pairs = frames.iter().zip(reference);
+        pairs.map(|(&a, b)| (f64::from(a) - b).abs()).fold(0.0, f64::max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Run;
+    use crate::recon::prior::temporal::TemporalVariation;
+    use crate::recon::prior::tv::TotalVariation;
+    use crate::recon::schedule::Schedule;
+    use crate::recon::sensing::SensingOperator;
+    use ndarray::{Array2, Array3};
+    use rand::{Rng, SeedableRng};
+
+    /// Strip by strip is what projection, total variation along time and that of each frame do one after
+    /// the other.
+    #[test]
+    fn the_sweep_by_strips_is_that_of_whole_frames_bit_by_bit() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let size = (3, 37, 21);
+        let mut random = || Array3::from_shape_simple_fn(size, || rng.random::<f32>());
+        let (masks, v) = (random(), random());
+        let op = SensingOperator::new(masks).unwrap();
+        let y = op.forward(random().view()).unwrap();
+        let schedule = Schedule::gap_tv3d();
+        let stage = &schedule.stages[0];
+        let settings = stage.settings(0);
+
+        let (mut expected, mut y1) = (Array3::zeros(size), Array2::zeros(y.raw_dim()));
+        op.project(0..size.1, &y, Some((&mut y1, stage.memory)), &v, &mut expected);
+        let (weight, updates) = (settings.temporal_weight, settings.tv_updates);
+        let mut temporal = TemporalVariation::new(size.0);
+        temporal.denoise(&mut expected, 0..size.1, weight, updates);
+        TotalVariation::new(size).denoise(&mut expected, settings.tv_weight, updates);
+        let difference = (&expected - &v).mapv(|d| d * d).sum() / expected.mapv(|x| x * x).sum();
+
+        for rows in [1, 2, 5, 16, 36, 37] {
+            let mut networks = ();
+            let mut run = Run::new(&op, y.view(), &schedule, &mut networks);
+            run.state.v.assign(&v);
+            let (squares, change) = run.sweep(stage, &settings, rows).unwrap();
+            assert_eq!(run.x, expected, "{rows} rows");
+            let residual = (&y - &op.forward(v.view()).unwrap()).mapv(|r| r * r).sum();
+            assert!((squares / f64::from(residual) - 1.0).abs() < 1e-4, "{rows} rows: {squares}");
+            assert!((change.relative() / difference.sqrt() - 1.0).abs() < 1e-4, "{rows} rows");
+        }
     }
 }

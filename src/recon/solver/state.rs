@@ -1,8 +1,50 @@
-//! How far an iterate has moved.
+//! What an iteration starts from, and how far it moves.
 
 use std::ops::Range;
 
-use ndarray::{Array3, Axis};
+use ndarray::{Array2, Array3, Axis};
+
+use crate::recon::schedule::{Method, Schedule};
+use crate::recon::sensing::SensingOperator;
+
+/// What an iteration starts from.
+#[derive(Clone)]
+pub(in crate::recon) struct State {
+    /// The iterate \[B,H,W\].
+    pub(super) v: Array3<f32>,
+    /// The target of accelerated GAP \[H,W\].
+    pub(super) y1: Option<Array2<f32>>,
+    /// What is projected, where it is not `v`: extrapolated, or with ADMM's multiplier.
+    pub(super) start: Option<Array3<f32>>,
+    /// ADMM's multiplier `u`.
+    pub(super) multiplier: Option<Array3<f32>>,
+}
+
+impl State {
+    /// All zero.
+    pub(super) fn new(size: (usize, usize, usize), schedule: &Schedule) -> Self {
+        let zeros = || Array3::zeros(size);
+        Self {
+            v: zeros(),
+            y1: schedule.accelerated.then(|| Array2::zeros((size.1, size.2))),
+            start: schedule.has_own_start().then(zeros),
+            multiplier: (schedule.method == Method::Admm).then(zeros),
+        }
+    }
+
+    /// Projects some rows into `x`; `||y - H v||^2` of them.
+    pub(super) fn project(
+        &mut self,
+        op: &SensingOperator,
+        rows: Range<usize>,
+        y: &Array2<f32>,
+        memory: f32,
+        x: &mut Array3<f32>,
+    ) -> f64 {
+        let y1 = self.y1.as_mut().map(|y1| (y1, memory));
+        op.project(rows, y, y1, self.start.as_ref().unwrap_or(&self.v), x)
+    }
+}
 
 /// Running sums side by side: so many that the compiler keeps them in a loop over registers.
 const LANES: usize = 256;

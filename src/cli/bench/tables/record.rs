@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::cli::CliError;
-use crate::job::{Algorithm, ScheduleSpec, TileSpec};
+use crate::job::{Algorithm, Schedule, TileSpec};
 use crate::pipeline::manifest::ModelRecord;
 
 /// Name and version of this form of record.
@@ -40,7 +40,7 @@ pub(super) struct Key {
     pub(super) setting: Setting,
     /// SHA-256 of masks, measurement and true frames, one after the other, as little-endian f32.
     pub(super) inputs_sha256: String,
-    pub(super) schedule: ScheduleSpec,
+    pub(super) schedule: Schedule,
     pub(super) tile: TileSpec,
     pub(super) models: Vec<ModelRecord>,
     /// Execution provider of the networks; none without one.

@@ -9,7 +9,6 @@ use sha2::{Digest, Sha256};
 use super::record::{Key, Row, Setting, ZoneRecord};
 use super::zones::Zones;
 use crate::cli::CliError;
-use crate::cli::arguments::checked;
 use crate::cli::bench::clips::Clip;
 use crate::cli::learned::{Learned, plan};
 use crate::cli::masks::MaskArguments;
@@ -141,13 +140,9 @@ impl Bench {
         let white = estimator
             .white(measurement.view())
             .map_err(|error| CliError::Input(format!("clip {}: {error}", snapshot.clip)))?;
-        let schedule;
         let solver = match &self.learned {
             Some(learned) if key.algorithm == Algorithm::Learned => Solver::Network(&learned.file),
-            _ => {
-                schedule = checked(&key.schedule)?;
-                Solver::Schedule(&schedule)
-            }
+            _ => Solver::Schedule(&key.schedule),
         };
         let input = SnapshotInput {
             snapshot: 0,

@@ -1,0 +1,291 @@
+//! Networks as priors: FFDNet, frame by frame (Zhang, Zuo and Zhang, IEEE TIP 2018), and FastDVDNet over whole
+//! clips (Tassano et al., CVPR 2020), with floating point or 8 bits.
+
+use std::ops::Range;
+
+use ndarray::{Array3, ArrayView2, ArrayView4, ArrayViewMut2, Axis};
+
+use super::onnx::{ClipNetwork, Runtime};
+use super::{Denoiser, Memory, Network, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
+use crate::recon::error::ReconError;
+
+/// FFDNet, frame by frame.
+pub const FFDNET: NetworkPrior = NetworkPrior {
+    name: "ffdnet",
+    summary: "FFDNet, frame by frame",
+    network: Network::FfdNet,
+    pass_ns: 1_450.0,
+    memory: FLOAT_MEMORY,
+};
+/// FastDVDNet over the clip, with a shared first stage.
+pub const FASTDVDNET: NetworkPrior = NetworkPrior {
+    name: "fastdvdnet",
+    summary: "FastDVDNet over the clip",
+    network: Network::FastDvdNet,
+    pass_ns: 4_900.0,
+    memory: FLOAT_MEMORY,
+};
+/// The same with weights and activations of 8 bits.
+pub const FASTDVDNET_INT8: NetworkPrior = NetworkPrior {
+    name: "fastdvdnet-int8",
+    summary: "FastDVDNet with weights and activations of 8 bits",
+    network: Network::FastDvdNetInt8,
+    // 0.36 of it, with AVX-512 VNNI.
+    pass_ns: 1_800.0,
+    // It stays loaded beside its twin.
+    memory: Memory { per_network_pixel: FLOAT_MEMORY.per_network_pixel + 2000, ..FLOAT_MEMORY },
+};
+
+/// Padded input, middle and output for each voxel, and the activations.
+const FLOAT_MEMORY: Memory = Memory { per_voxel: 24, per_network_pixel: 2600 };
+
+/// A network alone.
+pub struct NetworkPrior {
+    name: &'static str,
+    summary: &'static str,
+    network: Network,
+    pass_ns: f64,
+    memory: Memory,
+}
+
+impl Prior for NetworkPrior {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn summary(&self) -> &'static str {
+        self.summary
+    }
+
+    fn parameters(&self) -> Vec<&'static Parameter> {
+        vec![&SIGMA]
+    }
+
+    fn network(&self) -> Option<Network> {
+        Some(self.network)
+    }
+
+    fn cost(&self, _: &Settings) -> f64 {
+        self.pass_ns
+    }
+
+    fn memory(&self) -> Memory {
+        self.memory
+    }
+
+    fn begin(&self, _: (usize, usize, usize)) -> Box<dyn Pass> {
+        Box::new(self.network)
+    }
+}
+
+impl Pass for Network {
+    fn apply(
+        &mut self,
+        x: &mut Array3<f32>,
+        rows: Range<usize>,
+        settings: &Settings,
+        networks: &mut dyn Networks,
+        ready: &mut Ready<'_>,
+    ) -> Result<(), ReconError> {
+        networks.network(*self)?.denoise(x, settings.sigma)?;
+        (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
+        Ok(())
+    }
+}
+
+/// Pixels that go through a block at once, whole frames: more would take more memory and no less time.
+const PIXELS_AT_ONCE: usize = 2 * 256 * 256;
+
+/// A network for gray clips, loaded.
+///
+/// FFDNet is one block, from a frame to a frame. FastDVDNet is two, each of which denoises the middle of three
+/// frames: the first runs once for each triplet of the clip and serves three outputs, so a frame costs 2 blocks,
+/// not 4. Frames go through in chunks, which bounds the memory whatever the number of frames and changes no bit.
+pub struct ClipDenoiser {
+    blocks: Vec<ClipNetwork>,
+    /// Frames before and after a frame that a block looks at.
+    reach: usize,
+    /// Sides must be multiples of it: a network halves them once or twice.
+    multiple: usize,
+    input: Vec<f32>,
+    output: Vec<f32>,
+}
+
+impl ClipDenoiser {
+    /// Loads a network from its ONNX files, a block each (see [`ClipNetwork::load`] for their faces).
+    pub fn load(
+        runtime: &Runtime,
+        which: Network,
+        files: &[impl AsRef<[u8]>],
+    ) -> Result<Self, ReconError> {
+        let (names, reach, multiple): (&[_], _, _) = match which {
+            Network::FfdNet => (&["FFDNet"], 0, 2),
+            Network::FastDvdNet | Network::FastDvdNetInt8 => {
+                (&["FastDVDNet stage 1", "FastDVDNet stage 2"], 1, 4)
+            }
+        };
+        let files = names.iter().zip(files);
+        let blocks = files.map(|(name, file)| ClipNetwork::load(runtime, name, file.as_ref()));
+        let blocks = blocks.collect::<Result<_, _>>()?;
+        Ok(Self { blocks, reach, multiple, input: Vec::new(), output: Vec::new() })
+    }
+}
+
+impl Denoiser for ClipDenoiser {
+    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<(), ReconError> {
+        let Self { blocks, reach, multiple, input, output } = self;
+        let (count, height, width) = frames.dim();
+        let (rows, columns) =
+            (height.next_multiple_of(*multiple), width.next_multiple_of(*multiple));
+        let plane = rows * columns;
+        let margin = *reach * blocks.len();
+        input.resize((count + 2 * margin) * plane, 0.0);
+        for (k, padded) in input.chunks_exact_mut(plane).enumerate() {
+            let frame = reflect(k as isize - margin as isize, count);
+            pad_frame(frames.index_axis(Axis(0), frame), padded, columns);
+        }
+        for block in blocks {
+            output.resize(input.len() - 2 * *reach * plane, 0.0);
+            run_chunked(block, input, output, (rows, columns), sigma)?;
+            std::mem::swap(input, output);
+        }
+        for (frame, output) in frames.outer_iter_mut().zip(input.chunks_exact(plane)) {
+            unpad_frame(output, columns, frame);
+        }
+        Ok(())
+    }
+}
+
+/// Copies a frame into one with rows of `columns` pixels and as many rows as fit, mirrored at its
+/// lower and right ends.
+fn pad_frame(frame: ArrayView2<'_, f32>, padded: &mut [f32], columns: usize) {
+    let (height, width) = frame.dim();
+    for (i, row) in padded.chunks_exact_mut(columns).enumerate() {
+        let source = frame.row(reflect(i as isize, height));
+        for (j, value) in row.iter_mut().enumerate() {
+            *value = source[reflect(j as isize, width)];
+        }
+    }
+}
+
+/// Takes a frame out of one that was padded by [`pad_frame`].
+fn unpad_frame(padded: &[f32], columns: usize, mut frame: ArrayViewMut2<'_, f32>) {
+    for (mut row, padded) in frame.outer_iter_mut().zip(padded.chunks_exact(columns)) {
+        row.iter_mut().zip(padded).for_each(|(value, &x)| *value = x);
+    }
+}
+
+/// One block over a clip, some frames at a time.
+fn run_chunked(
+    block: &mut ClipNetwork,
+    input: &[f32],
+    output: &mut [f32],
+    (rows, columns): (usize, usize),
+    sigma: f32,
+) -> Result<(), ReconError> {
+    let plane = rows * columns;
+    let beside = (input.len() - output.len()) / plane;
+    let chunk = (PIXELS_AT_ONCE / plane).max(1);
+    for (index, output) in output.chunks_mut(chunk * plane).enumerate() {
+        let count = output.len() / plane + beside;
+        let frames = &input[index * chunk * plane..][..count * plane];
+        let frames = ArrayView4::from_shape((count, 1, rows, columns), frames)
+            .map_err(|error| ReconError::Runtime(error.to_string()))?;
+        block.run(frames, sigma, output)?;
+    }
+    Ok(())
+}
+
+/// The index inside `0..length` that mirrors `index` at the ends, without repeating them.
+fn reflect(index: isize, length: usize) -> usize {
+    if length == 1 {
+        return 0;
+    }
+    let period = 2 * (length as isize - 1);
+    let index = index.rem_euclid(period);
+    index.min(period - index) as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ClipDenoiser, reflect};
+    use crate::pipeline::models;
+    use crate::recon::prior::onnx::{Device, Runtime};
+    use crate::recon::prior::{Denoiser, Network};
+    use ndarray::{Array3, s};
+    use rand::{Rng, SeedableRng};
+    use std::path::PathBuf;
+
+    /// The network, or none (said aloud) where libonnxruntime has not been fetched.
+    fn network(which: Network) -> Option<ClipDenoiser> {
+        let library = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from).filter(|p| p.exists());
+        let Some(library) = library else {
+            eprintln!("skipped: no libonnxruntime (run scripts/fetch-onnxruntime.sh)");
+            return None;
+        };
+        let runtime = Runtime::open(&library, Device::Cpu).unwrap();
+        let files: Vec<_> = models::of(which).files.iter().map(|(_, file)| *file).collect();
+        Some(ClipDenoiser::load(&runtime, which, &files).unwrap())
+    }
+
+    fn noisy(frames: usize, height: usize, width: usize) -> (Array3<f32>, Array3<f32>) {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+        let clean = Array3::from_shape_fn((frames, height, width), |(k, i, j)| {
+            0.5 + 0.3 * ((i + 2 * k) as f32 * 0.15).sin() * (j as f32 * 0.1).cos()
+        });
+        let noisy = clean.mapv(|x: f32| x + 0.35 * (rng.random::<f32>() - 0.5));
+        (clean, noisy)
+    }
+
+    fn mean_square(a: &Array3<f32>, b: &Array3<f32>) -> f32 {
+        (a - b).mapv(|d| d * d).mean().unwrap()
+    }
+
+    #[test]
+    fn noise_falls_for_any_size_and_any_number_of_frames() {
+        let Some(mut network) = network(Network::FastDvdNet) else { return };
+        for (frames, height, width) in [(1, 32, 32), (2, 33, 46), (7, 50, 31)] {
+            let (clean, mut video) = noisy(frames, height, width);
+            let before = mean_square(&video, &clean);
+            network.denoise(&mut video, 0.1).unwrap();
+            let after = mean_square(&video, &clean);
+            assert!(after < 0.2 * before, "{frames}x{height}x{width}: {before} to {after}");
+        }
+    }
+
+    #[test]
+    fn a_frame_does_not_depend_on_how_the_clip_is_chunked() {
+        let Some(mut network) = network(Network::FastDvdNet) else { return };
+        // 300x300: two frames at once; the middle of 9 depends on its 4 neighbours alone.
+        let (_, video) = noisy(9, 300, 300);
+        let mut long = video.clone();
+        network.denoise(&mut long, 0.1).unwrap();
+        let mut short = video.slice(s![2..7, .., ..]).to_owned();
+        network.denoise(&mut short, 0.1).unwrap();
+        assert_eq!(long.slice(s![4, .., ..]), short.slice(s![2, .., ..]));
+    }
+
+    #[test]
+    fn eight_bits_change_little() {
+        let (Some(mut exact), Some(mut quick)) =
+            (network(Network::FastDvdNet), network(Network::FastDvdNetInt8))
+        else {
+            return;
+        };
+        let (clean, mut frames) = noisy(6, 64, 64);
+        let mut other = frames.clone();
+        exact.denoise(&mut frames, 0.1).unwrap();
+        quick.denoise(&mut other, 0.1).unwrap();
+        let (error, change) = (mean_square(&frames, &clean), mean_square(&frames, &other));
+        assert!(change > 0.0, "these are the same weights");
+        assert!(change < 0.05 * error, "{change} where the network's own error is {error}");
+    }
+
+    #[test]
+    fn reflection_mirrors_without_repeating_the_ends() {
+        let seen: Vec<usize> = (-3..7).map(|index| reflect(index, 4)).collect();
+        assert_eq!(seen, [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
+        assert_eq!((reflect(-2, 1), reflect(5, 1)), (0, 0));
+        assert_eq!((reflect(-2, 2), reflect(2, 2)), (0, 0));
+    }
+}
