@@ -12,6 +12,7 @@ use crate::recon::tile::TilePlan;
 /// An end-to-end network for one size of masks.
 pub struct Learned {
     name: String,
+    /// Its ONNX file.
     pub file: ModelFile,
     interface: Interface,
 }

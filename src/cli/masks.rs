@@ -74,7 +74,9 @@ pub struct Apertures {
 pub struct SimulatedMasks {
     /// \[B,H,W\] on \[0,1\].
     pub masks: Array3<f32>,
+    /// Share of the light of the whole open aperture, without a mask, that the masks pass.
     pub throughput: f64,
+    /// That share where a mask is 1.
     pub scale: f32,
     /// None for masks without an aperture.
     pub apertures: Option<Apertures>,

@@ -161,7 +161,7 @@ struct Light {
 
 impl OpticsFile {
     /// Reads and checks a file; without one these are the defaults.
-    pub fn read(path: Option<&Path>) -> Result<Self, CliError> {
+    pub(super) fn read(path: Option<&Path>) -> Result<Self, CliError> {
         let Some(path) = path else { return Ok(Self::default()) };
         let text = fs::read_to_string(path).map_err(|error| refused(path, &error))?;
         let file: Self = toml::from_str(&text).map_err(|error| refused(path, &error))?;
@@ -170,7 +170,7 @@ impl OpticsFile {
         Ok(file)
     }
 
-    pub fn geometry(&self) -> Geometry {
+    pub(super) fn geometry(&self) -> Geometry {
         Geometry {
             lcos_rows: self.lcos.rows,
             lcos_columns: self.lcos.columns,
@@ -186,7 +186,7 @@ impl OpticsFile {
         }
     }
 
-    pub fn camera(&self) -> Camera {
+    pub(super) fn camera(&self) -> Camera {
         let CameraSection {
             bits,
             full_well_e,
@@ -207,31 +207,32 @@ impl OpticsFile {
         }
     }
 
-    pub fn circle(&self) -> Circle {
+    pub(super) fn circle(&self) -> Circle {
         let CircleSection { radius_pixels, centre_pixels } = self.circle;
         Circle { radius_pixels, centre_pixels }
     }
 
-    pub fn placement(&self) -> Placement {
+    pub(super) fn placement(&self) -> Placement {
         match self.projection.placement {
             PlacementName::WholePixels => Placement::WholePixels,
             PlacementName::Geometric => Placement::Geometric,
         }
     }
 
-    pub fn method(&self) -> Method {
+    pub(super) fn method(&self) -> Method {
         match self.projection.method {
             MethodName::Shifts => Method::Shifts,
             MethodName::Convolution => Method::Convolution,
         }
     }
 
+    /// Share of the light that is lost at the corners.
     pub fn vignetting(&self) -> f64 {
         self.light.vignetting
     }
 
     /// The grid of sub-apertures for snapshots of `frames` frames.
-    pub fn grid(&self, frames: usize) -> Result<ApertureGrid, CliError> {
+    pub(super) fn grid(&self, frames: usize) -> Result<ApertureGrid, CliError> {
         let rule = ApertureGrid::for_frames(frames);
         match (self.sub_apertures.rows, self.sub_apertures.columns) {
             (None, None) => Ok(rule),
@@ -243,7 +244,7 @@ impl OpticsFile {
     }
 
     /// How random squares are drawn on a grid.
-    pub fn draw(&self, grid: ApertureGrid) -> Result<Draw, CliError> {
+    pub(super) fn draw(&self, grid: ApertureGrid) -> Result<Draw, CliError> {
         let SubApertures { open_share, rank, tries, .. } = self.sub_apertures;
         if !(open_share > 0.0 && open_share <= 1.0) {
             return Err(CliError::Input(format!(

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::request::TileSpec;
 use super::schedule::{PriorSpec, ScheduleSpec};
+use super::shape::TileSpec;
 use crate::recon::schedule::Schedule;
 
 /// The algorithms.

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::request::InvalidField;
+use super::text::InvalidField;
 use crate::recon::ReconError;
 use crate::recon::schedule::{Method, Network, Prior, Schedule, Sigma, Stage};
 

@@ -13,9 +13,9 @@ use sci_recon::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, generator, measure, noisy,
     single_apertures,
 };
+use sci_recon::pipeline::{NetworkSource, SnapshotInput, Solver};
 use sci_recon::recon::metrics;
 use sci_recon::recon::schedule::Schedule;
-use sci_recon::pipeline::{NetworkSource, SnapshotInput, Solver};
 use serde::Serialize;
 
 use super::clips::{Clip, read_clips};

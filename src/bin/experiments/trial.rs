@@ -7,13 +7,13 @@ use ndarray::{Array2, Array3, ArrayView, ArrayView2, ArrayView3, Axis, Dimension
 use sci_recon::cli::{CliError, Learned, MaskArguments, checked, plan};
 use sci_recon::job::{Algorithm, TileSpec};
 use sci_recon::optics::{illumination, measure, noisy};
-use sci_recon::recon::metrics;
-use sci_recon::recon::scale::ScaleEstimator;
-use sci_recon::recon::tile::TilePlan;
 use sci_recon::pipeline::manifest::{ModelRecord, Summary, TileRecord};
 use sci_recon::pipeline::{
     NetworkSource, SnapshotInput, Solver, TileOutcome, Usage, blended_frame, solve,
 };
+use sci_recon::recon::metrics;
+use sci_recon::recon::scale::ScaleEstimator;
+use sci_recon::recon::tile::TilePlan;
 use sha2::{Digest, Sha256};
 
 use super::clips::Clip;
