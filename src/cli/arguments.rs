@@ -30,7 +30,7 @@ pub(super) struct ScheduleArguments {
 
 /// Where the denoiser runs.
 #[derive(Debug, Args)]
-pub(super) struct EngineArguments {
+pub struct EngineArguments {
     /// The libonnxruntime [default: the one beside the program].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
@@ -78,7 +78,7 @@ impl ScheduleArguments {
 
 impl EngineArguments {
     /// The source of denoisers.
-    pub(super) fn network(&self) -> Result<NetworkSource, CliError> {
+    pub fn network(&self) -> Result<NetworkSource, CliError> {
         // An empty variable is one that is not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
         Ok(NetworkSource::new(library, Device::parse(&self.device)?))
@@ -86,7 +86,7 @@ impl EngineArguments {
 }
 
 /// Names of algorithms that need no network of the user's.
-pub(super) fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
+pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
     let [own @ .., _] = &Algorithm::ALL;
     named(own)
 }

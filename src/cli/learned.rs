@@ -10,9 +10,10 @@ use crate::recon::learned::{Interface, PictureSize};
 use crate::recon::tile::TilePlan;
 
 /// An end-to-end network for one size of masks.
-pub(super) struct Learned {
+pub struct Learned {
     name: String,
-    pub(super) file: ModelFile,
+    /// Its ONNX file.
+    pub file: ModelFile,
     interface: Interface,
 }
 
@@ -21,7 +22,7 @@ impl Learned {
     ///
     /// # Errors
     /// A file that can't be read or is no network, or no libonnxruntime.
-    pub(super) fn open(path: &Path, network: &NetworkSource) -> Result<Self, CliError> {
+    pub fn open(path: &Path, network: &NetworkSource) -> Result<Self, CliError> {
         let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
         let interface = network.end_to_end(&file)?.interface();
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -32,7 +33,7 @@ impl Learned {
     ///
     /// # Errors
     /// A network that is not for these.
-    pub(super) fn size(
+    pub fn size(
         &self,
         (frames, height, width): (usize, usize, usize),
     ) -> Result<PictureSize, CliError> {
@@ -40,7 +41,7 @@ impl Learned {
     }
 
     /// For a manifest.
-    pub(super) fn record(&self) -> ModelRecord {
+    pub fn record(&self) -> ModelRecord {
         ModelRecord { name: self.name.clone(), sha256: self.file.sha256().to_string() }
     }
 }
@@ -50,7 +51,7 @@ impl Learned {
 ///
 /// # Errors
 /// Tiles that can't be, or that the network does not take.
-pub(super) fn plan(
+pub fn plan(
     algorithm: Algorithm,
     (tile, overlap): (Option<usize>, Option<usize>),
     model: Option<&Learned>,

@@ -16,7 +16,7 @@ use crate::optics::{
 
 /// The masks that are asked for.
 #[derive(Debug, Args)]
-pub(super) struct MaskArguments {
+pub struct MaskArguments {
     /// Kind of the masks.
     #[arg(long, default_value = "random-squares")]
     pattern: Pattern,
@@ -61,7 +61,7 @@ enum Normalise {
 
 /// The aperture's patterns.
 #[derive(Debug, Serialize)]
-pub(super) struct Apertures {
+pub struct Apertures {
     rows: usize,
     columns: usize,
     rank: usize,
@@ -71,18 +71,20 @@ pub(super) struct Apertures {
 }
 
 /// Masks, and where they come from.
-pub(super) struct SimulatedMasks {
+pub struct SimulatedMasks {
     /// \[B,H,W\] on \[0,1\].
-    pub(super) masks: Array3<f32>,
-    pub(super) throughput: f64,
-    pub(super) scale: f32,
+    pub masks: Array3<f32>,
+    /// Share of the light of the whole open aperture, without a mask, that the masks pass.
+    pub throughput: f64,
+    /// That share where a mask is 1.
+    pub scale: f32,
     /// None for masks without an aperture.
-    pub(super) apertures: Option<Apertures>,
+    pub apertures: Option<Apertures>,
 }
 
 impl MaskArguments {
     /// The name of the kind.
-    pub(super) fn pattern(&self) -> &'static str {
+    pub fn pattern(&self) -> &'static str {
         match self.pattern {
             Pattern::Iid => "iid",
             Pattern::RandomSquares => "random-squares",
@@ -93,12 +95,12 @@ impl MaskArguments {
     }
 
     /// The optical parameters.
-    pub(super) fn optics(&self) -> Result<OpticsFile, CliError> {
+    pub fn optics(&self) -> Result<OpticsFile, CliError> {
         OpticsFile::read(self.optics.as_deref())
     }
 
     /// Makes the masks of frames x rows x columns.
-    pub(super) fn make(
+    pub fn make(
         &self,
         optics: &OpticsFile,
         (frames, height, width): (usize, usize, usize),

@@ -10,7 +10,6 @@ mod progress;
 mod supervisor;
 
 pub mod backup;
-pub mod bench;
 pub mod calibrate;
 pub mod check_model;
 pub mod demo;
@@ -22,4 +21,8 @@ pub mod simulate;
 pub mod token;
 pub mod worker;
 
+pub use arguments::{EngineArguments, algorithms, checked};
 pub use error::CliError;
+pub use learned::{Learned, plan};
+pub use masks::{MaskArguments, SimulatedMasks};
+pub use optics::OpticsFile;

@@ -24,7 +24,7 @@ pub struct Arguments {
 /// Everything that a file of optical parameters says.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub(super) struct OpticsFile {
+pub struct OpticsFile {
     lcos: Lcos,
     relay: Relay,
     mask: Mask,
@@ -226,7 +226,8 @@ impl OpticsFile {
         }
     }
 
-    pub(super) fn vignetting(&self) -> f64 {
+    /// Share of the light that is lost at the corners.
+    pub fn vignetting(&self) -> f64 {
         self.light.vignetting
     }
 

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::request::TileSpec;
+use super::shape::TileSpec;
 use crate::recon::prior::Prior;
 use crate::recon::prior::network::{FASTDVDNET, FASTDVDNET_INT8, FFDNET};
 use crate::recon::prior::nonlocal::NONLOCAL;

@@ -3,14 +3,12 @@
 mod access;
 mod algorithm;
 mod captures;
-mod disk;
-mod finding;
 mod ids;
 mod memory;
 mod model;
-mod reason;
 mod report;
 mod request;
+mod shape;
 mod state;
 mod task;
 mod text;
@@ -19,17 +17,15 @@ pub use crate::recon::schedule::Schedule;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
 pub use captures::Captures;
-pub use finding::{Finding, Grade, Severity};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
-pub use reason::without_paths;
-pub use report::{CalibrationReport, CaptureReport, MaskReport, PatternReport};
-pub use request::{
-    InvalidField, JobRequest, JobSpec, MAX_TASKS, SceneShape, SnapshotRange, SnapshotSelection,
-    TileSpec,
+pub use report::{
+    CalibrationReport, CaptureReport, Finding, Grade, MaskReport, PatternReport, Severity,
 };
+pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection};
+pub use shape::{SceneShape, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
 pub use task::{TaskKind, TaskProgress, TaskStage, TaskState};
-pub use text::{InvalidText, Label, Sha256, Timestamp};
+pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

@@ -2,45 +2,26 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::Finding;
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
-use super::text::Label;
+use super::report::Finding;
+use super::shape::{SceneShape, SnapshotRange, TileSpec};
+use super::text::{InvalidField, Label};
+use crate::recon::ReconError;
 use crate::recon::schedule::Schedule;
 use crate::recon::tile::TilePlan;
 
 /// The most tasks of one job; a larger one should be sent as several ranges of snapshots.
 pub const MAX_TASKS: usize = 50_000;
 
-/// One thing wrong with a request, and where it stands.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct InvalidField {
-    /// JSON pointer (RFC 6901) into the request.
-    pub pointer: String,
-    /// What is wrong and what would be right.
-    pub detail: String,
-}
-
-impl InvalidField {
-    /// `detail` is wrong at `pointer`.
-    pub fn new(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
-        Self { pointer: pointer.into(), detail: detail.into() }
-    }
-
-    /// All that is wrong with a schedule, with places in it.
-    pub fn of_schedule(schedule: &Schedule) -> Vec<Self> {
-        let faults = schedule.faults().into_iter();
-        faults.map(|(pointer, error)| Self::new(pointer, error.to_string())).collect()
-    }
-
-    /// The same error seen from one level further up.
-    #[must_use]
-    pub fn under(mut self, parent: &str) -> Self {
-        self.pointer.insert_str(0, parent);
-        self
-    }
-}
+/// Bytes of a voxel in a stored tile: one 32-bit float.
+const TILE_BYTES: u64 = 4;
+/// Bytes of a voxel in the results: EXR frames and stack, NumPy (32 bit each) and PNG (16 bit). EXR
+/// and PNG are compressed, but noise is not.
+const RESULT_BYTES: u64 = 4 + 4 + 4 + 2;
+/// Headers, manifests and rows, for each snapshot.
+const SNAPSHOT_BYTES: u64 = 1 << 20;
 
 /// Which snapshots a request means: `"all"`, one index, or `[first, last]` with both ends in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -86,59 +67,6 @@ impl From<SnapshotSelection> for SelectionJson {
             SnapshotSelection::Range(first, last) => Self::Range([first, last]),
         }
     }
-}
-
-/// Snapshots that stand side by side in a measurement.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SnapshotRange {
-    /// Index of the first, from 0.
-    pub first: u32,
-    /// How many, at least 1.
-    pub count: u32,
-}
-
-impl SnapshotRange {
-    /// The indices.
-    pub fn indices(self) -> impl Iterator<Item = u32> {
-        self.first..self.first + self.count
-    }
-
-    /// True if the snapshot with this index is among them.
-    #[must_use]
-    pub fn contains(self, index: u32) -> bool {
-        index >= self.first && index - self.first < self.count
-    }
-}
-
-/// How pictures are cut: side and overlap in pixels (see [`TilePlan::new`]).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TileSpec {
-    /// The largest side of a tile.
-    pub size: usize,
-    /// The least that neighbours share.
-    pub overlap: usize,
-}
-
-impl TileSpec {
-    /// One tile for the whole of a picture.
-    #[must_use]
-    pub fn whole(height: usize, width: usize) -> Self {
-        Self { size: height.max(width).max(16), overlap: 0 }
-    }
-}
-
-/// The sizes of a measurement and its calibration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SceneShape {
-    /// Frames that one snapshot codes (B).
-    pub frames: usize,
-    /// Rows.
-    pub height: usize,
-    /// Columns.
-    pub width: usize,
-    /// Snapshots of the measurement (S).
-    pub snapshots: u32,
 }
 
 /// The body of `POST /v1/jobs`.
@@ -301,12 +229,24 @@ impl SnapshotSelection {
 }
 
 impl JobSpec {
-    /// The tile plan of every snapshot of the job; none only if the spec was changed by hand.
-    ///
-    /// # Errors
-    /// As [`TilePlan::new`].
-    pub fn tile_plan(&self) -> Result<TilePlan, crate::recon::ReconError> {
+    /// The tile plan of every snapshot of the job; an error only if the spec was changed by hand.
+    pub fn tile_plan(&self) -> Result<TilePlan, ReconError> {
         TilePlan::new(self.shape.height, self.shape.width, self.tile.size, self.tile.overlap)
+    }
+
+    /// An upper bound of the bytes that the job writes to the disk. Tiles are kept until it has
+    /// succeeded, so both count.
+    #[must_use]
+    pub fn disk_bytes(&self) -> u64 {
+        let frames = self.shape.frames as u64;
+        let voxels = (self.shape.height * self.shape.width) as u64 * frames;
+        let area = |plan: TilePlan| {
+            plan.tiles().map(|tile| (tile.height * tile.width) as u64).sum::<u64>()
+        };
+        // A spec is checked before it is stored: its tiles can be planned.
+        let tiles = self.tile_plan().map_or(0, area) * frames;
+        let snapshot = voxels * RESULT_BYTES + tiles * TILE_BYTES + SNAPSHOT_BYTES;
+        u64::from(self.snapshots.count) * snapshot
     }
 }
 

@@ -1,10 +1,12 @@
-//! Small values that users give as text: labels and hashes. Both are checked once, when made.
+//! Small values as text: labels and hashes, each checked once when it is made; times; and what is
+//! wrong with a text.
 
 use std::fmt;
 use std::str::FromStr;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
+
+use crate::recon::schedule::Schedule;
 
 /// A text from a user that does not have the form it should have.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -14,6 +16,35 @@ pub struct InvalidText(String);
 impl InvalidText {
     pub(super) fn new(text: String) -> Self {
         Self(text)
+    }
+}
+
+/// One thing wrong with a request, and where it stands.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct InvalidField {
+    /// JSON pointer (RFC 6901) into the request.
+    pub pointer: String,
+    /// What is wrong and what would be right.
+    pub detail: String,
+}
+
+impl InvalidField {
+    /// `detail` is wrong at `pointer`.
+    pub fn new(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
+        Self { pointer: pointer.into(), detail: detail.into() }
+    }
+
+    /// All that is wrong with a schedule, with places in it.
+    pub fn of_schedule(schedule: &Schedule) -> Vec<Self> {
+        let faults = schedule.faults().into_iter();
+        faults.map(|(pointer, error)| Self::new(pointer, error.to_string())).collect()
+    }
+
+    /// The same error seen from one level further up.
+    #[must_use]
+    pub fn under(mut self, parent: &str) -> Self {
+        self.pointer.insert_str(0, parent);
+        self
     }
 }
 
@@ -92,7 +123,7 @@ impl Sha256 {
 
 impl fmt::Display for Sha256 {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+        f.write_str(&hex::encode(self.0))
     }
 }
 
@@ -100,18 +131,13 @@ impl FromStr for Sha256 {
     type Err = InvalidText;
 
     fn from_str(text: &str) -> Result<Self, InvalidText> {
-        let digits = text.as_bytes();
-        let lower_hex = |digit: &u8| matches!(digit, b'0'..=b'9' | b'a'..=b'f');
-        if digits.len() != 64 || !digits.iter().all(lower_hex) {
+        let mut bytes = [0; 32];
+        let upper = text.bytes().any(|digit| digit.is_ascii_uppercase());
+        if upper || hex::decode_to_slice(text, &mut bytes).is_err() {
             return Err(InvalidText(format!(
                 "{:?} is not a SHA-256 hash; it should be 64 lower-case hexadecimal digits",
                 text.chars().take(80).collect::<String>()
             )));
-        }
-        let value = |digit: u8| if digit <= b'9' { digit - b'0' } else { digit - b'a' + 10 };
-        let mut bytes = [0; 32];
-        for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
-            *byte = value(pair[0]) << 4 | value(pair[1]);
         }
         Ok(Self(bytes))
     }
@@ -139,8 +165,7 @@ impl Timestamp {
     /// The wall clock's time.
     #[must_use]
     pub fn now() -> Self {
-        let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        Self(i64::try_from(since.as_millis()).unwrap_or(i64::MAX))
+        Self(jiff::Timestamp::now().as_millisecond())
     }
 
     /// Seconds from `earlier` to this moment, not below zero.
@@ -153,21 +178,8 @@ impl Timestamp {
 
 impl fmt::Display for Timestamp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (days, ms) = (self.0.div_euclid(86_400_000), self.0.rem_euclid(86_400_000));
-        // Days to a civil date in the proleptic Gregorian calendar, with years that begin in March.
-        let z = days + 719_468;
-        let (era, doe) = (z.div_euclid(146_097), z.rem_euclid(146_097));
-        let yoe = (doe - doe / 1_460 + doe / 36_524 - doe / 146_096) / 365;
-        let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
-        let mp = (5 * doy + 2) / 153;
-        let (day, month) = (doy - (153 * mp + 2) / 5 + 1, if mp < 10 { mp + 3 } else { mp - 9 });
-        let year = yoe + era * 400 + i64::from(month <= 2);
-        let (hour, minute, second) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1_000 % 60);
-        write!(
-            f,
-            "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{:03}Z",
-            ms % 1000
-        )
+        let moment = jiff::Timestamp::from_millisecond(self.0).unwrap_or(jiff::Timestamp::MAX);
+        write!(f, "{moment:.3}")
     }
 }
 
@@ -177,9 +189,42 @@ impl Serialize for Timestamp {
     }
 }
 
+/// The text with each absolute path in it cut down to its last part: how the folders of the service
+/// are named is nobody's business, and what failed can still be told.
+#[must_use]
+pub fn without_paths(text: &str) -> String {
+    let mut clean = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = start_of_path(rest) {
+        let (before, path) = rest.split_at(at);
+        let end = path.find(ends_path).unwrap_or(path.len());
+        let (path, after) = path.split_at(end);
+        clean.push_str(before);
+        clean.push_str(path.trim_end_matches('/').rsplit('/').next().unwrap_or_default());
+        rest = after;
+    }
+    clean + rest
+}
+
+/// Where the first path with at least two parts begins.
+fn start_of_path(text: &str) -> Option<usize> {
+    let slashes = text.match_indices('/').map(|(at, _)| at);
+    slashes.into_iter().find(|&at| {
+        let before = text[..at].chars().next_back();
+        let path = &text[at + 1..];
+        let end = path.find(ends_path).unwrap_or(path.len());
+        // "and/or" and "s/m" are no paths; the slashes of "file:///x/y" and "/x/y" begin one.
+        !before.is_some_and(|c| c.is_alphanumeric()) && path[..end].trim_matches('/').contains('/')
+    })
+}
+
+fn ends_path(c: char) -> bool {
+    c.is_whitespace() || matches!(c, '"' | '\'' | '`' | ':' | ',' | ';' | '(' | ')' | '<' | '>')
+}
+
 #[cfg(test)]
 mod tests {
-    use super::{Label, Sha256, Timestamp};
+    use super::{Label, Sha256, Timestamp, without_paths};
 
     #[test]
     fn times_are_written_as_rfc_3339() {
@@ -204,6 +249,22 @@ mod tests {
         assert!(Label::try_from("../../etc/passwd".to_owned()).is_ok(), "a label is not a path");
         for bad in ["", "  ", "a\nb", "a\0b", "\u{1b}[31m", &"x".repeat(201)] {
             assert!(Label::try_from(bad.to_owned()).is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn paths_go_and_what_failed_stays() {
+        for (text, clean) in [
+            ("can't write /srv/sci/tmp/019a: No space left", "can't write 019a: No space left"),
+            ("there is no file /nowhere/lib.so; name it", "there is no file lib.so; name it"),
+            ("load \"/a/b/c.so\" (/x/y): both/or", "load \"c.so\" (y): both/or"),
+            ("/a/b and /c/d/", "b and d"),
+            ("file:///root/x/y failed", "file:y failed"),
+            ("speed in m/s, 1/2, / and /tmp", "speed in m/s, 1/2, / and /tmp"),
+            ("\u{e9}/\u{e9}/ \u{e9} /\u{e9}/\u{e9}", "\u{e9}/\u{e9}/ \u{e9} \u{e9}"),
+            ("", ""),
+        ] {
+            assert_eq!(without_paths(text), clean);
         }
     }
 }

@@ -11,6 +11,10 @@ fn sci_recon(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_sci-recon")).args(arguments).output().unwrap()
 }
 
+fn experiment(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_sci-recon-experiments")).args(arguments).output().unwrap()
+}
+
 fn json(output: &Output) -> Value {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).expect("one JSON object on standard output")
@@ -18,7 +22,10 @@ fn json(output: &Output) -> Value {
 
 /// Runs a command that must be refused as bad input; gives what it says.
 fn refused(arguments: &[&str]) -> String {
-    let output = sci_recon(arguments);
+    refusal(&sci_recon(arguments))
+}
+
+fn refusal(output: &Output) -> String {
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{message}");
     assert!(output.stdout.is_empty());
@@ -162,8 +169,8 @@ fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
 fn multiplexing_loses_without_noise_and_wins_with_it() {
     let files = Files::new();
     let (clip, out) = (concat!(env!("CARGO_MANIFEST_DIR"), "/demo/clip"), files.text("bench"));
-    let line = ["bench", "noise", "--clips", clip, "--cr", "8", "--scale", "128", "--out", &out];
-    let output = sci_recon(&[&line[..], &["--sigmas", "0,20"]].concat());
+    let line = ["noise", "--clips", clip, "--cr", "8", "--scale", "128", "--out", &out];
+    let output = experiment(&[&line[..], &["--sigmas", "0,20"]].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let record: Value =
         serde_json::from_slice(&bytes(&files.path("bench").join("noise.json"))).unwrap();
@@ -183,9 +190,9 @@ fn multiplexing_loses_without_noise_and_wins_with_it() {
 fn tables_of_clips_go_on_where_they_were_interrupted() {
     let files = Files::new();
     let (clip, out) = (concat!(env!("CARGO_MANIFEST_DIR"), "/demo/clip"), files.text("tables"));
-    let base = ["bench", "tables", "--clips", clip, "--scales", "64", "--out", &out, "--cr"];
+    let base = ["tables", "--clips", clip, "--scales", "64", "--out", &out, "--cr"];
     let run = |more: &[&str]| {
-        let output = sci_recon(&[&base[..], more].concat());
+        let output = experiment(&[&base[..], more].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap()
     };
@@ -230,16 +237,16 @@ fn a_row_of_the_tables_is_what_reconstruct_gives() {
     files.simulate("iid", "s", &[&["--compression-ratio", "6"][..], &shared].concat());
     let report = json(&files.reconstruct("s", &[]));
     let (clips, out) = (files.text("clips"), files.text("out"));
-    let line = ["bench", "tables", "--clips", &clips, "--scales", "48", "--cr", "6", "--out", &out];
+    let line = ["tables", "--clips", &clips, "--scales", "48", "--cr", "6", "--out", &out];
     let more = ["--algorithms", "gap-tv", "--pattern", "iid"];
-    let output = sci_recon(&[&line[..], &more, &shared].concat());
+    let output = experiment(&[&line[..], &more, &shared].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let file: Value = serde_json::from_slice(&bytes(&files.path("out/tables.json"))).unwrap();
     let row = &file["rows"][0];
     assert_eq!((&row["psnr_db"], &row["ssim"]), (&report["psnr_db"], &report["ssim"]));
     assert_eq!(row["clip"], "square");
 
-    let refuse = |more: &[&str]| refused(&[&line[..], more].concat());
+    let refuse = |more: &[&str]| refusal(&experiment(&[&line[..], more].concat()));
     let message = refuse(&["--cr", "7", "--algorithms", "gap-tv"]);
     assert!(message.contains("square.npy") && message.contains("7 are needed"), "{message}");
     let message = refuse(&["--scales", "48,64"]);

@@ -208,10 +208,8 @@ fn the_command_line_runs_a_network_too() {
     std::fs::create_dir(folder.path().join("clips")).unwrap();
     std::fs::copy(&masks, folder.path().join("clips/noise.npy")).unwrap();
     let (clips, tables) = (file("clips"), file("tables"));
-    let output = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
-        .args([
-            "bench", "tables", "--clips", &clips, "--scales", "48", "--cr", "4", "--out", &tables,
-        ])
+    let output = Command::new(env!("CARGO_BIN_EXE_sci-recon-experiments"))
+        .args(["tables", "--clips", &clips, "--scales", "48", "--cr", "4", "--out", &tables])
         .args(["--algorithms", "gap-tv", "--learned", network])
         .output()
         .unwrap();

@@ -4,37 +4,30 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array3, s};
+use sci_recon::cli::CliError;
+use sci_recon::intake::read_clip;
 
-use crate::cli::CliError;
-use crate::intake::read_clip;
-
-/// A clip of `frames` frames.
-#[derive(Debug)]
-pub(super) struct Clip {
+pub struct Clip {
     /// The name of its file or folder.
-    pub(super) name: String,
+    pub name: String,
     /// \[B,H,W\] on \[0,1\].
-    pub(super) frames: Array3<f32>,
+    pub frames: Array3<f32>,
 }
 
 /// The first `frames` frames of every clip in a folder, in the order of the clips' names; with `side`
 /// the square of so many pixels from the middle of each frame.
-///
-/// # Errors
-/// A folder without clips; clips that can't be read, or are too short or small.
-pub(super) fn read_clips(
+pub fn read_clips(
     folder: &Path,
     frames: usize,
     side: Option<usize>,
 ) -> Result<Vec<Clip>, CliError> {
     let unreadable = |error| CliError::Input(format!("cannot read {}: {error}", folder.display()));
-    let mut paths: Vec<PathBuf> = Vec::new();
-    for entry in fs::read_dir(folder).map_err(unreadable)? {
-        let path = entry.map_err(unreadable)?.path();
-        if is_clip(&path) {
-            paths.push(path);
-        }
-    }
+    let entries = fs::read_dir(folder).map_err(unreadable)?;
+    let mut paths = entries
+        .map(|entry| entry.map(|entry| entry.path()))
+        .filter(|path| path.as_ref().map_or(true, |path| is_clip(path)))
+        .collect::<Result<Vec<PathBuf>, _>>()
+        .map_err(unreadable)?;
     paths.sort();
     // A folder of pictures is one clip.
     if paths.is_empty() {
@@ -56,26 +49,24 @@ fn clip(path: &Path, frames: usize, side: Option<usize>) -> Result<Clip, CliErro
     if count < frames {
         return Err(refused(format!("{count} frames; {frames} are needed")));
     }
-    let cut = side.unwrap_or(height.max(width));
-    let (rows, columns) = (cut.min(height), cut.min(width));
-    if side.is_some_and(|side| side > height || side > width) {
-        return Err(refused(format!("frames of {height}x{width} are smaller than {cut}x{cut}")));
+    if let Some(side) = side.filter(|side| *side > height.min(width)) {
+        return Err(refused(format!("frames of {height}x{width} are smaller than {side}x{side}")));
     }
+    let (rows, columns) = side.map_or((height, width), |side| (side, side));
     let (top, left) = ((height - rows) / 2, (width - columns) / 2);
     let frames = all.slice(s![..frames, top..top + rows, left..left + columns]).to_owned();
     if let Some(value) = frames.iter().find(|value| !(-1e-6..=1.0 + 1e-6).contains(*value)) {
         return Err(refused(format!("{value} times the full scale; a scene lies between 0 and 1")));
     }
-    let name =
-        path.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+    let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     Ok(Clip { name, frames })
 }
 
 #[cfg(test)]
 mod tests {
     use super::read_clips;
-    use crate::formats::npy;
     use ndarray::Array3;
+    use sci_recon::formats::npy;
 
     #[test]
     fn clips_are_found_by_name_and_cut_to_the_middle() {
@@ -90,9 +81,11 @@ mod tests {
         assert_eq!(clips.iter().map(|clip| clip.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
         assert_eq!(clips[0].frames.dim(), (2, 2, 2));
         assert_eq!(clips[0].frames[[1, 0, 0]], value((1, 1, 2)));
-        let error = read_clips(folder.path(), 4, None).unwrap_err().to_string();
-        assert!(error.contains("3 frames; 4 are needed"), "{error}");
-        let error = read_clips(folder.path(), 2, Some(5)).unwrap_err().to_string();
-        assert!(error.contains("4x6 are smaller than 5x5"), "{error}");
+        let message = |frames, side| match read_clips(folder.path(), frames, side) {
+            Ok(_) => String::new(),
+            Err(error) => error.to_string(),
+        };
+        assert!(message(4, None).contains("3 frames; 4 are needed"));
+        assert!(message(2, Some(5)).contains("4x6 are smaller than 5x5"));
     }
 }

@@ -3,27 +3,43 @@
 use std::thread;
 use std::time::Instant;
 
-use ndarray::{Array2, Array3, ArrayView, Axis, Dimension, s};
-use sha2::{Digest, Sha256};
-
-use super::record::{Key, Row, Setting, ZoneRecord};
-use super::zones::Zones;
-use crate::cli::CliError;
-use crate::cli::bench::clips::Clip;
-use crate::cli::learned::{Learned, plan};
-use crate::cli::masks::MaskArguments;
-use crate::job::{Algorithm, TileSpec};
-use crate::optics::{illumination, measure, noisy};
-use crate::pipeline::manifest::{ModelRecord, Summary, TileRecord};
-use crate::pipeline::{
+use ndarray::{Array2, Array3, ArrayView, ArrayView2, ArrayView3, Axis, Dimension, s};
+use sci_recon::cli::{CliError, Learned, MaskArguments, plan};
+use sci_recon::job::{Algorithm, TileSpec};
+use sci_recon::optics::{illumination, measure, noisy};
+use sci_recon::pipeline::manifest::{ModelRecord, Summary, TileRecord};
+use sci_recon::pipeline::{
     NetworkSource, SnapshotInput, Solver, TileOutcome, Usage, blended_frame, solve,
 };
-use crate::recon::metrics;
-use crate::recon::scale::ScaleEstimator;
-use crate::recon::tile::TilePlan;
+use sci_recon::recon::metrics;
+use sci_recon::recon::scale::ScaleEstimator;
+use sci_recon::recon::tile::TilePlan;
+use sha2::{Digest, Sha256};
+
+use super::clips::Clip;
+use super::markdown::mean;
+use super::record::{Key, Row, Setting, ZoneRecord};
+
+pub fn solve_on_all_cores(
+    input: &SnapshotInput<'_>,
+    network: &NetworkSource,
+) -> Result<Vec<TileOutcome>, CliError> {
+    let cores = thread::available_parallelism().map_or(1, usize::from);
+    Ok(solve(input, network, cores, &())?.tiles)
+}
+
+/// Each frame \[1,H,W\] of the whole picture with its truth; memory holds one of them.
+pub fn frame_pairs<'a>(
+    plan: &'a TilePlan,
+    tiles: &'a [TileOutcome],
+    truth: &'a Array3<f32>,
+) -> impl Iterator<Item = (Array3<f32>, ArrayView3<'a, f32>)> {
+    let frame = |k| blended_frame(plan, tiles, k).insert_axis(Axis(0));
+    truth.axis_chunks_iter(Axis(0), 1).enumerate().map(move |(k, truth)| (frame(k), truth))
+}
 
 /// Makes rows.
-pub(super) struct Bench {
+pub struct Bench {
     network: NetworkSource,
     /// The network of `learned`.
     learned: Option<Learned>,
@@ -31,7 +47,7 @@ pub(super) struct Bench {
 }
 
 /// Masks of one compression ratio and scale.
-pub(super) struct Masks {
+pub struct Masks {
     /// \[B,H,W\] on \[0,1\].
     masks: Array3<f32>,
     /// What reaches the sensor of an even light \[H,W\].
@@ -39,7 +55,7 @@ pub(super) struct Masks {
 }
 
 /// A clip behind masks.
-pub(super) struct Snapshot<'a> {
+pub struct Snapshot<'a> {
     clip: &'a str,
     masks: &'a Array3<f32>,
     /// \[H,W\].
@@ -51,23 +67,18 @@ pub(super) struct Snapshot<'a> {
 
 impl Bench {
     /// With networks from `network`, and one of the user's own.
-    pub(super) fn new(network: NetworkSource, learned: Option<Learned>, setting: Setting) -> Self {
+    pub fn new(network: NetworkSource, learned: Option<Learned>, setting: Setting) -> Self {
         Self { network, learned, setting }
     }
 
     /// Why `algorithm` can't be run with so many frames of `side` x `side` pixels; none if it can.
-    pub(super) fn obstacle(
-        &self,
-        algorithm: Algorithm,
-        frames: usize,
-        side: usize,
-    ) -> Option<CliError> {
+    pub fn obstacle(&self, algorithm: Algorithm, frames: usize, side: usize) -> Option<CliError> {
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned)?;
         learned.size((frames, side, side)).err()
     }
 
     /// The masks of `frames` frames of `side` x `side` pixels.
-    pub(super) fn masks(
+    pub fn masks(
         &self,
         arguments: &MaskArguments,
         frames: usize,
@@ -80,7 +91,7 @@ impl Bench {
     }
 
     /// Measures the first frames of a clip, of which the middle is taken.
-    pub(super) fn snapshot<'a>(
+    pub fn snapshot<'a>(
         &self,
         Masks { masks, light }: &'a Masks,
         clip: &'a Clip,
@@ -101,14 +112,7 @@ impl Bench {
     }
 
     /// All that the row of this algorithm depends on.
-    ///
-    /// # Errors
-    /// A network that does not take the snapshot.
-    pub(super) fn key(
-        &self,
-        snapshot: &Snapshot<'_>,
-        algorithm: Algorithm,
-    ) -> Result<Key, CliError> {
+    pub fn key(&self, snapshot: &Snapshot<'_>, algorithm: Algorithm) -> Result<Key, CliError> {
         let (compression_ratio, scale, _) = snapshot.masks.dim();
         let schedule = algorithm.default_schedule();
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned);
@@ -132,7 +136,7 @@ impl Bench {
     }
 
     /// Reconstructs the snapshot as `key` says.
-    pub(super) fn run(&self, snapshot: &Snapshot<'_>, key: Key) -> Result<Row, CliError> {
+    pub fn run(&self, snapshot: &Snapshot<'_>, key: Key) -> Result<Row, CliError> {
         let Snapshot { masks, measurement, .. } = snapshot;
         let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
         let mut estimator = ScaleEstimator::new(key.scale, key.scale);
@@ -152,16 +156,15 @@ impl Bench {
             solver,
             plan: &plan,
         };
-        let cores = thread::available_parallelism().map_or(1, usize::from);
         let (started, before) = (Instant::now(), Usage::now());
-        let tiles = solve(&input, &self.network, cores, &())?.tiles;
+        let tiles = solve_on_all_cores(&input, &self.network)?;
         let cpu_seconds = (Usage::now() - before).cpu_seconds;
         let seconds = started.elapsed().as_secs_f64();
         let quality = Quality::of(&plan, &tiles, &snapshot.truth)?;
         let summary = Summary::of(&tiles.iter().map(TileRecord::from).collect::<Vec<_>>());
         Ok(Row {
             key,
-            psnr_db: mean(&quality.by_frame),
+            psnr_db: mean(quality.by_frame.iter().copied()),
             ssim: quality.ssim,
             psnr_db_by_frame: quality.by_frame,
             psnr_db_by_zone: quality.by_zone,
@@ -181,41 +184,80 @@ struct Quality {
 }
 
 impl Quality {
-    /// Frame by frame, so that memory holds one blended frame.
     fn of(plan: &TilePlan, tiles: &[TileOutcome], truth: &Array3<f32>) -> Result<Self, CliError> {
-        let (frames, height, width) = truth.dim();
-        let zones = Zones::new(height, width);
-        let (mut by_frame, mut ssim) = (Vec::with_capacity(frames), 0.0);
-        let mut by_zone = zones.radii().map(|_| Vec::with_capacity(frames));
-        for (k, truth) in truth.axis_chunks_iter(Axis(0), 1).enumerate() {
-            let frame = blended_frame(plan, tiles, k);
-            let stack = frame.view().insert_axis(Axis(0));
-            by_frame.push(finite(metrics::psnr(stack, truth)?));
-            ssim += metrics::ssim(stack, truth)?;
-            let errors = zones.errors(frame.view(), truth.index_axis(Axis(0), 0));
-            for (values, error) in by_zone.iter_mut().zip(errors) {
+        let finite = |value: f64| value.is_finite().then_some(value);
+        let (mut by_frame, mut ssim) = (Vec::new(), 0.0);
+        let mut by_zone: [Vec<Option<f64>>; ZONES] = Default::default();
+        for (frame, truth) in frame_pairs(plan, tiles, truth) {
+            by_frame.push(finite(metrics::psnr(frame.view(), truth)?));
+            ssim += metrics::ssim(frame.view(), truth)?;
+            let (frame, truth) = (frame.index_axis(Axis(0), 0), truth.index_axis(Axis(0), 0));
+            for (values, error) in by_zone.iter_mut().zip(errors_by_zone(frame, truth)) {
                 values.push(finite(-10.0 * error.log10()));
             }
         }
-        let record = |(outer_radius, values): (_, Vec<_>)| ZoneRecord {
-            outer_radius,
-            psnr_db: mean(&values),
+        let record = |(outer_radius, values): (_, Vec<_>)| {
+            let psnr_db = mean(values.into_iter());
+            ZoneRecord { outer_radius, psnr_db }
         };
-        let by_zone = zones.radii().into_iter().zip(by_zone).map(record).collect();
-        Ok(Self { by_frame, by_zone, ssim: ssim / frames as f64 })
+        let by_zone = outer_radii(plan.dim()).into_iter().zip(by_zone).map(record).collect();
+        let ssim = ssim / by_frame.len() as f64;
+        Ok(Self { by_frame, by_zone, ssim })
     }
 }
 
-fn finite(value: f64) -> Option<f64> {
-    value.is_finite().then_some(value)
+/// Rings from the centre to the edge, and the corners outside the largest circle. Masks of a hybrid
+/// aperture are worst at the rim, where fewer sub-apertures reach, so a mean over the whole picture
+/// hides where an algorithm fails.
+const ZONES: usize = 5;
+const RINGS: f64 = (ZONES - 1) as f64;
+
+/// The outer radius of each zone in pixels, from the centre on; none for the corners.
+fn outer_radii((height, width): (usize, usize)) -> [Option<f64>; ZONES] {
+    let radius = height.min(width) as f64 / 2.0;
+    std::array::from_fn(|zone| (zone + 1 < ZONES).then(|| radius * (zone + 1) as f64 / RINGS))
 }
 
-/// None if one of the values is none, or there are none.
-pub(super) fn mean(values: &[Option<f64>]) -> Option<f64> {
-    let sum = values.iter().copied().sum::<Option<f64>>()?;
-    finite(sum / values.len() as f64)
+/// Mean squared error of a frame \[H,W\] in each zone; NaN for a zone without pixels.
+fn errors_by_zone(frame: ArrayView2<'_, f32>, truth: ArrayView2<'_, f32>) -> [f64; ZONES] {
+    let (height, width) = frame.dim();
+    let middle = |length: usize| (length as f64 - 1.0) / 2.0;
+    let radius = height.min(width) as f64 / 2.0;
+    let (mut sums, mut counts) = ([0.0; ZONES], [0usize; ZONES]);
+    for (((row, column), &value), &true_value) in frame.indexed_iter().zip(truth) {
+        let distance = (row as f64 - middle(height)).hypot(column as f64 - middle(width)) / radius;
+        let zone = ((distance * RINGS) as usize).min(ZONES - 1);
+        sums[zone] += (f64::from(value) - f64::from(true_value)).powi(2);
+        counts[zone] += 1;
+    }
+    std::array::from_fn(|zone| sums[zone] / counts[zone] as f64)
 }
 
 fn feed<D: Dimension>(hash: &mut Sha256, values: ArrayView<'_, f32, D>) {
     values.iter().for_each(|value| hash.update(value.to_le_bytes()));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{errors_by_zone, outer_radii};
+    use ndarray::Array2;
+
+    #[test]
+    fn an_error_shows_in_its_own_zone() {
+        let radii = [Some(8.0), Some(16.0), Some(24.0), Some(32.0), None];
+        assert_eq!(outer_radii((64, 64)), radii);
+        let truth = Array2::<f32>::zeros((64, 64));
+        // (row, column) of a pixel at a known distance from the centre, and its zone.
+        for (place, zone) in
+            [((32, 32), 0), ((32, 45), 1), ((52, 32), 2), ((1, 32), 3), ((0, 0), 4)]
+        {
+            let mut frame = truth.clone();
+            frame[place] = 1.0;
+            let errors = errors_by_zone(frame.view(), truth.view());
+            let hit: Vec<usize> = (0..5).filter(|&zone| errors[zone] > 0.0).collect();
+            assert_eq!(hit, [zone], "{place:?}");
+        }
+        let ones = Array2::<f32>::ones((64, 64));
+        assert_eq!(errors_by_zone(ones.view(), truth.view()), [1.0; 5]);
+    }
 }

@@ -1,23 +1,16 @@
-//! `sci-recon bench tables`: the paper's Tables 1 and 2, algorithms compared on clips of your own.
-
-mod markdown;
-mod record;
-mod trial;
-mod zones;
+//! The paper's Tables 1 and 2: algorithms compared on clips of your own.
 
 use std::path::PathBuf;
 
 use clap::Args;
 
+use sci_recon::cli::{CliError, EngineArguments, Learned, MaskArguments, algorithms};
+use sci_recon::job::Algorithm;
+
 use super::clips::read_clips;
-use crate::cli::CliError;
-use crate::cli::arguments::{EngineArguments, algorithms};
-use crate::cli::learned::Learned;
-use crate::cli::masks::MaskArguments;
-use crate::job::Algorithm;
-use markdown::Layout;
-use record::{Records, Setting};
-use trial::Bench;
+use super::markdown::{Layout, line};
+use super::record::{Records, Setting};
+use super::trial::Bench;
 
 /// Compare algorithms as the paper's Tables 1 and 2 do: PSNR and SSIM of each clip at each scale
 /// and compression ratio, with processor seconds and deep passes. Each clip is measured through
@@ -69,18 +62,16 @@ pub struct Arguments {
 /// The algorithms of the paper's tables that need no network of their own for each set of masks.
 const PAPER: [Algorithm; 3] = [Algorithm::GapTv, Algorithm::PnpFfdNet, Algorithm::PnpTvFastDvdNet];
 
-/// Runs the comparison.
-///
-/// # Errors
-/// Clips that can't be used at the largest scale and ratio, told before anything is computed; a
-/// tables.json that is none; a failure on the way.
-pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
+/// What can't be done at the largest scale and ratio is told before anything is computed.
+pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let (ratios, scales) = (distinct(&arguments.cr), distinct(&arguments.scales));
     let most = |values: &[u16]| values.iter().copied().max().map(usize::from);
     let clips = read_clips(&arguments.clips, most(&ratios).unwrap_or(1), most(&scales))?;
+    let mut algorithms = distinct(&arguments.algorithms);
+    algorithms.extend(arguments.learned.is_some().then_some(Algorithm::Learned));
     let layout = Layout {
         clips: clips.iter().map(|clip| clip.name.clone()).collect(),
-        algorithms: named(arguments),
+        algorithms,
         by_frame: arguments.by_frame,
         by_zone: arguments.by_zone,
     };
@@ -115,7 +106,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
                         Some(row) => row.clone(),
                         None => records.add(bench.run(&snapshot, key)?)?,
                     };
-                    eprintln!("{}", layout.line(&row));
+                    eprintln!("{}", line(&row));
                     rows.push(row);
                     records.write("tables.md", &layout.markdown(&rows))?;
                 }
@@ -124,13 +115,6 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), CliError> {
     }
     print!("{}", layout.markdown(&rows));
     Ok(())
-}
-
-/// The algorithms, `learned` last.
-fn named(arguments: &Arguments) -> Vec<Algorithm> {
-    let mut algorithms = distinct(&arguments.algorithms);
-    algorithms.extend(arguments.learned.is_some().then_some(Algorithm::Learned));
-    algorithms
 }
 
 /// The values without repetitions, in their order.

@@ -1,0 +1,40 @@
+//! The paper's experiments on clips of your own: a program beside the service, on the same library.
+
+mod clips;
+mod markdown;
+mod noise;
+mod record;
+mod tables;
+mod trial;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Repeats the paper's experiments on clips of your own.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true)]
+struct Arguments {
+    #[command(subcommand)]
+    experiment: Experiment,
+}
+
+#[derive(Debug, Subcommand)]
+enum Experiment {
+    Noise(noise::Arguments),
+    Tables(Box<tables::Arguments>),
+}
+
+fn main() -> ExitCode {
+    let outcome = match Arguments::parse().experiment {
+        Experiment::Noise(arguments) => noise::run(&arguments),
+        Experiment::Tables(arguments) => tables::run(&arguments),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("sci-recon-experiments: {error}");
+            error.exit_code()
+        }
+    }
+}
