@@ -21,7 +21,7 @@ pub mod simulate;
 pub mod token;
 pub mod worker;
 
-pub use arguments::{EngineArguments, algorithms, checked};
+pub use arguments::{EngineArguments, algorithms};
 pub use error::CliError;
 pub use learned::{Learned, plan};
 pub use masks::{MaskArguments, SimulatedMasks};

@@ -4,7 +4,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
 
 use crate::job::{Lab, TaskState, WorkerId};
-use crate::store::{CalibrationInputs, Store, Work};
+use crate::store::{CalibrationInputs, Purpose, Store, Work};
 
 /// The last migration before calibrations became tasks.
 const BEFORE: i64 = 70;
@@ -64,7 +64,8 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
     sqlx::raw_sql(rows).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
 
-    let store = Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
+    let store =
+        Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
     let broken = sqlx::query("PRAGMA foreign_key_check").fetch_all(&store.readers).await.unwrap();
     assert!(broken.is_empty());
     let states: Vec<(String, String, u32, u32, u32)> = sqlx::query_as(
@@ -135,7 +136,8 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
 #[tokio::test]
 async fn the_states_of_tasks_are_those_of_the_table() {
     let folder = tempfile::tempdir().unwrap();
-    let store = Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
+    let store =
+        Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
     let names = TaskState::ALL.map(|state| format!("'{}'", state.name())).join(", ");
     let table: String = sqlx::query_scalar("SELECT sql FROM sqlite_master WHERE name = 'tasks'")
         .fetch_one(&store.readers)
