@@ -203,7 +203,7 @@ async fn a_folder_from_before_is_adopted_and_a_copy_of_it_starts() {
     // As an earlier version has left it.
     std::fs::remove_file(app.data().join("sci-recon.json")).unwrap();
     let mut connection = app.database().await;
-    for sql in ["DROP TABLE folder", "DELETE FROM _sqlx_migrations WHERE version >= 80"] {
+    for sql in ["DROP TABLE folder", "DELETE FROM _sqlx_migrations WHERE description = 'folder'"] {
         sqlx::query(sql).execute(&mut connection).await.unwrap();
     }
     drop(connection);
