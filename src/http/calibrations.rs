@@ -156,9 +156,9 @@ async fn of_masks(
     app.store.upload(lab, masks).await.map_err(|error| missing("/masks", error))?;
     let prepared =
         intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
-    let Prepared { info, found, file, .. } = prepared.await?;
-    let facts = facts(name, masks, &info, &found);
-    Ok(app.store.add_calibration(lab, facts, file).await?.into())
+    let prepared = prepared.await?;
+    let facts = facts(name, masks, &prepared);
+    Ok(app.store.add_calibration(lab, facts, prepared.file).await?.into())
 }
 
 /// Puts captures in the queue, once they look as if they could be calibrated with.
@@ -191,21 +191,21 @@ async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody
 fn facts(
     name: Option<Label>,
     masks: Sha256,
-    info: &crate::formats::StackInfo,
-    statistics: &MaskStatistics,
+    prepared: &Prepared<MaskStatistics>,
 ) -> NewCalibration {
+    let Prepared { info, full_scale, found, .. } = prepared;
     NewCalibration {
         name,
         masks,
         format: info.format.name().to_owned(),
         sample: info.sample.name().to_owned(),
-        frames: statistics.frames,
-        height: statistics.height,
-        width: statistics.width,
-        full_scale: statistics.full_scale.value(),
-        mask_mean: statistics.mean,
-        dead_pixels: statistics.dead_pixels,
-        clipped_negatives: statistics.clipped_negative,
+        frames: info.frames,
+        height: info.height,
+        width: info.width,
+        full_scale: *full_scale,
+        mask_mean: found.mean,
+        dead_pixels: found.dead_pixels,
+        clipped_negatives: found.clipped_negative,
     }
 }
 

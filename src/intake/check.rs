@@ -9,7 +9,7 @@ use super::IntakeError;
 use super::captures::{average, full_number};
 use super::open::Opened;
 use crate::formats::planar::Reader;
-use crate::formats::validate::{MaskCheck, MaskStatistics, MeasurementCheck};
+use crate::formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use crate::formats::{self, FormatError, FrameReader, Limits, StackInfo};
 use crate::job::Finding;
 use crate::optics::{MeasurementStudy, REACH, judge_measurement};
@@ -39,7 +39,7 @@ pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
 ) -> Result<MaskStatistics, IntakeError> {
-    MaskCheck::run(&mut *opened.reader, opened.full_scale, sink)
+    check_masks(&mut *opened.reader, opened.full_scale, sink)
         .map_err(IntakeError::format(opened.name))
 }
 
@@ -59,7 +59,7 @@ pub fn measurement(
     let dark = average_dark(&exposure.dark, (info.height, info.width), limits)?;
     let saturation = full_number(info.sample, exposure.saturation);
     let mut exposed = Exposed { reader, dark, saturation, full: Vec::new() };
-    MeasurementCheck::run(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
+    check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
     Ok(saturation.map(|_| exposed.full))
 }
 
