@@ -80,7 +80,7 @@ mod tests {
         let mut history = History::default();
         for done in 1..=iterations {
             let (residual, change) = (1.0 / done as f32, f32::INFINITY);
-            let sigma = (done % 2 == 0).then(|| 0.1);
+            let sigma = (done % 2 == 0).then_some(0.1);
             history.note(&Progress {
                 stage: 0,
                 done,
