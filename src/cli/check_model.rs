@@ -12,7 +12,8 @@ use rustix::process::{Resource, Rlimit};
 use super::CliError;
 use super::arguments::EngineArguments;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
-use crate::pipeline::{ModelFile, NetworkError, NetworkSource, Usage, peak_rss_bytes};
+use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
+use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use crate::recon::ReconError;
 use crate::recon::learned::{PictureSize, SnapshotNetwork, TensorInfo};
 use crate::recon::tile::TilePlan;
@@ -110,8 +111,8 @@ fn run_once(
     (height, width): (usize, usize),
 ) -> Result<ModelTrial, ReconError> {
     let masks = Array3::from_elem((frames, height, width), 0.5);
-    let before = Usage::now();
+    let before = cpu_seconds();
     network.frames(Array2::zeros((height, width)).view(), masks.view())?;
-    let cpu_seconds = (Usage::now() - before).cpu_seconds;
+    let cpu_seconds = cpu_seconds() - before;
     Ok(ModelTrial { height, width, cpu_seconds, peak_rss_bytes: peak_rss_bytes() })
 }

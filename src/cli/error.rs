@@ -7,7 +7,8 @@ use std::process::ExitCode;
 use super::serve::ServeError;
 use crate::formats::FormatError;
 use crate::intake::IntakeError;
-use crate::pipeline::{NetworkError, ResultError, SolveError};
+use crate::pipeline::PipelineError;
+use crate::pipeline::networks::NetworkError;
 use crate::recon::ReconError;
 
 /// Why a command failed, as a sentence for the user.
@@ -63,19 +64,11 @@ impl From<NetworkError> for CliError {
     }
 }
 
-impl From<SolveError> for CliError {
-    fn from(error: SolveError) -> Self {
+impl From<PipelineError> for CliError {
+    fn from(error: PipelineError) -> Self {
         match error {
-            SolveError::Recon(error) => error.into(),
-            other => Self::Failure(other.to_string()),
-        }
-    }
-}
-
-impl From<ResultError> for CliError {
-    fn from(error: ResultError) -> Self {
-        match error {
-            ResultError::Foreign { .. } => Self::Input(error.to_string()),
+            PipelineError::Recon(error) => error.into(),
+            PipelineError::Foreign { .. } => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }
     }

@@ -4,8 +4,7 @@ use std::path::Path;
 
 use super::CliError;
 use crate::job::{Algorithm, TileSpec};
-use crate::pipeline::manifest::ModelRecord;
-use crate::pipeline::{ModelFile, NetworkSource};
+use crate::pipeline::networks::{ModelFile, ModelRecord, NetworkSource};
 use crate::recon::learned::{Interface, PictureSize};
 use crate::recon::tile::TilePlan;
 

@@ -5,11 +5,6 @@ use std::sync::Mutex;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::job::Schedule;
-use crate::pipeline::{ShareDone, TileProgress};
-use crate::recon::solver::Progress;
-use crate::recon::tile::Tile;
-
 const STEPS: u64 = 1000;
 
 /// Standard error if it is a terminal, else nothing.
@@ -33,34 +28,24 @@ pub(super) fn show(bar: &ProgressBar, share: f64) {
     bar.set_position((share.clamp(0.0, 1.0) * STEPS as f64) as u64);
 }
 
-/// The tiles of one snapshot on one bar, each weighed by what its iterations cost.
+/// The tiles of one snapshot on one bar.
 pub(super) struct SnapshotBar {
     bar: ProgressBar,
-    tiles: Mutex<Vec<(ShareDone, f64)>>,
+    shares: Mutex<Vec<f64>>,
 }
 
 impl SnapshotBar {
-    pub(super) fn new(schedule: &Schedule, tiles: usize) -> Self {
-        let tile = (ShareDone::new(schedule.clone()), 0.0);
-        Self { bar: bar("reconstructing"), tiles: Mutex::new(vec![tile; tiles]) }
+    pub(super) fn new(tiles: usize) -> Self {
+        Self { bar: bar("reconstructing"), shares: Mutex::new(vec![0.0; tiles]) }
     }
 
-    fn update(&self, tile: &Tile, share: impl FnOnce(&mut ShareDone) -> f64) {
-        let Ok(mut tiles) = self.tiles.lock() else { return };
-        if let Some((counter, done)) = tiles.get_mut(tile.index) {
-            *done = share(counter);
+    /// Shows that a share of the work of a tile is done, on \[0,1\].
+    pub(super) fn update(&self, tile: usize, share: f64) {
+        let Ok(mut shares) = self.shares.lock() else { return };
+        if let Some(done) = shares.get_mut(tile) {
+            *done = share;
         }
-        show(&self.bar, tiles.iter().map(|tile| tile.1).sum::<f64>() / tiles.len() as f64);
-    }
-}
-
-impl TileProgress for SnapshotBar {
-    fn iteration(&self, tile: &Tile, progress: &Progress) {
-        self.update(tile, |counter| counter.after(progress));
-    }
-
-    fn finished(&self, tile: &Tile) {
-        self.update(tile, |_| 1.0);
+        show(&self.bar, shares.iter().sum::<f64>() / shares.len() as f64);
     }
 }
 

@@ -8,7 +8,7 @@ use std::thread;
 use std::time::Instant;
 
 use clap::Args;
-use ndarray::{Array2, Array3, s};
+use ndarray::{Array2, Array3};
 
 use super::CliError;
 use super::arguments::{EngineArguments, ScheduleArguments};
@@ -16,18 +16,17 @@ use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
 use crate::intake::{Scaled, Source, read_masks, read_snapshot, read_truth};
-use crate::job::{Algorithm, Schedule, Timestamp};
-use crate::pipeline::manifest::{
-    Content, Inputs, Manifest, ModelRecord, RunRecord, SCHEMA, ScaleRecord, Summary, TileRecord,
-    frame_attributes, full_schedule,
-};
-use crate::pipeline::pilot::PilotRecord;
-use crate::pipeline::{
-    NetworkSource, ResultSpec, SnapshotInput, Solved, Solver, TileOutcome, Usage, blended_frame,
-    check_output, peak_rss_bytes, replace_result, sha256_of, solve, write_result,
-};
-use crate::recon::metrics;
-use crate::recon::scale::ScaleEstimator;
+use crate::job::{Algorithm, SceneShape, Schedule, Sha256};
+use crate::pipeline::blend;
+use crate::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
+use crate::pipeline::networks::NetworkSource;
+use crate::pipeline::pilot::full_schedule;
+use crate::pipeline::quality::Quality;
+use crate::pipeline::records::{CostRecord, RunRecord, TileRecord};
+use crate::pipeline::scale::white;
+use crate::pipeline::snapshot::{SnapshotInput, Solved, Solver, solve};
+use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
+use crate::pipeline::write::{check_output, replace_result, write_result};
 use crate::recon::tile::TilePlan;
 use report::Report;
 
@@ -104,18 +103,6 @@ struct Setup {
     threads: usize,
 }
 
-impl Setup {
-    fn needs_network(&self) -> bool {
-        self.model.is_some() || self.schedule.needs_network()
-    }
-
-    fn models(&self) -> Result<Vec<ModelRecord>, CliError> {
-        let mut models = self.network.records(&self.schedule)?;
-        models.extend(self.model.as_ref().map(Learned::record));
-        Ok(models)
-    }
-}
-
 /// Runs the command.
 ///
 /// # Errors
@@ -127,35 +114,39 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     if let Some(out) = &arguments.out {
         check_output(out)?;
     }
+    let algorithm = arguments.schedule.algorithm;
     let model = learned(arguments, &network)?;
+    let cut = (arguments.tile, arguments.overlap);
+    let plan = plan(algorithm, cut, model.as_ref(), input.masks.array.dim())?;
     let cores = thread::available_parallelism().map_or(1, usize::from);
-    let setup = Setup {
-        algorithm: arguments.schedule.algorithm,
-        schedule,
-        snapshot: arguments.snapshot,
-        plan: plan(
-            arguments.schedule.algorithm,
-            (arguments.tile, arguments.overlap),
-            model.as_ref(),
-            input.masks.array.dim(),
-        )?,
-        network,
-        model,
-        threads: arguments.threads.map_or(cores, usize::from),
-    };
+    let threads = arguments.threads.map_or(cores, usize::from);
+    let snapshot = arguments.snapshot;
+    let setup = Setup { algorithm, schedule, snapshot, plan, network, model, threads };
 
-    let (started, before) = (Instant::now(), Usage::now());
-    let solution = input.solve(&setup)?;
-    let spent = Spent {
-        seconds: started.elapsed().as_secs_f64(),
-        cpu_seconds: (Usage::now() - before).cpu_seconds,
-    };
+    let (started, before) = (Instant::now(), cpu_seconds());
+    let (white, solved) = input.solve(&setup)?;
+    let seconds = started.elapsed().as_secs_f64();
+    let cpu_seconds = cpu_seconds() - before;
 
+    let deep = setup.model.is_some() || setup.schedule.needs_network();
+    let cost = CostRecord {
+        provider: deep.then(|| setup.network.provider().into()),
+        onnxruntime: None,
+        cpu_seconds,
+        peak_rss_bytes: peak_rss_bytes(),
+    };
+    let run = RunRecord::ended(None, cost, Some(seconds));
+    let tiles = solved.tiles.iter().map(TileRecord::from).collect();
+    let mut manifest = input.recipe(&setup, white, &solved)?.snapshot(snapshot, tiles, run);
+    let truth = input.truth.as_ref().map(|truth| truth.view());
+    let compare = |truth| Quality::of_tiles(&setup.plan, &solved.tiles, truth);
+    let quality = truth.map(compare).transpose()?;
+    let report = Report::new(&manifest, quality);
     if let Some(out) = &arguments.out {
-        let manifest = solution.manifest(&input, &setup, spent)?;
-        solution.write(out, &setup, manifest)?;
+        manifest.run.cost.onnxruntime = if deep { Some(setup.network.version()?) } else { None };
+        write(out, manifest, &setup.plan, &solved)?;
     }
-    solution.report(&input, &setup, spent)?.print(arguments)
+    report.print(arguments)
 }
 
 /// The network of `--model`.
@@ -168,13 +159,6 @@ fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Lear
             other.name()
         ))),
     }
-}
-
-/// What the computing took.
-#[derive(Debug, Clone, Copy)]
-struct Spent {
-    seconds: f64,
-    cpu_seconds: f64,
 }
 
 struct Sources<'a> {
@@ -205,9 +189,9 @@ impl<'a> Sources<'a> {
     }
 }
 
-fn sha256(path: &Path) -> Result<String, CliError> {
-    let hashed = File::open(path).and_then(|mut file| sha256_of(&mut file));
-    hashed.map_err(|error| CliError::file("read", path, &error))
+fn sha256(path: &Path) -> Result<Sha256, CliError> {
+    let hashed = File::open(path).and_then(|mut file| Sha256::of_reader(&mut file));
+    Ok(hashed.map_err(|error| CliError::file("read", path, &error))?.0)
 }
 
 /// The files' content.
@@ -240,146 +224,55 @@ impl<'a> Input<'a> {
         Ok(Self { sources, masks, measurement, truth })
     }
 
-    fn solve(&self, setup: &Setup) -> Result<Solution, CliError> {
-        let (height, width) = setup.plan.dim();
-        let mut estimator = ScaleEstimator::new(height, width);
-        self.masks.array.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
-        let white = estimator.white(self.measurement.array.view())?;
+    /// White level and tiles.
+    fn solve(&self, setup: &Setup) -> Result<(f32, Solved), CliError> {
+        let (masks, measurement) = (self.masks.array.view(), self.measurement.array.view());
+        let white = white(masks, measurement)?;
         let solver = match &setup.model {
             Some(model) => Solver::Network(&model.file),
             None => Solver::Schedule(&setup.schedule),
         };
-        let input = SnapshotInput {
-            snapshot: setup.snapshot,
-            masks: self.masks.array.view(),
-            measurement: self.measurement.array.view(),
-            white,
-            solver,
-            plan: &setup.plan,
-        };
-        let bar = SnapshotBar::new(&setup.schedule, setup.plan.len());
-        let Solved { tiles, pilot } = solve(&input, &setup.network, setup.threads, &bar)?;
-        Ok(Solution { white, tiles, pilot })
-    }
-}
-
-struct Solution {
-    white: f32,
-    tiles: Vec<TileOutcome>,
-    pilot: Option<PilotRecord>,
-}
-
-impl Solution {
-    fn records(&self) -> Vec<TileRecord> {
-        self.tiles.iter().map(TileRecord::from).collect()
+        let (snapshot, plan) = (setup.snapshot, &setup.plan);
+        let input = SnapshotInput { snapshot, masks, measurement, white, solver, plan };
+        let bar = SnapshotBar::new(plan.len());
+        let tell = |tile, share| bar.update(tile, share);
+        Ok((white, solve(&input, &setup.network, setup.threads, &tell)?))
     }
 
-    fn report(&self, input: &Input<'_>, setup: &Setup, spent: Spent) -> Result<Report, CliError> {
-        let (frames, height, width) = input.masks.array.dim();
-        let (psnr_db, ssim) = match &input.truth {
-            Some(truth) => self.compare(&setup.plan, truth)?,
-            None => (None, None),
-        };
-        let summary = Summary::of(&self.records());
-        Ok(Report {
-            algorithm: setup.algorithm.name(),
-            frames,
-            height,
-            width,
-            psnr_db,
-            ssim,
-            seconds: spent.seconds,
-            denoiser_passes: summary.denoiser_passes,
-            tv_iterations: summary.tv_iterations,
-            cpu_seconds: spent.cpu_seconds,
-            peak_rss_bytes: peak_rss_bytes(),
-            provider: setup.needs_network().then(|| setup.network.provider()),
-            stop_reason: summary.stop_reason,
-            pilot: self.pilot.clone(),
+    /// What the manifest tells.
+    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe, CliError> {
+        let (frames, height, width) = self.masks.array.dim();
+        let pilot = solved.pilot.clone();
+        let mut models = setup.network.records(&setup.schedule)?;
+        models.extend(setup.model.as_ref().map(Learned::record));
+        Ok(Recipe {
+            program_version: VERSION,
+            algorithm: setup.algorithm,
+            schedule: full_schedule(&setup.schedule, pilot.as_ref()),
+            pilot,
+            shape: SceneShape { frames, height, width, snapshots: 1 },
+            inputs: Inputs {
+                masks_sha256: sha256(self.sources.masks.path)?,
+                measurement_sha256: sha256(self.sources.measurement.path)?,
+            },
+            models,
+            scale: ScaleRecord {
+                masks_full_scale: self.masks.full_scale,
+                measurement_full_scale: self.measurement.full_scale,
+                white,
+            },
+            tile_plan: setup.plan.clone(),
+            warnings: Vec::new(),
+            camera: (None, None),
         })
     }
+}
 
-    /// PSNR and SSIM, frame by frame, so that memory holds one blended frame. None for SSIM of
-    /// frames that are smaller than its window.
-    fn compare(
-        &self,
-        plan: &TilePlan,
-        truth: &Array3<f32>,
-    ) -> Result<(Option<f64>, Option<f64>), CliError> {
-        let (mut psnr, mut ssim) = (0.0, 0.0);
-        let (frames, height, width) = truth.dim();
-        let windows = height >= metrics::WINDOW && width >= metrics::WINDOW;
-        for k in 0..frames {
-            let frame = blended_frame(plan, &self.tiles, k);
-            let frame = frame.view().insert_axis(ndarray::Axis(0));
-            let truth = truth.slice(s![k..=k, .., ..]);
-            psnr += metrics::psnr(frame, truth)?;
-            if windows {
-                ssim += metrics::ssim(frame, truth)?;
-            }
-        }
-        let count = frames as f64;
-        Ok((Some(psnr / count), windows.then_some(ssim / count)))
-    }
-
-    fn manifest(
-        &self,
-        input: &Input<'_>,
-        setup: &Setup,
-        spent: Spent,
-    ) -> Result<Manifest, CliError> {
-        let (frames, height, width) = input.masks.array.dim();
-        let deep = setup.needs_network();
-        let tiles = self.records();
-        let content = Content {
-            program_version: env!("CARGO_PKG_VERSION").into(),
-            algorithm: setup.algorithm,
-            schedule: full_schedule(&setup.schedule, self.pilot.as_ref()),
-            pilot: self.pilot.clone(),
-            frames,
-            height,
-            width,
-            snapshot: setup.snapshot,
-            inputs: Inputs {
-                masks_sha256: sha256(input.sources.masks.path)?,
-                measurement_sha256: sha256(input.sources.measurement.path)?,
-            },
-            models: setup.models()?,
-            scale: ScaleRecord {
-                masks_full_scale: input.masks.full_scale,
-                measurement_full_scale: input.measurement.full_scale,
-                white: self.white,
-            },
-            tile_plan: (&setup.plan).into(),
-            summary: Summary::of(&tiles),
-            tiles,
-            warnings: Vec::new(),
-            camera: None,
-            files: Vec::new(),
-        };
-        let run = RunRecord {
-            job: None,
-            provider: deep.then(|| setup.network.provider().into()),
-            onnxruntime: if deep { Some(setup.network.version()?) } else { None },
-            seconds: Some(spent.seconds),
-            cpu_seconds: spent.cpu_seconds,
-            peak_rss_bytes: peak_rss_bytes(),
-            finished_at: Timestamp::now().to_string(),
-        };
-        Ok(Manifest { schema: SCHEMA.into(), content, run })
-    }
-
-    fn write(&self, out: &Path, setup: &Setup, manifest: Manifest) -> Result<(), CliError> {
-        let failed = |error| CliError::file("write", out, &error);
-        fs::create_dir_all(out).map_err(failed)?;
-        // A failure on the way leaves an earlier result as it was.
-        let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
-        let Setup { plan, .. } = setup;
-        let (height, width) = plan.dim();
-        let attributes = frame_attributes(&manifest.content);
-        let spec = ResultSpec { height, width, attributes, white: self.white };
-        let frame = |k| Ok::<_, CliError>(blended_frame(plan, &self.tiles, k));
-        write_result(made.path(), &spec, frame, |files| manifest.with_files(files))?;
-        Ok(replace_result(made.path(), out)?)
-    }
+fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Result<(), CliError> {
+    let failed = |error| CliError::file("write", out, &error);
+    fs::create_dir_all(out).map_err(failed)?;
+    // A failure on the way leaves an earlier result as it was.
+    let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
+    write_result(made.path(), manifest, |k| Ok(blend::frame(plan, &solved.tiles, k)))?;
+    Ok(replace_result(made.path(), out)?)
 }

@@ -12,7 +12,7 @@ use crate::job::WorkerId;
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::store::{Purpose, Store};
-use crate::worker::{Worker, WorkerError};
+use crate::worker::{Local, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
 ///
@@ -35,7 +35,7 @@ pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
         tokio::spawn(listen(settings.supervised, stop.clone()));
         let id = settings.id.unwrap_or_else(WorkerId::new);
         let stall = Duration::from_secs(settings.engine.stall_seconds);
-        let worker = Worker::new(store.clone(), id, network, stall, stop);
+        let worker = Worker::new(Local::new(store.clone(), id), network, stall, stop);
         let ended = worker.run().await;
         store.close().await;
         match ended {

@@ -4,7 +4,7 @@ use axum::Json;
 use serde::Serialize;
 
 use crate::job::{Algorithm, Schedule, TileSpec};
-use crate::pipeline::models;
+use crate::pipeline::networks;
 
 /// An algorithm as it is shown.
 #[derive(Debug, Serialize)]
@@ -32,7 +32,11 @@ pub(super) async fn list() -> Json<ListBody> {
         AlgorithmBody {
             name,
             summary: name.summary(),
-            networks: schedule.networks().into_iter().map(|which| models::of(which).name).collect(),
+            networks: schedule
+                .networks()
+                .into_iter()
+                .map(|which| networks::carried(which).name)
+                .collect(),
             priors: name.priors().iter().map(|prior| prior.name()).collect(),
             planned_iterations: schedule.planned_iterations(),
             planned_passes: schedule.planned_passes(),

@@ -19,7 +19,7 @@ use crate::formats::mat::SceneArray;
 use crate::formats::{FormatError, Limits, npy};
 use crate::intake::{Opened, Source};
 use crate::job::{JobId, SceneShape, Sha256};
-use crate::recon::metrics;
+use crate::pipeline::quality::{FrameQuality, Quality};
 use crate::store::{Job, StoreError};
 
 /// The query.
@@ -36,19 +36,8 @@ pub(super) struct QualityQuery {
 #[derive(Debug, Serialize)]
 struct QualityBody {
     truth: Sha256,
-    /// Mean over the frames, in dB; null if a frame equals its truth.
-    psnr: f64,
-    /// Mean over the frames; null for frames smaller than the window.
-    ssim: Option<f64>,
-    frames: Vec<FrameQuality>,
-}
-
-/// The figures of one frame.
-#[derive(Debug, Serialize)]
-struct FrameQuality {
-    frame: usize,
-    psnr: f64,
-    ssim: Option<f64>,
+    #[serde(flatten)]
+    quality: Quality,
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/quality`
@@ -68,7 +57,7 @@ pub(super) async fn show(
         let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *limits);
         compare(&path, truth.open()?, snapshot as usize, shape)
     });
-    conditional::json(&summary(truth, frames.await?), &headers)
+    conditional::json(&QualityBody { truth, quality: frames.await?.into() }, &headers)
 }
 
 /// Where the frames of a snapshot are.
@@ -80,13 +69,6 @@ async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf, ApiError
         }
         Err(error) => Err(error.into()),
     }
-}
-
-fn summary(truth: Sha256, frames: Vec<FrameQuality>) -> QualityBody {
-    let count = frames.len().max(1) as f64;
-    let psnr = frames.iter().map(|frame| frame.psnr).sum::<f64>() / count;
-    let ssim = frames.iter().map(|frame| frame.ssim).sum::<Option<f64>>();
-    QualityBody { truth, psnr, ssim: ssim.map(|sum| sum / count), frames }
 }
 
 /// Compares the frames of a snapshot with those of a truth that has the frames of this snapshot, or
@@ -114,16 +96,10 @@ fn compare(
     }
     let result = npy::open_windows(path, &Limits::default())?;
     let figures = |k: usize| -> Result<FrameQuality, ApiError> {
-        let truth = next(&mut truth)?.insert_axis(Axis(0));
+        let truth = next(&mut truth)?;
         let frame = result.read_window(k..k + 1, 0..height, 0..width)?;
-        let psnr = metrics::psnr(frame.view(), truth.view());
-        let psnr = psnr.map_err(|error| ApiError::internal(&error))?;
-        // Refuses only what is smaller than its window.
-        Ok(FrameQuality {
-            frame: k + 1,
-            psnr,
-            ssim: metrics::ssim(frame.view(), truth.view()).ok(),
-        })
+        let quality = FrameQuality::of(k, frame.index_axis(Axis(0), 0), truth.view());
+        quality.map_err(|error| ApiError::internal(&error))
     };
     (0..frames).map(figures).collect()
 }

@@ -18,8 +18,8 @@ use super::conditional::{self, Wanted};
 use super::error::{ApiError, Code};
 use super::extract::Params;
 use super::jobs::with_snapshot;
-use crate::job::JobId;
-use crate::store::{Job, ResultFile, StoreError};
+use crate::job::{JobId, ResultFile};
+use crate::store::{Job, StoreError};
 
 /// The files of a snapshot.
 #[derive(Debug, Serialize)]

@@ -27,5 +27,5 @@ pub use report::{
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection};
 pub use shape::{SceneShape, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
-pub use task::{TaskKind, TaskProgress, TaskStage, TaskState};
+pub use task::{ResultFile, TaskKind, TaskProgress, TaskStage, TaskState};
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

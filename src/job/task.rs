@@ -5,6 +5,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::request::JobSpec;
+use super::text::Sha256;
 use crate::recon::{ReconError, pilot, preview};
 
 /// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
@@ -240,4 +241,15 @@ impl TaskProgress {
     /// Nothing is done yet.
     pub const START: Self =
         Self { stage: TaskStage::Reading, iterations: 0, passes: 0, fraction: 0.0 };
+}
+
+/// A file that a task has made.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ResultFile {
+    /// Its path below the folder of the snapshot or job, such as `frames/frame_0001.exr`.
+    pub name: String,
+    /// Its size in bytes.
+    pub size: u64,
+    /// The hash of its bytes.
+    pub sha256: Sha256,
 }

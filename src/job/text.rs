@@ -2,6 +2,7 @@
 //! wrong with a text.
 
 use std::fmt;
+use std::io::{self, BufReader, Read};
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -111,6 +112,17 @@ impl Sha256 {
     #[must_use]
     pub fn new(bytes: [u8; 32]) -> Self {
         Self(bytes)
+    }
+
+    /// The hash and the number of the bytes that are left to read.
+    ///
+    /// # Errors
+    /// Those of reading.
+    pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
+        use sha2::Digest;
+        let mut hasher = sha2::Sha256::new();
+        let size = io::copy(&mut BufReader::with_capacity(256 * 1024, reader), &mut hasher)?;
+        Ok((Self(hasher.finalize().into()), size))
     }
 
     /// The hash of `bytes`.

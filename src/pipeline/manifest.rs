@@ -1,142 +1,166 @@
-//! The record that stands beside every result.
+//! The record that stands beside every result: of a snapshot, and of a whole job.
 //!
-//! [`Manifest::content`] depends on inputs, parameters and the arithmetic alone: doing the same
+//! Both have a `content` that depends on inputs, parameters and the arithmetic alone: doing the same
 //! work again on the same kind of machine gives the same content, whatever the number of workers
-//! and however often they died. What belongs to one run (time, machine, ids) is in
-//! [`Manifest::run`].
+//! and however often they died. What belongs to one run (time, machine, ids) is in `run`.
 
-use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 
-pub use super::camera::CameraRecord;
-use super::models::{self, Model};
-use super::pilot::PilotRecord;
-use super::write::ResultFile;
+use serde::{Serialize, Serializer};
+
+use super::networks::ModelRecord;
+use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
 use crate::formats::exr::Attributes;
-use crate::job::{Algorithm, Finding, JobSpec, Label, Schedule, TileSpec};
+use crate::job::{
+    Algorithm, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, ResultFile,
+    SceneShape, Schedule, Sha256, TaskKind,
+};
 use crate::recon::tile::TilePlan;
 
-/// Name and version of this form of record.
-pub const SCHEMA: &str = "sci-recon/snapshot/1";
+/// Version of this program.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// What the names of all our records begin with.
 pub(super) const SCHEMA_FAMILY: &str = "sci-recon/";
+/// Name and version of the record of a snapshot.
+const SNAPSHOT_SCHEMA: &str = "sci-recon/snapshot/1";
+/// Name and version of the record of a job.
+const JOB_SCHEMA: &str = "sci-recon/job/1";
 
-/// Everything that is known about the reconstruction of one snapshot.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Manifest {
-    /// [`SCHEMA`].
-    pub schema: String,
-    /// What follows from inputs and parameters.
-    pub content: Content,
-    /// What belongs to this run.
-    pub run: RunRecord,
-}
-
-impl Manifest {
-    /// The same with the list of the files that came out.
-    pub fn with_files(mut self, files: Vec<ResultFile>) -> Self {
-        self.content.files = files;
-        self
-    }
-}
-
-/// What follows from inputs and parameters.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Content {
-    /// Version of this program.
-    pub program_version: String,
-    /// The algorithm.
+/// What the manifests of a job and of its snapshots have in common.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Recipe {
+    pub program_version: &'static str,
     pub algorithm: Algorithm,
-    /// The schedule of the tiles in full, defaults included; without stages for an end-to-end
-    /// network.
+    /// As the tiles run it, with all defaults; without stages for an end-to-end network.
     pub schedule: Schedule,
     /// How an adaptive schedule became this one.
-    #[serde(default)]
     pub pilot: Option<PilotRecord>,
-    /// Frames of the snapshot (B).
-    pub frames: usize,
-    /// Rows.
-    pub height: usize,
-    /// Columns.
-    pub width: usize,
-    /// The snapshot's index in the measurement, from 0.
-    pub snapshot: usize,
-    /// The files that went in.
     pub inputs: Inputs,
     /// The networks that the schedule names, or that of a job with a model.
     pub models: Vec<ModelRecord>,
-    /// Every scale factor.
     pub scale: ScaleRecord,
-    /// How the picture was cut.
-    pub tile_plan: TilePlanRecord,
-    /// What came of each tile, in the plan's order.
-    pub tiles: Vec<TileRecord>,
-    /// Sum over the snapshot: see [`Summary`].
-    pub summary: Summary,
+    #[serde(serialize_with = "tile_plan")]
+    pub tile_plan: TilePlan,
     /// What the check of the measurement against its calibration found.
-    #[serde(default)]
     pub warnings: Vec<Finding>,
-    /// Times of the camera, if it told them.
-    pub camera: Option<CameraRecord>,
+    #[serde(skip)]
+    pub shape: SceneShape,
+    /// Snapshots a second, and seconds that one is exposed, where the camera told.
+    #[serde(skip)]
+    pub camera: (Option<f64>, Option<f64>),
+}
+
+/// Size and overlap, and tiles as \[row, column, height, width\] in the plan's order.
+fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Record {
+        size: usize,
+        overlap: usize,
+        tiles: Vec<[usize; 4]>,
+    }
+    let tiles = plan.tiles().map(|t| [t.row, t.column, t.height, t.width]).collect();
+    Record { size: plan.size(), overlap: plan.overlap(), tiles }.serialize(serializer)
+}
+
+impl Recipe {
+    /// The manifest of a snapshot, by its index in the measurement, but for its files.
+    pub fn snapshot(&self, snapshot: usize, tiles: Vec<TileRecord>, run: RunRecord) -> Manifest {
+        let SceneShape { frames, height, width, .. } = self.shape;
+        let concerns = |warning: &Finding| warning.snapshot.is_none_or(|s| s as usize == snapshot);
+        let mut recipe = self.clone();
+        recipe.warnings.retain(concerns);
+        let content = Content {
+            camera: CameraRecord::new(self.camera, snapshot, frames),
+            recipe,
+            frames,
+            height,
+            width,
+            snapshot,
+            summary: Summary::of(&tiles),
+            tiles,
+            files: Vec::new(),
+        };
+        Manifest { schema: SNAPSHOT_SCHEMA, content, run }
+    }
+
+    /// The manifest of a job from what its tasks have left.
+    pub fn job(self, job: JobId, spec: &JobSpec, tasks: JobTasks) -> JobManifest {
+        let JobTasks { snapshots, seconds, attempts } = tasks;
+        let cost = CostRecord::sum(snapshots.iter().map(|(_, record)| &record.run.cost));
+        let mut seconds_by_task = BTreeMap::new();
+        for (kind, seconds) in &seconds {
+            *seconds_by_task.entry(kind.name()).or_insert(0.0) += seconds;
+        }
+        let entry = |(snapshot, record): (u32, SnapshotRecord)| {
+            let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
+            SnapshotEntry { snapshot, summary: record.summary, files: files.collect() }
+        };
+        let snapshots = snapshots.into_iter().map(entry).collect();
+        JobManifest {
+            schema: JOB_SCHEMA,
+            content: JobContent { shape: self.shape, recipe: self, snapshots },
+            run: JobRun {
+                run: RunRecord::ended(Some(job.to_string()), cost, None),
+                label: spec.label.clone(),
+                calibration: spec.calibration,
+                measurement: spec.measurement,
+                tasks: seconds.len() + 1,
+                attempts,
+                seconds_by_task,
+            },
+        }
+    }
+}
+
+/// What the tasks of a job have left when only its manifest is to be written.
+#[derive(Debug, Clone)]
+pub struct JobTasks {
+    /// The assembled snapshots by their index in the measurement.
+    pub snapshots: Vec<(u32, SnapshotRecord)>,
+    /// Seconds that each task took.
+    pub seconds: Vec<(TaskKind, f64)>,
+    /// How often workers took one up, that of the manifest among them.
+    pub attempts: u64,
+}
+
+/// `manifest.json` of a snapshot.
+#[derive(Debug, Serialize)]
+pub struct Manifest {
+    schema: &'static str,
+    pub content: Content,
+    pub run: RunRecord,
+}
+
+/// What follows from inputs and parameters.
+#[derive(Debug, Serialize)]
+pub struct Content {
+    #[serde(flatten)]
+    pub recipe: Recipe,
+    pub frames: usize,
+    pub height: usize,
+    pub width: usize,
+    /// The snapshot's index in the measurement, from 0.
+    snapshot: usize,
+    /// What came of each tile, in the plan's order.
+    tiles: Vec<TileRecord>,
+    pub summary: Summary,
+    camera: Option<CameraRecord>,
     /// The files that came out, without this one.
     pub files: Vec<ResultFile>,
 }
 
 /// The files that went in.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Inputs {
-    /// SHA-256 of the masks' file.
-    pub masks_sha256: String,
-    /// SHA-256 of the measurement's file.
-    pub measurement_sha256: String,
-}
-
-/// A network.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ModelRecord {
-    /// Its name.
-    pub name: String,
-    /// SHA-256 of its ONNX files, one after the other.
-    pub sha256: String,
-}
-
-impl ModelRecord {
-    /// Those of a schedule that the program carries, in a fixed order.
-    pub fn of(schedule: &Schedule) -> Vec<Self> {
-        let record = |network| {
-            let model = models::of(network);
-            Self::new(&model, model.files.iter().map(|(_, content)| *content))
-        };
-        schedule.networks().into_iter().map(record).collect()
-    }
-
-    /// Those of a job.
-    pub fn of_job(spec: &JobSpec) -> Vec<Self> {
-        let model = spec.model.as_ref().map(|model| Self {
-            name: model.name.as_ref().map_or("learned", Label::as_str).to_owned(),
-            sha256: model.sha256.to_string(),
-        });
-        Self::of(&spec.schedule).into_iter().chain(model).collect()
-    }
-
-    /// That of a model with these contents of its files.
-    pub(super) fn new<'a>(model: &Model, contents: impl Iterator<Item = &'a [u8]>) -> Self {
-        let digest = contents.fold(Sha256::new(), |hash, content| hash.chain_update(content));
-        let sha256 = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-        Self { name: model.name.into(), sha256 }
-    }
-}
-
-/// A schedule as the tiles run it, with all defaults filled in.
-pub fn full_schedule(schedule: &Schedule, pilot: Option<&PilotRecord>) -> Schedule {
-    pilot.map_or_else(|| schedule.clone(), |pilot| pilot.decide(schedule)).filled()
+    pub masks_sha256: Sha256,
+    pub measurement_sha256: Sha256,
 }
 
 /// Every factor between the stored numbers and the solver's \[0,1\]. All are undone in the
 /// frames but the masks', which defines what a mask is: frames are on the measurement's scale
 /// after division by its full scale.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ScaleRecord {
     /// Value in the masks' file that means 1.
     pub masks_full_scale: f32,
@@ -147,106 +171,96 @@ pub struct ScaleRecord {
     pub white: f32,
 }
 
-/// How the picture was cut.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct TilePlanRecord {
-    /// The parameters.
+/// What the camera told about time.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct CameraRecord {
+    /// Snapshots a second.
+    fps: Option<f64>,
+    /// Seconds that one snapshot is exposed.
+    exposure_s: Option<f64>,
+    /// Start of each frame in seconds after the start of snapshot 0; none where it does not
+    /// follow from the two.
+    frame_times_s: Option<Vec<f64>>,
+}
+
+impl CameraRecord {
+    /// The times of the `frames` frames of a snapshot.
+    ///
+    /// The masks share the exposure evenly; an unknown exposure is taken to fill the camera's
+    /// whole period. Without a frame rate only snapshot 0 has times.
+    fn new(
+        (fps, exposure_s): (Option<f64>, Option<f64>),
+        snapshot: usize,
+        frames: usize,
+    ) -> Option<Self> {
+        let exposure = exposure_s.or_else(|| fps.map(|fps| 1.0 / fps))?;
+        let start = match (fps, snapshot) {
+            (Some(fps), _) => Some(snapshot as f64 / fps),
+            (None, 0) => Some(0.0),
+            (None, _) => None,
+        };
+        let time =
+            |start: f64| (0..frames).map(move |k| start + exposure * k as f64 / frames as f64);
+        Some(Self { fps, exposure_s, frame_times_s: start.map(|start| time(start).collect()) })
+    }
+
+    /// Seconds that each of `frames` frames lasts.
+    fn frame_exposure_s(&self, frames: usize) -> Option<f64> {
+        let exposure = self.exposure_s.or_else(|| self.fps.map(|fps| 1.0 / fps))?;
+        Some(exposure / frames as f64)
+    }
+}
+
+/// `manifest.json` of a job.
+#[derive(Debug, Serialize)]
+pub struct JobManifest {
+    schema: &'static str,
+    content: JobContent,
+    run: JobRun,
+}
+
+#[derive(Debug, Serialize)]
+struct JobContent {
     #[serde(flatten)]
-    pub parameters: TileSpec,
-    /// Tiles as \[row, column, height, width\], in the plan's order.
-    pub tiles: Vec<[usize; 4]>,
+    recipe: Recipe,
+    shape: SceneShape,
+    snapshots: Vec<SnapshotEntry>,
 }
 
-impl From<&TilePlan> for TilePlanRecord {
-    fn from(plan: &TilePlan) -> Self {
-        Self {
-            parameters: TileSpec { size: plan.size(), overlap: plan.overlap() },
-            tiles: plan.tiles().map(|t| [t.row, t.column, t.height, t.width]).collect(),
-        }
-    }
+#[derive(Debug, Serialize)]
+struct SnapshotEntry {
+    snapshot: u32,
+    summary: Summary,
+    /// Without the snapshot's own manifest, whose times differ from run to run.
+    files: Vec<ResultFile>,
 }
 
-/// What came of a tile.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct TileRecord {
-    /// Iterations whose prior had a total-variation part.
-    pub tv_iterations: usize,
-    /// Passes of the learned denoiser.
-    pub denoiser_passes: usize,
-    /// `||y - H v|| / ||y||` of the tile's frames.
-    pub residual: f32,
-    /// `converged` or `max-iterations`.
-    pub stop_reason: String,
-}
-
-/// The tiles taken together.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Summary {
-    /// Most of any tile.
-    pub tv_iterations: usize,
-    /// Most of any tile.
-    pub denoiser_passes: usize,
-    /// Largest of any tile.
-    pub residual: f32,
-    /// `converged` if all tiles converged, else `max-iterations`.
-    pub stop_reason: String,
-}
-
-impl Summary {
-    /// Of the tiles of one snapshot.
-    pub fn of(tiles: &[TileRecord]) -> Self {
-        let converged = tiles.iter().all(|tile| tile.stop_reason == "converged");
-        Self {
-            tv_iterations: tiles.iter().map(|tile| tile.tv_iterations).max().unwrap_or(0),
-            denoiser_passes: tiles.iter().map(|tile| tile.denoiser_passes).max().unwrap_or(0),
-            residual: tiles.iter().map(|tile| tile.residual).fold(0.0, f32::max),
-            stop_reason: if converged { "converged" } else { "max-iterations" }.into(),
-        }
-    }
-}
-
-impl From<&super::TileOutcome> for TileRecord {
-    fn from(outcome: &super::TileOutcome) -> Self {
-        Self {
-            tv_iterations: outcome.tv_iterations,
-            denoiser_passes: outcome.denoiser_passes,
-            residual: outcome.residual,
-            stop_reason: outcome.stop_reason.name().into(),
-        }
-    }
-}
-
-/// What belongs to one run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct RunRecord {
-    /// The job; none on the command line.
-    pub job: Option<String>,
-    /// Execution provider of the network; none without a network.
-    pub provider: Option<String>,
-    /// Build of ONNX Runtime; none without a network.
-    pub onnxruntime: Option<String>,
-    /// Wall time of computing; none for a job, whose workers share their time with others'.
-    pub seconds: Option<f64>,
-    /// Processor seconds of computing: of all tiles together.
-    pub cpu_seconds: f64,
-    /// Largest resident memory of a process that computed.
-    pub peak_rss_bytes: u64,
-    /// When it ended, RFC 3339 in UTC.
-    pub finished_at: String,
+#[derive(Debug, Serialize)]
+struct JobRun {
+    #[serde(flatten)]
+    run: RunRecord,
+    label: Option<Label>,
+    calibration: CalibrationId,
+    measurement: MeasurementId,
+    /// Tasks of the job, and how often workers took one up.
+    tasks: usize,
+    attempts: u64,
+    /// Seconds that each kind of task took, over all tasks.
+    seconds_by_task: BTreeMap<&'static str, f64>,
 }
 
 /// What each EXR frame says about itself.
 pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
-    let algorithm = content.algorithm.name();
+    let recipe = &content.recipe;
     let mut shared = vec![
-        ("program".to_owned(), format!("sci-recon {}", content.program_version)),
-        ("algorithm".to_owned(), algorithm.to_owned()),
+        ("program".to_owned(), format!("sci-recon {}", recipe.program_version)),
+        ("algorithm".to_owned(), recipe.algorithm.name().to_owned()),
         ("snapshot".to_owned(), content.snapshot.to_string()),
-        ("masksSha256".to_owned(), content.inputs.masks_sha256.clone()),
-        ("measurementSha256".to_owned(), content.inputs.measurement_sha256.clone()),
-        ("whiteLevel".to_owned(), content.scale.white.to_string()),
+        ("masksSha256".to_owned(), recipe.inputs.masks_sha256.to_string()),
+        ("measurementSha256".to_owned(), recipe.inputs.measurement_sha256.to_string()),
+        ("whiteLevel".to_owned(), recipe.scale.white.to_string()),
     ];
-    for model in &content.models {
+    for model in &recipe.models {
         shared.push((format!("model {}", model.name), model.sha256.clone()));
     }
     let camera = content.camera.as_ref();
@@ -267,63 +281,31 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
 
 /// A manifest for tests.
 #[cfg(test)]
-pub(super) fn sample() -> Manifest {
-    use crate::recon::schedule::Schedule;
-    let algorithm = Algorithm::GapTv;
-    let hash = "0".repeat(64);
-    let plan = TilePlan::new(20, 24, 256, 32).unwrap();
-    let content = Content {
-        program_version: "0.0.0".into(),
-        algorithm,
+pub(super) fn sample(frames: usize) -> Manifest {
+    let hash = Sha256::of(b"");
+    let recipe = Recipe {
+        program_version: VERSION,
+        algorithm: Algorithm::GapTv,
         schedule: Schedule::gap_tv(),
         pilot: None,
-        frames: 3,
-        height: 20,
-        width: 24,
-        snapshot: 1,
-        inputs: Inputs { masks_sha256: hash.clone(), measurement_sha256: hash },
-        models: ModelRecord::of(&crate::job::Algorithm::PnpTvFastDvdNet.default_schedule()),
+        shape: SceneShape { frames, height: 20, width: 24, snapshots: 2 },
+        inputs: Inputs { masks_sha256: hash, measurement_sha256: hash },
+        models: ModelRecord::of(&Algorithm::PnpTvFastDvdNet.default_schedule()),
         scale: ScaleRecord { masks_full_scale: 1.0, measurement_full_scale: 255.0, white: 0.9 },
-        tile_plan: (&plan).into(),
-        tiles: Vec::new(),
-        summary: Summary::of(&[]),
+        tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),
         warnings: Vec::new(),
-        camera: CameraRecord::new(Some(50.0), Some(0.012), 1, 3),
-        files: Vec::new(),
+        camera: (Some(50.0), Some(0.012)),
     };
-    let run = RunRecord {
-        job: None,
-        provider: None,
-        onnxruntime: None,
-        seconds: None,
-        cpu_seconds: 1.0,
-        peak_rss_bytes: 1,
-        finished_at: "2026-01-01T00:00:00.000Z".into(),
-    };
-    Manifest { schema: SCHEMA.into(), content, run }
+    recipe.snapshot(1, Vec::new(), RunRecord::ended(None, CostRecord::default(), None))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Summary, TileRecord};
-
-    fn record(residual: f32, stop_reason: &str, passes: usize) -> TileRecord {
-        let stop_reason = stop_reason.to_owned();
-        TileRecord { tv_iterations: 40, denoiser_passes: passes, residual, stop_reason }
-    }
-
-    #[test]
-    fn a_summary_tells_the_worst_of_the_tiles() {
-        let tiles = [record(0.01, "converged", 20), record(0.03, "max-iterations", 24)];
-        let summary = Summary::of(&tiles);
-        assert_eq!((summary.denoiser_passes, summary.residual), (24, 0.03));
-        assert_eq!(summary.stop_reason, "max-iterations");
-        assert_eq!(Summary::of(&tiles[..1]).stop_reason, "converged");
-    }
+    use super::CameraRecord;
 
     #[test]
     fn frames_tell_where_they_come_from() {
-        let content = super::sample().content;
+        let content = super::sample(3).content;
         let attributes = super::frame_attributes(&content);
         assert_eq!(attributes.len(), 3);
         let text = |name: &str| {
@@ -339,5 +321,18 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let frame = ndarray::Array2::zeros((2, 2));
         crate::formats::exr::write_frame(file.path(), frame.view(), &attributes[2]).unwrap();
+    }
+
+    #[test]
+    fn frame_times_share_the_exposure() {
+        let camera = CameraRecord::new((Some(50.0), Some(0.016)), 2, 4).unwrap();
+        let times = camera.frame_times_s.clone().unwrap();
+        let expected = [0.040, 0.044, 0.048, 0.052];
+        assert!(times.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-12), "{times:?}");
+        assert_eq!(camera.frame_exposure_s(4), Some(0.004));
+        let full = CameraRecord::new((Some(50.0), None), 0, 4).unwrap();
+        assert_eq!(full.frame_times_s.unwrap()[1], 0.005);
+        assert_eq!(CameraRecord::new((None, Some(0.01)), 1, 4).unwrap().frame_times_s, None);
+        assert!(CameraRecord::new((None, None), 0, 4).is_none());
     }
 }

@@ -1,27 +1,23 @@
-//! From a snapshot to its frames: the network, the pilot, the tiles, and the files of a result.
+//! From a snapshot to its frames: white level, pilot, tiles, blending, and the files of a result.
 //!
 //! The command line and the workers share these steps, so that a job gives the same frames
-//! whichever way it came.
+//! whichever way it came. They know arrays and files, not the store or the queue.
 
-mod camera;
-pub mod history;
-mod learned;
-pub mod manifest;
-pub mod models;
+pub(crate) mod arrays;
+pub mod blend;
+pub(crate) mod error;
+pub(crate) mod manifest;
 pub mod networks;
-pub mod pilot;
-mod share;
-mod snapshot;
-pub mod tile;
-mod usage;
-mod write;
+pub(crate) mod pilot;
+pub(crate) mod preview;
+pub(crate) mod progress;
+pub mod quality;
+pub mod records;
+pub mod scale;
+pub mod snapshot;
+pub(crate) mod tile;
+pub mod usage;
+pub(crate) mod write;
 
-pub use learned::{ModelFile, run_network};
-pub use networks::{NetworkError, NetworkSource, WarmNetworks};
-pub use share::ShareDone;
-pub use snapshot::{SnapshotInput, SolveError, Solved, Solver, TileProgress, blended_frame, solve};
-pub use tile::{TileInput, TileOutcome, reconstruct_tile, typical_white};
-pub use usage::{Usage, peak_rss_bytes};
-pub use write::{
-    ResultError, ResultFile, ResultSpec, check_output, replace_result, sha256_of, write_result,
-};
+pub use error::PipelineError;
+pub use networks::NetworkSource;

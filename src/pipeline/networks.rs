@@ -1,19 +1,138 @@
-//! Where the denoiser comes from: libonnxruntime, and the network that the program carries or a
-//! folder holds.
+//! Networks: those that the program carries, those of a folder, end-to-end networks of a user's own,
+//! and the libonnxruntime that runs them.
 
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
-use super::learned::ModelFile;
-use super::manifest::ModelRecord;
-use super::models;
-use crate::job::{Schedule, Sha256};
+use serde::{Deserialize, Serialize};
+use sha2::Digest;
+
+use crate::job::{JobSpec, Label, Schedule, Sha256};
 use crate::recon::ReconError;
 use crate::recon::prior::network::ClipDenoiser;
 use crate::recon::prior::onnx::{Device, EndToEndNetwork, Runtime};
 use crate::recon::prior::{Denoiser, Network, Networks};
+
+/// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
+#[derive(Debug, Clone, Copy)]
+pub struct Model {
+    /// Name, for records.
+    pub name: &'static str,
+    /// The files, in the order in which a frame goes through them: name and content.
+    pub files: &'static [(&'static str, &'static [u8])],
+}
+
+/// The model of a network, trained for this project (see its model card in `models/`).
+pub const fn carried(network: Network) -> Model {
+    match network {
+        Network::FastDvdNet => FASTDVDNET_GRAY,
+        Network::FastDvdNetInt8 => FASTDVDNET_GRAY_INT8,
+        Network::FfdNet => FFDNET_GRAY,
+    }
+}
+
+const FASTDVDNET_GRAY: Model = Model {
+    name: "fastdvdnet-gray",
+    files: &[
+        ("stage1.onnx", include_bytes!("../../models/fastdvdnet-gray/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../../models/fastdvdnet-gray/stage2.onnx")),
+    ],
+};
+
+const FASTDVDNET_GRAY_INT8: Model = Model {
+    name: "fastdvdnet-gray-int8",
+    files: &[
+        ("stage1.onnx", include_bytes!("../../models/fastdvdnet-gray-int8/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../../models/fastdvdnet-gray-int8/stage2.onnx")),
+    ],
+};
+
+const FFDNET_GRAY: Model = Model {
+    name: "ffdnet-gray",
+    files: &[("model.onnx", include_bytes!("../../models/ffdnet-gray/model.onnx"))],
+};
+
+/// A network, as it stands in manifests.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ModelRecord {
+    /// Its name.
+    pub name: String,
+    /// SHA-256 of its ONNX files, one after the other.
+    pub sha256: String,
+}
+
+impl ModelRecord {
+    /// Those of a schedule that the program carries, in a fixed order.
+    pub fn of(schedule: &Schedule) -> Vec<Self> {
+        let record = |network| {
+            let model = carried(network);
+            Self::new(&model, model.files.iter().map(|(_, content)| *content))
+        };
+        schedule.networks().into_iter().map(record).collect()
+    }
+
+    /// Those of a job.
+    pub fn of_job(spec: &JobSpec) -> Vec<Self> {
+        let model = spec.model.as_ref().map(|model| Self {
+            name: model.name.as_ref().map_or("learned", Label::as_str).to_owned(),
+            sha256: model.sha256.to_string(),
+        });
+        Self::of(&spec.schedule).into_iter().chain(model).collect()
+    }
+
+    /// That of a model with these contents of its files.
+    fn new<'a>(model: &Model, contents: impl Iterator<Item = &'a [u8]>) -> Self {
+        let digest = contents.fold(sha2::Sha256::new(), Digest::chain_update);
+        let sha256 = Sha256::new(digest.finalize().into()).to_string();
+        Self { name: model.name.into(), sha256 }
+    }
+}
+
+/// An end-to-end network in its ONNX file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ModelFile {
+    path: PathBuf,
+    sha256: Sha256,
+}
+
+impl ModelFile {
+    /// A file that should have this hash.
+    pub fn new(path: PathBuf, sha256: Sha256) -> Self {
+        Self { path, sha256 }
+    }
+
+    /// A file as it is.
+    ///
+    /// # Errors
+    /// A file that can't be read.
+    pub fn open(path: &Path) -> Result<Self, NetworkError> {
+        let bytes = read(path)?;
+        Ok(Self { path: path.to_owned(), sha256: Sha256::of(&bytes) })
+    }
+
+    /// The hash of the file.
+    pub fn sha256(&self) -> Sha256 {
+        self.sha256
+    }
+
+    /// The content.
+    fn read(&self) -> Result<Vec<u8>, NetworkError> {
+        let bytes = read(&self.path)?;
+        let found = Sha256::of(&bytes);
+        if found == self.sha256 {
+            return Ok(bytes);
+        }
+        Err(NetworkError::Damaged { expected: self.sha256, found })
+    }
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, NetworkError> {
+    fs::read(path).map_err(|reason| NetworkError::Model { path: path.to_owned(), reason })
+}
 
 /// The library's name beside the executable.
 const LIBRARY: &str = "libonnxruntime.so";
@@ -33,7 +152,7 @@ pub enum NetworkError {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
-        reason: std::io::Error,
+        reason: io::Error,
     },
     /// The file of an end-to-end network is not what it was.
     #[error("the network's file is damaged: its hash should be {expected}, but is {found}")]
@@ -77,7 +196,7 @@ impl NetworkSource {
     pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;
-            Ok(ModelRecord::new(&models::of(network), contents.iter().map(AsRef::as_ref)))
+            Ok(ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref)))
         };
         let used: BTreeSet<_> = schedule.networks().into_iter().map(|n| self.used(n)).collect();
         used.into_iter().map(record).collect()
@@ -91,9 +210,14 @@ impl NetworkSource {
         }
     }
 
-    fn contents(&self, which: Network) -> Result<Vec<models::Content>, NetworkError> {
-        let contents = models::of(which).contents(self.models.as_deref());
-        contents.map_err(|(path, reason)| NetworkError::Model { path, reason })
+    /// The bytes of the files of a network, in their order.
+    fn contents(&self, which: Network) -> Result<Vec<Cow<'static, [u8]>>, NetworkError> {
+        let Model { name, files } = carried(which);
+        let content = |&(file, carried): &(&str, &'static [u8])| match &self.models {
+            None => Ok(Cow::Borrowed(carried)),
+            Some(folder) => read(&folder.join(name).join(file)).map(Cow::Owned),
+        };
+        files.iter().map(content).collect()
     }
 
     /// Name of the execution provider, for records.
@@ -213,8 +337,8 @@ fn version_in(library: &[u8]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::{NetworkSource, version_in};
-    use crate::job::Algorithm;
+    use super::{ModelFile, NetworkSource, carried, version_in};
+    use crate::job::{Algorithm, Sha256};
     use crate::recon::prior::Network;
     use crate::recon::prior::onnx::Device;
 
@@ -263,5 +387,27 @@ mod tests {
         content.push(0);
         std::fs::write(&file, &content).unwrap();
         assert_ne!(own.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
+    }
+
+    #[test]
+    fn the_twin_with_8_bits_was_made_from_these_weights() {
+        let (exact, quick) = (carried(Network::FastDvdNet), carried(Network::FastDvdNetInt8));
+        for ((name, exact), (_, quick)) in exact.files.iter().zip(quick.files) {
+            // `training/quantize.py` writes it among the file's properties.
+            let source = Sha256::of(exact).to_string();
+            let found = quick.windows(source.len()).any(|window| window == source.as_bytes());
+            assert!(found, "{name}: make the twin anew with training/quantize.py");
+        }
+    }
+
+    #[test]
+    fn a_damaged_file_is_not_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("network.onnx");
+        std::fs::write(&path, "as it was").unwrap();
+        let file = ModelFile::open(&path).unwrap();
+        assert_eq!(file.read().unwrap(), b"as it was");
+        std::fs::write(&path, "as it is").unwrap();
+        assert!(file.read().unwrap_err().to_string().contains("damaged"));
     }
 }

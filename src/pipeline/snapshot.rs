@@ -5,16 +5,18 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
-use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{ArrayView2, ArrayView3, Axis, s};
 
-use super::learned::{ModelFile, run_network};
-use super::networks::{NetworkError, NetworkSource, WarmNetworks};
-use super::pilot::{self, PilotRecord};
-use super::tile::{TileInput, TileOutcome, reconstruct_tile};
+use super::error::PipelineError;
+use super::networks::{ModelFile, NetworkSource, WarmNetworks};
+use super::pilot;
+use super::progress::ShareDone;
+use super::records::PilotRecord;
+use super::tile::{TileInput, reconstruct_tile, run_network};
+use crate::recon;
 use crate::recon::schedule::Schedule;
-use crate::recon::solver::{Control, Observer, Progress};
-use crate::recon::tile::{Tile, TilePlan};
-use crate::recon::{self, ReconError};
+use crate::recon::solver::{Control, Observer, Outcome, Progress};
+use crate::recon::tile::TilePlan;
 
 /// What is to be solved.
 #[derive(Debug, Clone, Copy)]
@@ -45,9 +47,11 @@ pub enum Solver<'a> {
 impl SnapshotInput<'_> {
     /// What one tile is made of.
     fn window(&self, rows: Range<usize>, columns: Range<usize>) -> TileInput {
+        let y = self.measurement.slice(s![rows.clone(), columns.clone()]);
         TileInput {
-            masks: self.masks.slice(s![.., rows.clone(), columns.clone()]).to_owned(),
-            measurement: self.measurement.slice(s![rows, columns]).to_owned(),
+            masks: self.masks.slice(s![.., rows, columns]).to_owned(),
+            y: y.to_owned().insert_axis(Axis(0)),
+            plane: 0,
             white: self.white,
         }
     }
@@ -57,38 +61,14 @@ impl SnapshotInput<'_> {
 #[derive(Debug)]
 pub struct Solved {
     /// The tiles in the plan's order.
-    pub tiles: Vec<TileOutcome>,
+    pub tiles: Vec<Outcome>,
     /// What the pilot of an adaptive schedule found.
     pub pilot: Option<PilotRecord>,
 }
 
-/// Why a snapshot was not solved.
-#[derive(Debug, thiserror::Error)]
-pub enum SolveError {
-    /// The solver refused or failed.
-    #[error(transparent)]
-    Recon(#[from] ReconError),
-    /// There is no network.
-    #[error(transparent)]
-    Network(#[from] NetworkError),
-    /// A thread died.
-    #[error("a computing thread ended unexpectedly")]
-    Thread,
-}
-
-/// Is told how far the tiles are; called from all threads.
-pub trait TileProgress: Sync {
-    /// A tile has done an iteration.
-    fn iteration(&self, tile: &Tile, progress: &Progress);
-    /// A tile is ready.
-    fn finished(&self, tile: &Tile);
-}
-
-/// Listens to nothing.
-impl TileProgress for () {
-    fn iteration(&self, _: &Tile, _: &Progress) {}
-    fn finished(&self, _: &Tile) {}
-}
+/// Hears of a tile, by its index in the plan, which share of its work is done, on \[0,1\]; called from
+/// all threads.
+pub type TileProgress<'a> = &'a (dyn Fn(usize, f64) + Sync);
 
 /// Solves all tiles of a snapshot on up to `threads` threads, one denoiser a thread; an adaptive
 /// schedule is decided before. The result does not depend on the number of threads.
@@ -99,9 +79,16 @@ pub fn solve(
     input: &SnapshotInput<'_>,
     network: &NetworkSource,
     threads: usize,
-    progress: &dyn TileProgress,
-) -> Result<Solved, SolveError> {
-    let pilot = run_pilot(input, network)?;
+    progress: TileProgress<'_>,
+) -> Result<Solved, PipelineError> {
+    let mut pilot = None;
+    if let Solver::Schedule(schedule) = input.solver {
+        let (rows, columns) = recon::pilot::piece(input.measurement);
+        let place = (input.snapshot, rows.start, columns.start);
+        let mut networks = WarmNetworks::new(network.clone());
+        let piece = input.window(rows, columns);
+        pilot = pilot::decide(piece, place, schedule, &mut networks, &mut ())?;
+    }
     let decided = match (&pilot, input.solver) {
         (Some(pilot), Solver::Schedule(schedule)) => Some(pilot.decide(schedule)),
         _ => None,
@@ -111,23 +98,12 @@ pub fn solve(
     Ok(Solved { tiles, pilot })
 }
 
-fn run_pilot(
-    input: &SnapshotInput<'_>,
-    network: &NetworkSource,
-) -> Result<Option<PilotRecord>, SolveError> {
-    let Solver::Schedule(schedule) = input.solver else { return Ok(None) };
-    let (rows, columns) = recon::pilot::piece(input.measurement);
-    let place = (input.snapshot, rows.start, columns.start);
-    let mut networks = WarmNetworks::new(network.clone());
-    Ok(pilot::decide(input.window(rows, columns), place, schedule, &mut networks, &mut ())?)
-}
-
 fn run_tiles(
     input: &SnapshotInput<'_>,
     network: &NetworkSource,
     threads: usize,
-    progress: &dyn TileProgress,
-) -> Result<Vec<TileOutcome>, SolveError> {
+    progress: TileProgress<'_>,
+) -> Result<Vec<Outcome>, PipelineError> {
     let run = Run {
         input,
         network,
@@ -137,32 +113,31 @@ fn run_tiles(
         done: Mutex::new((0..input.plan.len()).map(|_| None).collect()),
     };
     let threads = threads.clamp(1, input.plan.len());
-    let outcomes: Vec<Result<(), SolveError>> = thread::scope(|scope| {
+    let outcomes: Vec<Result<(), PipelineError>> = thread::scope(|scope| {
         let handles: Vec<_> = (0..threads).map(|_| scope.spawn(|| run.thread())).collect();
-        handles.into_iter().map(|h| h.join().unwrap_or(Err(SolveError::Thread))).collect()
+        handles.into_iter().map(|h| h.join().unwrap_or(Err(PipelineError::Thread))).collect()
     });
-    // Threads that were stopped report a cancellation; the cause is the other error.
-    let cancelled = |e: &SolveError| matches!(e, SolveError::Recon(ReconError::Cancelled));
-    let mut errors: Vec<SolveError> = outcomes.into_iter().filter_map(Result::err).collect();
-    errors.sort_by_key(cancelled);
+    // Threads that were stopped say so; the cause is the other error.
+    let mut errors: Vec<PipelineError> = outcomes.into_iter().filter_map(Result::err).collect();
+    errors.sort_by_key(|error| matches!(error, PipelineError::Stopped));
     if let Some(error) = errors.into_iter().next() {
         return Err(error);
     }
-    let done = run.done.into_inner().map_err(|_| SolveError::Thread)?;
-    done.into_iter().collect::<Option<_>>().ok_or(SolveError::Thread)
+    let done = run.done.into_inner().map_err(|_| PipelineError::Thread)?;
+    done.into_iter().collect::<Option<_>>().ok_or(PipelineError::Thread)
 }
 
 struct Run<'a, 'b> {
     input: &'a SnapshotInput<'b>,
     network: &'a NetworkSource,
-    progress: &'a dyn TileProgress,
+    progress: TileProgress<'a>,
     next: AtomicUsize,
     stop: AtomicBool,
-    done: Mutex<Vec<Option<TileOutcome>>>,
+    done: Mutex<Vec<Option<Outcome>>>,
 }
 
 impl Run<'_, '_> {
-    fn thread(&self) -> Result<(), SolveError> {
+    fn thread(&self) -> Result<(), PipelineError> {
         let outcome = self.tiles();
         if outcome.is_err() {
             self.stop.store(true, Ordering::Relaxed);
@@ -170,61 +145,49 @@ impl Run<'_, '_> {
         outcome
     }
 
-    fn tiles(&self) -> Result<(), SolveError> {
+    fn tiles(&self) -> Result<(), PipelineError> {
         let mut networks = WarmNetworks::new(self.network.clone());
         loop {
             let index = self.next.fetch_add(1, Ordering::Relaxed);
             let Some(tile) = self.input.plan.tile(index) else { return Ok(()) };
-            let (rows, columns) =
-                (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
-            let window = self.input.window(rows, columns);
+            let window = self.input.window(tile.rows(), tile.columns());
             let outcome = match self.input.solver {
                 Solver::Schedule(schedule) => {
-                    let (progress, stop) = (self.progress, &self.stop);
-                    let mut observer = TileObserver { progress, stop, tile };
+                    let share = ShareDone::new(schedule.clone());
+                    let mut observer = TileObserver { run: self, index, share };
                     reconstruct_tile(window, schedule, &mut networks, &mut observer)?
                 }
                 Solver::Network(_) if self.stop.load(Ordering::Relaxed) => {
-                    return Err(ReconError::Cancelled.into());
+                    return Err(PipelineError::Stopped);
                 }
                 Solver::Network(file) => run_network(window, networks.end_to_end(file)?)?,
             };
-            self.progress.finished(&tile);
-            self.done.lock().map_err(|_| SolveError::Thread)?[index] = Some(outcome);
+            (self.progress)(index, 1.0);
+            self.done.lock().map_err(|_| PipelineError::Thread)?[index] = Some(outcome);
         }
     }
 }
 
-struct TileObserver<'a> {
-    progress: &'a dyn TileProgress,
-    stop: &'a AtomicBool,
-    tile: Tile,
+struct TileObserver<'a, 'b, 'c> {
+    run: &'a Run<'b, 'c>,
+    index: usize,
+    share: ShareDone,
 }
 
-impl Observer for TileObserver<'_> {
+impl Observer for TileObserver<'_, '_, '_> {
     fn iteration(&mut self, progress: &Progress) -> Control {
-        self.progress.iteration(&self.tile, progress);
-        match self.stop.load(Ordering::Relaxed) {
-            true => Control::Cancel,
-            false => Control::Continue,
-        }
+        (self.run.progress)(self.index, self.share.after(progress));
+        if self.run.stop.load(Ordering::Relaxed) { Control::Cancel } else { Control::Continue }
     }
-}
-
-/// Frame `k` \[H,W\] of the whole picture, blended from its tiles in the plan's order.
-pub fn blended_frame(plan: &TilePlan, tiles: &[TileOutcome], k: usize) -> Array2<f32> {
-    let mut whole = Array2::zeros(plan.dim());
-    for (tile, outcome) in plan.tiles().zip(tiles) {
-        plan.blend(&tile, outcome.frames.index_axis(Axis(0), k), whole.view_mut());
-    }
-    whole
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{SnapshotInput, SolveError, Solver, blended_frame, solve};
+    use super::{SnapshotInput, Solver, solve};
     use crate::optics::{iid_masks, measure};
-    use crate::pipeline::NetworkSource;
+    use crate::pipeline::blend;
+    use crate::pipeline::error::PipelineError;
+    use crate::pipeline::networks::NetworkSource;
     use crate::recon::ReconError;
     use crate::recon::prior::onnx::Device;
     use crate::recon::schedule::Schedule;
@@ -252,8 +215,8 @@ mod tests {
             let (masks, measurement) = (masks.view(), y.view());
             let solver = Solver::Schedule(&schedule);
             let input = SnapshotInput { snapshot: 0, masks, measurement, white: 1.0, solver, plan };
-            let tiles = solve(&input, &network(), threads, &()).unwrap().tiles;
-            blended_frame(plan, &tiles, 1)
+            let tiles = solve(&input, &network(), threads, &|_, _| ()).unwrap().tiles;
+            blend::frame(plan, &tiles, 1)
         };
         let cut = TilePlan::new(96, 96, 48, 16).unwrap();
         let one = frames(&cut, 1);
@@ -276,7 +239,7 @@ mod tests {
         let solver = Solver::Schedule(&schedule);
         let input =
             SnapshotInput { snapshot: 0, masks, measurement, white: 1.0, solver, plan: &plan };
-        let error = solve(&input, &network(), 2, &()).unwrap_err();
-        assert!(matches!(error, SolveError::Recon(ReconError::Diverged { .. })), "{error}");
+        let error = solve(&input, &network(), 2, &|_, _| ()).unwrap_err();
+        assert!(matches!(error, PipelineError::Recon(ReconError::Diverged { .. })), "{error}");
     }
 }

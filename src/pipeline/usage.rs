@@ -1,34 +1,16 @@
 //! What this process has used of the machine.
 
 use std::fs;
-use std::ops::Sub;
 
 use rustix::param::clock_ticks_per_second;
 use rustix::time::{ClockId, clock_gettime};
 
 /// Processor time, user and system together, of this process and of its children that have
 /// ended, in seconds.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Usage {
-    /// The seconds.
-    pub cpu_seconds: f64,
-}
-
-impl Usage {
-    /// What has been used so far.
-    pub fn now() -> Self {
-        let own = clock_gettime(ClockId::ProcessCPUTime);
-        let own = own.tv_sec as f64 + own.tv_nsec as f64 * 1e-9;
-        Self { cpu_seconds: own + children_ticks() as f64 / clock_ticks_per_second() as f64 }
-    }
-}
-
-impl Sub for Usage {
-    type Output = Self;
-
-    fn sub(self, earlier: Self) -> Self {
-        Self { cpu_seconds: self.cpu_seconds - earlier.cpu_seconds }
-    }
+pub fn cpu_seconds() -> f64 {
+    let own = clock_gettime(ClockId::ProcessCPUTime);
+    let own = own.tv_sec as f64 + own.tv_nsec as f64 * 1e-9;
+    own + children_ticks() as f64 / clock_ticks_per_second() as f64
 }
 
 /// Clock ticks of children that have been waited for; 0 where /proc can't be read.
@@ -50,14 +32,14 @@ pub fn peak_rss_bytes() -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{Usage, peak_rss_bytes};
+    use super::{cpu_seconds, peak_rss_bytes};
 
     #[test]
     fn work_shows() {
-        let before = Usage::now();
+        let before = cpu_seconds();
         let mut sum = 0.0f64;
         let mut number = 0u32;
-        while (Usage::now() - before).cpu_seconds < 0.02 {
+        while cpu_seconds() - before < 0.02 {
             number = number.wrapping_add(1);
             sum += f64::from(number).sqrt();
         }
@@ -68,10 +50,10 @@ mod tests {
 
     #[test]
     fn children_count_when_they_have_ended() {
-        let before = Usage::now();
+        let before = cpu_seconds();
         let script = "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done";
         let status = std::process::Command::new("sh").args(["-c", script]).status().unwrap();
         assert!(status.success());
-        assert!((Usage::now() - before).cpu_seconds > 0.05);
+        assert!(cpu_seconds() - before > 0.05);
     }
 }

@@ -1,5 +1,7 @@
 //! Tiles with overlap and smooth blending: pure arithmetic.
 
+use std::ops::Range;
+
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
 
 use super::error::ReconError;
@@ -17,6 +19,18 @@ pub struct Tile {
     pub height: usize,
     /// Columns.
     pub width: usize,
+}
+
+impl Tile {
+    /// Its rows in the picture.
+    pub fn rows(&self) -> Range<usize> {
+        self.row..self.row + self.height
+    }
+
+    /// Its columns in the picture.
+    pub fn columns(&self) -> Range<usize> {
+        self.column..self.column + self.width
+    }
 }
 
 /// Sides of tiles are multiples of this, where the picture allows it: networks halve them twice.
@@ -132,8 +146,7 @@ impl TilePlan {
     /// Adds a frame of a tile, with its weights, to the whole frame \[H,W\] (0 at first).
     pub fn blend(&self, tile: &Tile, part: ArrayView2<'_, f32>, mut whole: ArrayViewMut2<'_, f32>) {
         let weights = self.weights(tile);
-        let mut window = whole
-            .slice_mut(s![tile.row..tile.row + tile.height, tile.column..tile.column + tile.width]);
+        let mut window = whole.slice_mut(s![tile.rows(), tile.columns()]);
         ndarray::azip!((sum in &mut window, &value in &part, &weight in &weights) {
             *sum += weight * value;
         });

@@ -46,13 +46,13 @@ pub use queue::{
     Work, WorkerEnd,
 };
 pub use rows::Page;
-pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath, hash_file};
+pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
     Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model,
     ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
-    PartialFile, ResultFile, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
-    TileState, Token, Unready, WorkerRow, WorkerTask,
+    PartialFile, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
+    Unready, WorkerRow, WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.

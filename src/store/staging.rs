@@ -4,17 +4,16 @@
 //! left. What is dropped before it is stored is removed.
 
 use std::fs::{self, File};
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::Digest;
 use uuid::Uuid;
 
 use super::Store;
-use super::dir::{self, sync_dir};
+use super::dir;
 use super::error::StoreError;
-use super::tables::results::ResultFile;
-use crate::job::Sha256;
+use crate::job::{ResultFile, Sha256};
 
 /// A temporary file or folder; its lock and its removal.
 #[derive(Debug)]
@@ -140,7 +139,10 @@ impl StagedPath {
     /// # Errors
     /// If that fails; the file is removed then.
     pub fn finish(self) -> Result<StagedBlob, StoreError> {
-        let (sha256, size) = hash_and_sync(&self.0.path)?;
+        let path = &self.0.path;
+        let mut file = File::open(path).map_err(StoreError::io("open", path))?;
+        let (sha256, size) = Sha256::of_reader(&mut file).map_err(StoreError::io("read", path))?;
+        file.sync_all().map_err(StoreError::io("write to the disk", path))?;
         Ok(StagedBlob { temporary: self.0, sha256, size })
     }
 }
@@ -186,7 +188,8 @@ impl StagedBlob {
     }
 }
 
-/// A temporary folder in which a task writes its result files.
+/// A temporary folder in which a task writes its result files. Whoever writes brings them to the
+/// disk.
 #[derive(Debug)]
 pub struct StagedDir(Temporary);
 
@@ -195,14 +198,6 @@ impl StagedDir {
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.0.path
-    }
-
-    /// Hashes all files and brings everything to the disk. The list is sorted by name.
-    pub(super) fn seal(&self) -> Result<Vec<ResultFile>, StoreError> {
-        let mut files = Vec::new();
-        seal_dir(&self.0.path, "", &mut files)?;
-        files.sort_by(|a, b| a.name.cmp(&b.name));
-        Ok(files)
     }
 
     /// Moves the folder to `place`; what was there goes. The writer's lock must be held.
@@ -226,41 +221,4 @@ impl StagedDir {
         }
         Ok(())
     }
-}
-
-fn seal_dir(path: &Path, prefix: &str, files: &mut Vec<ResultFile>) -> Result<(), StoreError> {
-    for entry in fs::read_dir(path).map_err(StoreError::io("read the folder", path))? {
-        let entry = entry.map_err(StoreError::io("read the folder", path))?;
-        let name = format!("{prefix}{}", entry.file_name().to_string_lossy());
-        if entry.path().is_dir() {
-            seal_dir(&entry.path(), &format!("{name}/"), files)?;
-        } else {
-            let (sha256, size) = hash_and_sync(&entry.path())?;
-            files.push(ResultFile { name, size, sha256 });
-        }
-    }
-    sync_dir(path)
-}
-
-/// Hash and size of a file, which is then on the disk.
-fn hash_and_sync(path: &Path) -> Result<(Sha256, u64), StoreError> {
-    let mut file = File::open(path).map_err(StoreError::io("open", path))?;
-    let mut hasher = sha2::Sha256::new();
-    let mut buffer = vec![0; 256 * 1024];
-    let mut size = 0;
-    loop {
-        let count = file.read(&mut buffer).map_err(StoreError::io("read", path))?;
-        if count == 0 {
-            break;
-        }
-        hasher.update(&buffer[..count]);
-        size += count as u64;
-    }
-    file.sync_all().map_err(StoreError::io("write to the disk", path))?;
-    Ok((Sha256::new(hasher.finalize().into()), size))
-}
-
-/// The hash of the file's bytes, to compare it with the one on record.
-pub fn hash_file(path: &Path) -> Result<Sha256, StoreError> {
-    hash_and_sync(path).map(|(sha256, _)| sha256)
 }

@@ -13,11 +13,11 @@ use tempfile::TempDir;
 
 use super::{
     ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
-    Product, Purpose, Store, StoreError, Work, WorkerEnd,
+    Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd,
 };
 use crate::job::{
-    Algorithm, JobId, JobRequest, JobState, MeasurementId, Sha256, SnapshotSelection, TaskKind,
-    TaskProgress, TileSpec, WorkerId,
+    Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sha256, SnapshotSelection,
+    TaskKind, TaskProgress, TileSpec, WorkerId,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -28,6 +28,12 @@ impl ClaimedTask {
         let Work::Job(task) = &self.work else { panic!("{:?}", self.work) };
         task
     }
+}
+
+fn file(folder: &StagedDir, name: &str, content: &str) -> ResultFile {
+    std::fs::write(folder.path().join(name), content).unwrap();
+    let sha256 = Sha256::of(content.as_bytes());
+    ResultFile { name: name.into(), size: content.len() as u64, sha256 }
 }
 
 struct Lab {
@@ -164,14 +170,14 @@ impl Lab {
             TaskKind::Assemble { .. } => {
                 let folder = self.store.staged_dir().unwrap();
                 std::fs::create_dir(folder.path().join("frames")).unwrap();
-                std::fs::write(folder.path().join("frames/frame_0001.exr"), "pixels").unwrap();
-                Product::Files(folder)
+                let file = file(&folder, "frames/frame_0001.exr", "pixels");
+                Product::Files(folder, vec![file])
             }
             TaskKind::Calibration => Product::Calibration(Box::new(calibrations::report())),
             TaskKind::Manifest => {
                 let folder = self.store.staged_dir().unwrap();
-                std::fs::write(folder.path().join("manifest.json"), "{}").unwrap();
-                Product::Files(folder)
+                let file = file(&folder, "manifest.json", "{}");
+                Product::Files(folder, vec![file])
             }
         };
         let record = json!({"kind": task.kind.name()});

@@ -1,13 +1,9 @@
 //! A worker: takes tasks from the queue, has the pipeline do them, and hands over what came of them.
 
-mod assemble;
-mod calibration_task;
-mod finish;
-mod pilot;
-mod prepare;
-mod preview;
+mod local;
+mod perform;
 mod run;
-mod task;
-mod tile;
+mod transport;
 
+pub use local::Local;
 pub use run::{Worker, WorkerError};

@@ -13,16 +13,15 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::task::{Shared, TaskError, perform};
-use crate::job::{TaskProgress, WorkerId, without_paths};
-use crate::pipeline::{NetworkSource, WarmNetworks};
-use crate::store::{
-    CalibrationTask, ClaimedTask, Completion, Heartbeat, Lease, Store, StoreError, Work,
-};
+use super::perform::perform;
+use super::transport::{Claim, Done, Owner, TaskError, TaskInput, Transport, TransportError};
+use crate::intake::IntakeError;
+use crate::job::{TaskProgress, without_paths};
+use crate::pipeline::networks::WarmNetworks;
+use crate::pipeline::progress::Monitor;
+use crate::pipeline::{NetworkSource, PipelineError};
+use crate::store::{Heartbeat, Lease};
 
-/// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
-/// against a lab's patience.
-const LEASE: Duration = Duration::from_secs(20);
 /// Time between heartbeats, and so the longest time until a cancel is heard of.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Time between looks for a task.
@@ -41,9 +40,9 @@ const SLOWNESS: f64 = 4.0;
 /// Why a worker had to end.
 #[derive(Debug, thiserror::Error)]
 pub enum WorkerError {
-    /// The database can't even be told that the worker is there.
+    /// Not even that the worker is there can be told.
     #[error(transparent)]
-    Store(#[from] StoreError),
+    Transport(#[from] TransportError),
     /// A task took the computing thread down.
     #[error("the computing thread panicked")]
     Panicked,
@@ -56,19 +55,18 @@ pub enum WorkerError {
 }
 
 /// A worker: takes tasks from the queue, one at a time.
-pub struct Worker {
-    store: Store,
-    id: WorkerId,
-    /// On its way between the loop and the computing thread.
-    engine: Option<WarmNetworks>,
-    network: NetworkSource,
+pub struct Worker<T> {
+    transport: T,
+    /// On their way between the loop and the computing thread.
+    networks: Option<WarmNetworks>,
+    source: NetworkSource,
     /// See [`Worker::new`].
     stall: Duration,
     stop: CancellationToken,
 }
 
 /// What the computing thread hands back.
-type Computed = (WarmNetworks, Result<Completion, TaskError>);
+type Computed = (WarmNetworks, Result<Done, TaskError>);
 
 /// Why a task was stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,17 +76,16 @@ enum Reason {
     Shutdown,
 }
 
-impl Worker {
-    /// A worker under the name `id` that ends, and gives its task back, when `stop` is called. A task
-    /// without progress for `stall` on top of four times its planned time is held to hang.
+impl<T: Transport> Worker<T> {
+    /// A worker that ends, and gives its task back, when `stop` is called. A task without progress for
+    /// `stall` on top of four times its planned time is held to hang.
     pub fn new(
-        store: Store,
-        id: WorkerId,
-        network: NetworkSource,
+        transport: T,
+        source: NetworkSource,
         stall: Duration,
         stop: CancellationToken,
     ) -> Self {
-        Self { store, id, engine: None, network, stall, stop }
+        Self { transport, networks: None, source, stall, stop }
     }
 
     /// Works until it is told to stop.
@@ -98,19 +95,18 @@ impl Worker {
     /// [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still runs: the
     /// process must end.
     pub async fn run(mut self) -> Result<(), WorkerError> {
-        self.store.worker_started(self.id, std::process::id()).await?;
-        tracing::info!(worker = %self.id, "waiting for tasks");
+        self.transport.started().await?;
+        tracing::info!("waiting for tasks");
         let mut looks = 0;
         while !self.stop.is_cancelled() {
-            match self.store.claim(self.id, LEASE).await {
-                Ok(Some(task)) => {
-                    self.work(task).await?;
-                    continue;
-                }
+            match self.transport.claim().await {
+                Ok(Some(claim)) => self.work(claim).await?,
                 Ok(None) => {
                     looks += 1;
-                    if looks % LOOKS_PER_SIGN == 0 {
-                        self.sign_of_life().await;
+                    if looks % LOOKS_PER_SIGN == 0
+                        && let Err(error) = self.transport.seen().await
+                    {
+                        tracing::warn!(%error, "the worker's sign of life is not recorded");
                     }
                     self.pause(POLL).await;
                 }
@@ -123,12 +119,6 @@ impl Worker {
         Ok(())
     }
 
-    async fn sign_of_life(&self) {
-        if let Err(error) = self.store.worker_seen(self.id).await {
-            tracing::warn!(%error, "the worker's sign of life is not recorded");
-        }
-    }
-
     async fn pause(&self, length: Duration) {
         tokio::select! {
             () = tokio::time::sleep(length) => {}
@@ -136,87 +126,102 @@ impl Worker {
         }
     }
 
-    /// Does one task and tells the store how it ended.
-    async fn work(&mut self, task: ClaimedTask) -> Result<(), WorkerError> {
-        let lease = task.lease;
-        let (kind, id) = (task.kind.name(), lease.task);
-        let span = match &task.work {
-            Work::Job(job) => tracing::info_span!("task", job = %job.job, kind, task = %id),
-            Work::Calibration(CalibrationTask { calibration, .. }) => {
+    /// Does one task and tells how it ended.
+    async fn work(&mut self, claim: Claim) -> Result<(), WorkerError> {
+        let Claim { lease, owner, kind, cost, input } = claim;
+        let (kind, id) = (kind.name(), lease.task);
+        let span = match owner {
+            Owner::Job(job) => tracing::info_span!("task", %job, kind, task = %id),
+            Owner::Calibration(calibration) => {
                 tracing::info_span!("task", %calibration, kind, task = %id)
             }
         };
-        let shared = Arc::new(Shared::new());
-        let patience = self.stall + Duration::from_secs_f64(SLOWNESS * task.cost);
-        let computing = self.start(task, &shared, span.clone());
-        let watching = self.watch(computing, &lease, &shared, patience).instrument(span.clone());
-        match watching.await {
-            Ok(((engine, outcome), reason)) => {
-                self.engine = Some(engine);
-                if outcome.is_ok() && reason.is_none() {
-                    self.last_news(&lease, &shared).instrument(span.clone()).await;
+        let monitor = Arc::new(Monitor::default());
+        let patience = self.stall + Duration::from_secs_f64(SLOWNESS * cost);
+        let computing = self.start(input, &monitor, span.clone());
+        let watched = async {
+            match self.watch(computing, &lease, &monitor, patience).await {
+                Ok(((networks, outcome), reason)) => {
+                    self.networks = Some(networks);
+                    if outcome.is_ok() && reason.is_none() {
+                        self.last_news(&lease, &monitor).await;
+                    }
+                    self.end(&lease, outcome, reason).await;
+                    Ok(())
                 }
-                self.end(&lease, outcome, reason).instrument(span).await;
-                Ok(())
+                Err(error) => {
+                    self.abandon(&lease, &error).await;
+                    Err(error)
+                }
             }
-            Err(error) => {
-                self.abandon(&lease, &error).instrument(span).await;
-                Err(error)
-            }
-        }
+        };
+        watched.instrument(span).await
     }
 
     /// Parts with a task whose thread does not come back.
     async fn abandon(&self, lease: &Lease, error: &WorkerError) {
         match error {
-            WorkerError::Stalled(_) => said(self.store.fail(lease, &error.to_string(), true).await),
-            WorkerError::Unfinished => said(self.store.release_task(lease).await),
+            WorkerError::Stalled(_) => {
+                said(self.transport.fail(lease, &error.to_string(), true).await);
+            }
+            WorkerError::Unfinished => said(self.transport.release(lease).await),
             // Who started this process learns how it ended.
-            WorkerError::Panicked | WorkerError::Store(_) => {}
+            WorkerError::Panicked | WorkerError::Transport(_) => {}
         }
     }
 
-    /// Tells the store how a task ended.
-    async fn end(
-        &self,
-        lease: &Lease,
-        outcome: Result<Completion, TaskError>,
-        reason: Option<Reason>,
-    ) {
-        match (outcome, reason) {
-            (Ok(completion), _) => self.complete(lease, completion).await,
-            (Err(TaskError::Stopped), Some(Reason::Cancelled)) => {
+    /// Tells how a task ended.
+    async fn end(&self, lease: &Lease, outcome: Result<Done, TaskError>, reason: Option<Reason>) {
+        let error = match outcome {
+            Ok(done) => return self.complete(lease, done).await,
+            Err(error) => error,
+        };
+        match (&error, reason) {
+            (
+                TaskError::Pipeline(PipelineError::Stopped)
+                | TaskError::Intake(IntakeError::Stopped),
+                reason,
+            ) => self.stopped(lease, reason).await,
+            (TaskError::Pipeline(PipelineError::Damaged(tiles)), _) => {
+                tracing::error!(?tiles, "stored tiles are damaged and will be done again");
+                said(self.transport.redo(lease, tiles).await);
+            }
+            _ => self.failed(lease, &error).await,
+        }
+    }
+
+    /// Tells that a task has stopped as it was asked to.
+    async fn stopped(&self, lease: &Lease, reason: Option<Reason>) {
+        match reason {
+            Some(Reason::Cancelled) => {
                 tracing::info!("cancelled");
-                said(self.store.cancelled(lease).await);
+                said(self.transport.cancelled(lease).await);
             }
-            (Err(TaskError::Stopped), Some(Reason::Shutdown) | None) => {
-                tracing::info!("given back");
-                said(self.store.release_task(lease).await);
-            }
-            (Err(TaskError::Stopped), Some(Reason::Lost)) => {
+            Some(Reason::Lost) => {
                 tracing::warn!("the task is another worker's now, or nobody's");
             }
-            (Err(TaskError::Damaged(tiles)), _) => {
-                tracing::error!(?tiles, "stored tiles are damaged and will be done again");
-                said(self.store.redo_tiles(lease, &tiles).await);
+            Some(Reason::Shutdown) | None => {
+                tracing::info!("given back");
+                said(self.transport.release(lease).await);
             }
-            (Err(error), _) => self.failed(lease, &error).await,
         }
     }
 
     fn start(
         &mut self,
-        task: ClaimedTask,
-        shared: &Arc<Shared>,
+        input: Result<TaskInput, TaskError>,
+        monitor: &Arc<Monitor>,
         span: tracing::Span,
     ) -> JoinHandle<Computed> {
-        let mut engine =
-            self.engine.take().unwrap_or_else(|| WarmNetworks::new(self.network.clone()));
-        let (store, shared) = (self.store.clone(), shared.clone());
+        let source = &self.source;
+        let mut networks =
+            self.networks.take().unwrap_or_else(|| WarmNetworks::new(source.clone()));
+        let (transport, monitor) = (self.transport.clone(), monitor.clone());
         tokio::task::spawn_blocking(move || {
             let _entered = span.enter();
-            let outcome = perform(&store, &task, &mut engine, &shared);
-            (engine, outcome)
+            let outcome =
+                input.and_then(|input| perform(&transport, input, &mut networks, &monitor));
+            (networks, outcome)
         })
     }
 
@@ -225,7 +230,7 @@ impl Worker {
         &self,
         mut computing: JoinHandle<Computed>,
         lease: &Lease,
-        shared: &Shared,
+        monitor: &Monitor,
         patience: Duration,
     ) -> Result<(Computed, Option<Reason>), WorkerError> {
         let mut tick = tokio::time::interval(HEARTBEAT);
@@ -239,7 +244,7 @@ impl Worker {
         };
         tokio::pin!(too_late);
         loop {
-            let silence = shared.silence();
+            let silence = monitor.silence();
             if silence > patience {
                 return Err(WorkerError::Stalled(silence));
             }
@@ -249,7 +254,7 @@ impl Worker {
                 }
                 () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
                 () = &mut too_late => return Err(WorkerError::Unfinished),
-                _ = tick.tick() => match self.beat(lease, shared).await {
+                _ = tick.tick() => match self.beat(lease, monitor).await {
                     Ok(Heartbeat::Continue) => {}
                     Ok(Heartbeat::Cancelled) => reason = Some(Reason::Cancelled),
                     Ok(Heartbeat::Lost) => reason = Some(Reason::Lost),
@@ -258,36 +263,36 @@ impl Worker {
                 },
             }
             if reason.is_some() {
-                shared.stop();
+                monitor.stop();
             }
         }
     }
 
     /// A heartbeat with all that there is to tell.
-    async fn beat(&self, lease: &Lease, shared: &Shared) -> Result<Heartbeat, StoreError> {
-        let news = shared.news();
-        self.store.heartbeat_with(lease, shared.progress(), news.as_deref()).await
+    async fn beat(&self, lease: &Lease, monitor: &Monitor) -> Result<Heartbeat, TransportError> {
+        let news = monitor.news();
+        self.transport.heartbeat(lease, monitor.progress(), news.as_deref()).await
     }
 
     /// Tells what the solver did after the last heartbeat.
-    async fn last_news(&self, lease: &Lease, shared: &Shared) {
-        if let Some(news) = shared.news() {
-            let told = self.store.heartbeat_with(lease, shared.progress(), Some(&news)).await;
+    async fn last_news(&self, lease: &Lease, monitor: &Monitor) {
+        if let Some(news) = monitor.news() {
+            let told = self.transport.heartbeat(lease, monitor.progress(), Some(&news)).await;
             said(told.map(|_| ()));
         }
     }
 
-    async fn complete(&self, lease: &Lease, completion: Completion) {
-        let progress = completion.progress;
+    async fn complete(&self, lease: &Lease, done: Done) {
+        let progress = done.progress;
         let completed = tokio::select! {
-            completed = self.store.complete(lease, completion) => completed,
-            // Bringing a large result to the disk may take longer than a lease.
+            completed = self.transport.complete(lease, done) => completed,
+            // Bringing a large result to its place may take longer than a lease.
             never = self.keep(lease, progress) => match never {},
         };
         match completed {
             Ok(Heartbeat::Lost) => tracing::warn!("done, but too late: the lease had run out"),
             Ok(_) => tracing::info!("done"),
-            Err(error) => self.failed(lease, &error.into()).await,
+            Err(error) => self.failed(lease, &TaskError::Transport(error)).await,
         }
     }
 
@@ -295,7 +300,7 @@ impl Worker {
     async fn keep(&self, lease: &Lease, progress: TaskProgress) -> Infallible {
         loop {
             tokio::time::sleep(HEARTBEAT).await;
-            if let Err(error) = self.store.heartbeat(lease, progress).await {
+            if let Err(error) = self.transport.heartbeat(lease, progress, None).await {
                 tracing::error!(%error, "a heartbeat is not recorded");
             }
         }
@@ -305,12 +310,12 @@ impl Worker {
         tracing::error!(%error, "the task failed");
         // The user reads the reason, and has no business with the folders of this machine.
         let reason = without_paths(&error.to_string());
-        said(self.store.fail(lease, &reason, error.is_retryable()).await);
+        said(self.transport.fail(lease, &reason, error.is_retryable()).await);
     }
 }
 
-/// Logs that the store could not be told; the lease runs out then.
-fn said(told: Result<(), StoreError>) {
+/// Logs that the end of a task could not be told; the lease runs out then.
+fn said(told: Result<(), TransportError>) {
     if let Err(error) = told {
         tracing::error!(%error, "the end of the task is not recorded");
     }

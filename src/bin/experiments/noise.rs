@@ -13,14 +13,15 @@ use sci_recon::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, generator, measure, noisy,
     single_apertures,
 };
-use sci_recon::pipeline::{NetworkSource, SnapshotInput, Solver};
-use sci_recon::recon::metrics;
+use sci_recon::pipeline::NetworkSource;
+use sci_recon::pipeline::quality::Quality;
+use sci_recon::pipeline::snapshot::{SnapshotInput, Solver};
 use sci_recon::recon::schedule::Schedule;
 use serde::Serialize;
 
 use super::clips::{Clip, read_clips};
 use super::markdown;
-use super::trial::{frame_pairs, solve_on_all_cores};
+use super::trial::solve_on_all_cores;
 
 /// Compare multiplexed masks with single sub-apertures as noise grows. Masks are normalised by
 /// light throughput, so that a mask through one of twelve sub-apertures is a sixth as bright as one
@@ -179,11 +180,7 @@ impl Bench<'_> {
                 plan: &plan,
             };
             let tiles = solve_on_all_cores(&input, &self.network)?;
-            let mut psnr = 0.0;
-            for (frame, truth) in frame_pairs(&plan, &tiles, &clip.frames) {
-                psnr += metrics::psnr(frame.view(), truth)?;
-            }
-            let value = psnr / clip.frames.dim().0 as f64;
+            let value = Quality::of_tiles(&plan, &tiles, clip.frames.view())?.psnr;
             eprintln!("{}, {name}, sigma {sigma}: {value:.2} dB", clip.name);
             by_sigma.push(value);
         }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use sci_recon::cli::CliError;
 use sci_recon::job::{Algorithm, Schedule, TileSpec};
-use sci_recon::pipeline::manifest::ModelRecord;
+use sci_recon::pipeline::networks::ModelRecord;
 use serde::{Deserialize, Serialize};
 
 /// Name and version of this form of record.

@@ -3,16 +3,18 @@
 use std::thread;
 use std::time::Instant;
 
-use ndarray::{Array2, Array3, ArrayView, ArrayView2, ArrayView3, Axis, Dimension, s};
+use ndarray::{Array2, Array3, ArrayView, ArrayView2, Dimension, s};
 use sci_recon::cli::{CliError, Learned, MaskArguments, plan};
 use sci_recon::job::{Algorithm, TileSpec};
 use sci_recon::optics::{illumination, measure, noisy};
-use sci_recon::pipeline::manifest::{ModelRecord, Summary, TileRecord};
-use sci_recon::pipeline::{
-    NetworkSource, SnapshotInput, Solver, TileOutcome, Usage, blended_frame, solve,
-};
-use sci_recon::recon::metrics;
-use sci_recon::recon::scale::ScaleEstimator;
+use sci_recon::pipeline::blend;
+use sci_recon::pipeline::networks::{ModelRecord, NetworkSource};
+use sci_recon::pipeline::quality::FrameQuality;
+use sci_recon::pipeline::records::{Summary, TileRecord};
+use sci_recon::pipeline::scale::white;
+use sci_recon::pipeline::snapshot::{SnapshotInput, Solver, solve};
+use sci_recon::pipeline::usage::cpu_seconds;
+use sci_recon::recon::solver::Outcome;
 use sci_recon::recon::tile::TilePlan;
 use sha2::{Digest, Sha256};
 
@@ -23,19 +25,9 @@ use super::record::{Key, Row, Setting, ZoneRecord};
 pub fn solve_on_all_cores(
     input: &SnapshotInput<'_>,
     network: &NetworkSource,
-) -> Result<Vec<TileOutcome>, CliError> {
+) -> Result<Vec<Outcome>, CliError> {
     let cores = thread::available_parallelism().map_or(1, usize::from);
-    Ok(solve(input, network, cores, &())?.tiles)
-}
-
-/// Each frame \[1,H,W\] of the whole picture with its truth; memory holds one of them.
-pub fn frame_pairs<'a>(
-    plan: &'a TilePlan,
-    tiles: &'a [TileOutcome],
-    truth: &'a Array3<f32>,
-) -> impl Iterator<Item = (Array3<f32>, ArrayView3<'a, f32>)> {
-    let frame = |k| blended_frame(plan, tiles, k).insert_axis(Axis(0));
-    truth.axis_chunks_iter(Axis(0), 1).enumerate().map(move |(k, truth)| (frame(k), truth))
+    Ok(solve(input, network, cores, &|_, _| ())?.tiles)
 }
 
 /// Makes rows.
@@ -139,10 +131,7 @@ impl Bench {
     pub fn run(&self, snapshot: &Snapshot<'_>, key: Key) -> Result<Row, CliError> {
         let Snapshot { masks, measurement, .. } = snapshot;
         let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
-        let mut estimator = ScaleEstimator::new(key.scale, key.scale);
-        masks.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
-        let white = estimator
-            .white(measurement.view())
+        let white = white(masks.view(), measurement.view())
             .map_err(|error| CliError::Input(format!("clip {}: {error}", snapshot.clip)))?;
         let solver = match &self.learned {
             Some(learned) if key.algorithm == Algorithm::Learned => Solver::Network(&learned.file),
@@ -156,9 +145,9 @@ impl Bench {
             solver,
             plan: &plan,
         };
-        let (started, before) = (Instant::now(), Usage::now());
+        let (started, before) = (Instant::now(), cpu_seconds());
         let tiles = solve_on_all_cores(&input, &self.network)?;
-        let cpu_seconds = (Usage::now() - before).cpu_seconds;
+        let cpu_seconds = cpu_seconds() - before;
         let seconds = started.elapsed().as_secs_f64();
         let quality = Quality::of(&plan, &tiles, &snapshot.truth)?;
         let summary = Summary::of(&tiles.iter().map(TileRecord::from).collect::<Vec<_>>());
@@ -184,15 +173,16 @@ struct Quality {
 }
 
 impl Quality {
-    fn of(plan: &TilePlan, tiles: &[TileOutcome], truth: &Array3<f32>) -> Result<Self, CliError> {
+    fn of(plan: &TilePlan, tiles: &[Outcome], truth: &Array3<f32>) -> Result<Self, CliError> {
         let finite = |value: f64| value.is_finite().then_some(value);
         let (mut by_frame, mut ssim) = (Vec::new(), 0.0);
         let mut by_zone: [Vec<Option<f64>>; ZONES] = Default::default();
-        for (frame, truth) in frame_pairs(plan, tiles, truth) {
-            by_frame.push(finite(metrics::psnr(frame.view(), truth)?));
-            ssim += metrics::ssim(frame.view(), truth)?;
-            let (frame, truth) = (frame.index_axis(Axis(0), 0), truth.index_axis(Axis(0), 0));
-            for (values, error) in by_zone.iter_mut().zip(errors_by_zone(frame, truth)) {
+        for (k, truth) in truth.outer_iter().enumerate() {
+            let frame = blend::frame(plan, tiles, k);
+            let quality = FrameQuality::of(k, frame.view(), truth)?;
+            by_frame.push(finite(quality.psnr));
+            ssim += quality.ssim.unwrap_or_default();
+            for (values, error) in by_zone.iter_mut().zip(errors_by_zone(frame.view(), truth)) {
                 values.push(finite(-10.0 * error.log10()));
             }
         }

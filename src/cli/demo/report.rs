@@ -6,7 +6,7 @@ use ndarray::Array3;
 use serde::Serialize;
 
 use crate::cli::CliError;
-use crate::recon::metrics;
+use crate::pipeline::quality::{self, FrameQuality};
 
 /// The figures of one algorithm.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -33,11 +33,11 @@ pub(super) fn compare(
     truth: &Array3<f32>,
     cpu_seconds: f64,
 ) -> Result<Quality, CliError> {
-    Ok(Quality {
-        psnr_db: metrics::psnr(frames.view(), truth.view())?,
-        ssim: metrics::ssim(frames.view(), truth.view())?,
-        cpu_seconds,
-    })
+    let pairs = frames.outer_iter().zip(truth.outer_iter()).enumerate();
+    let compared = pairs.map(|(k, (frame, truth))| FrameQuality::of(k, frame, truth));
+    let quality = quality::Quality::from(compared.collect::<Result<Vec<_>, _>>()?);
+    let ssim = quality.ssim.unwrap_or_default();
+    Ok(Quality { psnr_db: quality.psnr, ssim, cpu_seconds })
 }
 
 impl Report {

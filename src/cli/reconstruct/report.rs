@@ -4,30 +4,53 @@ use serde::Serialize;
 
 use super::Arguments;
 use crate::cli::CliError;
-use crate::pipeline::pilot::PilotRecord;
+use crate::pipeline::manifest::Manifest;
+use crate::pipeline::quality::Quality;
+use crate::pipeline::records::PilotRecord;
 
 /// What `--json` prints.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
-    pub(super) algorithm: &'static str,
-    pub(super) frames: usize,
-    pub(super) height: usize,
-    pub(super) width: usize,
-    pub(super) psnr_db: Option<f64>,
-    pub(super) ssim: Option<f64>,
-    pub(super) seconds: f64,
-    pub(super) denoiser_passes: usize,
-    pub(super) tv_iterations: usize,
-    pub(super) cpu_seconds: f64,
-    pub(super) peak_rss_bytes: u64,
+    algorithm: &'static str,
+    frames: usize,
+    height: usize,
+    width: usize,
+    psnr_db: Option<f64>,
+    ssim: Option<f64>,
+    seconds: f64,
+    denoiser_passes: usize,
+    tv_iterations: usize,
+    cpu_seconds: f64,
+    peak_rss_bytes: u64,
     /// None for a schedule without a network.
-    pub(super) provider: Option<&'static str>,
-    pub(super) stop_reason: String,
+    provider: Option<String>,
+    stop_reason: String,
     /// How an adaptive schedule was decided.
-    pub(super) pilot: Option<PilotRecord>,
+    pilot: Option<PilotRecord>,
 }
 
 impl Report {
+    /// Of a snapshot, and of its frames if the truth is known.
+    pub(super) fn new(manifest: &Manifest, quality: Option<Quality>) -> Self {
+        let (content, run) = (&manifest.content, &manifest.run);
+        Self {
+            algorithm: content.recipe.algorithm.name(),
+            frames: content.frames,
+            height: content.height,
+            width: content.width,
+            psnr_db: quality.as_ref().map(|quality| quality.psnr),
+            ssim: quality.and_then(|quality| quality.ssim),
+            seconds: run.seconds.unwrap_or_default(),
+            denoiser_passes: content.summary.denoiser_passes,
+            tv_iterations: content.summary.tv_iterations,
+            cpu_seconds: run.cost.cpu_seconds,
+            peak_rss_bytes: run.cost.peak_rss_bytes,
+            provider: run.cost.provider.clone(),
+            stop_reason: content.summary.stop_reason.clone(),
+            pilot: content.recipe.pilot.clone(),
+        }
+    }
+
     /// Prints it as the user asked for.
     pub(super) fn print(&self, arguments: &Arguments) -> Result<(), CliError> {
         if arguments.json {

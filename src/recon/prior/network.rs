@@ -209,7 +209,7 @@ fn reflect(index: isize, length: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::{ClipDenoiser, reflect};
-    use crate::pipeline::models;
+    use crate::pipeline::networks;
     use crate::recon::prior::onnx::{Device, Runtime};
     use crate::recon::prior::{Denoiser, Network};
     use ndarray::{Array3, s};
@@ -224,7 +224,7 @@ mod tests {
             return None;
         };
         let runtime = Runtime::open(&library, Device::Cpu).unwrap();
-        let files: Vec<_> = models::of(which).files.iter().map(|(_, file)| *file).collect();
+        let files: Vec<_> = networks::carried(which).files.iter().map(|(_, file)| *file).collect();
         Some(ClipDenoiser::load(&runtime, which, &files).unwrap())
     }
 

@@ -55,14 +55,8 @@ pub struct JobTask {
     pub spec: JobSpec,
     /// The calibration's record.
     pub calibration: Calibration,
-    /// The prepared masks: planar f32 [B, H, W] on [0, 1].
-    pub masks: PathBuf,
     /// The measurement's record.
     pub measurement: Measurement,
-    /// The prepared snapshots: planar f32 [S, H, W], full scale divided out.
-    pub snapshots: PathBuf,
-    /// The ONNX file of the job's model, if it has one.
-    pub model: Option<PathBuf>,
     /// What the job's prepare task recorded; none for that task itself.
     pub prepared: Option<Value>,
     /// What its pilot recorded, if it has one that is done.
@@ -222,9 +216,6 @@ impl Store {
         };
         Ok(Work::Job(Box::new(JobTask {
             job,
-            masks: self.dir().blob(&calibration.prepared),
-            snapshots: self.dir().blob(&measurement.prepared),
-            model: spec.model.as_ref().map(|model| self.dir().blob(&model.sha256)),
             spec,
             calibration,
             measurement,

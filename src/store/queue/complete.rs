@@ -6,14 +6,15 @@ use sqlx::SqliteConnection;
 use super::lease::{self, Heartbeat, Lease, Outcome};
 use super::{graph, job};
 use crate::job::{
-    CalibrationId, CalibrationReport, JobId, TaskKind, TaskProgress, TaskState, Timestamp,
+    CalibrationId, CalibrationReport, JobId, ResultFile, TaskKind, TaskProgress, TaskState,
+    Timestamp,
 };
 use crate::store::error::StoreError;
 use crate::store::staging::{StagedBlob, StagedDir};
 use crate::store::tables::blobs::Origin;
 use crate::store::tables::calibrations::{self, NewCalibration};
 use crate::store::tables::reports;
-use crate::store::tables::results::{self, ResultFile};
+use crate::store::tables::results;
 use crate::store::tables::tasks::Owner;
 use crate::store::{Store, dir, on_files};
 
@@ -37,8 +38,8 @@ pub enum Product {
     TileCost(f64),
     /// The reconstructed tile, or preview.
     Tile(StagedBlob),
-    /// The files of a snapshot (assemble) or of the job (manifest).
-    Files(StagedDir),
+    /// The files of a snapshot (assemble) or of the job (manifest), which are on the disk.
+    Files(StagedDir, Vec<ResultFile>),
     /// The masks and the report of a calibration.
     Calibration(Box<CalibrationDone>),
 }
@@ -63,19 +64,12 @@ impl Store {
         lease: &Lease,
         completion: Completion,
     ) -> Result<Heartbeat, StoreError> {
-        // Hashing and syncing files takes long, so it is done before the lock is taken.
-        let (files, product) = match completion.product {
-            Product::Files(staged) => on_files(move || Ok((staged.seal()?, staged)))
-                .await
-                .map(|(files, staged)| (files, Product::Files(staged)))?,
-            other => (Vec::new(), other),
-        };
         let mut transaction = self.write().await?;
         let Some((owner, kind)) = lease::held(&mut transaction, lease).await? else {
             return Ok(Heartbeat::Lost);
         };
         let mut result = None;
-        match (owner, product) {
+        match (owner, completion.product) {
             (Owner::Job(_), Product::Record) => {}
             (Owner::Job(job), Product::TileCost(share)) => {
                 graph::scale_tiles(&mut transaction, job, share).await?;
@@ -84,7 +78,7 @@ impl Store {
                 result = Some(staged.sha256().to_string());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }
-            (Owner::Job(job), Product::Files(staged)) => {
+            (Owner::Job(job), Product::Files(staged, files)) => {
                 results::record(&mut transaction, job, kind.snapshot(), &files).await?;
                 self.put_files(job, kind, staged, files).await?;
             }

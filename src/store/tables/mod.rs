@@ -18,7 +18,6 @@ pub use jobs::{Job, JobFilter};
 pub use measurements::{Measurement, MeasurementFilter, NewMeasurement};
 pub use models::{Model, ModelFilter, NewModel};
 pub use partials::{FoundPartial, NewPartial, Partial, PartialFile};
-pub use results::ResultFile;
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
 pub use workers::{WorkerRow, WorkerTask};

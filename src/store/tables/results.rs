@@ -2,28 +2,16 @@
 
 use std::path::PathBuf;
 
-use serde::{Deserialize, Serialize};
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use crate::job::{JobId, Sha256};
+use crate::job::{JobId, ResultFile};
 use crate::store::error::StoreError;
 use crate::store::rows::{integer, number, parsed};
 use crate::store::{Job, Store};
 
 /// The snapshot of files that belong to the whole job.
 const WHOLE_JOB: i64 = -1;
-
-/// A file of a result.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ResultFile {
-    /// Its path below the folder of the snapshot or job, such as `frames/frame_0001.exr`.
-    pub name: String,
-    /// Its size in bytes.
-    pub size: u64,
-    /// The hash of its bytes.
-    pub sha256: Sha256,
-}
 
 impl Store {
     /// A result file of a snapshot (or, with none, of the whole job), and where it lies.

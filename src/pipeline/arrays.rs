@@ -1,0 +1,78 @@
+//! The prepared arrays of a job, read window by window.
+
+use std::fs::File;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use ndarray::{Array2, Axis};
+
+use super::error::PipelineError;
+use super::tile::TileInput;
+use crate::formats::planar::Reader;
+use crate::formats::{FormatError, Limits};
+use crate::job::Sha256;
+
+/// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], their full scale
+/// divided out.
+#[derive(Debug, Clone)]
+pub struct Arrays {
+    /// The masks and the hash that they should have.
+    pub masks: (PathBuf, Sha256),
+    /// The snapshots and the hash that they should have.
+    pub snapshots: (PathBuf, Sha256),
+}
+
+impl Arrays {
+    /// Refuses files whose bytes are not those that were stored.
+    pub fn verify(&self) -> Result<(), PipelineError> {
+        for (what, (path, sha256)) in [("masks", &self.masks), ("snapshots", &self.snapshots)] {
+            if !is_intact(path, *sha256)? {
+                return Err(PipelineError::Corrupt { what, sha256: *sha256 });
+            }
+        }
+        Ok(())
+    }
+
+    /// The masks, to be read one by one.
+    pub(super) fn masks(&self) -> Result<Reader, FormatError> {
+        Reader::open(&self.masks.0, &Limits::default())
+    }
+
+    /// One snapshot \[H,W\].
+    pub fn snapshot(&self, index: u32) -> Result<Array2<f32>, FormatError> {
+        let reader = Reader::open(&self.snapshots.0, &Limits::default())?;
+        plane(&reader, index as usize)
+    }
+
+    /// A piece of some snapshots with its masks.
+    pub fn window(
+        &self,
+        snapshots: Range<u32>,
+        (rows, columns): (Range<usize>, Range<usize>),
+        white: f32,
+    ) -> Result<TileInput, FormatError> {
+        let masks = self.masks()?;
+        let which = snapshots.start as usize..snapshots.end as usize;
+        let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
+        let y = snapshots.read_window(which, rows.clone(), columns.clone())?;
+        let masks = masks.read_window(0..masks.info().frames, rows, columns)?;
+        Ok(TileInput { masks, y, plane: 0, white })
+    }
+}
+
+/// One frame \[H,W\] of a prepared array.
+pub(super) fn plane(reader: &Reader, frame: usize) -> Result<Array2<f32>, FormatError> {
+    let (height, width) = (reader.info().height, reader.info().width);
+    let window = reader.read_window(frame..frame + 1, 0..height, 0..width)?;
+    Ok(window.index_axis_move(Axis(0), 0))
+}
+
+/// Whether a file is there and has the bytes that were stored.
+pub(super) fn is_intact(path: &Path, sha256: Sha256) -> Result<bool, FormatError> {
+    if !path.exists() {
+        return Ok(false);
+    }
+    let failed = |source| FormatError::Io { action: "read a stored file", source };
+    let hashed = File::open(path).and_then(|mut file| Sha256::of_reader(&mut file));
+    Ok(hashed.map_err(failed)?.0 == sha256)
+}

@@ -1,0 +1,101 @@
+//! Why a step of the pipeline did not come to its end.
+
+use std::io;
+
+use super::networks::NetworkError;
+use crate::formats::FormatError;
+use crate::job::Sha256;
+use crate::recon::ReconError;
+
+/// Why a step did not come to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum PipelineError {
+    /// It was asked to stop.
+    #[error("stopped")]
+    Stopped,
+    /// The solver refused or failed.
+    #[error(transparent)]
+    Recon(ReconError),
+    /// There is no network.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// An array or a frame can't be read or written.
+    #[error(transparent)]
+    Format(#[from] FormatError),
+    /// A file of the result can't be written.
+    #[error("the result's {name}: {source}")]
+    File {
+        /// Its name in the result's folder.
+        name: String,
+        /// What went wrong.
+        source: io::Error,
+    },
+    /// The output folder holds something that is not an earlier result.
+    #[error(
+        "the output folder already holds {name:?}, which no earlier run of this program left \
+         there: name a new folder"
+    )]
+    Foreign {
+        /// What stands in the way.
+        name: String,
+    },
+    /// Stored tiles are not what was stored.
+    #[error("the stored results of tiles {0:?} are damaged")]
+    Damaged(Vec<u32>),
+    /// A prepared array is not what was stored.
+    #[error(
+        "the stored {what} (blob {sha256}) are damaged: send the files again, and make the \
+         calibration and the measurement anew"
+    )]
+    Corrupt {
+        /// Masks or snapshots.
+        what: &'static str,
+        /// The hash that it should have.
+        sha256: Sha256,
+    },
+    /// A snapshot without light.
+    #[error("snapshot {snapshot}: {source}")]
+    Snapshot {
+        /// Its index.
+        snapshot: u32,
+        /// What is wrong with it.
+        source: ReconError,
+    },
+    /// A record in the database is not what this program writes.
+    #[error("the record of the {what} can't be used: {problem}")]
+    Record {
+        /// Whose record.
+        what: &'static str,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A thread died.
+    #[error("a computing thread ended unexpectedly")]
+    Thread,
+}
+
+impl PipelineError {
+    /// A record that can't be read or written as JSON; for `map_err`.
+    pub fn record(what: &'static str) -> impl Fn(serde_json::Error) -> Self {
+        move |error| Self::Record { what, problem: error.to_string() }
+    }
+
+    /// Whether another attempt may succeed: the machine failed, not the data.
+    pub fn is_retryable(&self) -> bool {
+        match self {
+            Self::Recon(error) => matches!(error, ReconError::Runtime(_)),
+            Self::Format(error) => !error.is_callers_fault(),
+            Self::Snapshot { .. } | Self::Record { .. } | Self::Corrupt { .. } => false,
+            _ => true,
+        }
+    }
+}
+
+impl From<ReconError> for PipelineError {
+    fn from(error: ReconError) -> Self {
+        match error {
+            ReconError::Cancelled => Self::Stopped,
+            other => Self::Recon(other),
+        }
+    }
+}

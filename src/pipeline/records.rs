@@ -1,0 +1,208 @@
+//! What the tasks of a job leave for those that follow, and for the manifests.
+
+use serde::{Deserialize, Serialize};
+
+use crate::job::{ResultFile, Timestamp};
+use crate::recon::prior::Prior;
+use crate::recon::schedule::Schedule;
+use crate::recon::solver::Outcome;
+
+/// The record of the task that prepares a job.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub struct PreparedRecord {
+    /// White level of the scene, for all snapshots and tiles of the job.
+    pub white: f32,
+}
+
+/// What the pilot found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PilotRecord {
+    /// The snapshot, from 0.
+    pub snapshot: usize,
+    /// First row of the piece.
+    pub row: usize,
+    /// First column.
+    pub column: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// The stages of the schedule that was asked for.
+    pub stages: Vec<StageRecord>,
+}
+
+impl PilotRecord {
+    /// The schedule for the tiles.
+    pub fn decide(&self, schedule: &Schedule) -> Schedule {
+        let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
+        schedule.decided(&found.collect::<Vec<_>>())
+    }
+}
+
+/// What the pilot found out about a stage.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StageRecord {
+    /// Its prior.
+    pub prior: &'static dyn Prior,
+    /// The most iterations that might have been.
+    pub planned: usize,
+    /// Those that pay.
+    pub iterations: usize,
+    /// Weight of the total variation along time that was asked for; 0 for none.
+    #[serde(default)]
+    pub planned_temporal_weight: f32,
+    /// The same if it pays; else 0.
+    #[serde(default)]
+    pub temporal_weight: f32,
+    /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
+    pub end: String,
+    /// Error at the held-out pixels before the stage, relative to the measurement.
+    pub error_before: f64,
+    /// The same after its iterations.
+    pub error_after: f64,
+}
+
+impl StageRecord {
+    /// What became of the total variation along time; none if it was not asked for.
+    pub fn along_time(&self) -> Option<&'static str> {
+        let kept = self.temporal_weight > 0.0;
+        (self.planned_temporal_weight > 0.0).then_some(if kept { "kept" } else { "left out" })
+    }
+}
+
+/// What came of a tile.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TileRecord {
+    /// Iterations whose prior had a total-variation part.
+    pub tv_iterations: usize,
+    /// Passes of the learned denoiser.
+    pub denoiser_passes: usize,
+    /// `||y - H v|| / ||y||` of the tile's frames.
+    pub residual: f32,
+    /// `converged` or `max-iterations`.
+    pub stop_reason: String,
+}
+
+impl From<&Outcome> for TileRecord {
+    fn from(outcome: &Outcome) -> Self {
+        Self {
+            tv_iterations: outcome.tv_iterations,
+            denoiser_passes: outcome.denoiser_passes,
+            residual: outcome.residual,
+            stop_reason: outcome.stop_reason.name().into(),
+        }
+    }
+}
+
+/// The record of a tile's task.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct TileTaskRecord {
+    /// What came of the tile.
+    #[serde(flatten)]
+    pub tile: TileRecord,
+    /// From reading its window to its frames.
+    #[serde(flatten)]
+    pub cost: CostRecord,
+}
+
+/// What computing took, and on what.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct CostRecord {
+    /// Execution provider of the network; none without a network.
+    pub provider: Option<String>,
+    /// Build of ONNX Runtime; none without a network.
+    pub onnxruntime: Option<String>,
+    /// Processor seconds.
+    pub cpu_seconds: f64,
+    /// Largest resident memory of a process that computed.
+    pub peak_rss_bytes: u64,
+}
+
+impl CostRecord {
+    /// Of several parts taken together.
+    pub fn sum<'a>(parts: impl Iterator<Item = &'a Self>) -> Self {
+        parts.fold(Self::default(), |sum, part| Self {
+            provider: sum.provider.or_else(|| part.provider.clone()),
+            onnxruntime: sum.onnxruntime.or_else(|| part.onnxruntime.clone()),
+            cpu_seconds: sum.cpu_seconds + part.cpu_seconds,
+            peak_rss_bytes: sum.peak_rss_bytes.max(part.peak_rss_bytes),
+        })
+    }
+}
+
+/// What belongs to one run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunRecord {
+    /// The job; none on the command line.
+    pub job: Option<String>,
+    /// Of all tiles together.
+    #[serde(flatten)]
+    pub cost: CostRecord,
+    /// Wall time of computing; none for a job, whose workers share their time with others'.
+    pub seconds: Option<f64>,
+    /// When it ended, RFC 3339 in UTC.
+    pub finished_at: String,
+}
+
+impl RunRecord {
+    /// Of a run that ends now.
+    pub fn ended(job: Option<String>, cost: CostRecord, seconds: Option<f64>) -> Self {
+        Self { job, cost, seconds, finished_at: Timestamp::now().to_string() }
+    }
+}
+
+/// The tiles of a snapshot taken together.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Most of any tile.
+    pub tv_iterations: usize,
+    /// Most of any tile.
+    pub denoiser_passes: usize,
+    /// Largest of any tile.
+    pub residual: f32,
+    /// `converged` if all tiles converged, else `max-iterations`.
+    pub stop_reason: String,
+}
+
+impl Summary {
+    /// Of these tiles.
+    pub fn of(tiles: &[TileRecord]) -> Self {
+        let converged = tiles.iter().all(|tile| tile.stop_reason == "converged");
+        Self {
+            tv_iterations: tiles.iter().map(|tile| tile.tv_iterations).max().unwrap_or(0),
+            denoiser_passes: tiles.iter().map(|tile| tile.denoiser_passes).max().unwrap_or(0),
+            residual: tiles.iter().map(|tile| tile.residual).fold(0.0, f32::max),
+            stop_reason: if converged { "converged" } else { "max-iterations" }.into(),
+        }
+    }
+}
+
+/// The record of a snapshot's assembly.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SnapshotRecord {
+    /// The tiles taken together.
+    pub summary: Summary,
+    /// What belongs to the run.
+    pub run: RunRecord,
+    /// All files, the manifest last.
+    pub files: Vec<ResultFile>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Summary, TileRecord};
+
+    fn record(residual: f32, stop_reason: &str, passes: usize) -> TileRecord {
+        let stop_reason = stop_reason.to_owned();
+        TileRecord { tv_iterations: 40, denoiser_passes: passes, residual, stop_reason }
+    }
+
+    #[test]
+    fn a_summary_tells_the_worst_of_the_tiles() {
+        let tiles = [record(0.01, "converged", 20), record(0.03, "max-iterations", 24)];
+        let summary = Summary::of(&tiles);
+        assert_eq!((summary.denoiser_passes, summary.residual), (24, 0.03));
+        assert_eq!(summary.stop_reason, "max-iterations");
+        assert_eq!(Summary::of(&tiles[..1]).stop_reason, "converged");
+    }
+}

@@ -1,0 +1,269 @@
+//! The store of the same machine, as a worker sees it.
+
+use std::io::{BufWriter, IntoInnerError};
+
+use ndarray::ArrayView3;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use super::transport::{
+    Claim, Done, LEASE, Output, Owner, TaskError, TaskInput, TileTask, Transport, TransportError,
+};
+use crate::formats::planar;
+use crate::job::{Sha256, TaskKind, TaskProgress, WorkerId};
+use crate::pipeline::PipelineError;
+use crate::pipeline::arrays::Arrays;
+use crate::pipeline::blend::StoredTile;
+use crate::pipeline::manifest::{Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
+use crate::pipeline::networks::{ModelFile, ModelRecord};
+use crate::pipeline::pilot::full_schedule;
+use crate::pipeline::records::{PilotRecord, PreparedRecord};
+use crate::pipeline::tile::TileInput;
+use crate::store::{
+    CalibrationInputs, CalibrationTask, ClaimedTask, Completion, Heartbeat, JobTask, Lease,
+    Product, StagedBlob, Step, Store, StoreError, TaskRecord, TileResult, Work,
+};
+
+/// The store, and who works for it.
+#[derive(Debug, Clone)]
+pub struct Local {
+    store: Store,
+    worker: WorkerId,
+}
+
+impl Local {
+    /// For a worker of this name.
+    pub fn new(store: Store, worker: WorkerId) -> Self {
+        Self { store, worker }
+    }
+
+    fn arrays(&self, masks: Sha256, snapshots: Sha256) -> Arrays {
+        Arrays { masks: (self.path(masks), masks), snapshots: (self.path(snapshots), snapshots) }
+    }
+
+    /// All that a task needs, at the attempt of this number.
+    fn input(&self, work: &Work, attempt: u32) -> Result<TaskInput, TaskError> {
+        match work {
+            Work::Job(task) => self.step(task, attempt),
+            Work::Calibration(CalibrationTask { name, inputs, .. }) => Ok(match inputs {
+                CalibrationInputs::Masks(masks) => TaskInput::Report(masks.clone()),
+                CalibrationInputs::Captures(captures) => TaskInput::Captures {
+                    name: name.clone(),
+                    files: captures.map(|upload| self.path(*upload)),
+                    scratch: self.store.staged_path().map_err(failed)?,
+                    masks: self.store.blob_writer().map_err(failed)?,
+                },
+            }),
+        }
+    }
+
+    fn step(&self, task: &JobTask, attempt: u32) -> Result<TaskInput, TaskError> {
+        let JobTask { job, spec, calibration, measurement, .. } = task;
+        let arrays = self.arrays(calibration.prepared, measurement.prepared);
+        let folder = || self.store.staged_dir().map_err(failed);
+        Ok(match &task.step {
+            Step::Prepare => TaskInput::Prepare { arrays, snapshots: spec.snapshots },
+            Step::Preview { snapshot } => TaskInput::Preview {
+                arrays,
+                shape: spec.shape,
+                snapshot: *snapshot,
+                white: white(task)?,
+            },
+            Step::Pilot => TaskInput::Pilot {
+                arrays,
+                snapshot: spec.snapshots.first,
+                white: white(task)?,
+                schedule: spec.schedule.clone(),
+            },
+            Step::Tile { snapshot, tile } => {
+                TaskInput::Tile(Box::new(tile_task(task, *snapshot, *tile)?))
+            }
+            Step::Assemble { snapshot, tiles } => TaskInput::Assemble {
+                job: *job,
+                recipe: Box::new(recipe(task)?),
+                snapshot: *snapshot,
+                tiles: tiles.iter().map(stored_tile).collect::<Result<_, _>>()?,
+                folder: folder()?,
+            },
+            Step::Manifest { records } => TaskInput::Manifest {
+                job: *job,
+                spec: Box::new(spec.clone()),
+                recipe: Box::new(recipe(task)?),
+                tasks: tasks(records, attempt)?,
+                folder: folder()?,
+            },
+        })
+    }
+
+    /// What was made, as the store takes it. Blocks on the disk.
+    fn product(&self, output: Output) -> Result<Product, TransportError> {
+        Ok(match output {
+            Output::Record => Product::Record,
+            Output::TileCost(share) => Product::TileCost(share),
+            Output::Stack(frames) => Product::Tile(self.staged(frames.view())?),
+            Output::Files(folder, files) => Product::Files(folder, files),
+            Output::Calibration(done) => Product::Calibration(done),
+        })
+    }
+
+    /// Frames \[B,h,w\] as a prepared array.
+    fn staged(&self, frames: ArrayView3<'_, f32>) -> Result<StagedBlob, TransportError> {
+        let (count, height, width) = frames.dim();
+        let blob = BufWriter::new(self.store.blob_writer()?);
+        let mut writer = planar::writer(blob, count, height, width)?;
+        frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
+        let blob = writer.finish()?.into_inner();
+        Ok(blob.map_err(IntoInnerError::into_error)?.finish()?)
+    }
+
+    fn path(&self, sha256: Sha256) -> std::path::PathBuf {
+        self.store.dir().blob(&sha256)
+    }
+}
+
+impl Transport for Local {
+    async fn started(&self) -> Result<(), TransportError> {
+        Ok(self.store.worker_started(self.worker, std::process::id()).await?)
+    }
+
+    async fn seen(&self) -> Result<(), TransportError> {
+        Ok(self.store.worker_seen(self.worker).await?)
+    }
+
+    async fn claim(&self) -> Result<Option<Claim>, TransportError> {
+        let Some(task) = self.store.claim(self.worker, LEASE).await? else { return Ok(None) };
+        let ClaimedTask { lease, kind, cost, work } = task;
+        let owner = match &work {
+            Work::Job(task) => Owner::Job(task.job),
+            Work::Calibration(task) => Owner::Calibration(task.calibration),
+        };
+        let here = self.clone();
+        let input = tokio::task::spawn_blocking(move || here.input(&work, lease.attempt)).await?;
+        Ok(Some(Claim { lease, owner, kind, cost, input }))
+    }
+
+    async fn heartbeat(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+        history: Option<&str>,
+    ) -> Result<Heartbeat, TransportError> {
+        Ok(self.store.heartbeat_with(lease, progress, history).await?)
+    }
+
+    async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError> {
+        let Done { progress, record, output } = done;
+        let here = self.clone();
+        let product = tokio::task::spawn_blocking(move || here.product(output)).await??;
+        Ok(self.store.complete(lease, Completion { progress, record, product }).await?)
+    }
+
+    async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError> {
+        Ok(self.store.fail(lease, reason, retry).await?)
+    }
+
+    async fn release(&self, lease: &Lease) -> Result<(), TransportError> {
+        Ok(self.store.release_task(lease).await?)
+    }
+
+    async fn cancelled(&self, lease: &Lease) -> Result<(), TransportError> {
+        Ok(self.store.cancelled(lease).await?)
+    }
+
+    async fn redo(&self, lease: &Lease, tiles: &[u32]) -> Result<(), TransportError> {
+        Ok(self.store.redo_tiles(lease, tiles).await?)
+    }
+
+    fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError> {
+        let arrays = self.arrays(task.masks, task.measurement);
+        let place = (task.tile.rows(), task.tile.columns());
+        let input = arrays.window(task.snapshots.clone(), place, task.white)?;
+        Ok(TileInput { plane: task.plane, ..input })
+    }
+
+    fn model(&self, sha256: Sha256) -> ModelFile {
+        ModelFile::new(self.path(sha256), sha256)
+    }
+}
+
+fn failed(error: StoreError) -> TaskError {
+    TaskError::Transport(error.into())
+}
+
+/// A record that this program wrote.
+fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, PipelineError> {
+    T::deserialize(record).map_err(PipelineError::record(what))
+}
+
+/// White level of the scene.
+fn white(task: &JobTask) -> Result<f32, PipelineError> {
+    let prepared = task.prepared.as_ref().unwrap_or(&Value::Null);
+    Ok(parsed::<PreparedRecord>("prepare task", prepared)?.white)
+}
+
+/// What the pilot found; none before it, and for a job without one.
+fn pilot(task: &JobTask) -> Result<Option<PilotRecord>, PipelineError> {
+    parsed("pilot", task.pilot.as_ref().unwrap_or(&Value::Null))
+}
+
+fn stored_tile(stored: &TileResult) -> Result<StoredTile, PipelineError> {
+    let TileResult { tile, path, sha256, record } = stored;
+    let record = parsed("tile", record)?;
+    Ok(StoredTile { tile: *tile, path: path.clone(), sha256: *sha256, record })
+}
+
+fn tile_task(task: &JobTask, snapshot: u32, index: u32) -> Result<TileTask, PipelineError> {
+    let plan = task.spec.tile_plan()?;
+    let tile = plan.tile(index as usize).ok_or_else(|| PipelineError::Record {
+        what: "task",
+        problem: format!("tile {index} of a plan of {}", plan.len()),
+    })?;
+    Ok(TileTask {
+        masks: task.calibration.prepared,
+        measurement: task.measurement.prepared,
+        snapshots: snapshot..snapshot + 1,
+        plane: 0,
+        tile,
+        white: white(task)?,
+        schedule: full_schedule(&task.spec.schedule, pilot(task)?.as_ref()),
+        model: task.spec.model.as_ref().map(|model| model.sha256),
+    })
+}
+
+/// What the manifests tell of a job.
+fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
+    let (spec, calibration, measurement) =
+        (&task.spec, &task.calibration.facts, &task.measurement.facts);
+    let pilot = pilot(task)?;
+    Ok(Recipe {
+        program_version: VERSION,
+        algorithm: spec.algorithm,
+        schedule: full_schedule(&spec.schedule, pilot.as_ref()),
+        pilot,
+        shape: spec.shape,
+        inputs: Inputs { masks_sha256: calibration.masks, measurement_sha256: measurement.data },
+        models: ModelRecord::of_job(spec),
+        scale: ScaleRecord {
+            masks_full_scale: calibration.full_scale,
+            measurement_full_scale: measurement.full_scale,
+            white: white(task)?,
+        },
+        tile_plan: spec.tile_plan()?,
+        warnings: spec.warnings.clone(),
+        camera: (measurement.camera_fps, measurement.exposure_s),
+    })
+}
+
+/// What the other tasks of a job have left for its manifest, which `attempt` is to write.
+fn tasks(records: &[TaskRecord], attempt: u32) -> Result<JobTasks, PipelineError> {
+    let mut tasks =
+        JobTasks { snapshots: Vec::new(), seconds: Vec::new(), attempts: u64::from(attempt) };
+    for task in records {
+        tasks.seconds.push((task.kind, task.seconds));
+        tasks.attempts += u64::from(task.attempt);
+        if let TaskKind::Assemble { snapshot } = task.kind {
+            tasks.snapshots.push((snapshot, parsed("snapshot", &task.record)?));
+        }
+    }
+    Ok(tasks)
+}

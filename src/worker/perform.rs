@@ -1,0 +1,199 @@
+//! Does one task, whatever its kind.
+
+use std::io::{BufWriter, IntoInnerError};
+
+use ndarray::Array3;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, TransportError};
+use crate::formats::planar::{self, Reader};
+use crate::formats::{Limits, StackInfo};
+use crate::intake::{self, Calibrated, IntakeError, Report, calibrate};
+use crate::job::{Label, Schedule, Sha256, TaskProgress, TaskStage};
+use crate::pipeline::PipelineError;
+use crate::pipeline::arrays::Arrays;
+use crate::pipeline::blend;
+use crate::pipeline::networks::{ModelFile, WarmNetworks};
+use crate::pipeline::pilot::{self, full_schedule};
+use crate::pipeline::progress::Monitor;
+use crate::pipeline::records::{
+    CostRecord, PilotRecord, PreparedRecord, RunRecord, SnapshotRecord, TileRecord, TileTaskRecord,
+};
+use crate::pipeline::tile::{TileInput, reconstruct_tile, run_network};
+use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
+use crate::pipeline::write::{write_manifest, write_result};
+use crate::pipeline::{preview, scale};
+use crate::recon;
+use crate::recon::solver::Outcome;
+use crate::store::{CalibrationDone, NewCalibration, StagedBlob};
+
+/// Does a task. Blocks for as long as it takes.
+pub(super) fn perform(
+    transport: &impl Transport,
+    input: TaskInput,
+    networks: &mut WarmNetworks,
+    monitor: &Monitor,
+) -> Result<Done, TaskError> {
+    let (record, output) = match input {
+        TaskInput::Prepare { arrays, snapshots } => {
+            arrays.verify()?;
+            let white = scale::white_of_job(&arrays, snapshots, monitor)?;
+            monitor.reach(TaskStage::Reading, 1.0);
+            (json(&PreparedRecord { white })?, Output::Record)
+        }
+        TaskInput::Preview { arrays, shape, snapshot, white } => {
+            let frames = preview::frames(&arrays, shape, snapshot, white, monitor)?;
+            monitor.reach(TaskStage::Tv, 1.0);
+            (Value::Null, Output::Stack(frames))
+        }
+        TaskInput::Pilot { arrays, snapshot, white, schedule } => {
+            let record = run_pilot(&arrays, snapshot, white, &schedule, networks, monitor)?;
+            let decided = full_schedule(&schedule, record.as_ref());
+            let share = decided.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
+            monitor.reach(monitor.progress().stage, 1.0);
+            (json(&record)?, Output::TileCost(share))
+        }
+        TaskInput::Tile(task) => {
+            let (record, frames) = tile(transport, &task, networks, monitor)?;
+            (json(&record)?, Output::Stack(frames))
+        }
+        TaskInput::Assemble { job, recipe, snapshot, tiles, folder } => {
+            blend::verify(&recipe.tile_plan, &tiles, monitor)?;
+            let cost = CostRecord::sum(tiles.iter().map(|tile| &tile.record.cost));
+            let run = RunRecord::ended(Some(job.to_string()), cost, None);
+            let records = tiles.iter().map(|tile| tile.record.tile.clone()).collect();
+            let manifest = recipe.snapshot(snapshot as usize, records, run.clone());
+            let summary = manifest.content.summary.clone();
+            let files = write_result(folder.path(), manifest, |k| {
+                monitor.check()?;
+                monitor.reach(TaskStage::Writing, k as f64 / recipe.shape.frames as f64);
+                Ok(blend::stored_frame(&recipe.tile_plan, &tiles, k)?)
+            })?;
+            monitor.reach(TaskStage::Writing, 1.0);
+            let record = SnapshotRecord { summary, run, files: files.clone() };
+            (json(&record)?, Output::Files(folder, files))
+        }
+        TaskInput::Manifest { job, spec, recipe, tasks, folder } => {
+            let file = write_manifest(folder.path(), &recipe.job(job, &spec, tasks))?;
+            monitor.reach(TaskStage::Writing, 1.0);
+            (Value::Null, Output::Files(folder, vec![file]))
+        }
+        TaskInput::Captures { name, files, scratch, masks } => {
+            let masks = BufWriter::with_capacity(256 * 1024, masks);
+            let open =
+                |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
+            let limits = Limits::default();
+            let (made, masks) = calibrate(&files, &limits, scratch.path(), open, &mut |share| {
+                tell(share, monitor)
+            })?;
+            let masks = masks.into_inner().map_err(IntoInnerError::into_error);
+            let masks =
+                masks.map_err(TransportError::from)?.finish().map_err(TransportError::from)?;
+            let facts = facts(name, &made, masks.sha256());
+            (Value::Null, calibration(Some((facts, masks)), made.report, monitor))
+        }
+        TaskInput::Report(masks) => {
+            let masks = Reader::open(&masks, &Limits::default()).map_err(IntakeError::from)?;
+            let report = intake::report(&masks, &mut |share| tell(share, monitor))?;
+            (Value::Null, calibration(None, report, monitor))
+        }
+    };
+    Ok(Done { progress: monitor.progress(), record, output })
+}
+
+/// Tells which share of a calibration is done; false asks to stop.
+fn tell(fraction: f64, monitor: &Monitor) -> bool {
+    monitor.reach(TaskStage::Reading, fraction);
+    !monitor.stopped()
+}
+
+fn calibration(
+    masks: Option<(NewCalibration, StagedBlob)>,
+    Report { report, maps }: Report,
+    monitor: &Monitor,
+) -> Output {
+    monitor.reach(TaskStage::Reading, 1.0);
+    Output::Calibration(Box::new(CalibrationDone { masks, report, maps }))
+}
+
+fn facts(name: Option<Label>, made: &Calibrated, masks: Sha256) -> NewCalibration {
+    let report = &made.report.report;
+    NewCalibration {
+        name,
+        masks,
+        format: "captures".into(),
+        sample: made.sample.name().to_owned(),
+        frames: report.frames,
+        height: report.height,
+        width: report.width,
+        full_scale: 1.0,
+        mask_mean: report.masks.mean,
+        dead_pixels: report.masks.dead_pixels,
+        clipped_negatives: made.clipped_negatives,
+    }
+}
+
+/// What is to be remembered of a task.
+fn json(record: &impl Serialize) -> Result<Value, PipelineError> {
+    serde_json::to_value(record).map_err(PipelineError::record("task"))
+}
+
+fn run_pilot(
+    arrays: &Arrays,
+    snapshot: u32,
+    white: f32,
+    schedule: &Schedule,
+    networks: &mut WarmNetworks,
+    monitor: &Monitor,
+) -> Result<Option<PilotRecord>, PipelineError> {
+    let (rows, columns) = recon::pilot::piece(arrays.snapshot(snapshot)?.view());
+    let place = (snapshot as usize, rows.start, columns.start);
+    let input = arrays.window(snapshot..snapshot + 1, (rows, columns), white)?;
+    let mut observer = monitor.observe(schedule.clone());
+    Ok(pilot::decide(input, place, schedule, networks, &mut observer)?)
+}
+
+/// Reconstructs a tile.
+fn tile(
+    transport: &impl Transport,
+    task: &TileTask,
+    networks: &mut WarmNetworks,
+    monitor: &Monitor,
+) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
+    let before = cpu_seconds();
+    let input = transport.window(task)?;
+    let outcome = match task.model {
+        Some(sha256) => by_network(input, &transport.model(sha256), networks, monitor)?,
+        None => {
+            let mut observer = monitor.observe(task.schedule.clone());
+            reconstruct_tile(input, &task.schedule, networks, &mut observer)?
+        }
+    };
+    monitor.reach(TaskStage::Writing, monitor.progress().fraction);
+    let deep = task.model.is_some() || task.schedule.needs_network();
+    let source = networks.source();
+    let cost = CostRecord {
+        provider: deep.then(|| source.provider().into()),
+        onnxruntime: if deep { Some(source.version()?) } else { None },
+        cpu_seconds: cpu_seconds() - before,
+        peak_rss_bytes: peak_rss_bytes(),
+    };
+    Ok((TileTaskRecord { tile: TileRecord::from(&outcome), cost }, outcome.frames))
+}
+
+/// One run of an end-to-end network, which can't be stopped on its way.
+fn by_network(
+    input: TileInput,
+    file: &ModelFile,
+    networks: &mut WarmNetworks,
+    monitor: &Monitor,
+) -> Result<Outcome, PipelineError> {
+    monitor.reach(TaskStage::Deep, 0.0);
+    let network = networks.end_to_end(file)?;
+    monitor.check()?;
+    let outcome = run_network(input, network)?;
+    monitor.check()?;
+    monitor.set_progress(TaskProgress { passes: 1, fraction: 1.0, ..monitor.progress() });
+    Ok(outcome)
+}

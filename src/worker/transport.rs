@@ -1,0 +1,246 @@
+//! How a worker reaches the queue and the files: the store of the same machine today. A transport to
+//! other machines would offer the same, with tile tasks alone.
+
+use std::error::Error;
+use std::ops::Range;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use ndarray::Array3;
+use serde_json::Value;
+
+use crate::intake::{CaptureFiles, IntakeError};
+use crate::job::{
+    CalibrationId, JobId, JobSpec, Label, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange,
+    TaskKind, TaskProgress,
+};
+use crate::pipeline::PipelineError;
+use crate::pipeline::arrays::Arrays;
+use crate::pipeline::blend::StoredTile;
+use crate::pipeline::manifest::{JobTasks, Recipe};
+use crate::pipeline::networks::ModelFile;
+use crate::pipeline::tile::TileInput;
+use crate::recon::tile::Tile;
+use crate::store::{BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath};
+
+/// The queue or the files can't be reached.
+pub type TransportError = Box<dyn Error + Send + Sync>;
+
+/// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
+/// against a lab's patience.
+pub(super) const LEASE: Duration = Duration::from_secs(20);
+
+/// The way to the queue and the files.
+#[allow(async_fn_in_trait)] // a worker does not move between threads
+pub trait Transport: Clone + Send + 'static {
+    /// Tells that the worker has started.
+    async fn started(&self) -> Result<(), TransportError>;
+
+    /// Tells that the worker, which has nothing to do, is alive.
+    async fn seen(&self) -> Result<(), TransportError>;
+
+    /// The next task, if there is one.
+    async fn claim(&self) -> Result<Option<Claim>, TransportError>;
+
+    /// Renews a lease, notes the progress and how the solver went (JSON), and asks whether to go on.
+    async fn heartbeat(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+        history: Option<&str>,
+    ) -> Result<Heartbeat, TransportError>;
+
+    /// Hands over what was made. [`Heartbeat::Lost`] says that the task is someone else's by now; an
+    /// error that it is still the worker's.
+    async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError>;
+
+    /// Tells why a task could not be done, and whether another attempt may succeed.
+    async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError>;
+
+    /// Gives a task back unharmed.
+    async fn release(&self, lease: &Lease) -> Result<(), TransportError>;
+
+    /// Tells that a cancelled task has stopped.
+    async fn cancelled(&self, lease: &Lease) -> Result<(), TransportError>;
+
+    /// Has tiles done again that an assembly, which is given back, found damaged.
+    async fn redo(&self, lease: &Lease, tiles: &[u32]) -> Result<(), TransportError>;
+
+    /// What a tile is made of. Blocks.
+    fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError>;
+
+    /// The file of an end-to-end network, on this machine. Blocks.
+    fn model(&self, sha256: Sha256) -> ModelFile;
+}
+
+/// A claimed task.
+#[derive(Debug)]
+pub struct Claim {
+    /// The right to it, to be shown with every message about it.
+    pub lease: Lease,
+    /// Whose it is, for logs.
+    pub owner: Owner,
+    /// What it is, for logs.
+    pub kind: TaskKind,
+    /// Its planned processor time in seconds.
+    pub cost: f64,
+    /// What is to be done, or why that can't be told.
+    pub input: Result<TaskInput, TaskError>,
+}
+
+/// Whose a task is.
+#[derive(Debug, Clone, Copy)]
+pub enum Owner {
+    /// A job's.
+    Job(JobId),
+    /// A calibration's.
+    Calibration(CalibrationId),
+}
+
+/// What is to be done, with all that is needed.
+#[derive(Debug)]
+pub enum TaskInput {
+    /// Estimate the white level of a job.
+    Prepare {
+        /// Masks and measurement.
+        arrays: Arrays,
+        /// The snapshots of the job.
+        snapshots: SnapshotRange,
+    },
+    /// Reconstruct a snapshot coarsely.
+    Preview {
+        /// Masks and measurement.
+        arrays: Arrays,
+        /// Their sizes.
+        shape: SceneShape,
+        /// Which snapshot.
+        snapshot: u32,
+        /// White level of the scene.
+        white: f32,
+    },
+    /// Find out how many iterations of an adaptive schedule pay.
+    Pilot {
+        /// Masks and measurement.
+        arrays: Arrays,
+        /// On which snapshot.
+        snapshot: u32,
+        /// White level of the scene.
+        white: f32,
+        /// The schedule that was asked for.
+        schedule: Schedule,
+    },
+    /// Reconstruct a tile.
+    Tile(Box<TileTask>),
+    /// Blend the tiles of a snapshot and write its frames.
+    Assemble {
+        /// The job.
+        job: JobId,
+        /// What the manifest tells of it.
+        recipe: Box<Recipe>,
+        /// Which snapshot.
+        snapshot: u32,
+        /// All its tiles in the plan's order.
+        tiles: Vec<StoredTile>,
+        /// For the files.
+        folder: StagedDir,
+    },
+    /// Write the manifest of a job.
+    Manifest {
+        /// The job.
+        job: JobId,
+        /// Itself.
+        spec: Box<JobSpec>,
+        /// What the manifest tells of it.
+        recipe: Box<Recipe>,
+        /// What its other tasks have left.
+        tasks: JobTasks,
+        /// For the file.
+        folder: StagedDir,
+    },
+    /// Make masks of captures, and a report on them.
+    Captures {
+        /// The user's name for the calibration.
+        name: Option<Label>,
+        /// The captures.
+        files: CaptureFiles,
+        /// For the masks before their scale is known.
+        scratch: StagedPath,
+        /// For the masks.
+        masks: BlobWriter,
+    },
+    /// Make a report on masks, a prepared array at this place.
+    Report(PathBuf),
+}
+
+/// A tile to be reconstructed. Arrays and models are named by their hashes, so that this can go to
+/// another machine as it is.
+#[derive(Debug, Clone)]
+pub struct TileTask {
+    /// The prepared masks.
+    pub masks: Sha256,
+    /// The prepared measurement.
+    pub measurement: Sha256,
+    /// The snapshots that are solved together; one today.
+    pub snapshots: Range<u32>,
+    /// The colour plane of the sensor, from 0; one today.
+    pub plane: usize,
+    /// The window.
+    pub tile: Tile,
+    /// White level of the scene.
+    pub white: f32,
+    /// The schedule, after the pilot; without stages if there is a model.
+    pub schedule: Schedule,
+    /// The end-to-end network of the job, if it has one.
+    pub model: Option<Sha256>,
+}
+
+/// The end of a task.
+#[derive(Debug)]
+pub struct Done {
+    /// Where the task stood when it ended: `fraction` is below 1 if the solver converged early.
+    pub progress: TaskProgress,
+    /// What is to be remembered of it, for the manifest.
+    pub record: Value,
+    /// What it has made.
+    pub output: Output,
+}
+
+/// What a task has made.
+#[derive(Debug)]
+pub enum Output {
+    /// Nothing but its record.
+    Record,
+    /// The share of their planned cost that the tiles still have, on \[0,1\].
+    TileCost(f64),
+    /// The frames \[B,h,w\] of a tile, or of a preview.
+    Stack(Array3<f32>),
+    /// Files of a result, which are on the disk, and their folder.
+    Files(StagedDir, Vec<ResultFile>),
+    /// The report on a calibration, and its masks if they were made of captures.
+    Calibration(Box<CalibrationDone>),
+}
+
+/// Why there is no output.
+#[derive(Debug, thiserror::Error)]
+pub enum TaskError {
+    /// A step did not come to its end.
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    /// Captures or masks can't be used.
+    #[error(transparent)]
+    Intake(#[from] IntakeError),
+    /// What is needed can't be had.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+}
+
+impl TaskError {
+    /// Whether another attempt may succeed.
+    pub(super) fn is_retryable(&self) -> bool {
+        match self {
+            Self::Pipeline(error) => error.is_retryable(),
+            Self::Intake(error) => error.is_retryable(),
+            Self::Transport(_) => true,
+        }
+    }
+}
