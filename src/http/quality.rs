@@ -22,7 +22,6 @@ use crate::job::{JobId, SceneShape, Sha256};
 use crate::recon::metrics;
 use crate::store::{Job, StoreError};
 
-/// The query.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct QualityQuery {
@@ -32,7 +31,6 @@ pub(super) struct QualityQuery {
     full_scale: Option<f32>,
 }
 
-/// The figures as they are shown.
 #[derive(Debug, Serialize)]
 struct QualityBody {
     truth: Sha256,
@@ -43,7 +41,6 @@ struct QualityBody {
     frames: Vec<FrameQuality>,
 }
 
-/// The figures of one frame.
 #[derive(Debug, Serialize)]
 struct FrameQuality {
     frame: usize,
