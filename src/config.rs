@@ -8,6 +8,7 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 
 use crate::job::WorkerId;
+use crate::recon::prior::onnx::Device;
 
 /// Serves the HTTP API and runs workers.
 #[derive(Debug, Clone, Args)]
@@ -202,6 +203,15 @@ impl ServeArguments {
     #[must_use]
     pub fn request_time(&self) -> Duration {
         Duration::from_secs(self.request_seconds)
+    }
+}
+
+impl EngineArguments {
+    /// Name of the execution provider for the device. Workers refuse a device that can't be read,
+    /// with the reason.
+    #[must_use]
+    pub fn provider(&self) -> &'static str {
+        Device::parse(&self.device).map_or("unknown", Device::provider)
     }
 }
 

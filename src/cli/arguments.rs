@@ -28,9 +28,9 @@ pub(super) struct ScheduleArguments {
     iterations: Option<u32>,
 }
 
-/// Where the denoiser runs.
+/// Where networks run.
 #[derive(Debug, Args)]
-pub struct EngineArguments {
+pub struct NetworkArguments {
     /// The libonnxruntime [default: the one beside the program].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
@@ -76,7 +76,7 @@ impl ScheduleArguments {
     }
 }
 
-impl EngineArguments {
+impl NetworkArguments {
     /// The source of denoisers.
     pub fn network(&self) -> Result<NetworkSource, CliError> {
         // An empty variable is one that is not set.

@@ -20,9 +20,6 @@ pub struct Arguments {
 }
 
 /// Makes the copy and prints its figures as one JSON line.
-///
-/// # Errors
-/// If a folder can't be used, or files are damaged: their names are in the text.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     if arguments.out.exists() {
         let text = format!("{} is there already; name a new folder", arguments.out.display());

@@ -10,7 +10,7 @@ use ndarray::{Array2, Array3};
 use rustix::process::{Resource, Rlimit};
 
 use super::CliError;
-use super::arguments::EngineArguments;
+use super::arguments::NetworkArguments;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
 use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
@@ -41,13 +41,10 @@ pub struct Arguments {
     #[arg(long, value_name = "BYTES")]
     memory_bytes: Option<u64>,
     #[command(flatten)]
-    engine: EngineArguments,
+    engine: NetworkArguments,
 }
 
 /// Runs the command. A network that can't be used is no failure of the command.
-///
-/// # Errors
-/// A file that can't be read, or no libonnxruntime.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;

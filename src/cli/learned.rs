@@ -18,9 +18,6 @@ pub struct Learned {
 
 impl Learned {
     /// Loads the network once, to see what it takes.
-    ///
-    /// # Errors
-    /// A file that can't be read or is no network, or no libonnxruntime.
     pub fn open(path: &Path, network: &NetworkSource) -> Result<Self, CliError> {
         let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
         let interface = network.end_to_end(&file)?.interface();
@@ -29,9 +26,6 @@ impl Learned {
     }
 
     /// Which pictures it takes, for masks of frames x rows x columns.
-    ///
-    /// # Errors
-    /// A network that is not for these.
     pub fn size(
         &self,
         (frames, height, width): (usize, usize, usize),
@@ -47,9 +41,6 @@ impl Learned {
 
 /// How masks of frames x rows x columns are cut: as asked for, else as the algorithm or the network
 /// wants it.
-///
-/// # Errors
-/// Tiles that can't be, or that the network does not take.
 pub fn plan(
     algorithm: Algorithm,
     (tile, overlap): (Option<usize>, Option<usize>),

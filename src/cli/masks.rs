@@ -114,7 +114,7 @@ impl MaskArguments {
         let mut rng = generator(seed);
         let grid = optics.grid(frames)?;
         let patterns = match self.pattern {
-            Pattern::RotatingCircle => optics.circle().patterns(frames, &optics.geometry())?,
+            Pattern::RotatingCircle => optics.circle.patterns(frames, &optics.geometry())?,
             Pattern::SingleApertures => single_apertures(frames, grid, &mut rng)?,
             Pattern::Images => self.images(frames)?,
             Pattern::RandomSquares | Pattern::Iid => {
@@ -137,7 +137,7 @@ impl MaskArguments {
 
     fn aperture(&self, optics: &OpticsFile) -> Result<HybridAperture, CliError> {
         let (placement, method) = if self.on_grid() {
-            (optics.placement(), optics.method())
+            (optics.projection.placement, optics.projection.method)
         } else {
             (Placement::Geometric, Method::Convolution)
         };

@@ -2,9 +2,9 @@
 
 mod arguments;
 mod error;
-mod housekeeping;
 mod learned;
 mod logging;
+mod maintenance;
 mod masks;
 mod progress;
 mod supervisor;
@@ -21,7 +21,7 @@ pub mod simulate;
 pub mod token;
 pub mod worker;
 
-pub use arguments::{EngineArguments, algorithms};
+pub use arguments::{NetworkArguments, algorithms};
 pub use error::CliError;
 pub use learned::{Learned, plan};
 pub use masks::{MaskArguments, SimulatedMasks};

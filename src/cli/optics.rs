@@ -29,39 +29,12 @@ pub struct OpticsFile {
     relay: Relay,
     mask: Mask,
     sensor: Sensor,
-    projection: Projection,
+    pub(super) projection: Projection,
     sub_apertures: SubApertures,
-    circle: CircleSection,
+    pub(super) circle: Circle,
     light: Light,
-    camera: CameraSection,
+    pub(super) camera: Camera,
 }
-
-/// A section of the file, with the defaults of the type that it stands for.
-macro_rules! section {
-    ($name:ident = $defaults:expr => { $($field:ident: $type:ty),* $(,)? }) => {
-        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-        #[serde(default, deny_unknown_fields)]
-        struct $name { $($field: $type),* }
-
-        impl Default for $name {
-            fn default() -> Self {
-                let defaults = $defaults;
-                Self { $($field: defaults.$field),* }
-            }
-        }
-    };
-}
-
-section!(CircleSection = Circle::default() => { radius_pixels: f64, centre_pixels: f64 });
-section!(CameraSection = Camera::default() => {
-    bits: u32,
-    full_well_e: f64,
-    read_noise_e: f64,
-    black_level: f64,
-    background: f64,
-    calibration_exposure: f64,
-    measurement_exposure: f64,
-});
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -78,7 +51,19 @@ impl Default for Lcos {
     }
 }
 
-section!(Relay = Geometry::default() => { focal_length_mm: f64, magnification: f64 });
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Relay {
+    focal_length_mm: f64,
+    magnification: f64,
+}
+
+impl Default for Relay {
+    fn default() -> Self {
+        let paper = Geometry::default();
+        Self { focal_length_mm: paper.focal_length_mm, magnification: paper.magnification }
+    }
+}
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -106,25 +91,11 @@ impl Default for Sensor {
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum PlacementName {
-    WholePixels,
-    Geometric,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum MethodName {
-    Shifts,
-    Convolution,
-}
-
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-struct Projection {
-    placement: PlacementName,
-    method: MethodName,
+pub(super) struct Projection {
+    pub(super) placement: Placement,
+    pub(super) method: Method,
     phase_rows: f64,
     phase_columns: f64,
     blur_um: f64,
@@ -132,7 +103,7 @@ struct Projection {
 
 impl Default for Projection {
     fn default() -> Self {
-        let (placement, method) = (PlacementName::WholePixels, MethodName::Shifts);
+        let (placement, method) = (Placement::WholePixels, Method::Shifts);
         Self { placement, method, phase_rows: 0.0, phase_columns: 0.0, blur_um: 0.0 }
     }
 }
@@ -166,7 +137,7 @@ impl OpticsFile {
         let text = fs::read_to_string(path).map_err(|error| refused(path, &error))?;
         let file: Self = toml::from_str(&text).map_err(|error| refused(path, &error))?;
         file.geometry().check().map_err(|error| refused(path, &error))?;
-        file.camera().check().map_err(|error| refused(path, &error))?;
+        file.camera.check().map_err(|error| refused(path, &error))?;
         Ok(file)
     }
 
@@ -183,46 +154,6 @@ impl OpticsFile {
             blur_um: self.projection.blur_um,
             phase_rows: self.projection.phase_rows,
             phase_columns: self.projection.phase_columns,
-        }
-    }
-
-    pub(super) fn camera(&self) -> Camera {
-        let CameraSection {
-            bits,
-            full_well_e,
-            read_noise_e,
-            black_level,
-            background,
-            calibration_exposure,
-            measurement_exposure,
-        } = self.camera;
-        Camera {
-            bits,
-            full_well_e,
-            read_noise_e,
-            black_level,
-            background,
-            calibration_exposure,
-            measurement_exposure,
-        }
-    }
-
-    pub(super) fn circle(&self) -> Circle {
-        let CircleSection { radius_pixels, centre_pixels } = self.circle;
-        Circle { radius_pixels, centre_pixels }
-    }
-
-    pub(super) fn placement(&self) -> Placement {
-        match self.projection.placement {
-            PlacementName::WholePixels => Placement::WholePixels,
-            PlacementName::Geometric => Placement::Geometric,
-        }
-    }
-
-    pub(super) fn method(&self) -> Method {
-        match self.projection.method {
-            MethodName::Shifts => Method::Shifts,
-            MethodName::Convolution => Method::Convolution,
         }
     }
 
@@ -274,9 +205,6 @@ struct Derived {
 }
 
 /// Runs the command.
-///
-/// # Errors
-/// A file that can't be used.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let Some(path) = &arguments.check else {
         print!("{DEFAULTS}");

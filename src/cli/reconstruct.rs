@@ -11,7 +11,7 @@ use clap::Args;
 use ndarray::{Array2, Array3};
 
 use super::CliError;
-use super::arguments::{EngineArguments, ScheduleArguments};
+use super::arguments::{NetworkArguments, ScheduleArguments};
 use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
 use crate::formats::mat::SceneArray;
@@ -67,7 +67,7 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE", required_if_eq("algorithm", Algorithm::Learned.name()))]
     model: Option<PathBuf>,
     #[command(flatten)]
-    engine: EngineArguments,
+    engine: NetworkArguments,
     /// Networks of your own instead of those in the program: a folder with
     /// fastdvdnet-gray/stage1.onnx and stage2.onnx, or ffdnet-gray/model.onnx. The manifest names
     /// them by their hash.

@@ -15,9 +15,6 @@ pub struct Arguments {
 }
 
 /// Runs the command.
-///
-/// # Errors
-/// A file that is no schedule, or one that does not fit the algorithm.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let schedule = arguments.schedule.resolve()?;
     println!("{:#}", json!(schedule));

@@ -10,8 +10,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use super::housekeeping::keep_house;
 use super::logging;
+use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, router};
@@ -57,9 +57,6 @@ fn io(action: &'static str) -> impl FnOnce(std::io::Error) -> ServeError {
 }
 
 /// Serves until SIGTERM or Ctrl-C.
-///
-/// # Errors
-/// If it can't start.
 pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
     logging::start(settings.log_format);
     tokio::runtime::Runtime::new().map_err(io("start the runtime"))?.block_on(serve(settings))
@@ -82,15 +79,16 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let address = listener.local_addr().map_err(io("learn the address"))?;
     tracing::info!(%address, data = %store.dir().root().display(), swept, "listening");
     announce(store.dir().root(), address)?;
-    // 4. Workers and housekeeping, until the signal.
+    // 4. Workers and maintenance, until the signal.
     let (stopper, stop) = watch::channel(false);
     let metrics = Metrics::install()?;
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
     let closing = CancellationToken::new();
-    let house = keep_house(store.clone(), metrics.clone(), settings.clone());
-    tokio::spawn(closing.clone().run_until_cancelled_owned(house));
+    let figures = metrics.clone();
+    let maintenance = maintain(store.clone(), move || figures.upkeep(), settings.clone());
+    tokio::spawn(closing.clone().run_until_cancelled_owned(maintenance));
     let closer = closing.clone();
     tokio::spawn(async move {
         signal.await;

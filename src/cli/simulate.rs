@@ -77,9 +77,6 @@ struct Record {
 }
 
 /// Runs the command.
-///
-/// # Errors
-/// Input that can't be used, or files that can't be written.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let frames = read_clip(&arguments.frames, arguments.full_scale)?;
     check_range(&arguments.frames, &frames)?;
@@ -122,7 +119,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         .map_err(|error| CliError::file("make", &arguments.out, &error))?;
     if let Some(repeats) = arguments.captures {
         let lab = captures::Lab {
-            camera: record.optics.camera(),
+            camera: record.optics.camera,
             illumination: light.view(),
             masks: masks.view(),
             scale,

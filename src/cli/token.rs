@@ -54,9 +54,6 @@ struct Create {
 }
 
 /// Does what the arguments say.
-///
-/// # Errors
-/// If there is no such token, or the store can't be used.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;

@@ -15,9 +15,6 @@ use crate::store::{Purpose, Store};
 use crate::worker::{Local, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
-///
-/// # Errors
-/// Settings that can't be used, no store, or a task that took the computing thread down.
 pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
     logging::start(settings.log_format);
     stand_back(settings.engine.nice)?;

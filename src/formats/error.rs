@@ -11,76 +11,34 @@ use super::Format;
 /// no path: the caller knows which file it meant, and a server must not show its own layout.
 /// Frames, rows and columns count from 0.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // the messages say what the fields are
 pub enum FormatError {
     /// The operating system refused a read or a write.
     #[error("cannot {action}: {source}")]
-    Io {
-        /// What was being done, as a verb phrase ("read the frame").
-        action: &'static str,
-        /// The error of the operating system.
-        source: io::Error,
-    },
+    Io { action: &'static str, source: io::Error },
     /// A call that breaks the rules of this module (a window outside the stack, a frame of the wrong size).
     #[error("internal error in the use of a file format: {0}")]
     Internal(String),
     /// The first bytes belong to none of the formats that can be read.
     #[error("the file is in no format that is read here: {found}; accepted are {accepted}")]
-    UnknownFormat {
-        /// What the file begins with, or what it seems to be.
-        found: String,
-        /// The formats that would be right.
-        accepted: &'static str,
-    },
+    UnknownFormat { found: String, accepted: &'static str },
     /// The format is known but not this kind of content.
     #[error("{format} file: found {found}; accepted: {accepted}")]
-    Unsupported {
-        /// The format of the file.
-        format: Format,
-        /// What was found.
-        found: String,
-        /// What would be right.
-        accepted: &'static str,
-    },
+    Unsupported { format: Format, found: String, accepted: &'static str },
     /// The file is shorter than its header says.
     #[error(
         "{format} file is cut short: its header promises {promised}, but the file holds {present}"
     )]
-    Truncated {
-        /// The format of the file.
-        format: Format,
-        /// What the header promises, with numbers.
-        promised: String,
-        /// What is there, with numbers.
-        present: String,
-    },
+    Truncated { format: Format, promised: String, present: String },
     /// The bytes contradict the format's rules or themselves.
     #[error("{format} file is malformed: {problem}")]
-    Malformed {
-        /// The format of the file.
-        format: Format,
-        /// What is wrong and where.
-        problem: String,
-    },
+    Malformed { format: Format, problem: String },
     /// The content is larger than this installation accepts ([`super::Limits`]).
     #[error("{format} file is too large: {what} is {value}, the limit is {limit}")]
-    OverLimit {
-        /// The format of the file.
-        format: Format,
-        /// The quantity and its unit.
-        what: &'static str,
-        /// Its value in the file.
-        value: u64,
-        /// The largest value that is accepted.
-        limit: u64,
-    },
+    OverLimit { format: Format, what: &'static str, value: u64, limit: u64 },
     /// A .mat file without the array that was asked for.
     #[error(".mat file has no array named '{name}'; it holds {present}")]
-    MissingArray {
-        /// The name that was looked for.
-        name: &'static str,
-        /// The arrays that are there.
-        present: String,
-    },
+    MissingArray { name: &'static str, present: String },
     /// A full scale that is no finite positive number.
     #[error("full_scale must be a finite number above 0, not {0}")]
     FullScale(f32),
@@ -88,63 +46,28 @@ pub enum FormatError {
     #[error(
         "{subject}: {value} at frame {frame}, row {row}, column {column} (counted from 0); every value must be finite"
     )]
-    NotFinite {
-        /// Masks or measurement.
-        subject: &'static str,
-        /// The first such value.
-        value: f32,
-        /// Frame (or snapshot) of the value.
-        frame: usize,
-        /// Row of the value.
-        row: usize,
-        /// Column of the value.
-        column: usize,
-    },
+    NotFinite { subject: &'static str, value: f32, frame: usize, row: usize, column: usize },
     /// A mask value above the full scale.
     #[error(
         "masks: the largest value is {largest} (frame {frame}, row {row}, column {column}, counted from 0), above the full scale {full_scale}; \
          masks must lie in [0, full_scale]: state the full_scale that means fully open"
     )]
-    AboveFullScale {
-        /// The largest value as stored in the file.
-        largest: f32,
-        /// Its frame.
-        frame: usize,
-        /// Its row.
-        row: usize,
-        /// Its column.
-        column: usize,
-        /// The full scale in use.
-        full_scale: f32,
-    },
+    AboveFullScale { largest: f32, frame: usize, row: usize, column: usize, full_scale: f32 },
     /// No mask lets any light through.
     #[error(
         "masks: no value is above 0 in any of the {frames} frames; a calibration needs open pixels"
     )]
-    AllMasksZero {
-        /// Number of frames.
-        frames: usize,
-    },
+    AllMasksZero { frames: usize },
     /// One mask lets no light through.
     #[error(
         "masks: frame {frame} of {frames} (counted from 0) has no value above 0; every mask needs open pixels"
     )]
-    MaskFrameZero {
-        /// The first such frame.
-        frame: usize,
-        /// Number of frames.
-        frames: usize,
-    },
+    MaskFrameZero { frame: usize, frames: usize },
     /// A snapshot without any signal.
     #[error(
         "measurement: snapshot {snapshot} of {snapshots} (counted from 0) is zero everywhere; there is nothing to reconstruct"
     )]
-    SnapshotZero {
-        /// The first such snapshot.
-        snapshot: usize,
-        /// Number of snapshots.
-        snapshots: usize,
-    },
+    SnapshotZero { snapshot: usize, snapshots: usize },
 }
 
 impl FormatError {

@@ -7,10 +7,12 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use headers::authorization::{Authorization, Bearer};
+use headers::{Cookie, HeaderMapExt};
 
-use super::app::App;
 use super::error::{ApiError, Code};
 use crate::job::{Lab, Role, Secret, TokenId};
+use crate::store::Store;
 
 /// A page that can't set headers of its requests (for pictures and events, say) keeps the token in
 /// this cookie. It opens only what changes nothing, so that no foreign page can use it to do harm.
@@ -60,13 +62,13 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
 
 /// Lets a request pass if its token may do what it wants.
 pub(super) async fn guard(
-    State((app, rule)): State<(App, Rule)>,
+    State((store, rule)): State<(Store, Rule)>,
     mut request: Request,
     next: Next,
 ) -> Response {
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
     let secret = secret(request.method(), request.headers());
-    match admit(&app, secret, role).await {
+    match admit(&store, secret, role).await {
         Ok(access) => {
             tracing::Span::current().record("lab", access.lab.as_str());
             request.extensions_mut().insert(access);
@@ -76,13 +78,13 @@ pub(super) async fn guard(
     }
 }
 
-async fn admit(app: &App, secret: Option<Secret>, role: Role) -> Result<Access, ApiError> {
+async fn admit(store: &Store, secret: Option<Secret>, role: Role) -> Result<Access, ApiError> {
     let token = match &secret {
-        Some(secret) => app.store.token(secret).await?,
+        Some(secret) => store.token(secret).await?,
         None => None,
     };
     let Some(token) = token else {
-        if app.store.is_open().await? {
+        if store.is_open().await? {
             return Ok(Access { lab: Lab::local(), token: None, max_bytes: None });
         }
         return Err(missing());
@@ -95,18 +97,11 @@ async fn admit(app: &App, secret: Option<Secret>, role: Role) -> Result<Access, 
 }
 
 fn secret(method: &Method, headers: &HeaderMap) -> Option<Secret> {
-    if let Some(value) = headers.get(header::AUTHORIZATION) {
-        let (scheme, text) = value.to_str().ok()?.split_once(' ')?;
-        return Secret::parse(text.trim()).filter(|_| scheme.eq_ignore_ascii_case("bearer"));
+    match headers.typed_try_get::<Authorization<Bearer>>() {
+        Ok(Some(bearer)) => Secret::parse(bearer.token().trim()),
+        Ok(None) if method.is_safe() => Secret::parse(headers.typed_get::<Cookie>()?.get(COOKIE)?),
+        _ => None,
     }
-    if !method.is_safe() {
-        return None;
-    }
-    let cookies = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
-    let mut pairs =
-        cookies.flat_map(|text| text.split(';')).filter_map(|pair| pair.split_once('='));
-    let (_, text) = pairs.find(|(name, _)| name.trim() == COOKIE)?;
-    Secret::parse(text.trim())
 }
 
 /// The same for a token that is missing, unknown, misspelled or revoked.

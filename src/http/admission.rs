@@ -1,98 +1,133 @@
-//! What is let in: a file or a job is taken only if the disk has room for all of it.
+//! What is let in: a file or a job is taken only if the disk has room for all of it, and only so many
+//! uploads at a time.
+//!
+//! Slots for uploads are no limit of `tower`: its answer would come before the body is read, and a
+//! client that is still sending would not see it.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
 use super::access::Access;
-use super::app::App;
 use super::error::{ApiError, Code};
+use crate::config::ServeArguments;
+use crate::store::Store;
 
 /// What an upload that does not say its length reserves at a time.
 const STEP: u64 = 64 << 20;
 
-/// Bytes promised to uploads that are coming in.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Promises(Arc<AtomicU64>);
-
-/// Room on the disk for an upload; what is not written is given back when this is dropped.
 #[derive(Debug)]
-pub(super) struct Room {
-    promises: Promises,
+pub(super) struct Admission {
+    store: Store,
+    max_upload_bytes: u64,
+    min_free_bytes: u64,
+    /// Bytes reserved for uploads that are coming in.
+    reserved: Arc<AtomicU64>,
+    slots: Arc<Semaphore>,
+}
+
+/// Bytes of the disk reserved for an upload; what is not written is given back when this is dropped.
+#[derive(Debug)]
+pub(super) struct Reservation {
+    reserved: Arc<AtomicU64>,
     left: u64,
 }
 
-impl Drop for Room {
+impl Drop for Reservation {
     fn drop(&mut self) {
-        self.promises.0.fetch_sub(self.left, Ordering::AcqRel);
+        self.reserved.fetch_sub(self.left, Ordering::AcqRel);
     }
 }
 
-impl Room {
-    /// Reserves room for `length` bytes.
-    pub(super) async fn reserve(app: &App, length: u64) -> Result<Self, ApiError> {
-        let promises = app.promises.clone();
-        // First the promise and then the look: of two that want the last room, none gets too much.
-        promises.0.fetch_add(length, Ordering::AcqRel);
-        let room = Self { promises, left: length };
-        check_disk(app, 0, "the upload", length).await?;
-        Ok(room)
+impl Admission {
+    pub(super) fn new(store: Store, settings: &ServeArguments) -> Self {
+        Self {
+            store,
+            max_upload_bytes: settings.max_upload_bytes,
+            min_free_bytes: settings.min_free_bytes,
+            reserved: Arc::default(),
+            slots: Arc::new(Semaphore::new(settings.max_uploads)),
+        }
     }
 
-    /// Takes note of bytes that are about to be written; reserves more if they were not announced.
-    pub(super) async fn take(&mut self, app: &App, bytes: u64) -> Result<(), ApiError> {
-        if bytes > self.left {
-            let more = Self::reserve(app, bytes.max(STEP)).await?;
-            self.left += more.left;
-            // The promise is this room's now.
-            std::mem::forget(more);
+    /// Takes one of the slots for uploads.
+    pub(super) fn slot(&self) -> Result<OwnedSemaphorePermit, ApiError> {
+        self.slots.clone().try_acquire_owned().map_err(|_| {
+            ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
+        })
+    }
+
+    pub(super) async fn reserve(&self, length: u64) -> Result<Reservation, ApiError> {
+        let reserved = self.reserved.clone();
+        // First the reservation and then the look: of two that want the last room, none gets too
+        // much.
+        reserved.fetch_add(length, Ordering::AcqRel);
+        let reservation = Reservation { reserved, left: length };
+        self.check_disk(0, "the upload", length).await?;
+        Ok(reservation)
+    }
+
+    /// Takes bytes that are about to be written from a reservation; reserves more if they were not
+    /// announced.
+    pub(super) async fn take(
+        &self,
+        reservation: &mut Reservation,
+        bytes: u64,
+    ) -> Result<(), ApiError> {
+        if bytes > reservation.left {
+            let mut more = self.reserve(bytes.max(STEP)).await?;
+            reservation.left += std::mem::take(&mut more.left);
         }
-        self.left -= bytes;
-        self.promises.0.fetch_sub(bytes, Ordering::AcqRel);
+        reservation.left -= bytes;
+        self.reserved.fetch_sub(bytes, Ordering::AcqRel);
         Ok(())
     }
-}
 
-/// Refuses `what` if the disk has no room for its `needed` bytes beside what was promised to others.
-/// Of the promises to uploads, `needed` is one unless `extra` says that it comes on top.
-async fn check_disk(app: &App, extra: u64, what: &str, needed: u64) -> Result<(), ApiError> {
-    let (free, _) = app.store.dir().disk()?;
-    let promised = app.store.promised_bytes().await? + app.promises.0.load(Ordering::Acquire);
-    let wanted = promised.saturating_add(extra).saturating_add(app.min_free_bytes);
-    if free >= wanted {
-        return Ok(());
+    /// Refuses `what` if the disk has no room for its `needed` bytes beside what is reserved for
+    /// others. They are part of what is reserved unless `extra` says that they come on top.
+    async fn check_disk(&self, extra: u64, what: &str, needed: u64) -> Result<(), ApiError> {
+        let (free, _) = self.store.dir().disk()?;
+        let reserved = self.store.promised_bytes().await? + self.reserved.load(Ordering::Acquire);
+        let wanted = reserved.saturating_add(extra).saturating_add(self.min_free_bytes);
+        if free >= wanted {
+            return Ok(());
+        }
+        let others = reserved.saturating_sub(needed - extra);
+        let detail = format!(
+            "{what} needs {needed} bytes; {free} are free, of which {others} are promised to others \
+             and {} are kept in reserve",
+            self.min_free_bytes
+        );
+        Err(ApiError::new(Code::InsufficientStorage, detail))
     }
-    let others = promised.saturating_sub(needed - extra);
-    let detail = format!(
-        "{what} needs {needed} bytes; {free} are free, of which {others} are promised to others \
-         and {} are kept in reserve",
-        app.min_free_bytes
-    );
-    Err(ApiError::new(Code::InsufficientStorage, detail))
-}
 
-/// Refuses a job, or an upload in pieces, that the disk has no room for. What is accepted is kept
-/// count of by the database.
-pub(super) async fn check_room(app: &App, what: &str, needed: u64) -> Result<(), ApiError> {
-    check_disk(app, needed, what, needed).await
-}
-
-/// Refuses an upload that is too large, or with which the token would keep more than it may.
-pub(super) async fn check_length(app: &App, access: &Access, length: u64) -> Result<(), ApiError> {
-    if length > app.max_upload_bytes {
-        return Err(too_large(app));
+    /// Refuses a job, or an upload in pieces, that the disk has no room for. What is accepted is
+    /// reserved by the database.
+    pub(super) async fn check_room(&self, what: &str, needed: u64) -> Result<(), ApiError> {
+        self.check_disk(needed, what, needed).await
     }
-    let (Some(token), Some(limit)) = (access.token, access.max_bytes) else { return Ok(()) };
-    let kept = app.store.token_bytes(token).await?;
-    if kept.saturating_add(length) <= limit {
-        return Ok(());
-    }
-    let detail =
-        format!("the upload has {length} bytes, and the token keeps {kept} of the {limit} it may");
-    Err(ApiError::new(Code::QuotaExceeded, detail))
-}
 
-/// The refusal of an upload that is larger than any may be.
-pub(super) fn too_large(app: &App) -> ApiError {
-    let detail = format!("an upload has at most {} bytes", app.max_upload_bytes);
-    ApiError::new(Code::TooLarge, detail)
+    /// Refuses an upload that is larger than any may be.
+    pub(super) fn check_size(&self, length: u64) -> Result<(), ApiError> {
+        if length <= self.max_upload_bytes {
+            return Ok(());
+        }
+        let detail = format!("an upload has at most {} bytes", self.max_upload_bytes);
+        Err(ApiError::new(Code::TooLarge, detail))
+    }
+
+    /// Refuses an upload that is too large, or with which the token would keep more than it may.
+    pub(super) async fn check_length(&self, access: &Access, length: u64) -> Result<(), ApiError> {
+        self.check_size(length)?;
+        let (Some(token), Some(limit)) = (access.token, access.max_bytes) else { return Ok(()) };
+        let kept = self.store.token_bytes(token).await?;
+        if kept.saturating_add(length) <= limit {
+            return Ok(());
+        }
+        let detail = format!(
+            "the upload has {length} bytes, and the token keeps {kept} of the {limit} it may"
+        );
+        Err(ApiError::new(Code::QuotaExceeded, detail))
+    }
 }

@@ -6,7 +6,6 @@ use serde::Serialize;
 use crate::job::{Algorithm, Schedule, TileSpec};
 use crate::pipeline::networks;
 
-/// An algorithm as it is shown.
 #[derive(Debug, Serialize)]
 pub(super) struct AlgorithmBody {
     name: Algorithm,
@@ -19,7 +18,6 @@ pub(super) struct AlgorithmBody {
     tile: TileSpec,
 }
 
-/// The list as it is shown.
 #[derive(Debug, Serialize)]
 pub(super) struct ListBody {
     items: Vec<AlgorithmBody>,

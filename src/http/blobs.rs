@@ -5,10 +5,11 @@ use axum::body::Body;
 use axum::extract::{FromRequest, Multipart, Request, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use headers::{ContentLength, HeaderMapExt};
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::access::Access;
-use super::admission::{self, Room};
+use super::admission::Reservation;
 use super::app::App;
 use super::error::{ApiError, Code};
 use super::extract::Params;
@@ -23,7 +24,7 @@ pub(super) async fn create(
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response, ApiError> {
-    let (_permit, room) = match begin(&app, &access, &headers).await {
+    let (_slot, room) = match begin(&app, &access, &headers).await {
         Ok(begun) => begun,
         Err(refusal) => return Err(refuse(refusal, &headers, request.into_body()).await),
     };
@@ -43,7 +44,7 @@ pub(super) async fn put(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    let (_permit, room) = match begin(&app, &access, &headers).await {
+    let (_slot, room) = match begin(&app, &access, &headers).await {
         Ok(begun) => begun,
         Err(refusal) => return Err(refuse(refusal, &headers, body).await),
     };
@@ -64,14 +65,17 @@ pub(super) async fn show(
     Ok(Json(app.store.upload(&access.lab, sha256).await?))
 }
 
-/// Takes one of the places for uploads, and room on the disk.
+/// Takes one of the slots for uploads and reserves room on the disk; refuses an upload that says by
+/// its length that it can't be taken, before its first byte.
 async fn begin(
     app: &App,
     access: &Access,
     headers: &HeaderMap,
-) -> Result<(OwnedSemaphorePermit, Room), ApiError> {
-    let permit = upload::place(app)?;
-    Ok((permit, upload::admit(app, access, headers).await?))
+) -> Result<(OwnedSemaphorePermit, Reservation), ApiError> {
+    let slot = app.admission.slot()?;
+    let length = headers.typed_get::<ContentLength>().map_or(0, |length| length.0);
+    app.admission.check_length(access, length).await?;
+    Ok((slot, app.admission.reserve(length).await?))
 }
 
 /// Lets the client come to the end of a small body, so that it gets to see the refusal.
@@ -88,7 +92,11 @@ fn is_form(headers: &HeaderMap) -> bool {
     kind.is_some_and(|kind| kind.trim_start().to_ascii_lowercase().starts_with("multipart/"))
 }
 
-async fn receive_form(app: &App, room: Room, request: Request) -> Result<StagedBlob, ApiError> {
+async fn receive_form(
+    app: &App,
+    room: Reservation,
+    request: Request,
+) -> Result<StagedBlob, ApiError> {
     let malformed = |text: String| ApiError::new(Code::MalformedRequest, text);
     let mut form = Multipart::from_request(request, app)
         .await
@@ -103,7 +111,7 @@ async fn receive_form(app: &App, room: Room, request: Request) -> Result<StagedB
 
 async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response, ApiError> {
     // Again, for an upload that did not say its length before.
-    admission::check_length(app, access, staged.size()).await?;
+    app.admission.check_length(access, staged.size()).await?;
     let (blob, new) = app.store.store_upload(&access.lab, access.token, staged).await?;
     let status = if new { StatusCode::CREATED } else { StatusCode::OK };
     let location = [(header::LOCATION, format!("/v1/blobs/{}", blob.sha256))];

@@ -30,7 +30,6 @@ pub(super) struct CalibrationRequest {
     captures: Option<Captures>,
 }
 
-/// The query of the list.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
@@ -153,7 +152,7 @@ async fn of_masks(
     masks: Sha256,
     full_scale: Option<f32>,
 ) -> Result<CalibrationBody, ApiError> {
-    app.store.upload(lab, masks).await.map_err(|error| missing("/masks", error))?;
+    app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
     let prepared =
         intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
     let prepared = prepared.await?;
@@ -170,7 +169,7 @@ async fn of_captures(
 ) -> Result<CalibrationBody, ApiError> {
     captures.check().map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     for (place, upload) in captures.uploads() {
-        app.store.upload(lab, upload).await.map_err(|error| missing(&place, error))?;
+        app.store.upload(lab, upload).await.map_err(|error| ApiError::reference(&place, error))?;
     }
     let captures = intake::run(app, move |store, limits| {
         check_sizes(&captures.map(|upload| store.dir().blob(upload)), limits)?;
@@ -206,14 +205,6 @@ fn facts(
         mask_mean: found.mean,
         dead_pixels: found.dead_pixels,
         clipped_negatives: found.clipped_negative,
-    }
-}
-
-/// An upload or calibration that a body names and that is not there is an error of the body.
-pub(super) fn missing(pointer: &str, error: crate::store::StoreError) -> ApiError {
-    match error {
-        crate::store::StoreError::NotFound { .. } => ApiError::field(pointer, error.to_string()),
-        error => error.into(),
     }
 }
 

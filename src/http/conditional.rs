@@ -2,6 +2,7 @@
 
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use headers::{ETag, HeaderMapExt, IfNoneMatch};
 use serde::Serialize;
 
 use super::error::ApiError;
@@ -14,23 +15,25 @@ pub(super) fn etag(sha256: &Sha256) -> String {
 
 /// True if the client has the content with this ETag (`If-None-Match`, compared weakly).
 pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
-    let tags =
-        headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
-    tags.flat_map(|list| list.split(','))
-        .map(str::trim)
-        .any(|tag| tag == "*" || tag.strip_prefix("W/").unwrap_or(tag) == etag)
+    match (headers.typed_get::<IfNoneMatch>(), etag.parse::<ETag>()) {
+        (Some(known), Ok(etag)) => !known.precondition_passes(&etag),
+        _ => false,
+    }
 }
 
-/// A body with its ETag, or word that the client has it.
-pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
-    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
-    let etag = etag(&Sha256::of(&text));
+/// Content with its ETag, or word that the client has it.
+pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -> Response {
+    let etag = etag(&Sha256::of(&bytes));
     let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
     if is_known(headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
+        return (StatusCode::NOT_MODIFIED, tags).into_response();
     }
-    let kind = [(header::CONTENT_TYPE, "application/json")];
-    Ok((tags, kind, text).into_response())
+    (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response()
+}
+
+pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
+    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
+    Ok(content(headers, "application/json", text))
 }
 
 /// What part of a file is asked for.

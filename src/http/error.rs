@@ -58,94 +58,43 @@ static CHECKSUM_STATUS: LazyLock<StatusCode> =
 impl Code {
     /// The table: status, stable name, title, and whether the same request may succeed later.
     #[must_use]
+    #[rustfmt::skip]
     pub fn row(self) -> (StatusCode, &'static str, &'static str, bool) {
         use StatusCode as S;
         match self {
-            Self::MalformedJson => {
-                (S::BAD_REQUEST, "malformed_json", "The body is not JSON", false)
-            }
-            Self::MalformedRequest => {
-                (S::BAD_REQUEST, "malformed_request", "The request can't be read", false)
-            }
-            Self::InvalidQuery => {
-                (S::BAD_REQUEST, "invalid_query", "A query parameter is wrong", false)
-            }
+            Self::MalformedJson => (S::BAD_REQUEST, "malformed_json", "The body is not JSON", false),
+            Self::MalformedRequest => (S::BAD_REQUEST, "malformed_request", "The request can't be read", false),
+            Self::InvalidQuery => (S::BAD_REQUEST, "invalid_query", "A query parameter is wrong", false),
             Self::EmptyBody => (S::BAD_REQUEST, "empty_body", "The body is empty", false),
             Self::Unauthorized => (S::UNAUTHORIZED, "unauthorized", "Who is there?", false),
             Self::Forbidden => (S::FORBIDDEN, "forbidden", "The token does not allow it", false),
             Self::NotFound => (S::NOT_FOUND, "not_found", "There is no such thing", false),
             Self::NotReady => (S::NOT_FOUND, "not_ready", "It is not there yet", true),
-            Self::CalibrationNotReady => {
-                (S::CONFLICT, "calibration_not_ready", "The masks are not there", true)
-            }
-            Self::MethodNotAllowed => {
-                (S::METHOD_NOT_ALLOWED, "method_not_allowed", "Not with this method", false)
-            }
-            Self::UploadStalled => {
-                (S::REQUEST_TIMEOUT, "upload_stalled", "The upload came to a halt", true)
-            }
-            Self::OffsetMismatch => {
-                (S::CONFLICT, "offset_mismatch", "The piece does not follow", false)
-            }
-            Self::TusVersion => {
-                (S::PRECONDITION_FAILED, "tus_version", "Not in this version of tus", false)
-            }
+            Self::CalibrationNotReady => (S::CONFLICT, "calibration_not_ready", "The masks are not there", true),
+            Self::MethodNotAllowed => (S::METHOD_NOT_ALLOWED, "method_not_allowed", "Not with this method", false),
+            Self::UploadStalled => (S::REQUEST_TIMEOUT, "upload_stalled", "The upload came to a halt", true),
+            Self::OffsetMismatch => (S::CONFLICT, "offset_mismatch", "The piece does not follow", false),
+            Self::TusVersion => (S::PRECONDITION_FAILED, "tus_version", "Not in this version of tus", false),
             Self::UploadBusy => (S::LOCKED, "upload_busy", "Another request is at it", true),
-            Self::UploadDamaged => {
-                (S::GONE, "upload_damaged", "Bytes of the upload are lost", false)
-            }
-            Self::ChecksumMismatch => {
-                (*CHECKSUM_STATUS, "checksum_mismatch", "The piece has come damaged", true)
-            }
+            Self::UploadDamaged => (S::GONE, "upload_damaged", "Bytes of the upload are lost", false),
+            Self::ChecksumMismatch => (*CHECKSUM_STATUS, "checksum_mismatch", "The piece has come damaged", true),
             Self::InUse => (S::CONFLICT, "in_use", "Something else needs it", false),
             Self::IllegalState => (S::CONFLICT, "illegal_state", "Not in this state", false),
             Self::TooLarge => (S::PAYLOAD_TOO_LARGE, "too_large", "The body is too large", false),
-            Self::UnsupportedMediaType => (
-                S::UNSUPPORTED_MEDIA_TYPE,
-                "unsupported_media_type",
-                "Not in this media type",
-                false,
-            ),
-            Self::RangeNotSatisfiable => {
-                (S::RANGE_NOT_SATISFIABLE, "range_not_satisfiable", "The range is outside", false)
-            }
-            Self::InvalidRequest => {
-                (S::UNPROCESSABLE_ENTITY, "invalid_request", "The request does not fit", false)
-            }
-            Self::InvalidContent => {
-                (S::UNPROCESSABLE_ENTITY, "invalid_content", "The file does not fit", false)
-            }
-            Self::SizeMismatch => {
-                (S::UNPROCESSABLE_ENTITY, "size_mismatch", "The sizes do not fit", false)
-            }
-            Self::HashMismatch => {
-                (S::UNPROCESSABLE_ENTITY, "hash_mismatch", "The bytes are not those named", true)
-            }
-            Self::IdempotencyKeyReused => (
-                S::UNPROCESSABLE_ENTITY,
-                "idempotency_key_reused",
-                "The key was used for another request",
-                false,
-            ),
-            Self::TooManyUploads => {
-                (S::TOO_MANY_REQUESTS, "too_many_uploads", "Too many uploads at once", true)
-            }
+            Self::UnsupportedMediaType => (S::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", "Not in this media type", false),
+            Self::RangeNotSatisfiable => (S::RANGE_NOT_SATISFIABLE, "range_not_satisfiable", "The range is outside", false),
+            Self::InvalidRequest => (S::UNPROCESSABLE_ENTITY, "invalid_request", "The request does not fit", false),
+            Self::InvalidContent => (S::UNPROCESSABLE_ENTITY, "invalid_content", "The file does not fit", false),
+            Self::SizeMismatch => (S::UNPROCESSABLE_ENTITY, "size_mismatch", "The sizes do not fit", false),
+            Self::HashMismatch => (S::UNPROCESSABLE_ENTITY, "hash_mismatch", "The bytes are not those named", true),
+            Self::IdempotencyKeyReused => (S::UNPROCESSABLE_ENTITY, "idempotency_key_reused", "The key was used for another request", false),
+            Self::TooManyUploads => (S::TOO_MANY_REQUESTS, "too_many_uploads", "Too many uploads at once", true),
             Self::QueueFull => (S::TOO_MANY_REQUESTS, "queue_full", "Enough jobs wait", true),
-            Self::Internal => {
-                (S::INTERNAL_SERVER_ERROR, "internal", "The service has failed", true)
-            }
-            Self::Unavailable => {
-                (S::SERVICE_UNAVAILABLE, "unavailable", "The service can't serve this now", true)
-            }
-            Self::TimedOut => {
-                (S::SERVICE_UNAVAILABLE, "timed_out", "The answer took too long", true)
-            }
-            Self::InsufficientStorage => {
-                (S::INSUFFICIENT_STORAGE, "insufficient_storage", "The disk is full", true)
-            }
-            Self::QuotaExceeded => {
-                (S::INSUFFICIENT_STORAGE, "quota_exceeded", "The token's limit is reached", false)
-            }
+            Self::Internal => (S::INTERNAL_SERVER_ERROR, "internal", "The service has failed", true),
+            Self::Unavailable => (S::SERVICE_UNAVAILABLE, "unavailable", "The service can't serve this now", true),
+            Self::TimedOut => (S::SERVICE_UNAVAILABLE, "timed_out", "The answer took too long", true),
+            Self::InsufficientStorage => (S::INSUFFICIENT_STORAGE, "insufficient_storage", "The disk is full", true),
+            Self::QuotaExceeded => (S::INSUFFICIENT_STORAGE, "quota_exceeded", "The token's limit is reached", false),
         }
     }
 }
@@ -195,6 +144,15 @@ impl ApiError {
     /// A request with one field that is wrong.
     pub fn field(pointer: &str, detail: impl Into<String>) -> Self {
         Self::fields(Code::InvalidRequest, vec![InvalidField::new(pointer, detail)])
+    }
+
+    /// What a request names and is not there is an error of the request.
+    #[must_use]
+    pub fn reference(pointer: &str, error: StoreError) -> Self {
+        match error {
+            StoreError::NotFound { .. } => Self::field(pointer, error.to_string()),
+            error => error.into(),
+        }
     }
 
     /// The same error with the place in the request.

@@ -18,7 +18,6 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
-use super::app::App;
 use super::error::{ApiError, Code};
 use crate::job::{JobId, Lab};
 use crate::store::{JobMark, Store};
@@ -26,7 +25,7 @@ use crate::store::{JobMark, Store};
 /// Time between two looks.
 const LOOK: Duration = Duration::from_secs(1);
 /// Listeners at the same time: each holds a connection.
-const PLACES: usize = 128;
+const LISTENERS: usize = 128;
 /// The most jobs that an event names; beyond that a list is cheaper to read again.
 const NAMED: usize = 200;
 
@@ -41,17 +40,17 @@ struct Change {
     more: bool,
 }
 
-/// Marks of jobs, and whose they are.
-type Marks = HashMap<(Lab, JobId), JobMark>;
+/// The version of each job, by lab and job.
+type Versions = HashMap<(Lab, JobId), JobMark>;
 
 /// What the listeners of each lab are told, as JSON.
 type Changes = Arc<HashMap<Lab, String>>;
 
-/// Those who listen.
-#[derive(Debug)]
+/// The stream of changes to which listeners subscribe.
+#[derive(Debug, Clone)]
 pub(super) struct Events {
     sender: broadcast::Sender<Changes>,
-    places: Arc<Semaphore>,
+    slots: Arc<Semaphore>,
     closing: CancellationToken,
 }
 
@@ -60,12 +59,12 @@ impl Events {
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
         tokio::spawn(closing.clone().run_until_cancelled_owned(look(store, sender.clone())));
-        Self { sender, places: Arc::new(Semaphore::new(PLACES)), closing }
+        Self { sender, slots: Arc::new(Semaphore::new(LISTENERS)), closing }
     }
 }
 
 async fn look(store: Store, sender: broadcast::Sender<Changes>) {
-    let mut before: Option<Marks> = None;
+    let mut before: Option<Versions> = None;
     let mut tick = tokio::time::interval(LOOK);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
@@ -90,9 +89,9 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
 }
 
 /// What differs, for each lab for which anything does.
-fn changes(before: &Marks, now: &Marks) -> HashMap<Lab, String> {
+fn changes(before: &Versions, now: &Versions) -> HashMap<Lab, String> {
     let mut changes: HashMap<&Lab, Change> = HashMap::new();
-    for ((lab, job), _) in now.iter().filter(|(id, mark)| before.get(id) != Some(mark)) {
+    for ((lab, job), _) in now.iter().filter(|(id, version)| before.get(id) != Some(version)) {
         changes.entry(lab).or_default().changed.push(*job);
     }
     for (lab, job) in before.keys().filter(|id| !now.contains_key(id)) {
@@ -102,7 +101,7 @@ fn changes(before: &Marks, now: &Marks) -> HashMap<Lab, String> {
 }
 
 /// Has every lab that has jobs read its list again.
-fn everything(now: &Marks) -> HashMap<Lab, String> {
+fn everything(now: &Versions) -> HashMap<Lab, String> {
     let labs: HashSet<&Lab> = now.keys().map(|(lab, _)| lab).collect();
     told(labs.into_iter().map(|lab| (lab, Change { more: true, ..Change::default() })))
 }
@@ -126,16 +125,19 @@ impl Change {
 }
 
 /// `GET /v1/events`
-pub(super) async fn listen(State(app): State<App>, access: Access) -> Result<Response, ApiError> {
-    let place = app.events.places.clone().try_acquire_owned().map_err(|_| {
+pub(super) async fn listen(
+    State(events): State<Events>,
+    access: Access,
+) -> Result<Response, ApiError> {
+    let slot = events.slots.clone().try_acquire_owned().map_err(|_| {
         ApiError::new(Code::Unavailable, "all places for listeners are taken; poll instead")
     })?;
     let listener = Listener {
         lab: access.lab,
-        receiver: app.events.sender.subscribe(),
-        closing: app.events.closing.clone(),
+        receiver: events.sender.subscribe(),
+        closing: events.closing.clone(),
         greeted: false,
-        _place: place,
+        _slot: slot,
     };
     let events = stream::unfold(listener, Listener::next);
     // Proxies must not gather events into larger packets.
@@ -148,7 +150,7 @@ struct Listener {
     receiver: broadcast::Receiver<Changes>,
     closing: CancellationToken,
     greeted: bool,
-    _place: OwnedSemaphorePermit,
+    _slot: OwnedSemaphorePermit,
 }
 
 impl Listener {

@@ -54,7 +54,6 @@ where
     }
 }
 
-/// A JSON body.
 #[derive(Debug)]
 pub(super) struct Body<T>(pub(super) T);
 

@@ -7,9 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::access::Access;
-use super::admission;
 use super::app::App;
-use super::calibrations::missing;
 use super::conditional;
 use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf, idempotency_key};
@@ -20,7 +18,6 @@ use crate::job::{
 };
 use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
 
-/// A job as it is shown.
 #[derive(Debug, Serialize)]
 pub(super) struct JobBody {
     id: JobId,
@@ -84,7 +81,6 @@ impl JobBody {
     }
 }
 
-/// The query of the list.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
@@ -132,8 +128,8 @@ async fn insert(
         return Ok(Inserted::Before(job));
     }
     let spec = resolve(app, &lab, request).await?;
-    admission::check_room(app, "the job", spec.disk_bytes()).await?;
-    let most_jobs = app.max_jobs;
+    app.admission.check_room("the job", spec.disk_bytes()).await?;
+    let most_jobs = app.settings.max_jobs;
     let new = NewJob { most_jobs, lab, spec, request: hash, idempotency_key };
     Ok(app.store.add_job(new).await?)
 }
@@ -141,9 +137,10 @@ async fn insert(
 /// Checks a request against the measurement that it names.
 async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, ApiError> {
     let measurement = app.store.measurement(lab, request.measurement).await;
-    let measurement = measurement.map_err(|error| missing("/measurement", error))?.facts;
+    let measurement =
+        measurement.map_err(|error| ApiError::reference("/measurement", error))?.facts;
     let calibration = app.store.calibration(lab, measurement.calibration).await;
-    let calibration = calibration.map_err(|error| missing("/measurement", error))?;
+    let calibration = calibration.map_err(|error| ApiError::reference("/measurement", error))?;
     let shape = SceneShape {
         frames: calibration.facts.frames,
         height: measurement.height,
@@ -154,7 +151,7 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, A
         None => None,
         Some(id) => {
             let model = app.store.model(lab, id).await;
-            Some(model.map_err(|error| missing("/model", error))?.into())
+            Some(model.map_err(|error| ApiError::reference("/model", error))?.into())
         }
     };
     let resolved = request.resolve(calibration.id, shape, model);
@@ -173,7 +170,7 @@ fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding>
 
 /// Refuses a job that no worker could do.
 fn check_memory(app: &App, spec: &JobSpec) -> Result<(), ApiError> {
-    let (needed, allowed) = (spec.worker_bytes() >> 20, app.worker_memory_bytes >> 20);
+    let (needed, allowed) = (spec.worker_bytes() >> 20, app.settings.worker_memory_bytes >> 20);
     if needed <= allowed {
         return Ok(());
     }

@@ -3,7 +3,7 @@
 use std::any::Any;
 use std::time::Instant;
 
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{MatchedPath, Request};
 use axum::http::{HeaderName, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -11,7 +11,6 @@ use tracing::Instrument;
 use tracing::field::Empty;
 use uuid::Uuid;
 
-use super::app::App;
 use super::error::{ApiError, Code};
 use super::metrics;
 
@@ -70,17 +69,10 @@ fn new_id() -> HeaderValue {
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static("unknown"))
 }
 
-/// Gives up on an answer that takes too long.
-pub(super) async fn timeout(State(app): State<App>, request: Request, next: Next) -> Response {
-    match tokio::time::timeout(app.request_time, next.run(request)).await {
-        Ok(response) => response,
-        Err(_) => {
-            let seconds = app.request_time.as_secs();
-            tracing::warn!(seconds, "an answer took too long");
-            let detail = format!("there was no answer within {seconds} seconds");
-            ApiError::new(Code::TimedOut, detail).into_response()
-        }
-    }
+/// The answer to a request that takes too long.
+pub(super) fn timed_out(seconds: u64) -> ApiError {
+    tracing::warn!(seconds, "an answer took too long");
+    ApiError::new(Code::TimedOut, format!("there was no answer within {seconds} seconds"))
 }
 
 /// After an upload that was refused on the way the connection still holds the rest of its body; a

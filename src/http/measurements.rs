@@ -8,7 +8,6 @@ use serde::Deserialize;
 
 use super::access::Access;
 use super::app::App;
-use super::calibrations::missing;
 use super::error::{ApiError, Code};
 use super::extract::{Body, Params, QueryOf};
 use super::intake::{self, Prepared};
@@ -41,7 +40,6 @@ pub(super) struct MeasurementRequest {
     exposure_s: Option<f64>,
 }
 
-/// The query of the list.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
@@ -60,11 +58,14 @@ pub(super) async fn create(
     check_times(&request)?;
     let (data, full_scale) = (request.data, request.full_scale);
     let calibration = app.store.calibration(&access.lab, request.calibration).await;
-    let calibration = calibration.map_err(|error| missing("/calibration", error))?;
-    app.store.upload(&access.lab, data).await.map_err(|error| missing("/data", error))?;
+    let calibration = calibration.map_err(|error| ApiError::reference("/calibration", error))?;
+    app.store
+        .upload(&access.lab, data)
+        .await
+        .map_err(|error| ApiError::reference("/data", error))?;
     for (index, dark) in request.dark.iter().enumerate() {
         let there = app.store.upload(&access.lab, *dark).await;
-        there.map_err(|error| missing(&format!("/dark/{index}"), error))?;
+        there.map_err(|error| ApiError::reference(&format!("/dark/{index}"), error))?;
     }
     let exposure = Exposure {
         dark: request.dark.iter().map(|dark| app.store.dir().blob(dark)).collect(),

@@ -1,20 +1,10 @@
-//! `/metrics`: what Prometheus reads. Requests are counted as they go by; what stands in the store
-//! is read when it is asked for.
+//! The figures of this process for Prometheus. Requests are counted as they go by.
 
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use axum::extract::State;
-use axum::http::header;
-use axum::response::{IntoResponse, Response};
-use metrics::{
-    Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge, histogram,
-};
+use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogram, histogram};
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
-
-use super::app::App;
-use super::error::ApiError;
-use crate::job::JobState;
 
 const REQUEST_SECONDS: &str = "sci_recon_http_request_duration_seconds";
 const BUCKETS: [f64; 10] = [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0, 30.0];
@@ -43,6 +33,11 @@ impl Metrics {
     /// Folds what was observed into the histograms; to be called every few seconds.
     pub fn upkeep(&self) {
         self.0.run_upkeep();
+    }
+
+    /// What Prometheus reads.
+    pub(super) fn render(&self) -> String {
+        self.0.render()
     }
 }
 
@@ -76,38 +71,4 @@ pub(super) fn observe(method: &str, route: &str, status: u16, took: Duration) {
         "status" => status.to_string())
     .increment(1);
     histogram!(REQUEST_SECONDS, "method" => method, "route" => route).record(took.as_secs_f64());
-}
-
-/// `GET /metrics`
-#[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
-pub(super) async fn show(State(app): State<App>) -> Result<Response, ApiError> {
-    let counted = app.store.job_counts().await?;
-    for state in JobState::ALL {
-        let jobs = counted.iter().find(|(found, _)| *found == state).map_or(0, |(_, jobs)| *jobs);
-        gauge!("sci_recon_jobs", "state" => state.name()).set(jobs as f64);
-    }
-    for ((kind, state), count) in app.store.task_counts().await? {
-        gauge!("sci_recon_tasks", "kind" => kind, "state" => state.name()).set(count as f64);
-    }
-    for done in app.store.totals().await? {
-        let kind = || done.kind.clone();
-        counter!("sci_recon_tasks_done_total", "kind" => kind()).absolute(done.tasks);
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // whole seconds will do
-        counter!("sci_recon_task_seconds_total", "kind" => kind()).absolute(done.seconds as u64);
-        if done.kind == "tile" {
-            counter!("sci_recon_solver_iterations_total").absolute(done.iterations);
-            counter!("sci_recon_denoiser_passes_total").absolute(done.passes);
-        }
-    }
-    gauge!("sci_recon_disk_promised_bytes").set(app.store.promised_bytes().await? as f64);
-    let workers = app.store.live_workers(Duration::from_secs(15)).await?.len();
-    gauge!("sci_recon_workers").set(workers as f64);
-    let (files, bytes) = app.store.blob_totals().await?;
-    gauge!("sci_recon_blobs").set(files as f64);
-    gauge!("sci_recon_blob_bytes").set(bytes as f64);
-    let (free, size) = app.store.dir().disk()?;
-    gauge!("sci_recon_disk_free_bytes").set(free as f64);
-    gauge!("sci_recon_disk_size_bytes").set(size as f64);
-    let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
-    Ok((kind, app.metrics.0.render()).into_response())
 }

@@ -14,7 +14,6 @@ mod dashboard;
 pub mod error;
 mod events;
 mod extract;
-mod health;
 mod intake;
 mod jobs;
 mod layers;

@@ -1,17 +1,16 @@
 //! The check of a network, in a process of its own: it runs native code on what a stranger has sent,
 //! and may crash, hang, or take all memory.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
 use tokio::process::Command;
 use tokio::sync::Semaphore;
 
-use super::app::App;
 use super::error::{ApiError, Code};
 use crate::config::{EngineArguments, ServeArguments};
-use crate::job::{ModelFacts, ModelVerdict, Sha256, without_paths};
+use crate::job::{ModelFacts, ModelVerdict, without_paths};
 use crate::store::NewCalibration;
 
 /// The longest check: loading the network and one run.
@@ -38,9 +37,9 @@ impl Checker {
         }
     }
 
-    fn command(&self, app: &App, file: &Sha256, masks: &NewCalibration) -> Option<Command> {
+    fn command(&self, file: &Path, masks: &NewCalibration) -> Option<Command> {
         let mut command = Command::new(self.program.as_ref()?);
-        command.arg("check-model").arg(app.store.dir().blob(file));
+        command.arg("check-model").arg(file);
         for (name, value) in
             [("--frames", masks.frames), ("--height", masks.height), ("--width", masks.width)]
         {
@@ -57,46 +56,45 @@ impl Checker {
         command.stdin(Stdio::null()).kill_on_drop(true);
         Some(command)
     }
-}
 
-/// Checks whether an upload is a network for these masks, and runs it once; one check at a time.
-///
-/// # Errors
-/// 422 with what it has and what is needed; 503 if no network can be run here.
-pub(super) async fn check(
-    app: &App,
-    file: &Sha256,
-    masks: &NewCalibration,
-) -> Result<ModelFacts, ApiError> {
-    let unavailable = |why: &str| ApiError::new(Code::Unavailable, why);
-    let stopped = |_| unavailable("the service is shutting down");
-    let _permit = app.checker.turn.acquire().await.map_err(stopped)?;
-    let mut command = app
-        .checker
-        .command(app, file, masks)
-        .ok_or_else(|| unavailable("the service can't start the check of a network"))?;
-    let refused =
-        |why: String| ApiError::new(Code::InvalidContent, without_paths(&why)).at("/file");
-    let output = match tokio::time::timeout(TIME, command.output()).await {
-        Ok(output) => output.map_err(|error| ApiError::internal(&error))?,
-        Err(_) => {
-            let seconds = TIME.as_secs();
-            return Err(refused(format!("one run of the network takes more than {seconds} s")));
+    /// Checks whether an upload is a network for these masks, and runs it once; one check at a time.
+    ///
+    /// # Errors
+    /// 422 with what it has and what is needed; 503 if no network can be run here.
+    pub(super) async fn check(
+        &self,
+        file: &Path,
+        masks: &NewCalibration,
+    ) -> Result<ModelFacts, ApiError> {
+        let unavailable = |why: &str| ApiError::new(Code::Unavailable, why);
+        let stopped = |_| unavailable("the service is shutting down");
+        let _permit = self.turn.acquire().await.map_err(stopped)?;
+        let mut command = self
+            .command(file, masks)
+            .ok_or_else(|| unavailable("the service can't start the check of a network"))?;
+        let refused =
+            |why: String| ApiError::new(Code::InvalidContent, without_paths(&why)).at("/file");
+        let output = match tokio::time::timeout(TIME, command.output()).await {
+            Ok(output) => output.map_err(|error| ApiError::internal(&error))?,
+            Err(_) => {
+                let seconds = TIME.as_secs();
+                return Err(refused(format!("one run of the network takes more than {seconds} s")));
+            }
+        };
+        if let Some(how) = killed(output.status) {
+            return Err(refused(format!(
+                "the network ended the process that tried it ({how}); it may take {} MiB of memory",
+                self.memory_bytes >> 20
+            )));
         }
-    };
-    if let Some(how) = killed(output.status) {
-        return Err(refused(format!(
-            "the network ended the process that tried it ({how}); it may take {} MiB of memory",
-            app.worker_memory_bytes >> 20
-        )));
-    }
-    match serde_json::from_slice(&output.stdout) {
-        Ok(ModelVerdict::Fits(facts)) => Ok(facts),
-        Ok(ModelVerdict::Refused(why)) => Err(refused(why)),
-        Err(_) => {
-            let said = String::from_utf8_lossy(&output.stderr);
-            tracing::error!(%said, status = %output.status, "a network can't be checked");
-            Err(unavailable("the service can't run networks now; its log says why"))
+        match serde_json::from_slice(&output.stdout) {
+            Ok(ModelVerdict::Fits(facts)) => Ok(facts),
+            Ok(ModelVerdict::Refused(why)) => Err(refused(why)),
+            Err(_) => {
+                let said = String::from_utf8_lossy(&output.stderr);
+                tracing::error!(%said, status = %output.status, "a network can't be checked");
+                Err(unavailable("the service can't run networks now; its log says why"))
+            }
         }
     }
 }

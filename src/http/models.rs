@@ -8,10 +8,8 @@ use serde::Deserialize;
 
 use super::access::Access;
 use super::app::App;
-use super::calibrations::missing;
 use super::error::ApiError;
 use super::extract::{Body, Params, QueryOf};
-use super::model_check;
 use super::page::{Limit, PageBody};
 use crate::job::{CalibrationId, Label, ModelId, Sha256};
 use crate::store::{Model, ModelFilter, NewModel};
@@ -27,7 +25,6 @@ pub(super) struct ModelRequest {
     file: Sha256,
 }
 
-/// The query of the list.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
@@ -45,9 +42,12 @@ pub(super) async fn create(
 ) -> Result<Response, ApiError> {
     let ModelRequest { name, calibration, file } = request;
     let found = app.store.calibration(&access.lab, calibration).await;
-    let masks = found.map_err(|error| missing("/calibration", error))?.facts;
-    app.store.upload(&access.lab, file).await.map_err(|error| missing("/file", error))?;
-    let facts = model_check::check(&app, &file, &masks).await?;
+    let masks = found.map_err(|error| ApiError::reference("/calibration", error))?.facts;
+    app.store
+        .upload(&access.lab, file)
+        .await
+        .map_err(|error| ApiError::reference("/file", error))?;
+    let facts = app.checker.check(&app.store.dir().blob(&file), &masks).await?;
     let new = NewModel { name, calibration, file, facts };
     let model = app.store.add_model(&access.lab, new).await?;
     let location = [(header::LOCATION, format!("/v1/models/{}", model.id))];

@@ -37,7 +37,6 @@ impl Limit {
     }
 }
 
-/// A page as JSON.
 #[derive(Debug, Serialize)]
 pub(super) struct PageBody<T> {
     items: Vec<T>,

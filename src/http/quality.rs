@@ -22,7 +22,6 @@ use crate::job::{JobId, SceneShape, Sha256};
 use crate::pipeline::quality::{FrameQuality, Quality};
 use crate::store::{Job, StoreError};
 
-/// The query.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct QualityQuery {
@@ -32,7 +31,6 @@ pub(super) struct QualityQuery {
     full_scale: Option<f32>,
 }
 
-/// The figures as they are shown.
 #[derive(Debug, Serialize)]
 struct QualityBody {
     truth: Sha256,

@@ -1,8 +1,8 @@
 //! `/v1/calibrations/{calibration}/report.json`, `report.html` and `maps/{name}.png`.
 
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::{HeaderMap, header};
+use axum::response::Response;
 
 use super::access::Access;
 use super::app::App;
@@ -10,7 +10,7 @@ use super::conditional;
 use super::error::{ApiError, Code};
 use super::extract::Params;
 use crate::intake::report_page;
-use crate::job::{CalibrationId, CalibrationReport, Lab, Sha256};
+use crate::job::{CalibrationId, CalibrationReport, Lab};
 
 /// What the browser may load: our own style and pictures, and no script at all.
 const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
@@ -24,8 +24,7 @@ pub(super) async fn json(
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let report = report(&app, &access.lab, id).await?;
-    let text = serde_json::to_vec(&report).map_err(|error| ApiError::internal(&error))?;
-    Ok(known(&headers, "application/json", text))
+    conditional::json(&report, &headers)
 }
 
 /// `GET /v1/calibrations/{calibration}/report.html`
@@ -39,7 +38,7 @@ pub(super) async fn html(
     let name = app.store.calibration(&access.lab, id).await?.facts.name;
     let title = name.map_or_else(|| id.to_string(), |name| name.as_str().to_owned());
     let text = report_page(&title, &report).into_bytes();
-    let mut response = known(&headers, "text/html; charset=utf-8", text);
+    let mut response = conditional::content(&headers, "text/html; charset=utf-8", text);
     let policy = header::HeaderValue::from_static(POLICY);
     response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
     Ok(response)
@@ -60,7 +59,7 @@ pub(super) async fn map(
         ApiError::new(Code::NotFound, format!("there is no such map; the maps are {names:?}"))
     };
     let png = app.store.map(id, plain.ok_or_else(missing)?).await?;
-    Ok(known(&headers, "image/png", png.ok_or_else(missing)?))
+    Ok(conditional::content(&headers, "image/png", png.ok_or_else(missing)?))
 }
 
 /// The report, if it is made.
@@ -70,14 +69,4 @@ async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationRe
     let not_yet =
         || ApiError::new(Code::NotReady, "the report is not made yet; ask again in a moment");
     app.store.report(id).await?.ok_or_else(not_yet)
-}
-
-/// Content with its ETag, or 304 for who has it.
-fn known(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -> Response {
-    let etag = conditional::etag(&Sha256::of(&bytes));
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
-    if conditional::is_known(headers, &etag) {
-        return (StatusCode::NOT_MODIFIED, tags).into_response();
-    }
-    (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response()
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tokio::fs::File;
@@ -21,7 +21,6 @@ use super::jobs::with_snapshot;
 use crate::job::{JobId, ResultFile};
 use crate::store::{Job, StoreError};
 
-/// The files of a snapshot.
 #[derive(Debug, Serialize)]
 pub(super) struct SnapshotBody {
     snapshot: u32,
@@ -30,7 +29,6 @@ pub(super) struct SnapshotBody {
     files: Vec<FileBody>,
 }
 
-/// A file as it is shown.
 #[derive(Debug, Serialize)]
 struct FileBody {
     #[serde(flatten)]
@@ -74,37 +72,18 @@ pub(super) async fn job_manifest(
     send(&app, &job, None, "manifest.json", &headers).await
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/manifest.json`
-pub(super) async fn manifest(
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr` or
+/// `frames.npy`, as the routes have them.
+pub(super) async fn file(
     State(app): State<App>,
     access: Access,
     Params((job, snapshot)): Params<(JobId, u32)>,
+    uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
-    send(&app, &job, Some(snapshot), "manifest.json", &headers).await
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/stack.exr`
-pub(super) async fn stack(
-    State(app): State<App>,
-    access: Access,
-    Params((job, snapshot)): Params<(JobId, u32)>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
-    send(&app, &job, Some(snapshot), "stack.exr", &headers).await
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames.npy`
-pub(super) async fn array(
-    State(app): State<App>,
-    access: Access,
-    Params((job, snapshot)): Params<(JobId, u32)>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
-    send(&app, &job, Some(snapshot), "frames.npy", &headers).await
+    let name = uri.path().rsplit('/').next().unwrap_or_default();
+    send(&app, &job, Some(snapshot), name, &headers).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}`, where the frame is `1.exr` or `1.png`.

@@ -1,17 +1,20 @@
 //! The routes: the table of contents of the API. `openapi.yaml` has the same ones; a test sees to it.
 
-use axum::Router;
+use axum::error_handling::HandleErrorLayer;
 use axum::extract::DefaultBodyLimit;
 use axum::handler::Handler;
 use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::routing::{MethodFilter, MethodRouter, on};
+use axum::{BoxError, Router};
+use tower::ServiceBuilder;
 use tower_http::catch_panic::CatchPanicLayer;
 
 use super::access::{self, Rule};
 use super::app::App;
+use super::pictures::{OfCalibration, OfJob, OfMeasurement};
 use super::{
-    algorithms, blobs, calibrations, dashboard, events, health, jobs, layers, measurements,
-    metrics, models, pictures, quality, reports, results, system, tiles, tus,
+    algorithms, blobs, calibrations, dashboard, events, jobs, layers, measurements, models,
+    pictures, quality, reports, results, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -43,40 +46,42 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/retry").post(jobs::retry),
         R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}").get(results::snapshot),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::manifest),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::stack),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::array),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::file),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::file),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::file),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::job_preview),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::job_spread),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::job_tile),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}").get(pictures::measurement_preview),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}/spread").get(pictures::measurement_spread),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::measurement_tile),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}").get(pictures::calibration_preview),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::calibration_spread),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::calibration_tile),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>),
         R::at("/v1/events").get(events::listen).slow(),
         R::at("/v1/system").get(system::show).only(Rule::Admin),
         R::at("/").get(dashboard::page).only(Rule::Public),
         R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
-        R::at("/livez").get(health::live).only(Rule::Public),
-        R::at("/readyz").get(health::ready).only(Rule::Public),
-        R::at("/metrics").get(metrics::show).only(Rule::Admin),
-        R::at("/openapi.yaml").get(health::contract).only(Rule::Public),
+        R::at("/livez").get(system::live).only(Rule::Public),
+        R::at("/readyz").get(system::ready).only(Rule::Public),
+        R::at("/metrics").get(system::metrics).only(Rule::Admin),
+        R::at("/openapi.yaml").get(system::contract).only(Rule::Public),
     ]
 }
 
 /// The router with all routes and layers.
 pub fn router(app: App) -> Router {
-    let timeout = from_fn_with_state(app.clone(), layers::timeout);
+    let seconds = app.settings.request_seconds;
+    let late = HandleErrorLayer::new(move |_: BoxError| async move { layers::timed_out(seconds) });
+    let timeout = ServiceBuilder::new().layer(late).timeout(app.settings.request_time());
     let close = map_response(layers::close_after_refusal);
     let mut router = Router::new();
     for route in routes() {
-        let guard = from_fn_with_state((app.clone(), route.rule), access::guard);
+        let guard = from_fn_with_state((app.store.clone(), route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let handlers = handlers.route_layer(guard);

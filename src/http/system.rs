@@ -1,10 +1,14 @@
-//! `/v1/system`: what the service is and how busy it is, for people.
+//! What the service is and how it is: `/v1/system` for people, `/livez` and `/readyz` for what watches
+//! it, `/metrics` for Prometheus; and the contract, `/openapi.yaml`.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use axum::Json;
 use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use metrics::{counter, gauge};
 use serde::Serialize;
 
 use super::app::App;
@@ -12,10 +16,9 @@ use super::error::ApiError;
 use crate::job::{JobState, TaskState, Timestamp};
 use crate::store::WorkerRow;
 
-/// Workers that were silent for longer are not shown.
+/// Workers that were silent for longer are not counted.
 const WORKER_AGE: Duration = Duration::from_secs(15);
 
-/// The service as it is shown.
 #[derive(Debug, Serialize)]
 pub(super) struct SystemBody {
     version: &'static str,
@@ -62,23 +65,23 @@ struct LimitsBody {
 
 /// `GET /v1/system`
 pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>, ApiError> {
-    let about = &app.about;
+    let settings = &app.settings;
     Ok(Json(SystemBody {
         version: env!("CARGO_PKG_VERSION"),
-        started_at: about.started_at,
+        started_at: app.started_at,
         now: Timestamp::now(),
-        device: about.device.clone(),
-        provider: about.provider,
+        device: settings.engine.device.clone(),
+        provider: settings.engine.provider(),
         onnxruntime: app.store.last_onnxruntime().await?,
-        workers_wanted: about.workers,
+        workers_wanted: settings.worker_count(),
         workers: app.store.live_workers(WORKER_AGE).await?,
         jobs: jobs(&app).await?,
         queue: queue(&app).await?,
         disk: disk(&app).await?,
         limits: LimitsBody {
-            upload_bytes: app.max_upload_bytes,
-            uploads: about.uploads,
-            worker_memory_bytes: app.worker_memory_bytes,
+            upload_bytes: settings.max_upload_bytes,
+            uploads: settings.max_uploads,
+            worker_memory_bytes: settings.worker_memory_bytes,
         },
     }))
 }
@@ -104,6 +107,86 @@ async fn queue(app: &App) -> Result<QueueBody, ApiError> {
 async fn disk(app: &App) -> Result<DiskBody, ApiError> {
     let (free_bytes, size_bytes) = app.store.dir().disk()?;
     let (files, file_bytes) = app.store.blob_totals().await?;
-    let reserved_bytes = app.min_free_bytes;
+    let reserved_bytes = app.settings.min_free_bytes;
     Ok(DiskBody { free_bytes, size_bytes, reserved_bytes, files, file_bytes })
+}
+
+/// Each part of the service: `ok`, or what is wrong.
+#[derive(Debug, Serialize)]
+struct Readiness {
+    ready: bool,
+    database: String,
+    disk: String,
+    workers: String,
+}
+
+/// `GET /livez`: the process answers.
+pub(super) async fn live() -> Json<serde_json::Value> {
+    Json(serde_json::json!({"live": true}))
+}
+
+/// `GET /readyz`: database, disk and workers are there. A long queue is no fault.
+pub(super) async fn ready(State(app): State<App>) -> Response {
+    let checks = [database_answers(&app).await, disk_has_room(&app), workers_live(&app).await];
+    let ready = checks.iter().all(Result::is_ok);
+    let [database, disk, workers] =
+        checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
+    let status = if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
+    (status, Json(Readiness { ready, database, disk, workers })).into_response()
+}
+
+async fn database_answers(app: &App) -> Result<(), String> {
+    app.store.ping().await.map_err(|_| "the database does not answer".to_owned())
+}
+
+fn disk_has_room(app: &App) -> Result<(), String> {
+    let (free, _) = app.store.dir().disk().map_err(|_| "the disk does not answer".to_owned())?;
+    if free < app.settings.min_free_bytes {
+        return Err(format!("{free} bytes are free, {} should be", app.settings.min_free_bytes));
+    }
+    Ok(())
+}
+
+async fn workers_live(app: &App) -> Result<(), String> {
+    let live = app.store.live_workers(WORKER_AGE).await;
+    let live = live.map_err(|_| "the database does not answer".to_owned())?.len();
+    if live == 0 { Err("no worker lives".to_owned()) } else { Ok(()) }
+}
+
+/// `GET /metrics`
+#[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
+pub(super) async fn metrics(State(app): State<App>) -> Result<Response, ApiError> {
+    for (state, count) in jobs(&app).await? {
+        gauge!("sci_recon_jobs", "state" => state).set(count as f64);
+    }
+    for ((kind, state), count) in app.store.task_counts().await? {
+        gauge!("sci_recon_tasks", "kind" => kind, "state" => state.name()).set(count as f64);
+    }
+    for done in app.store.totals().await? {
+        let kind = || done.kind.clone();
+        counter!("sci_recon_tasks_done_total", "kind" => kind()).absolute(done.tasks);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // whole seconds will do
+        counter!("sci_recon_task_seconds_total", "kind" => kind()).absolute(done.seconds as u64);
+        if done.kind == "tile" {
+            counter!("sci_recon_solver_iterations_total").absolute(done.iterations);
+            counter!("sci_recon_denoiser_passes_total").absolute(done.passes);
+        }
+    }
+    gauge!("sci_recon_disk_promised_bytes").set(app.store.promised_bytes().await? as f64);
+    let workers = app.store.live_workers(WORKER_AGE).await?.len();
+    gauge!("sci_recon_workers").set(workers as f64);
+    let (files, bytes) = app.store.blob_totals().await?;
+    gauge!("sci_recon_blobs").set(files as f64);
+    gauge!("sci_recon_blob_bytes").set(bytes as f64);
+    let (free, size) = app.store.dir().disk()?;
+    gauge!("sci_recon_disk_free_bytes").set(free as f64);
+    gauge!("sci_recon_disk_size_bytes").set(size as f64);
+    let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
+    Ok((kind, app.metrics.render()).into_response())
+}
+
+/// `GET /openapi.yaml`
+pub(super) async fn contract() -> Response {
+    let kind = [(header::CONTENT_TYPE, "application/yaml")];
+    (kind, include_str!("../../openapi.yaml")).into_response()
 }

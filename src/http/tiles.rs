@@ -14,14 +14,12 @@ use super::jobs::with_snapshot;
 use crate::job::JobId;
 use crate::store::{TileHistory, TileState};
 
-/// The tiles of a snapshot as they are shown.
 #[derive(Debug, Serialize)]
 struct TilesBody {
     snapshot: u32,
     items: Vec<TileBody>,
 }
 
-/// A tile as it is shown.
 #[derive(Debug, Serialize)]
 struct TileBody {
     row: usize,

@@ -4,12 +4,10 @@ use std::io::Write;
 use std::time::Duration;
 
 use axum::body::Bytes;
-use axum::http::{HeaderMap, header};
 use futures_util::{Stream, StreamExt};
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::sync::mpsc;
 
-use super::access::Access;
-use super::admission::{self, Room};
+use super::admission::Reservation;
 use super::app::App;
 use super::error::{ApiError, Code};
 use crate::store::{StagedBlob, Store, StoreError};
@@ -24,7 +22,7 @@ const DRAIN_TIME: Duration = Duration::from_secs(2);
 /// Receives a stream into a file that is not yet in the store. What is broken off leaves nothing.
 pub(super) async fn receive<S, E>(
     app: &App,
-    mut room: Room,
+    mut room: Reservation,
     mut stream: S,
 ) -> Result<StagedBlob, ApiError>
 where
@@ -71,7 +69,7 @@ where
 /// Hands chunks on to the writer, for which there must be room.
 async fn pump<S, E>(
     app: &App,
-    room: &mut Room,
+    room: &mut Reservation,
     stream: &mut S,
     sender: mpsc::Sender<Bytes>,
 ) -> Result<(), ApiError>
@@ -82,10 +80,8 @@ where
     let mut size = 0;
     while let Some(chunk) = next(app, stream).await? {
         size += chunk.len() as u64;
-        if size > app.max_upload_bytes {
-            return Err(admission::too_large(app));
-        }
-        room.take(app, chunk.len() as u64).await?;
+        app.admission.check_size(size)?;
+        app.admission.take(room, chunk.len() as u64).await?;
         // A writer that takes no more has failed, and says why itself.
         if sender.send(chunk).await.is_err() {
             break;
@@ -100,7 +96,7 @@ where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
 {
-    match tokio::time::timeout(app.upload_idle, stream.next()).await {
+    match tokio::time::timeout(app.settings.upload_idle(), stream.next()).await {
         Ok(Some(Ok(chunk))) => Ok(Some(chunk)),
         Ok(None) => Ok(None),
         Ok(Some(Err(error))) => {
@@ -108,7 +104,7 @@ where
             Err(ApiError::new(Code::MalformedRequest, detail))
         }
         Err(_) => {
-            let seconds = app.upload_idle.as_secs();
+            let seconds = app.settings.upload_idle_seconds;
             let detail = format!("no byte came for {seconds} seconds; send the file again");
             Err(ApiError::new(Code::UploadStalled, detail))
         }
@@ -125,24 +121,4 @@ fn write(store: &Store, mut chunks: mpsc::Receiver<Bytes>) -> Result<StagedBlob,
         })?;
     }
     writer.finish()
-}
-
-/// Refuses an upload that says by its length that it can't be taken, before its first byte; gives
-/// the room that was reserved for it.
-pub(super) async fn admit(
-    app: &App,
-    access: &Access,
-    headers: &HeaderMap,
-) -> Result<Room, ApiError> {
-    let length = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok());
-    let length: u64 = length.and_then(|text| text.parse().ok()).unwrap_or(0);
-    admission::check_length(app, access, length).await?;
-    Room::reserve(app, length).await
-}
-
-/// Takes one of the places for uploads.
-pub(super) fn place(app: &App) -> Result<OwnedSemaphorePermit, ApiError> {
-    app.uploads.clone().try_acquire_owned().map_err(|_| {
-        ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
-    })
 }

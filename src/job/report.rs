@@ -3,17 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+pub use crate::optics::Severity;
 use crate::optics::{self, CaptureFigures, MaskFigures, PatternFigures};
-
-/// How bad a finding is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Severity {
-    /// Results will be worse than they could be.
-    Warning,
-    /// Results will be wrong.
-    Error,
-}
 
 /// Something that is wrong.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,10 +27,6 @@ pub struct Finding {
 impl From<optics::Finding> for Finding {
     fn from(finding: optics::Finding) -> Self {
         let optics::Finding { code, severity, detail, remedy, frames } = finding;
-        let severity = match severity {
-            optics::Severity::Warning => Severity::Warning,
-            optics::Severity::Error => Severity::Error,
-        };
         Self { code: code.into(), severity, detail, remedy: remedy.into(), frames, snapshot: None }
     }
 }

@@ -180,6 +180,18 @@ impl Timestamp {
         Self(jiff::Timestamp::now().as_millisecond())
     }
 
+    fn moment(self) -> jiff::Timestamp {
+        jiff::Timestamp::from_millisecond(self.0).unwrap_or(jiff::Timestamp::MAX)
+    }
+
+    /// As in the headers of HTTP (RFC 9110).
+    #[must_use]
+    pub fn http_date(self) -> String {
+        let printer = jiff::fmt::rfc2822::DateTimePrinter::new();
+        // Fails only before the year 0.
+        printer.timestamp_to_rfc9110_string(&self.moment()).unwrap_or_default()
+    }
+
     /// Seconds from `earlier` to this moment, not below zero.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
@@ -190,8 +202,7 @@ impl Timestamp {
 
 impl fmt::Display for Timestamp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let moment = jiff::Timestamp::from_millisecond(self.0).unwrap_or(jiff::Timestamp::MAX);
-        write!(f, "{moment:.3}")
+        write!(f, "{:.3}", self.moment())
     }
 }
 

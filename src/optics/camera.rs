@@ -3,11 +3,13 @@
 use ndarray::{Array2, ArrayView2};
 use rand::Rng;
 use rand_distr::{Distribution, Normal, Poisson};
+use serde::{Deserialize, Serialize};
 
 use super::OpticsError;
 
 /// A camera and the light that it works in. Signals are shares of the full well.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct Camera {
     /// Bits of a stored number, 1 to 16.
     pub bits: u32,

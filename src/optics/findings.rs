@@ -4,9 +4,11 @@ use super::{
     Calibrator, Expected, MaskFigures, RawMask, Reordered, flatness, pattern_likeness, reordered,
 };
 use ndarray::ArrayView3;
+use serde::{Deserialize, Serialize};
 
 /// How bad it is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Severity {
     /// Results will be worse than they could be.
     Warning,

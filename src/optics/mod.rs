@@ -40,17 +40,11 @@ use thiserror::Error;
 
 /// What can't be built or simulated.
 #[derive(Debug, Error, PartialEq)]
+#[allow(missing_docs)] // the messages say what the fields are
 pub enum OpticsError {
     /// A number that is out of its range.
     #[error("{name} is {value}; it must be {range}")]
-    Parameter {
-        /// Name of the number.
-        name: &'static str,
-        /// Its value.
-        value: String,
-        /// The values that are right.
-        range: &'static str,
-    },
+    Parameter { name: &'static str, value: String, range: &'static str },
     /// Random patterns kept a rank below the largest possible one.
     #[error(
         "{tries} random draws of {frames} patterns with {open} of {apertures} sub-apertures open \
@@ -58,17 +52,11 @@ pub enum OpticsError {
          about half of the sub-apertures"
     )]
     Rank {
-        /// Number of draws.
         tries: usize,
-        /// Patterns in a draw.
         frames: usize,
-        /// Open sub-apertures of a pattern.
         open: usize,
-        /// All sub-apertures.
         apertures: usize,
-        /// Best rank seen.
         reached: usize,
-        /// Rank that is possible.
         wanted: usize,
     },
     /// Patterns, or a lithography mask, that can't be used.
@@ -79,12 +67,7 @@ pub enum OpticsError {
     Captures(String),
     /// Masks and frames that do not belong together.
     #[error("the frames are {frames}, the masks {masks}; both must have the same size")]
-    Sizes {
-        /// Size of the frames, as frames x rows x columns.
-        frames: String,
-        /// Size of the masks.
-        masks: String,
-    },
+    Sizes { frames: String, masks: String },
 }
 
 /// The generator of everything random here: the same on every machine.

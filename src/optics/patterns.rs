@@ -4,6 +4,7 @@
 use ndarray::{Array3, ArrayView3};
 use rand::Rng;
 use rand::seq::index;
+use serde::{Deserialize, Serialize};
 
 use super::multiplex::rank;
 use super::{Geometry, Multiplexing, OpticsError, check_size};
@@ -79,7 +80,8 @@ pub fn single_apertures(
 }
 
 /// An open circle that turns about the axis of the LCoS from frame to frame: the paper's camera.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct Circle {
     /// Its radius in LCoS pixels.
     pub radius_pixels: f64,

@@ -3,12 +3,14 @@
 use ndarray::{Array1, Array2, ArrayView2, s};
 use rayon::iter::{IndexedParallelIterator, ParallelIterator};
 use rayon::slice::ParallelSliceMut;
+use serde::{Deserialize, Serialize};
 
 use super::axis::{Axis, Cell};
 use super::{Geometry, OpticsError, check_size};
 
 /// Where the cells of a pattern shift the mask to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Placement {
     /// By whole mask pixels, neighbours by what the geometry gives, rounded: the paper's simulation.
     WholePixels,
@@ -17,7 +19,8 @@ pub enum Placement {
 }
 
 /// How the light through a cell is taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Method {
     /// All through the cell's centre: a pattern's mask is a sum of shifted masks (Eq. 1).
     Shifts,

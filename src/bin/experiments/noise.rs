@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 use maud::{Markup, html};
 use ndarray::Array3;
-use sci_recon::cli::{CliError, EngineArguments, algorithms, plan};
+use sci_recon::cli::{CliError, NetworkArguments, algorithms, plan};
 use sci_recon::job::Algorithm;
 use sci_recon::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, generator, measure, noisy,
@@ -47,7 +47,7 @@ pub struct Arguments {
           value_parser = algorithms())]
     algorithm: Algorithm,
     #[command(flatten)]
-    engine: EngineArguments,
+    engine: NetworkArguments,
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,

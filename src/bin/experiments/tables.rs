@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use sci_recon::cli::{CliError, EngineArguments, Learned, MaskArguments, algorithms};
+use sci_recon::cli::{CliError, Learned, MaskArguments, NetworkArguments, algorithms};
 use sci_recon::job::Algorithm;
 
 use super::clips::read_clips;
@@ -50,7 +50,7 @@ pub struct Arguments {
     #[arg(long)]
     by_zone: bool,
     #[command(flatten)]
-    engine: EngineArguments,
+    engine: NetworkArguments,
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,

@@ -41,9 +41,6 @@ pub struct Arguments {
 }
 
 /// Runs the command.
-///
-/// # Errors
-/// A folder that holds something else, or a failure on the way.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let failed = |error: std::io::Error| CliError::Failure(format!("the runtime: {error}"));
     let out = fresh_folder(&arguments.out)?;

@@ -1,38 +1,60 @@
 //! Reduced pictures that were asked for lately, so that no stack is read twice for one thumbnail.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::io::ErrorKind;
+use std::sync::Arc;
 
 use ndarray::Array2;
-use tokio::sync::{OnceCell, Semaphore};
+use quick_cache::sync::{Cache, DefaultLifecycle};
+use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
+use tokio::sync::Semaphore;
 
 use super::render::{Picture, Region};
+use crate::formats::FormatError;
 use crate::http::error::{ApiError, Code};
 
 /// Memory for reduced pictures, in bytes.
-const BUDGET: usize = 64 << 20;
+const BUDGET: u64 = 64 << 20;
 /// Pictures that are reduced at the same time: the cores are for the workers.
-const PLACES: usize = 2;
+const AT_ONCE: usize = 2;
 
-type Cell = Arc<OnceCell<Arc<Array2<f32>>>>;
+type Key = (String, Region);
+type Values = Arc<Array2<f32>>;
 
 /// Reduces pictures, each of them once for all who ask for it.
 #[derive(Debug)]
 pub(in crate::http) struct Pictures {
-    held: Mutex<Held>,
-    places: Semaphore,
+    reduced: Cache<Key, Values, Bytes>,
+    turns: Semaphore,
 }
 
-#[derive(Debug, Default)]
-struct Held {
-    cells: HashMap<(String, Region), (Cell, usize, u64)>,
-    bytes: usize,
-    clock: u64,
+#[derive(Debug, Clone)]
+struct Bytes;
+
+impl Weighter<Key, Values> for Bytes {
+    fn weight(&self, _: &Key, values: &Values) -> u64 {
+        (values.len() * size_of::<f32>()) as u64
+    }
 }
 
 impl Pictures {
     pub(in crate::http) fn new() -> Self {
-        Self { held: Mutex::default(), places: Semaphore::new(PLACES) }
+        // One shard: in one of many the largest pictures would find no room.
+        let options = OptionsBuilder::new()
+            .shards(1)
+            .estimated_items_capacity(1024)
+            .weight_capacity(BUDGET)
+            .build();
+        // The options are complete, so this can't fail.
+        let reduced = match options {
+            Ok(options) => Cache::with_options(
+                options,
+                Bytes,
+                DefaultHashBuilder::default(),
+                DefaultLifecycle::default(),
+            ),
+            Err(_) => Cache::with_weighter(1024, BUDGET, Bytes),
+        };
+        Self { reduced, turns: Semaphore::new(AT_ONCE) }
     }
 
     /// The values of a region.
@@ -40,48 +62,26 @@ impl Pictures {
         &self,
         picture: Arc<Picture>,
         region: Region,
-    ) -> Result<Arc<Array2<f32>>, ApiError> {
-        let cell = self.cell(&picture, &region);
-        let values = cell.get_or_try_init(|| async {
+    ) -> Result<Values, ApiError> {
+        let key = (picture.identity.clone(), region.clone());
+        let reduce = async {
             let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
-            let _place = self.places.acquire().await.map_err(stopped)?;
+            let _turn = self.turns.acquire().await.map_err(stopped)?;
             let reduce = tokio::task::spawn_blocking(move || picture.reduce(&region));
             let values = reduce.await.map_err(|error| ApiError::internal(&error))?;
-            Ok(Arc::new(values.map_err(super::unreadable)?))
-        });
-        values.await.cloned()
-    }
-
-    /// The place of a region's values, empty if nobody has asked for them lately.
-    fn cell(&self, picture: &Picture, region: &Region) -> Cell {
-        // Whole values are stored: a poisoned lock holds good ones.
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
-        held.clock += 1;
-        let clock = held.clock;
-        let key = (picture.identity.clone(), region.clone());
-        if let Some((cell, _, used)) = held.cells.get_mut(&key) {
-            *used = clock;
-            return cell.clone();
-        }
-        let bytes = region.rows.len() * region.columns.len() * size_of::<f32>();
-        held.make_room(bytes);
-        let cell = Cell::default();
-        held.cells.insert(key, (cell.clone(), bytes, clock));
-        held.bytes += bytes;
-        cell
+            Ok(Arc::new(values.map_err(unreadable)?))
+        };
+        self.reduced.get_or_insert_async(&key, reduce).await
     }
 }
 
-impl Held {
-    /// Lets go of what was not asked for the longest.
-    fn make_room(&mut self, bytes: usize) {
-        while self.bytes + bytes > BUDGET {
-            let oldest = self.cells.iter().min_by_key(|(_, (_, _, used))| *used);
-            let Some(key) = oldest.map(|(key, _)| key.clone()) else { return };
-            if let Some((_, freed, _)) = self.cells.remove(&key) {
-                self.bytes -= freed;
-            }
+/// A file that is gone was one of the tiles that have just been put together.
+fn unreadable(error: FormatError) -> ApiError {
+    match error {
+        FormatError::Io { source, .. } if source.kind() == ErrorKind::NotFound => {
+            ApiError::new(Code::NotReady, "the frames are being put together; ask again")
         }
+        error => error.into(),
     }
 }
 
@@ -123,7 +123,7 @@ mod tests {
         for name in 0..40 {
             ask(name).await;
         }
-        let held = pictures.held.lock().unwrap().bytes;
+        let held = pictures.reduced.weight();
         assert!(held <= BUDGET && held > BUDGET / 2, "{held}");
         let before = reads.load(Ordering::Relaxed);
         ask(39).await;

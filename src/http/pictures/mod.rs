@@ -6,7 +6,6 @@ mod names;
 mod render;
 mod source;
 
-use std::io::ErrorKind;
 use std::sync::Arc;
 
 use axum::extract::State;
@@ -15,22 +14,22 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 pub(super) use cache::Pictures;
-use names::{CalibrationPicture, JobPicture, MeasurementPicture};
-use render::{Picture, Region, TILE, spread};
+use names::Named;
+pub(super) use names::{OfCalibration, OfJob, OfMeasurement};
+use render::{Picture, Region, TILE};
 
 use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code};
 use super::extract::{Params, QueryOf};
-use crate::formats::{FormatError, png};
-use crate::job::{CalibrationId, JobId, MeasurementId, Sha256};
+use crate::formats::png;
+use crate::job::Sha256;
 
 /// Pixels of a preview's longer side: default, and the range.
 const PREVIEW: usize = 512;
 const PREVIEWS: std::ops::RangeInclusive<usize> = 16..=1024;
 
-/// The query of a preview.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PreviewQuery {
@@ -39,7 +38,6 @@ pub(super) struct PreviewQuery {
     white: Option<f32>,
 }
 
-/// The query of a tile.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct TileQuery {
@@ -61,134 +59,23 @@ struct SpreadBody {
     high: f32,
 }
 
-type JobPath = (JobId, u32, JobPicture);
-type MeasurementPath = (MeasurementId, MeasurementPicture);
-type CalibrationPath = (CalibrationId, CalibrationPicture);
+/// Which tile of a picture.
+#[derive(Debug, Deserialize)]
+pub(super) struct TilePath {
+    level: u32,
+    row: usize,
+    column: usize,
+}
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}`
-pub(super) async fn job_preview(
+/// `GET .../pictures/{picture}`
+pub(super) async fn preview<N: Named>(
     State(app): State<App>,
     access: Access,
-    Params(path): Params<JobPath>,
+    Params(name): Params<N>,
     QueryOf(query): QueryOf<PreviewQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
-    preview(&app, names::of_job(&app, &access.lab, path).await?, &query, &headers).await
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread`
-pub(super) async fn job_spread(
-    State(app): State<App>,
-    access: Access,
-    Params(path): Params<JobPath>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    tell_spread(&app, names::of_job(&app, &access.lab, path).await?, &headers).await
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}`
-pub(super) async fn job_tile(
-    State(app): State<App>,
-    access: Access,
-    Params((job, snapshot, name, level, row, column)): Params<(
-        JobId,
-        u32,
-        JobPicture,
-        u32,
-        usize,
-        usize,
-    )>,
-    QueryOf(query): QueryOf<TileQuery>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    let picture = names::of_job(&app, &access.lab, (job, snapshot, name)).await?;
-    tile(&app, picture, (level, row, column), &query, &headers).await
-}
-
-/// `GET /v1/measurements/{measurement}/pictures/{picture}`
-pub(super) async fn measurement_preview(
-    State(app): State<App>,
-    access: Access,
-    Params(path): Params<MeasurementPath>,
-    QueryOf(query): QueryOf<PreviewQuery>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    preview(&app, names::of_measurement(&app, &access.lab, path).await?, &query, &headers).await
-}
-
-/// `GET /v1/measurements/{measurement}/pictures/{picture}/spread`
-pub(super) async fn measurement_spread(
-    State(app): State<App>,
-    access: Access,
-    Params(path): Params<MeasurementPath>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    tell_spread(&app, names::of_measurement(&app, &access.lab, path).await?, &headers).await
-}
-
-/// `GET /v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}`
-pub(super) async fn measurement_tile(
-    State(app): State<App>,
-    access: Access,
-    Params((id, name, level, row, column)): Params<(
-        MeasurementId,
-        MeasurementPicture,
-        u32,
-        usize,
-        usize,
-    )>,
-    QueryOf(query): QueryOf<TileQuery>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    let picture = names::of_measurement(&app, &access.lab, (id, name)).await?;
-    tile(&app, picture, (level, row, column), &query, &headers).await
-}
-
-/// `GET /v1/calibrations/{calibration}/pictures/{picture}`
-pub(super) async fn calibration_preview(
-    State(app): State<App>,
-    access: Access,
-    Params(path): Params<CalibrationPath>,
-    QueryOf(query): QueryOf<PreviewQuery>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    preview(&app, names::of_calibration(&app, &access.lab, path).await?, &query, &headers).await
-}
-
-/// `GET /v1/calibrations/{calibration}/pictures/{picture}/spread`
-pub(super) async fn calibration_spread(
-    State(app): State<App>,
-    access: Access,
-    Params(path): Params<CalibrationPath>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    tell_spread(&app, names::of_calibration(&app, &access.lab, path).await?, &headers).await
-}
-
-/// `GET /v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}`
-pub(super) async fn calibration_tile(
-    State(app): State<App>,
-    access: Access,
-    Params((id, name, level, row, column)): Params<(
-        CalibrationId,
-        CalibrationPicture,
-        u32,
-        usize,
-        usize,
-    )>,
-    QueryOf(query): QueryOf<TileQuery>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
-    let picture = names::of_calibration(&app, &access.lab, (id, name)).await?;
-    tile(&app, picture, (level, row, column), &query, &headers).await
-}
-
-async fn preview(
-    app: &App,
-    picture: Picture,
-    query: &PreviewQuery,
-    headers: &HeaderMap,
-) -> Result<Response, ApiError> {
+    let picture = name.find(&app, &access.lab).await?;
     let size = query.size.unwrap_or(PREVIEW);
     if !PREVIEWS.contains(&size) {
         let (least, most) = (PREVIEWS.start(), PREVIEWS.end());
@@ -204,16 +91,19 @@ async fn preview(
         }
     };
     let region = picture.whole(picture.level_within(size));
-    draw(app, picture, region, window, headers).await
+    draw(&app, picture, region, window, &headers).await
 }
 
-async fn tile(
-    app: &App,
-    picture: Picture,
-    (level, row, column): (u32, usize, usize),
-    query: &TileQuery,
-    headers: &HeaderMap,
+/// `GET .../pictures/{picture}/tiles/{level}/{row}/{column}`
+pub(super) async fn tile<N: Named>(
+    State(app): State<App>,
+    access: Access,
+    Params(name): Params<N>,
+    Params(TilePath { level, row, column }): Params<TilePath>,
+    QueryOf(query): QueryOf<TileQuery>,
+    headers: HeaderMap,
 ) -> Result<Response, ApiError> {
+    let picture = name.find(&app, &access.lab).await?;
     let window = window(query.black, query.white)?;
     let region = picture.tile(level, row, column).ok_or_else(|| {
         let detail = format!(
@@ -225,7 +115,24 @@ async fn tile(
         );
         ApiError::new(Code::NotFound, detail)
     })?;
-    draw(app, picture, region, Some(window), headers).await
+    draw(&app, picture, region, Some(window), &headers).await
+}
+
+/// `GET .../pictures/{picture}/spread`
+pub(super) async fn spread<N: Named>(
+    State(app): State<App>,
+    access: Access,
+    Params(name): Params<N>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let picture = name.find(&app, &access.lab).await?;
+    let (height, width) = (picture.height, picture.width);
+    let levels = picture.level_within(TILE);
+    let region = picture.whole(picture.level_within(PREVIEW));
+    let found = render::spread(&*app.pictures.reduced(Arc::new(picture), region).await?);
+    let (minimum, maximum, low, high) = (found.minimum, found.maximum, found.low, found.high);
+    let body = SpreadBody { height, width, tile: TILE, levels, minimum, maximum, low, high };
+    conditional::json(&body, &headers)
 }
 
 /// The values that become black and white.
@@ -256,35 +163,11 @@ async fn draw(
     let values = app.pictures.reduced(Arc::new(picture), region).await?;
     let encode = tokio::task::spawn_blocking(move || {
         let (black, white) = window.unwrap_or_else(|| {
-            let found = spread(&values);
+            let found = render::spread(&values);
             (found.low, if found.high > found.low { found.high } else { found.low + 1.0 })
         });
         png::encode_u8(values.view(), black, white)
     });
     let bytes = encode.await.map_err(|error| ApiError::internal(&error))??;
     Ok((tags, [(header::CONTENT_TYPE, "image/png")], bytes).into_response())
-}
-
-async fn tell_spread(
-    app: &App,
-    picture: Picture,
-    headers: &HeaderMap,
-) -> Result<Response, ApiError> {
-    let (height, width) = (picture.height, picture.width);
-    let levels = picture.level_within(TILE);
-    let region = picture.whole(picture.level_within(PREVIEW));
-    let found = spread(&*app.pictures.reduced(Arc::new(picture), region).await?);
-    let (minimum, maximum, low, high) = (found.minimum, found.maximum, found.low, found.high);
-    let body = SpreadBody { height, width, tile: TILE, levels, minimum, maximum, low, high };
-    conditional::json(&body, headers)
-}
-
-/// A file that is gone was one of the tiles that have just been put together.
-fn unreadable(error: FormatError) -> ApiError {
-    match error {
-        FormatError::Io { source, .. } if source.kind() == ErrorKind::NotFound => {
-            ApiError::new(Code::NotReady, "the frames are being put together; ask again")
-        }
-        error => error.into(),
-    }
 }

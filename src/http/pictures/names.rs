@@ -3,19 +3,20 @@
 use std::sync::Arc;
 
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
 use super::render::Picture;
-use super::source::{Files, Stack, Unfinished};
+use super::source::{DoneTile, Files, Stack, Unfinished};
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code};
 use crate::http::jobs::with_snapshot;
 use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
-use crate::store::{Calibration, Job, Measurement, StoreError};
+use crate::store::{Calibration, Job, Measurement, StoreError, TileResult};
 
-/// A picture of a job's snapshot.
+/// What can be seen of a job's snapshot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
-pub(in crate::http) enum JobPicture {
+enum JobPicture {
     /// `frame-1` and so on.
     Frame(usize),
     /// `difference-2`: frame 2 without frame 1.
@@ -29,12 +30,12 @@ pub(in crate::http) enum JobPicture {
 /// A picture of a measurement: `snapshot-0` and so on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
-pub(in crate::http) struct MeasurementPicture(usize);
+struct MeasurementPicture(usize);
 
 /// A picture of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
-pub(in crate::http) enum CalibrationPicture {
+enum CalibrationPicture {
     /// `mask-1` and so on.
     Mask(usize),
     /// `mean` of the masks.
@@ -89,59 +90,78 @@ impl TryFrom<String> for CalibrationPicture {
     }
 }
 
-/// The picture of a job.
-pub(super) async fn of_job(
-    app: &App,
-    lab: &Lab,
-    (id, snapshot, name): (JobId, u32, JobPicture),
-) -> Result<Picture, ApiError> {
-    let job = with_snapshot(app, lab, id, snapshot).await?;
-    let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
-    let stack = frames_of(app, &job, snapshot).await?;
-    match name {
-        JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
-        JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
-        JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
-        JobPicture::Residual => {
-            let masks = masks_of(app, &app.store.calibration(lab, job.spec.calibration).await?);
-            let measurement = app.store.measurement(lab, job.spec.measurement).await?;
-            Ok(stack.residual(&masks, &snapshots_of(app, &measurement), snapshot as usize))
+/// The parameters of a path that name a picture.
+pub(in crate::http) trait Named: DeserializeOwned + Send {
+    fn find(self, app: &App, lab: &Lab) -> impl Future<Output = Result<Picture, ApiError>> + Send;
+}
+
+/// A picture of a job's snapshot.
+#[derive(Debug, Deserialize)]
+pub(in crate::http) struct OfJob {
+    job: JobId,
+    snapshot: u32,
+    picture: JobPicture,
+}
+
+#[derive(Debug, Deserialize)]
+pub(in crate::http) struct OfMeasurement {
+    measurement: MeasurementId,
+    picture: MeasurementPicture,
+}
+
+#[derive(Debug, Deserialize)]
+pub(in crate::http) struct OfCalibration {
+    calibration: CalibrationId,
+    picture: CalibrationPicture,
+}
+
+impl Named for OfJob {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture, ApiError> {
+        let Self { job, snapshot, picture } = self;
+        let job = with_snapshot(app, lab, job, snapshot).await?;
+        let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
+        let stack = frames_of(app, &job, snapshot).await?;
+        match picture {
+            JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
+            JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
+            JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
+            JobPicture::Residual => {
+                let masks = masks_of(app, &app.store.calibration(lab, job.spec.calibration).await?);
+                let measurement = app.store.measurement(lab, job.spec.measurement).await?;
+                Ok(stack.residual(&masks, &snapshots_of(app, &measurement), snapshot as usize))
+            }
+            _ => Err(outside(format!(
+                "frames are counted from 1 to {frames}, differences from 2, rows from 0 to {}",
+                height.saturating_sub(1)
+            ))),
         }
-        _ => Err(outside(format!(
-            "frames are counted from 1 to {frames}, differences from 2, rows from 0 to {}",
-            height.saturating_sub(1)
-        ))),
     }
 }
 
-/// The picture of a measurement.
-pub(super) async fn of_measurement(
-    app: &App,
-    lab: &Lab,
-    (id, MeasurementPicture(snapshot)): (MeasurementId, MeasurementPicture),
-) -> Result<Picture, ApiError> {
-    let stack = snapshots_of(app, &app.store.measurement(lab, id).await?);
-    let count = stack.shape.0;
-    if snapshot < count {
-        return Ok(stack.frame(snapshot));
+impl Named for OfMeasurement {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture, ApiError> {
+        let stack = snapshots_of(app, &app.store.measurement(lab, self.measurement).await?);
+        let (MeasurementPicture(snapshot), count) = (self.picture, stack.shape.0);
+        if snapshot < count {
+            return Ok(stack.frame(snapshot));
+        }
+        Err(outside(format!("snapshots are counted from 0 to {}", count.saturating_sub(1))))
     }
-    Err(outside(format!("snapshots are counted from 0 to {}", count.saturating_sub(1))))
 }
 
-/// The picture of a calibration.
-pub(super) async fn of_calibration(
-    app: &App,
-    lab: &Lab,
-    (id, name): (CalibrationId, CalibrationPicture),
-) -> Result<Picture, ApiError> {
-    let stack = masks_of(app, &app.store.calibration(lab, id).await?);
-    let count = stack.shape.0;
-    match name {
-        CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
-        CalibrationPicture::Mask(_) => Err(outside(format!("masks are counted from 1 to {count}"))),
-        CalibrationPicture::Mean => Ok(stack.mean()),
-        CalibrationPicture::Gram => Ok(stack.gram()),
-        CalibrationPicture::Dead => Ok(stack.dead()),
+impl Named for OfCalibration {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture, ApiError> {
+        let stack = masks_of(app, &app.store.calibration(lab, self.calibration).await?);
+        let count = stack.shape.0;
+        match self.picture {
+            CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
+            CalibrationPicture::Mask(_) => {
+                Err(outside(format!("masks are counted from 1 to {count}")))
+            }
+            CalibrationPicture::Mean => Ok(stack.mean()),
+            CalibrationPicture::Gram => Ok(stack.gram()),
+            CalibrationPicture::Dead => Ok(stack.dead()),
+        }
     }
 }
 
@@ -189,7 +209,12 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiErro
     let parts = preview.iter().map(|(sha256, _)| sha256).chain(done.iter().map(|t| &t.sha256));
     let hashes: String = parts.map(ToString::to_string).collect();
     let plan = spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
-    let place = |tile: crate::store::TileResult| Some((plan.tile(tile.tile as usize)?, tile.path));
+    let place = |done: TileResult| {
+        let tile = plan.tile(done.tile as usize)?;
+        let (rows, columns) =
+            (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
+        Some(DoneTile { rows, columns, path: done.path })
+    };
     let tiles = done.into_iter().filter_map(place).collect();
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };
     let identity = Sha256::of(hashes.as_bytes()).to_string();

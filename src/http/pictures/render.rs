@@ -15,7 +15,7 @@ const BAND: usize = 4 << 20;
 type Read = dyn Fn(Range<usize>, Range<usize>) -> Result<Array2<f32>, FormatError> + Send + Sync;
 
 /// A picture of which windows can be read.
-pub(super) struct Picture {
+pub(in crate::http) struct Picture {
     /// Rows.
     pub(super) height: usize,
     /// Columns.
@@ -78,9 +78,6 @@ impl Picture {
 
     /// The values of a region \[rows, columns\]: each is the mean of the pixels that it stands for.
     /// Reads no more than these, a band of rows at a time.
-    ///
-    /// # Errors
-    /// Those of reading.
     pub(super) fn reduce(&self, region: &Region) -> Result<Array2<f32>, FormatError> {
         let step = 1usize << region.level;
         let mut reduced = Array2::zeros((region.rows.len(), region.columns.len()));

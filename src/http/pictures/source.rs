@@ -9,7 +9,6 @@ use ndarray::{Array2, Array3, Axis, s};
 
 use super::render::Picture;
 use crate::formats::{FormatError, Limits, npy, planar};
-use crate::recon::tile::Tile;
 
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
@@ -37,8 +36,15 @@ pub(super) enum Files {
 pub(super) struct Unfinished {
     /// A prepared array of coarse frames.
     pub(super) preview: Option<PathBuf>,
-    /// The tiles that are done.
-    pub(super) tiles: Vec<(Tile, PathBuf)>,
+    pub(super) tiles: Vec<DoneTile>,
+}
+
+/// A tile that is done, as a prepared array, and the window that it covers.
+#[derive(Debug)]
+pub(super) struct DoneTile {
+    pub(super) rows: Range<usize>,
+    pub(super) columns: Range<usize>,
+    pub(super) path: PathBuf,
 }
 
 type Window = Result<Array3<f32>, FormatError>;
@@ -181,46 +187,37 @@ fn enlarged(
 /// Lays the tiles that are done over a window of a picture. Where they overlap the later one counts:
 /// they are blended when all are done.
 fn lay(
-    tiles: &[(Tile, PathBuf)],
+    tiles: &[DoneTile],
     frames: Range<usize>,
     rows: Range<usize>,
     columns: Range<usize>,
     whole: &mut Array3<f32>,
 ) -> Result<(), FormatError> {
-    for (tile, path) in tiles {
-        let (down, across) =
-            (common(&rows, tile.row, tile.height), common(&columns, tile.column, tile.width));
+    let common = |a: &Range<usize>, b: &Range<usize>| a.start.max(b.start)..a.end.min(b.end);
+    let within =
+        |part: &Range<usize>, of: &Range<usize>| part.start - of.start..part.end - of.start;
+    for tile in tiles {
+        let (down, across) = (common(&rows, &tile.rows), common(&columns, &tile.columns));
         if down.is_empty() || across.is_empty() {
             continue;
         }
-        let part = planar::Reader::open(path, &Limits::default())?.read_window(
+        let part = planar::Reader::open(&tile.path, &Limits::default())?.read_window(
             frames.clone(),
-            down.start - tile.row..down.end - tile.row,
-            across.start - tile.column..across.end - tile.column,
+            within(&down, &tile.rows),
+            within(&across, &tile.columns),
         )?;
-        let place = s![
-            ..,
-            down.start - rows.start..down.end - rows.start,
-            across.start - columns.start..across.end - columns.start
-        ];
+        let place = s![.., within(&down, &rows), within(&across, &columns)];
         whole.slice_mut(place).assign(&part);
     }
     Ok(())
-}
-
-/// The part of a range that a tile of this start and length covers.
-fn common(range: &Range<usize>, start: usize, length: usize) -> Range<usize> {
-    let (from, to) = (range.start.max(start), range.end.min(start + length));
-    from..to.max(from)
 }
 
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
 
-    use super::{Files, Stack, Unfinished};
+    use super::{DoneTile, Files, Stack, Unfinished};
     use crate::formats::planar;
-    use crate::recon::tile::Tile;
     use ndarray::{Array3, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
@@ -267,14 +264,13 @@ mod tests {
     fn tiles_that_are_done_stand_in_their_place_on_the_preview() {
         let folder = tempfile::tempdir().unwrap();
         let x = Array3::from_shape_fn((2, 40, 40), |(k, i, j)| (k * 1600 + i * 40 + j) as f32);
-        let tile = Tile { index: 3, row: 16, column: 20, height: 24, width: 20 };
         let part = x.slice(s![.., 16..40, 20..40]).to_owned();
         let path = prepared(folder.path(), "tile", &part);
         let coarse = Array3::from_shape_fn((2, 5, 5), |(k, i, j)| (k + i * 5 + j) as f32);
         let coarse_path = prepared(folder.path(), "preview", &coarse);
         for preview in [None, Some(coarse_path)] {
             let below = |i: usize, j: usize| preview.as_ref().map(|_| coarse[[1, i / 8, j / 8]]);
-            let tiles = vec![(tile, path.clone())];
+            let tiles = vec![DoneTile { rows: 16..40, columns: 20..40, path: path.clone() }];
             let unfinished = Unfinished { preview: preview.clone(), tiles };
             let picture = stack((2, 40, 40), Files::Tiles(Arc::new(unfinished))).frame(1);
             assert!(!picture.settled);

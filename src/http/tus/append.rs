@@ -30,7 +30,9 @@ pub(super) async fn append(
             return Err(ApiError::new(Code::ChecksumMismatch, detail));
         }
         _ => {
-            app.store.advance_partial(&mut written.file, written.bytes, app.upload_age).await?;
+            app.store
+                .advance_partial(&mut written.file, written.bytes, app.settings.upload_age())
+                .await?;
             metrics::counter!("sci_recon_upload_bytes_total").increment(written.bytes);
         }
     }

@@ -4,8 +4,6 @@
 mod append;
 pub mod headers;
 
-use std::time::{Duration, UNIX_EPOCH};
-
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
@@ -13,7 +11,6 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
 use super::access::Access;
-use super::admission;
 use super::app::App;
 use super::error::{ApiError, Code};
 use super::extract::Params;
@@ -49,7 +46,7 @@ pub(super) async fn options(State(app): State<App>) -> Response {
         ("tus-version", "1.0.0".to_owned()),
         ("tus-extension", "creation,checksum,expiration,termination".to_owned()),
         ("tus-checksum-algorithm", headers::ALGORITHMS.to_owned()),
-        ("tus-max-size", app.max_upload_bytes.to_string()),
+        ("tus-max-size", app.settings.max_upload_bytes.to_string()),
     ];
     (StatusCode::NO_CONTENT, fields).into_response()
 }
@@ -66,11 +63,11 @@ pub(super) async fn create(
     }
     let metadata = text(&headers, &METADATA)?.unwrap_or_default();
     let expected = expected(metadata).map_err(malformed)?;
-    admission::check_length(&app, &access, length).await?;
-    admission::check_room(&app, "the upload", length).await?;
+    app.admission.check_length(&access, length).await?;
+    app.admission.check_room("the upload", length).await?;
     let Access { lab, token, .. } = access;
     let facts = NewPartial { lab, token, length, metadata: metadata.to_owned(), expected };
-    let upload = app.store.begin_partial(facts, app.upload_age).await?;
+    let upload = app.store.begin_partial(facts, app.settings.upload_age()).await?;
     let location = [(header::LOCATION, format!("/v1/uploads/{}", upload.id))];
     Ok((StatusCode::CREATED, location, state(&upload)).into_response())
 }
@@ -122,7 +119,7 @@ pub(super) async fn patch(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    let permit = super::upload::place(&app)?;
+    let permit = app.admission.slot()?;
     let upload = to_the_end(async move {
         let _permit = permit;
         piece(&app, &access, id, &headers, body).await
@@ -188,11 +185,9 @@ pub(super) async fn delete(
 
 /// How far the upload is, until when it is kept, and, once it is stored, as what.
 fn state(upload: &Partial) -> HeaderMap {
-    let expires = u64::try_from(upload.expires_at.0).unwrap_or_default();
-    let expires = UNIX_EPOCH + Duration::from_millis(expires);
     let mut fields = HeaderMap::new();
     fields.insert(OFFSET, upload.received.into());
-    if let Ok(expires) = HeaderValue::try_from(httpdate::fmt_http_date(expires)) {
+    if let Ok(expires) = HeaderValue::try_from(upload.expires_at.http_date()) {
         fields.insert(EXPIRES, expires);
     }
     if let Some(Ok(place)) =

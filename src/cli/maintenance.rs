@@ -1,9 +1,8 @@
-//! What the server does beside serving: figures, and cleaning up.
+//! Maintenance beside serving: figures, and cleaning up.
 
 use std::time::Duration;
 
 use crate::config::ServeArguments;
-use crate::http::Metrics;
 use crate::job::Timestamp;
 use crate::store::{Store, StoreError};
 
@@ -16,11 +15,11 @@ const HOUR: Duration = Duration::from_secs(3600);
 const DAY: Duration = Duration::from_secs(86_400);
 
 /// Every few seconds: figures; at the start and every ten minutes: cleaning.
-pub(super) async fn keep_house(store: Store, metrics: Metrics, settings: ServeArguments) {
+pub(super) async fn maintain(store: Store, fold_figures: impl Fn(), settings: ServeArguments) {
     let mut tick = tokio::time::interval(TICK);
     for count in 0u64.. {
         tick.tick().await;
-        metrics.upkeep();
+        fold_figures();
         if count % TICKS_PER_CLEANING != 0 {
             continue;
         }
