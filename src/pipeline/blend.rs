@@ -52,9 +52,6 @@ pub fn verify(
 }
 
 /// Frame `k` \[H,W\], of which each stored tile's part is read when it is needed.
-///
-/// # Errors
-/// A tile that can't be read.
 pub fn stored_frame(
     plan: &TilePlan,
     tiles: &[StoredTile],

@@ -9,8 +9,8 @@ use crate::recon::ReconError;
 
 /// Why a step did not come to its end.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // the messages say it
 pub enum PipelineError {
-    /// It was asked to stop.
     #[error("stopped")]
     Stopped,
     /// The solver refused or failed.
@@ -24,21 +24,13 @@ pub enum PipelineError {
     Format(#[from] FormatError),
     /// A file of the result can't be written.
     #[error("the result's {name}: {source}")]
-    File {
-        /// Its name in the result's folder.
-        name: String,
-        /// What went wrong.
-        source: io::Error,
-    },
+    File { name: String, source: io::Error },
     /// The output folder holds something that is not an earlier result.
     #[error(
         "the output folder already holds {name:?}, which no earlier run of this program left \
          there: name a new folder"
     )]
-    Foreign {
-        /// What stands in the way.
-        name: String,
-    },
+    Foreign { name: String },
     /// Stored tiles are not what was stored.
     #[error("the stored results of tiles {0:?} are damaged")]
     Damaged(Vec<u32>),
@@ -47,29 +39,13 @@ pub enum PipelineError {
         "the stored {what} (blob {sha256}) are damaged: send the files again, and make the \
          calibration and the measurement anew"
     )]
-    Corrupt {
-        /// Masks or snapshots.
-        what: &'static str,
-        /// The hash that it should have.
-        sha256: Sha256,
-    },
+    Corrupt { what: &'static str, sha256: Sha256 },
     /// A snapshot without light.
     #[error("snapshot {snapshot}: {source}")]
-    Snapshot {
-        /// Its index.
-        snapshot: u32,
-        /// What is wrong with it.
-        source: ReconError,
-    },
+    Snapshot { snapshot: u32, source: ReconError },
     /// A record in the database is not what this program writes.
     #[error("the record of the {what} can't be used: {problem}")]
-    Record {
-        /// Whose record.
-        what: &'static str,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// A thread died.
+    Record { what: &'static str, problem: String },
     #[error("a computing thread ended unexpectedly")]
     Thread,
 }

@@ -106,9 +106,6 @@ impl ModelFile {
     }
 
     /// A file as it is.
-    ///
-    /// # Errors
-    /// A file that can't be read.
     pub fn open(path: &Path) -> Result<Self, NetworkError> {
         let bytes = read(path)?;
         Ok(Self { path: path.to_owned(), sha256: Sha256::of(&bytes) })
@@ -190,9 +187,6 @@ impl NetworkSource {
     }
 
     /// The networks of a schedule, for records.
-    ///
-    /// # Errors
-    /// A file of the folder of models can't be read.
     pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;
@@ -226,9 +220,6 @@ impl NetworkSource {
     }
 
     /// Version of the library, for records; loads it.
-    ///
-    /// # Errors
-    /// No library, or one that can't be loaded.
     pub fn version(&self) -> Result<String, NetworkError> {
         let runtime = self.runtime()?;
         let path = self.path()?;
@@ -286,9 +277,6 @@ impl WarmNetworks {
     }
 
     /// The end-to-end network in this file, which is kept until another one is asked for.
-    ///
-    /// # Errors
-    /// As [`NetworkSource::end_to_end`].
     pub fn end_to_end(&mut self, file: &ModelFile) -> Result<&mut EndToEndNetwork, NetworkError> {
         let warm = self.end_to_end.take().filter(|(sha256, _)| *sha256 == file.sha256());
         let network = match warm {

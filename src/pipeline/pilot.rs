@@ -12,9 +12,6 @@ use crate::recon::solver::Observer;
 
 /// Runs the pilot of an adaptive schedule on a piece of a snapshot; none for a schedule that is
 /// fixed, or a piece that no light reaches.
-///
-/// # Errors
-/// As [`pilot::run`].
 pub fn decide(
     input: TileInput,
     (snapshot, row, column): (usize, usize, usize),

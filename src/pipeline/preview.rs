@@ -10,9 +10,6 @@ use crate::recon::preview::{self, Blocks};
 
 /// Coarse frames \[B,h,w\] of a snapshot on the scale of the measurement: as large as the snapshot
 /// where it is small, else one pixel a block.
-///
-/// # Errors
-/// Arrays that can't be read, or a stop.
 pub fn frames(
     arrays: &Arrays,
     shape: SceneShape,

@@ -22,9 +22,6 @@ pub struct FrameQuality {
 
 impl FrameQuality {
     /// Of the frame \[H,W\] with index `k`, from 0, on \[0,1\].
-    ///
-    /// # Errors
-    /// Sizes that differ.
     pub fn of(
         k: usize,
         frame: ArrayView2<'_, f32>,
@@ -50,9 +47,6 @@ pub struct Quality {
 
 impl Quality {
     /// Of tiles in memory, against the frames \[B,H,W\].
-    ///
-    /// # Errors
-    /// Sizes that differ.
     pub fn of_tiles(
         plan: &TilePlan,
         tiles: &[Outcome],

@@ -10,9 +10,6 @@ use crate::recon::ReconError;
 use crate::recon::scale::ScaleEstimator;
 
 /// The white level of a scene in memory: masks \[B,H,W\] and one snapshot \[H,W\].
-///
-/// # Errors
-/// Sizes that differ, or a snapshot without light.
 pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Result<f32, ReconError> {
     let (_, height, width) = masks.dim();
     let mut estimator = ScaleEstimator::new(height, width);
@@ -22,9 +19,6 @@ pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Result<f32, 
 
 /// The typical white level of the snapshots of a job; memory holds a few planes, whatever the number
 /// of frames.
-///
-/// # Errors
-/// Arrays that can't be read, a snapshot without light, or a stop.
 pub fn white_of_job(
     arrays: &Arrays,
     snapshots: SnapshotRange,

@@ -1,7 +1,6 @@
 //! A whole snapshot in memory, its tiles on several threads.
 
 use std::ops::Range;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
@@ -104,80 +103,58 @@ fn run_tiles(
     threads: usize,
     progress: TileProgress<'_>,
 ) -> Result<Vec<Outcome>, PipelineError> {
-    let run = Run {
-        input,
-        network,
-        progress,
-        next: AtomicUsize::new(0),
-        stop: AtomicBool::new(false),
-        done: Mutex::new((0..input.plan.len()).map(|_| None).collect()),
-    };
-    let threads = threads.clamp(1, input.plan.len());
-    let outcomes: Vec<Result<(), PipelineError>> = thread::scope(|scope| {
-        let handles: Vec<_> = (0..threads).map(|_| scope.spawn(|| run.thread())).collect();
-        handles.into_iter().map(|h| h.join().unwrap_or(Err(PipelineError::Thread))).collect()
-    });
-    // Threads that were stopped say so; the cause is the other error.
-    let mut errors: Vec<PipelineError> = outcomes.into_iter().filter_map(Result::err).collect();
-    errors.sort_by_key(|error| matches!(error, PipelineError::Stopped));
-    if let Some(error) = errors.into_iter().next() {
-        return Err(error);
-    }
-    let done = run.done.into_inner().map_err(|_| PipelineError::Thread)?;
-    done.into_iter().collect::<Option<_>>().ok_or(PipelineError::Thread)
-}
-
-struct Run<'a, 'b> {
-    input: &'a SnapshotInput<'b>,
-    network: &'a NetworkSource,
-    progress: TileProgress<'a>,
-    next: AtomicUsize,
-    stop: AtomicBool,
-    done: Mutex<Vec<Option<Outcome>>>,
-}
-
-impl Run<'_, '_> {
-    fn thread(&self) -> Result<(), PipelineError> {
-        let outcome = self.tiles();
-        if outcome.is_err() {
-            self.stop.store(true, Ordering::Relaxed);
-        }
-        outcome
-    }
-
-    fn tiles(&self) -> Result<(), PipelineError> {
-        let mut networks = WarmNetworks::new(self.network.clone());
-        loop {
-            let index = self.next.fetch_add(1, Ordering::Relaxed);
-            let Some(tile) = self.input.plan.tile(index) else { return Ok(()) };
-            let window = self.input.window(tile.rows(), tile.columns());
-            let outcome = match self.input.solver {
+    let (next, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
+    let tiles = || -> Result<Vec<(usize, Outcome)>, PipelineError> {
+        let mut networks = WarmNetworks::new(network.clone());
+        let mut done = Vec::new();
+        while let Some(tile) = input.plan.tile(next.fetch_add(1, Ordering::Relaxed)) {
+            let window = input.window(tile.rows(), tile.columns());
+            let outcome = match input.solver {
                 Solver::Schedule(schedule) => {
                     let share = ShareDone::new(schedule.clone());
-                    let mut observer = TileObserver { run: self, index, share };
+                    let tell = |share| progress(tile.index, share);
+                    let mut observer = TileObserver { tell, stop: &stop, share };
                     reconstruct_tile(window, schedule, &mut networks, &mut observer)?
                 }
-                Solver::Network(_) if self.stop.load(Ordering::Relaxed) => {
+                Solver::Network(_) if stop.load(Ordering::Relaxed) => {
                     return Err(PipelineError::Stopped);
                 }
                 Solver::Network(file) => run_network(window, networks.end_to_end(file)?)?,
             };
-            (self.progress)(index, 1.0);
-            self.done.lock().map_err(|_| PipelineError::Thread)?[index] = Some(outcome);
+            progress(tile.index, 1.0);
+            done.push((tile.index, outcome));
+        }
+        Ok(done)
+    };
+    let thread = || tiles().inspect_err(|_| stop.store(true, Ordering::Relaxed));
+    let outcomes: Vec<_> = thread::scope(|scope| {
+        let count = threads.clamp(1, input.plan.len());
+        let handles: Vec<_> = (0..count).map(|_| scope.spawn(thread)).collect();
+        handles.into_iter().map(|h| h.join().unwrap_or(Err(PipelineError::Thread))).collect()
+    });
+    let (mut done, mut failure) = (Vec::new(), None);
+    for outcome in outcomes {
+        match outcome {
+            Ok(tiles) => done.extend(tiles),
+            // Threads that were stopped say so; the cause is the other error.
+            Err(PipelineError::Stopped) if failure.is_some() => {}
+            Err(error) => failure = Some(error),
         }
     }
+    done.sort_by_key(|(index, _)| *index);
+    failure.map_or_else(|| Ok(done.into_iter().map(|(_, outcome)| outcome).collect()), Err)
 }
 
-struct TileObserver<'a, 'b, 'c> {
-    run: &'a Run<'b, 'c>,
-    index: usize,
+struct TileObserver<'a, F> {
+    tell: F,
+    stop: &'a AtomicBool,
     share: ShareDone,
 }
 
-impl Observer for TileObserver<'_, '_, '_> {
+impl<F: Fn(f64)> Observer for TileObserver<'_, F> {
     fn iteration(&mut self, progress: &Progress) -> Control {
-        (self.run.progress)(self.index, self.share.after(progress));
-        if self.run.stop.load(Ordering::Relaxed) { Control::Cancel } else { Control::Continue }
+        (self.tell)(self.share.after(progress));
+        if self.stop.load(Ordering::Relaxed) { Control::Cancel } else { Control::Continue }
     }
 }
 

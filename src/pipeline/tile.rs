@@ -90,9 +90,6 @@ pub fn reconstruct_tile(
 }
 
 /// Reconstructs one tile in one run of an end-to-end network.
-///
-/// # Errors
-/// Inputs that can't be, or a network that fails.
 pub fn run_network(
     input: TileInput,
     network: &mut dyn SnapshotNetwork,

@@ -67,9 +67,6 @@ pub fn write_result(
 }
 
 /// Writes a `manifest.json`; it and its folder are on the disk (fsync) when this returns.
-///
-/// # Errors
-/// Those of writing.
 pub fn write_manifest(
     folder: &Path,
     manifest: &impl Serialize,
@@ -83,9 +80,6 @@ pub fn write_manifest(
 }
 
 /// Refuses a folder that holds files with the names of a result, but no manifest of ours.
-///
-/// # Errors
-/// [`PipelineError::Foreign`].
 pub fn check_output(folder: &Path) -> Result<(), PipelineError> {
     // Of any version of this program: the form of manifests changes.
     let manifest = fs::read(folder.join(MANIFEST)).ok();

@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::transport::{
-    Claim, Done, LEASE, Output, Owner, TaskError, TaskInput, TileTask, Transport, TransportError,
+    Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
 };
 use crate::formats::planar;
 use crate::job::{Sha256, TaskKind, TaskProgress, WorkerId};
@@ -133,13 +133,16 @@ impl Transport for Local {
     async fn claim(&self) -> Result<Option<Claim>, TransportError> {
         let Some(task) = self.store.claim(self.worker, LEASE).await? else { return Ok(None) };
         let ClaimedTask { lease, kind, cost, work } = task;
-        let owner = match &work {
-            Work::Job(task) => Owner::Job(task.job),
-            Work::Calibration(task) => Owner::Calibration(task.calibration),
+        let (id, kind) = (lease.task, kind.name());
+        let span = match &work {
+            Work::Job(task) => tracing::info_span!("task", job = %task.job, kind, task = %id),
+            Work::Calibration(CalibrationTask { calibration, .. }) => {
+                tracing::info_span!("task", %calibration, kind, task = %id)
+            }
         };
         let here = self.clone();
         let input = tokio::task::spawn_blocking(move || here.input(&work, lease.attempt)).await?;
-        Ok(Some(Claim { lease, owner, kind, cost, input }))
+        Ok(Some(Claim { lease, span, cost, input }))
     }
 
     async fn heartbeat(

@@ -14,9 +14,9 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::perform::perform;
-use super::transport::{Claim, Done, Owner, TaskError, TaskInput, Transport, TransportError};
+use super::transport::{Claim, Done, TaskError, TaskInput, Transport, TransportError};
 use crate::intake::IntakeError;
-use crate::job::{TaskProgress, without_paths};
+use crate::job::without_paths;
 use crate::pipeline::networks::WarmNetworks;
 use crate::pipeline::progress::Monitor;
 use crate::pipeline::{NetworkSource, PipelineError};
@@ -128,14 +128,7 @@ impl<T: Transport> Worker<T> {
 
     /// Does one task and tells how it ended.
     async fn work(&mut self, claim: Claim) -> Result<(), WorkerError> {
-        let Claim { lease, owner, kind, cost, input } = claim;
-        let (kind, id) = (kind.name(), lease.task);
-        let span = match owner {
-            Owner::Job(job) => tracing::info_span!("task", %job, kind, task = %id),
-            Owner::Calibration(calibration) => {
-                tracing::info_span!("task", %calibration, kind, task = %id)
-            }
-        };
+        let Claim { lease, span, cost, input } = claim;
         let monitor = Arc::new(Monitor::default());
         let patience = self.stall + Duration::from_secs_f64(SLOWNESS * cost);
         let computing = self.start(input, &monitor, span.clone());
@@ -143,10 +136,7 @@ impl<T: Transport> Worker<T> {
             match self.watch(computing, &lease, &monitor, patience).await {
                 Ok(((networks, outcome), reason)) => {
                     self.networks = Some(networks);
-                    if outcome.is_ok() && reason.is_none() {
-                        self.last_news(&lease, &monitor).await;
-                    }
-                    self.end(&lease, outcome, reason).await;
+                    self.end(&lease, outcome, reason, &monitor).await;
                     Ok(())
                 }
                 Err(error) => {
@@ -171,9 +161,15 @@ impl<T: Transport> Worker<T> {
     }
 
     /// Tells how a task ended.
-    async fn end(&self, lease: &Lease, outcome: Result<Done, TaskError>, reason: Option<Reason>) {
+    async fn end(
+        &self,
+        lease: &Lease,
+        outcome: Result<Done, TaskError>,
+        reason: Option<Reason>,
+        monitor: &Monitor,
+    ) {
         let error = match outcome {
-            Ok(done) => return self.complete(lease, done).await,
+            Ok(done) => return self.complete(lease, done, monitor).await,
             Err(error) => error,
         };
         match (&error, reason) {
@@ -274,20 +270,13 @@ impl<T: Transport> Worker<T> {
         self.transport.heartbeat(lease, monitor.progress(), news.as_deref()).await
     }
 
-    /// Tells what the solver did after the last heartbeat.
-    async fn last_news(&self, lease: &Lease, monitor: &Monitor) {
-        if let Some(news) = monitor.news() {
-            let told = self.transport.heartbeat(lease, monitor.progress(), Some(&news)).await;
-            said(told.map(|_| ()));
-        }
-    }
-
-    async fn complete(&self, lease: &Lease, done: Done) {
-        let progress = done.progress;
+    async fn complete(&self, lease: &Lease, done: Done, monitor: &Monitor) {
+        // What the solver did after the last heartbeat.
+        said(self.beat(lease, monitor).await.map(|_| ()));
         let completed = tokio::select! {
             completed = self.transport.complete(lease, done) => completed,
             // Bringing a large result to its place may take longer than a lease.
-            never = self.keep(lease, progress) => match never {},
+            never = self.keep(lease, monitor) => match never {},
         };
         match completed {
             Ok(Heartbeat::Lost) => tracing::warn!("done, but too late: the lease had run out"),
@@ -297,10 +286,10 @@ impl<T: Transport> Worker<T> {
     }
 
     /// Renews the lease for as long as this is awaited.
-    async fn keep(&self, lease: &Lease, progress: TaskProgress) -> Infallible {
+    async fn keep(&self, lease: &Lease, monitor: &Monitor) -> Infallible {
         loop {
             tokio::time::sleep(HEARTBEAT).await;
-            if let Err(error) = self.transport.heartbeat(lease, progress, None).await {
+            if let Err(error) = self.beat(lease, monitor).await {
                 tracing::error!(%error, "a heartbeat is not recorded");
             }
         }

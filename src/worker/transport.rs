@@ -11,8 +11,7 @@ use serde_json::Value;
 
 use crate::intake::{CaptureFiles, IntakeError};
 use crate::job::{
-    CalibrationId, JobId, JobSpec, Label, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange,
-    TaskKind, TaskProgress,
+    JobId, JobSpec, Label, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange, TaskProgress,
 };
 use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
@@ -78,96 +77,43 @@ pub trait Transport: Clone + Send + 'static {
 pub struct Claim {
     /// The right to it, to be shown with every message about it.
     pub lease: Lease,
-    /// Whose it is, for logs.
-    pub owner: Owner,
-    /// What it is, for logs.
-    pub kind: TaskKind,
+    /// For logs.
+    pub span: tracing::Span,
     /// Its planned processor time in seconds.
     pub cost: f64,
     /// What is to be done, or why that can't be told.
     pub input: Result<TaskInput, TaskError>,
 }
 
-/// Whose a task is.
-#[derive(Debug, Clone, Copy)]
-pub enum Owner {
-    /// A job's.
-    Job(JobId),
-    /// A calibration's.
-    Calibration(CalibrationId),
-}
-
 /// What is to be done, with all that is needed.
 #[derive(Debug)]
 pub enum TaskInput {
     /// Estimate the white level of a job.
-    Prepare {
-        /// Masks and measurement.
-        arrays: Arrays,
-        /// The snapshots of the job.
-        snapshots: SnapshotRange,
-    },
+    Prepare { arrays: Arrays, snapshots: SnapshotRange },
     /// Reconstruct a snapshot coarsely.
-    Preview {
-        /// Masks and measurement.
-        arrays: Arrays,
-        /// Their sizes.
-        shape: SceneShape,
-        /// Which snapshot.
-        snapshot: u32,
-        /// White level of the scene.
-        white: f32,
-    },
+    Preview { arrays: Arrays, shape: SceneShape, snapshot: u32, white: f32 },
     /// Find out how many iterations of an adaptive schedule pay.
-    Pilot {
-        /// Masks and measurement.
-        arrays: Arrays,
-        /// On which snapshot.
-        snapshot: u32,
-        /// White level of the scene.
-        white: f32,
-        /// The schedule that was asked for.
-        schedule: Schedule,
-    },
+    Pilot { arrays: Arrays, snapshot: u32, white: f32, schedule: Schedule },
     /// Reconstruct a tile.
     Tile(Box<TileTask>),
-    /// Blend the tiles of a snapshot and write its frames.
+    /// Blend all tiles of a snapshot, and write its frames to the folder.
     Assemble {
-        /// The job.
         job: JobId,
-        /// What the manifest tells of it.
         recipe: Box<Recipe>,
-        /// Which snapshot.
         snapshot: u32,
-        /// All its tiles in the plan's order.
         tiles: Vec<StoredTile>,
-        /// For the files.
         folder: StagedDir,
     },
-    /// Write the manifest of a job.
+    /// Write the manifest of a job to the folder.
     Manifest {
-        /// The job.
         job: JobId,
-        /// Itself.
         spec: Box<JobSpec>,
-        /// What the manifest tells of it.
         recipe: Box<Recipe>,
-        /// What its other tasks have left.
         tasks: JobTasks,
-        /// For the file.
         folder: StagedDir,
     },
-    /// Make masks of captures, and a report on them.
-    Captures {
-        /// The user's name for the calibration.
-        name: Option<Label>,
-        /// The captures.
-        files: CaptureFiles,
-        /// For the masks before their scale is known.
-        scratch: StagedPath,
-        /// For the masks.
-        masks: BlobWriter,
-    },
+    /// Make masks of captures, and a report on them; they lie in `scratch` until their scale is known.
+    Captures { name: Option<Label>, files: CaptureFiles, scratch: StagedPath, masks: BlobWriter },
     /// Make a report on masks, a prepared array at this place.
     Report(PathBuf),
 }
@@ -176,21 +122,16 @@ pub enum TaskInput {
 /// another machine as it is.
 #[derive(Debug, Clone)]
 pub struct TileTask {
-    /// The prepared masks.
     pub masks: Sha256,
-    /// The prepared measurement.
     pub measurement: Sha256,
     /// The snapshots that are solved together; one today.
     pub snapshots: Range<u32>,
     /// The colour plane of the sensor, from 0; one today.
     pub plane: usize,
-    /// The window.
     pub tile: Tile,
-    /// White level of the scene.
     pub white: f32,
     /// The schedule, after the pilot; without stages if there is a model.
     pub schedule: Schedule,
-    /// The end-to-end network of the job, if it has one.
     pub model: Option<Sha256>,
 }
 
@@ -201,7 +142,6 @@ pub struct Done {
     pub progress: TaskProgress,
     /// What is to be remembered of it, for the manifest.
     pub record: Value,
-    /// What it has made.
     pub output: Output,
 }
 
@@ -223,13 +163,10 @@ pub enum Output {
 /// Why there is no output.
 #[derive(Debug, thiserror::Error)]
 pub enum TaskError {
-    /// A step did not come to its end.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
-    /// Captures or masks can't be used.
     #[error(transparent)]
     Intake(#[from] IntakeError),
-    /// What is needed can't be had.
     #[error(transparent)]
     Transport(#[from] TransportError),
 }
