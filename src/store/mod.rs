@@ -5,7 +5,7 @@
 //! processes work on the same content: the database is the one mutex of the service. No transaction
 //! is open while anything is computed or uploaded.
 //!
-//! What comes in goes through [`submit`] to the [`queue`], and from there to the [`tables`]; nothing
+//! What comes in goes through `submit` to the `queue`, and from there to the `tables`; nothing
 //! goes the other way.
 //!
 //! # Errors
@@ -125,7 +125,7 @@ impl Store {
         Ok(store)
     }
 
-    /// Lets the database and the marker be newer than all copies of them; see [`identity`].
+    /// Lets the database and the marker be newer than all copies of them; see `identity.rs`.
     pub async fn advance_generation(&self) -> Result<(), StoreError> {
         sqlx::query("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
         self.write_marker().await

@@ -38,11 +38,13 @@ impl Weighter<Key, Values> for Bytes {
 
 impl Pictures {
     pub(in crate::http) fn new() -> Self {
-        // One shard: in one of many the largest pictures would find no room.
+        // One shard: in one of many the largest pictures would find no room. Half is for what was
+        // asked for once: a screen of tiles is looked at again with another contrast.
         let options = OptionsBuilder::new()
             .shards(1)
             .estimated_items_capacity(1024)
             .weight_capacity(BUDGET)
+            .hot_allocation(0.5)
             .build();
         // The options are complete, so this can't fail.
         let reduced = match options {
