@@ -14,7 +14,8 @@ if [ ${#missing[@]} -gt 0 ]; then
 fi
 export CHROMIUM
 
-${CARGO:-cargo} build --quiet
+# With the test, so that it is the program that `make test` has built.
+${CARGO:-cargo} test --no-run --quiet --test service
 target=$(${CARGO:-cargo} metadata --format-version 1 --no-deps | node -p 'JSON.parse(require("fs").readFileSync(0)).target_directory')
 (cd tests/e2e && npm ci --silent --no-audit --no-fund)
 exec node tests/e2e/run.mjs "$target/debug/sci-recon"
