@@ -11,13 +11,14 @@ use crate::job::{Algorithm, InvalidField};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
+use strum::VariantArray;
 
 /// Which algorithm, and how long.
 #[derive(Debug, Args)]
 pub(super) struct ScheduleArguments {
     /// The algorithm.
-    #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastDvdNet.name(),
-          value_parser = named(&Algorithm::ALL))]
+    #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
+          value_parser = named(Algorithm::VARIANTS))]
     pub(super) algorithm: Algorithm,
     /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
     #[arg(long, value_name = "FILE")]
@@ -87,14 +88,15 @@ impl NetworkArguments {
 
 /// Names of algorithms that need no network of the user's.
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
-    let [own @ .., _] = &Algorithm::ALL;
+    let own = &Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1];
     named(own)
 }
 
 fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {
-    let names: Vec<&str> = algorithms.iter().map(|algorithm| algorithm.name()).collect();
+    let names: Vec<&str> = algorithms.iter().map(|algorithm| algorithm.into_str()).collect();
     PossibleValuesParser::new(names).try_map(|name: String| {
-        let named = Algorithm::ALL.into_iter().find(|algorithm| algorithm.name() == name);
+        let named =
+            Algorithm::VARIANTS.iter().copied().find(|algorithm| algorithm.into_str() == name);
         named.ok_or("no such algorithm")
     })
 }
@@ -121,7 +123,7 @@ mod tests {
         let spec = parse(&["--algorithm", "gap-tv", "--iterations", "7"]).resolve().unwrap();
         assert_eq!(spec.planned_iterations(), 7);
         assert!(spec.stages.iter().all(|stage| stage.tolerance == 0.0));
-        assert_eq!(parse(&[]).algorithm, Algorithm::PnpTvFastDvdNet);
+        assert_eq!(parse(&[]).algorithm, Algorithm::PnpTvFastdvdnet);
         assert!(Command::try_parse_from(["test", "--algorithm", "magic"]).is_err());
         assert!(Command::try_parse_from(["test", "--iterations", "0"]).is_err());
     }

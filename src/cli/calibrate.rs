@@ -83,7 +83,7 @@ fn write_report(arguments: &Arguments, made: &Report) -> Result<(), CliError> {
     if arguments.json {
         println!("{text}");
     } else {
-        println!("grade: {}", made.report.grade.name());
+        println!("grade: {}", made.report.grade.into_str());
         for finding in &made.report.findings {
             println!("{}: {}. What to do: {}.", finding.code, finding.detail, finding.remedy);
         }

@@ -62,7 +62,7 @@ pub struct Arguments {
     /// The network of --algorithm learned: an ONNX file with inputs `measurement [1,1,H,W]` and
     /// `masks [1,B,H,W]` and output `frames [1,B,H,W]`, all float32. The measurement is sum C x with
     /// frames x from 0 to 1.
-    #[arg(long, value_name = "FILE", required_if_eq("algorithm", Algorithm::Learned.name()))]
+    #[arg(long, value_name = "FILE", required_if_eq("algorithm", Algorithm::Learned.into_str()))]
     model: Option<PathBuf>,
     #[command(flatten)]
     engine: NetworkArguments,
@@ -154,7 +154,7 @@ fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Lear
         Algorithm::Learned => Learned::open(path, network).map(Some),
         other => Err(CliError::Input(format!(
             "{} takes no --model; ask for --algorithm learned",
-            other.name()
+            other.into_str()
         ))),
     }
 }
@@ -301,7 +301,7 @@ impl Report {
     fn new(manifest: &Manifest, quality: Option<Quality>) -> Self {
         let (content, run) = (&manifest.content, &manifest.run);
         Self {
-            algorithm: content.recipe.algorithm.name(),
+            algorithm: content.recipe.algorithm.into_str(),
             frames: content.frames,
             height: content.height,
             width: content.width,

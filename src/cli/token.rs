@@ -128,7 +128,7 @@ fn table(tokens: &[(Token, u64)]) -> String {
             "{:36}  {:16}  {:6}  {bytes:>14}  {limit:>14}  {:24}  {revoked:24}  {}",
             token.id.to_string(),
             token.lab.as_str(),
-            token.role.name(),
+            token.role.into_str(),
             token.created_at.to_string(),
             token.note.as_ref().map_or("", Label::as_str),
         ));

@@ -1,6 +1,6 @@
 //! The formats, told apart by the first bytes of a file.
 
-use std::fmt;
+use strum::Display;
 
 /// The first bytes of every npy file.
 pub(super) const NPY_MAGIC: &[u8] = b"\x93NUMPY";
@@ -8,35 +8,29 @@ pub(super) const NPY_MAGIC: &[u8] = b"\x93NUMPY";
 pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 
 /// A file format that is read or written here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
 pub enum Format {
     /// NumPy's array file.
+    #[strum(serialize = "npy")]
     Npy,
     /// TIFF and BigTIFF, one frame a page.
+    #[strum(serialize = "TIFF")]
     Tiff,
     /// PNG, one frame.
+    #[strum(serialize = "PNG")]
     Png,
     /// MATLAB's level 5 array file.
+    #[strum(serialize = ".mat")]
     Mat,
     /// OpenEXR.
+    #[strum(serialize = "EXR")]
     Exr,
     /// Our own prepared arrays ([`super::planar`]).
+    #[strum(serialize = "planar")]
     Planar,
 }
 
 impl Format {
-    /// The name in messages and records.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Npy => "npy",
-            Self::Tiff => "TIFF",
-            Self::Png => "PNG",
-            Self::Mat => ".mat",
-            Self::Exr => "EXR",
-            Self::Planar => "planar",
-        }
-    }
-
     /// The format whose signature these first bytes (128 suffice) carry.
     pub(super) fn sniff(head: &[u8]) -> Option<Self> {
         const BIG_ENDIAN_MAT: &[u8] = &[1, 0, b'M', b'I'];
@@ -60,12 +54,6 @@ impl Format {
                 _ => None,
             }
         }
-    }
-}
-
-impl fmt::Display for Format {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
     }
 }
 

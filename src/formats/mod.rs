@@ -7,6 +7,8 @@
 //!
 //! Arrays are f32 with axes (frame, row, column).
 
+#![warn(missing_docs)]
+
 mod error;
 mod format;
 mod limits;

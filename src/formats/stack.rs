@@ -1,38 +1,31 @@
 //! What a stack of frames is, whatever file it lies in.
 
-use std::fmt;
-
 use ndarray::Array2;
 
 use super::{Format, FormatError};
+use strum::Display;
 
-/// How one sample is stored in a file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// How one sample is stored in a file, by NumPy's names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
 pub enum SampleType {
     /// One byte, 0 or 1.
+    #[strum(serialize = "bool")]
     Bool,
     /// Unsigned 8 bit.
+    #[strum(serialize = "uint8")]
     U8,
     /// Unsigned 16 bit.
+    #[strum(serialize = "uint16")]
     U16,
     /// 32-bit float.
+    #[strum(serialize = "float32")]
     F32,
     /// 64-bit float, rounded to 32 bit when read.
+    #[strum(serialize = "float64")]
     F64,
 }
 
 impl SampleType {
-    /// NumPy's name of the type.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Bool => "bool",
-            Self::U8 => "uint8",
-            Self::U16 => "uint16",
-            Self::F32 => "float32",
-            Self::F64 => "float64",
-        }
-    }
-
     /// Bytes a sample.
     pub fn bytes(self) -> usize {
         match self {
@@ -51,12 +44,6 @@ impl SampleType {
             Self::U16 => FullScale(65535.0),
             Self::Bool | Self::F32 | Self::F64 => FullScale(1.0),
         }
-    }
-}
-
-impl fmt::Display for SampleType {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
     }
 }
 

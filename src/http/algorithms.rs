@@ -5,6 +5,7 @@ use serde::Serialize;
 
 use crate::job::{Algorithm, Schedule, TileSpec};
 use crate::pipeline::networks;
+use strum::VariantArray;
 
 #[derive(Debug, Serialize)]
 pub(super) struct AlgorithmBody {
@@ -42,5 +43,5 @@ pub(super) async fn list() -> Json<ListBody> {
             tile: name.default_tile(),
         }
     };
-    Json(ListBody { items: Algorithm::ALL.map(show).into() })
+    Json(ListBody { items: Algorithm::VARIANTS.iter().copied().map(show).collect() })
 }

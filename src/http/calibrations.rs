@@ -196,8 +196,8 @@ fn facts(
     NewCalibration {
         name,
         masks,
-        format: info.format.name().to_owned(),
-        sample: info.sample.name().to_owned(),
+        format: info.format.to_string(),
+        sample: info.sample.to_string(),
         frames: info.frames,
         height: info.height,
         width: info.width,

@@ -109,8 +109,8 @@ fn facts(
         name: request.name,
         calibration: request.calibration,
         data: request.data,
-        format: info.format.name().to_owned(),
-        sample: info.sample.name().to_owned(),
+        format: info.format.to_string(),
+        sample: info.sample.to_string(),
         // The limits on uploads keep the count far below this.
         snapshots: u32::try_from(info.frames).unwrap_or(u32::MAX),
         height: info.height,

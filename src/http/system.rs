@@ -15,6 +15,7 @@ use super::app::App;
 use super::error::ApiError;
 use crate::job::{JobState, TaskState, Timestamp};
 use crate::store::WorkerRow;
+use strum::VariantArray;
 
 /// Workers that were silent for longer are not counted.
 const WORKER_AGE: Duration = Duration::from_secs(15);
@@ -89,7 +90,7 @@ pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>, Api
 async fn jobs(app: &App) -> Result<BTreeMap<&'static str, u64>, ApiError> {
     let counted = app.store.job_counts().await?;
     let count = |state| counted.iter().find(|(found, _)| *found == state).map_or(0, |(_, n)| *n);
-    Ok(JobState::ALL.iter().map(|&state| (state.name(), count(state))).collect())
+    Ok(JobState::VARIANTS.iter().map(|&state| (state.into_str(), count(state))).collect())
 }
 
 async fn queue(app: &App) -> Result<QueueBody, ApiError> {
@@ -160,7 +161,7 @@ pub(super) async fn metrics(State(app): State<App>) -> Result<Response, ApiError
         gauge!("sci_recon_jobs", "state" => state).set(count as f64);
     }
     for ((kind, state), count) in app.store.task_counts().await? {
-        gauge!("sci_recon_tasks", "kind" => kind, "state" => state.name()).set(count as f64);
+        gauge!("sci_recon_tasks", "kind" => kind, "state" => state.into_str()).set(count as f64);
     }
     for done in app.store.totals().await? {
         let kind = || done.kind.clone();

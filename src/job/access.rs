@@ -4,11 +4,12 @@ use std::fmt;
 use std::str::FromStr;
 
 use serde::Serialize;
+use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::text::{InvalidText, Sha256};
 
 /// A lab, to which data belong: no lab sees another one's.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, derive_more::Display)]
 #[serde(transparent)]
 pub struct Lab(String);
 
@@ -40,15 +41,24 @@ impl FromStr for Lab {
     }
 }
 
-impl fmt::Display for Lab {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
 /// What a token is good for. Each role may do what those before it may.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Serialize,
+    Display,
+    EnumString,
+    IntoStaticStr,
+    VariantArray,
+)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case", const_into_str)]
+#[strum(parse_err_ty = InvalidText, parse_err_fn = no_role)]
 pub enum Role {
     /// Look at the lab's data and download results.
     Read,
@@ -58,36 +68,9 @@ pub enum Role {
     Admin,
 }
 
-impl Role {
-    /// All roles, from the weakest on.
-    pub const ALL: [Self; 3] = [Self::Read, Self::Submit, Self::Admin];
-
-    /// The role's name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Read => "read",
-            Self::Submit => "submit",
-            Self::Admin => "admin",
-        }
-    }
-}
-
-impl fmt::Display for Role {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-impl FromStr for Role {
-    type Err = InvalidText;
-
-    fn from_str(text: &str) -> Result<Self, InvalidText> {
-        let found = Self::ALL.into_iter().find(|role| role.name() == text);
-        found.ok_or_else(|| {
-            InvalidText::new(format!("{text:?} is not a role; roles are read, submit and admin"))
-        })
-    }
+/// Says which roles there are.
+fn no_role(text: &str) -> InvalidText {
+    InvalidText::new(format!("{text:?} is not a role; roles are read, submit and admin"))
 }
 
 /// A token as its holder has it. It shows itself to nobody who only prints it for debugging.
@@ -132,6 +115,8 @@ impl fmt::Debug for Secret {
 
 #[cfg(test)]
 mod tests {
+    use strum::VariantArray;
+
     use super::{Lab, Role, Secret};
 
     #[test]
@@ -145,8 +130,8 @@ mod tests {
     #[test]
     fn roles_are_ordered_and_named() {
         assert!(Role::Read < Role::Submit && Role::Submit < Role::Admin);
-        for role in Role::ALL {
-            assert_eq!(role.name().parse::<Role>().unwrap(), role);
+        for role in Role::VARIANTS {
+            assert_eq!(role.into_str().parse::<Role>().unwrap(), *role);
         }
     }
 

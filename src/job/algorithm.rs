@@ -1,6 +1,7 @@
 //! The algorithms, and what belongs to each.
 
 use serde::{Deserialize, Serialize};
+use strum::{IntoStaticStr, VariantArray};
 
 use super::shape::TileSpec;
 use crate::recon::prior::Prior;
@@ -11,59 +12,31 @@ use crate::recon::prior::tv::TV;
 use crate::recon::schedule::Schedule;
 
 /// The algorithms.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray,
+)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case", const_into_str)]
 pub enum Algorithm {
     /// GAP with total variation.
     GapTv,
     /// GAP with total variation in space and, where it pays, in time.
-    #[serde(rename = "gap-tv3d")]
     GapTv3d,
     /// ADMM with total variation.
     AdmmTv,
     /// GAP with total variation, then with the nonlocal prior.
     PnpNonlocal,
     /// GAP with total variation, then with FFDNet.
-    #[serde(rename = "pnp-ffdnet")]
-    PnpFfdNet,
+    PnpFfdnet,
     /// GAP with total variation, then with FastDVDNet.
-    #[serde(rename = "pnp-fastdvdnet")]
-    PnpFastDvdNet,
+    PnpFastdvdnet,
     /// GAP with total variation, with FastDVDNet, then with the nonlocal prior.
-    #[serde(rename = "pnp-tv-fastdvdnet")]
-    PnpTvFastDvdNet,
+    PnpTvFastdvdnet,
     /// A network from measurement and masks to frames, trained for one calibration.
     Learned,
 }
 
 impl Algorithm {
-    /// All algorithms.
-    pub const ALL: [Self; 8] = [
-        Self::GapTv,
-        Self::GapTv3d,
-        Self::AdmmTv,
-        Self::PnpNonlocal,
-        Self::PnpFfdNet,
-        Self::PnpFastDvdNet,
-        Self::PnpTvFastDvdNet,
-        Self::Learned,
-    ];
-
-    /// The name in JSON, on the command line and in the database.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::GapTv => "gap-tv",
-            Self::GapTv3d => "gap-tv3d",
-            Self::AdmmTv => "admm-tv",
-            Self::PnpNonlocal => "pnp-nonlocal",
-            Self::PnpFfdNet => "pnp-ffdnet",
-            Self::PnpFastDvdNet => "pnp-fastdvdnet",
-            Self::PnpTvFastDvdNet => "pnp-tv-fastdvdnet",
-            Self::Learned => "learned",
-        }
-    }
-
     /// What it does, in a sentence.
     #[must_use]
     pub fn summary(self) -> &'static str {
@@ -84,9 +57,9 @@ impl Algorithm {
                 "Total variation, then groups of similar patches of several frames, filtered by \
                  their own covariance: no network."
             }
-            Self::PnpFfdNet => "Total variation, then FFDNet on each frame.",
-            Self::PnpFastDvdNet => "Total variation, then FastDVDNet over the clip.",
-            Self::PnpTvFastDvdNet => {
+            Self::PnpFfdnet => "Total variation, then FFDNet on each frame.",
+            Self::PnpFastdvdnet => "Total variation, then FastDVDNet over the clip.",
+            Self::PnpTvFastdvdnet => {
                 "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best \
                  on all masks measured."
             }
@@ -105,9 +78,9 @@ impl Algorithm {
             Self::GapTv3d => Schedule::gap_tv3d(),
             Self::AdmmTv => Schedule::admm_tv(),
             Self::PnpNonlocal => Schedule::pnp_nonlocal(),
-            Self::PnpFfdNet => Schedule::pnp_ffdnet(),
-            Self::PnpFastDvdNet => Schedule::pnp_fastdvdnet(),
-            Self::PnpTvFastDvdNet => Schedule::pnp_tv_fastdvdnet(),
+            Self::PnpFfdnet => Schedule::pnp_ffdnet(),
+            Self::PnpFastdvdnet => Schedule::pnp_fastdvdnet(),
+            Self::PnpTvFastdvdnet => Schedule::pnp_tv_fastdvdnet(),
             Self::Learned => Schedule::none(),
         }
     }
@@ -129,9 +102,9 @@ impl Algorithm {
         match self {
             Self::GapTv | Self::GapTv3d | Self::AdmmTv => &[&TV],
             Self::PnpNonlocal => &[&TV, &NONLOCAL],
-            Self::PnpFfdNet => &[&TV, &FFDNET],
-            Self::PnpFastDvdNet => &[&TV, &FASTDVDNET_INT8, &FASTDVDNET],
-            Self::PnpTvFastDvdNet => {
+            Self::PnpFfdnet => &[&TV, &FFDNET],
+            Self::PnpFastdvdnet => &[&TV, &FASTDVDNET_INT8, &FASTDVDNET],
+            Self::PnpTvFastdvdnet => {
                 &[&TV, &FASTDVDNET_INT8, &FASTDVDNET, &TV_FASTDVDNET, &NONLOCAL]
             }
             Self::Learned => &[],
@@ -146,8 +119,9 @@ impl Algorithm {
         let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;
         let taken = |other: &&Self| other.misfit(schedule).is_none();
         // Later ones take more.
-        let later = Self::ALL.iter().skip_while(|other| **other != self).skip(1).find(taken);
-        let instead = later.map_or_else(String::new, |other| format!("; ask for {}", other.name()));
-        Some(format!("{} has no stages of {}{instead}", self.name(), stranger.prior.name()))
+        let later = Self::VARIANTS.iter().skip_while(|other| **other != self).skip(1).find(taken);
+        let instead =
+            later.map_or_else(String::new, |other| format!("; ask for {}", other.into_str()));
+        Some(format!("{} has no stages of {}{instead}", self.into_str(), stranger.prior.name()))
     }
 }

@@ -1,9 +1,9 @@
 //! Identifiers: one type for each kind of thing, all version 7 UUIDs, so that they sort by time.
 
-use std::fmt;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use derive_more::Display;
+use serde_with::{DeserializeFromStr, SerializeDisplay};
 use uuid::Uuid;
 
 /// The text given is not an identifier.
@@ -17,8 +17,8 @@ pub struct InvalidId {
 macro_rules! identifier {
     ($(#[$doc:meta])* $name:ident) => {
         $(#[$doc])*
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-        #[serde(try_from = "String", into = "String")]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[derive(Display, SerializeDisplay, DeserializeFromStr)]
         pub struct $name(Uuid);
 
         impl $name {
@@ -27,12 +27,6 @@ macro_rules! identifier {
             #[allow(clippy::new_without_default)] // two calls differ: a default should not
             pub fn new() -> Self {
                 Self(Uuid::now_v7())
-            }
-        }
-
-        impl fmt::Display for $name {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                self.0.as_hyphenated().fmt(f)
             }
         }
 
@@ -46,20 +40,6 @@ macro_rules! identifier {
                     .filter(|id| id.as_hyphenated().to_string() == text)
                     .map(Self)
                     .ok_or_else(|| InvalidId { text: text.chars().take(60).collect() })
-            }
-        }
-
-        impl TryFrom<String> for $name {
-            type Error = InvalidId;
-
-            fn try_from(text: String) -> Result<Self, InvalidId> {
-                text.parse()
-            }
-        }
-
-        impl From<$name> for String {
-            fn from(id: $name) -> String {
-                id.to_string()
             }
         }
     };

@@ -106,15 +106,15 @@ mod tests {
 
     #[test]
     fn the_bound_holds_for_what_was_measured_and_is_near_it() {
-        use Algorithm::{GapTv, PnpTvFastDvdNet};
+        use Algorithm::{GapTv, PnpTvFastdvdnet};
         for (algorithm, side, frames, measured) in [
             (GapTv, 1024, 20, 368),
             (GapTv, 1024, 40, 688),
-            (PnpTvFastDvdNet, 256, 10, 620),
-            (PnpTvFastDvdNet, 256, 40, 761),
-            (PnpTvFastDvdNet, 320, 10, 463),
-            (PnpTvFastDvdNet, 512, 10, 1345),
-            (PnpTvFastDvdNet, 768, 10, 2891),
+            (PnpTvFastdvdnet, 256, 10, 620),
+            (PnpTvFastdvdnet, 256, 40, 761),
+            (PnpTvFastdvdnet, 320, 10, 463),
+            (PnpTvFastdvdnet, 512, 10, 1345),
+            (PnpTvFastdvdnet, 768, 10, 2891),
         ] {
             let bound = megabytes(algorithm, side, frames);
             assert!(bound >= measured, "{side}x{side}x{frames}: {bound} < {measured}");

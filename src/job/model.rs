@@ -102,7 +102,8 @@ impl ModelChoice<'_> {
                 "learned needs the network of a model: register one with POST /v1/models".into(),
             ),
             Some(_) if !learned => {
-                let detail = format!("{} takes no model; ask for learned", self.algorithm.name());
+                let detail =
+                    format!("{} takes no model; ask for learned", self.algorithm.into_str());
                 wrong("/model", detail);
             }
             Some(model) if model.calibration != calibration => wrong(

@@ -2,6 +2,7 @@
 //! are stored and shown.
 
 use serde::{Deserialize, Serialize};
+use strum::IntoStaticStr;
 
 pub use crate::optics::Severity;
 use crate::optics::{self, CaptureFigures, MaskFigures, PatternFigures};
@@ -32,8 +33,9 @@ impl From<optics::Finding> for Finding {
 }
 
 /// A verdict on a calibration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case", const_into_str)]
 pub enum Grade {
     /// Nothing is wrong with it.
     Good,
@@ -51,16 +53,6 @@ impl Grade {
             None => Self::Good,
             Some(Severity::Warning) => Self::Usable,
             Some(Severity::Error) => Self::Bad,
-        }
-    }
-
-    /// Its name in JSON.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Good => "good",
-            Self::Usable => "usable",
-            Self::Bad => "bad",
         }
     }
 }

@@ -1,13 +1,25 @@
 //! The states of a job and the steps between them that are legal.
 
-use std::fmt;
-use std::str::FromStr;
-
 use serde::{Deserialize, Serialize};
+use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
-/// Where a job stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+/// Where a job stands, in the order of its life.
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    Hash,
+    Serialize,
+    Deserialize,
+    Display,
+    EnumString,
+    IntoStaticStr,
+    VariantArray,
+)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case", const_into_str)]
 pub enum JobState {
     /// Accepted; no task of it was claimed yet.
     Queued,
@@ -34,29 +46,6 @@ pub struct IllegalTransition {
 }
 
 impl JobState {
-    /// All states, in the order of a job's life.
-    pub const ALL: [Self; 6] = [
-        Self::Queued,
-        Self::Running,
-        Self::Succeeded,
-        Self::Failed,
-        Self::Cancelling,
-        Self::Cancelled,
-    ];
-
-    /// The state's name in JSON and in the database.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Succeeded => "succeeded",
-            Self::Failed => "failed",
-            Self::Cancelling => "cancelling",
-            Self::Cancelled => "cancelled",
-        }
-    }
-
     /// True if nothing happens to the job any more unless a user asks for it.
     #[must_use]
     pub fn is_final(self) -> bool {
@@ -80,37 +69,23 @@ impl JobState {
     }
 }
 
-impl fmt::Display for JobState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-impl FromStr for JobState {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        Self::ALL.into_iter().find(|state| state.name() == text).ok_or_else(|| {
-            format!("{text:?} is not a job state; the states are {:?}", Self::ALL.map(Self::name))
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use strum::VariantArray;
+
     use super::JobState;
 
     #[test]
     fn names_are_one_to_one() {
-        for state in JobState::ALL {
-            assert_eq!(state.name().parse::<JobState>().unwrap(), state);
-            assert_eq!(serde_json::to_value(state).unwrap(), state.name());
+        for state in JobState::VARIANTS.iter().copied() {
+            assert_eq!(state.into_str().parse::<JobState>().unwrap(), state);
+            assert_eq!(serde_json::to_value(state).unwrap(), state.into_str());
         }
     }
 
     #[test]
     fn success_is_for_ever_and_the_other_ends_can_be_retried() {
-        for to in JobState::ALL {
+        for to in JobState::VARIANTS.iter().copied() {
             assert!(JobState::Succeeded.step(to).is_err());
         }
         assert_eq!(JobState::Failed.step(JobState::Queued), Ok(JobState::Queued));

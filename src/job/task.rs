@@ -1,8 +1,7 @@
 //! Tasks: what workers do. A job is cut into many; a calibration is one.
 
-use std::str::FromStr;
-
 use serde::{Deserialize, Serialize};
+use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
 
 use super::request::JobSpec;
 use super::text::Sha256;
@@ -20,7 +19,8 @@ const PREVIEW_WHOLE_S: f64 = 120e-9;
 /// The order of work is prepare, then previews, the pilot of an adaptive schedule, and all tiles; a
 /// snapshot is assembled when its tiles are done, and the manifest is written when all snapshots
 /// are assembled.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantNames)]
+#[strum(serialize_all = "snake_case", const_into_str)]
 pub enum TaskKind {
     /// Estimate the scene's scale, once a job, so that no two tiles differ in it.
     Prepare,
@@ -50,24 +50,6 @@ pub enum TaskKind {
 }
 
 impl TaskKind {
-    /// The names of all kinds.
-    pub const NAMES: [&'static str; 7] =
-        ["prepare", "preview", "pilot", "tile", "assemble", "manifest", "calibration"];
-
-    /// The kind's name in the database, in metrics and in logs.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Prepare => "prepare",
-            Self::Preview { .. } => "preview",
-            Self::Pilot => "pilot",
-            Self::Tile { .. } => "tile",
-            Self::Assemble { .. } => "assemble",
-            Self::Manifest => "manifest",
-            Self::Calibration => "calibration",
-        }
-    }
-
     /// The snapshot that the task belongs to, if it belongs to one.
     #[must_use]
     pub fn snapshot(self) -> Option<u32> {
@@ -88,7 +70,7 @@ impl TaskKind {
         }
     }
 
-    /// The kind with this name and these indices: the inverse of the three functions above.
+    /// The kind with this name and these indices: the inverse of the functions above and `into_str`.
     #[must_use]
     pub fn from_parts(name: &str, snapshot: Option<u32>, tile: Option<u32>) -> Option<Self> {
         match (name, snapshot, tile) {
@@ -145,9 +127,25 @@ fn place(tile: u32) -> f64 {
     (f64::from(tile) * 0.618_033_988_75).fract()
 }
 
-/// Where a task stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+/// Where a task stands, in the order of its life.
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    Serialize,
+    Deserialize,
+    Display,
+    EnumString,
+    IntoStaticStr,
+    VariantArray,
+)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case", const_into_str)]
 pub enum TaskState {
     /// Waits for other tasks of its job.
     Blocked,
@@ -163,39 +161,10 @@ pub enum TaskState {
     Cancelled,
 }
 
-impl TaskState {
-    /// All states, in the order of a task's life.
-    pub const ALL: [Self; 6] =
-        [Self::Blocked, Self::Ready, Self::Running, Self::Done, Self::Failed, Self::Cancelled];
-
-    /// The state's name in JSON, in the database and in metrics.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Blocked => "blocked",
-            Self::Ready => "ready",
-            Self::Running => "running",
-            Self::Done => "done",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }
-    }
-}
-
-impl FromStr for TaskState {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        Self::ALL
-            .into_iter()
-            .find(|state| state.name() == text)
-            .ok_or_else(|| format!("{text:?} is not a task state"))
-    }
-}
-
 /// The part of its work that a task is in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Display, EnumString)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
 pub enum TaskStage {
     /// Reading inputs.
     Reading,
@@ -207,20 +176,6 @@ pub enum TaskStage {
     Nonlocal,
     /// Blending and writing.
     Writing,
-}
-
-impl TaskStage {
-    /// The stage's name in JSON and in the database.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Reading => "reading",
-            Self::Tv => "tv",
-            Self::Deep => "deep",
-            Self::Nonlocal => "nonlocal",
-            Self::Writing => "writing",
-        }
-    }
 }
 
 /// How far a running task is.

@@ -5,7 +5,9 @@ use std::fmt;
 use std::io::{self, BufReader, Read};
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use derive_more::Display;
+use serde::Serialize;
+use serde_with::{DeserializeFromStr, SerializeDisplay};
 
 use crate::recon::schedule::Schedule;
 
@@ -50,8 +52,7 @@ impl InvalidField {
 }
 
 /// A name that a user gives to a thing. It is shown and searched for, and never becomes a path.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Debug, Clone, PartialEq, Eq, Display, SerializeDisplay, DeserializeFromStr)]
 pub struct Label(String);
 
 impl Label {
@@ -65,10 +66,10 @@ impl Label {
     }
 }
 
-impl TryFrom<String> for Label {
-    type Error = InvalidText;
+impl FromStr for Label {
+    type Err = InvalidText;
 
-    fn try_from(text: String) -> Result<Self, InvalidText> {
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
         let length = text.chars().count();
         if text.trim().is_empty() {
             return Err(InvalidText("a name must not be blank; leave it out instead".into()));
@@ -83,28 +84,15 @@ impl TryFrom<String> for Label {
             Some(at) => Err(InvalidText(format!(
                 "the name holds a control character at position {at}; names are printable text"
             ))),
-            None => Ok(Self(text)),
+            None => Ok(Self(text.to_owned())),
         }
     }
 }
 
-impl FromStr for Label {
-    type Err = InvalidText;
-
-    fn from_str(text: &str) -> Result<Self, InvalidText> {
-        text.to_owned().try_into()
-    }
-}
-
-impl From<Label> for String {
-    fn from(label: Label) -> String {
-        label.0
-    }
-}
-
 /// The SHA-256 hash of a file's bytes, which is also the file's address in the store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, SerializeDisplay, DeserializeFromStr,
+)]
 pub struct Sha256([u8; 32]);
 
 impl Sha256 {
@@ -155,22 +143,8 @@ impl FromStr for Sha256 {
     }
 }
 
-impl TryFrom<String> for Sha256 {
-    type Error = InvalidText;
-
-    fn try_from(text: String) -> Result<Self, InvalidText> {
-        text.parse()
-    }
-}
-
-impl From<Sha256> for String {
-    fn from(hash: Sha256) -> String {
-        hash.to_string()
-    }
-}
-
 /// A moment: milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text, always in UTC.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay)]
 pub struct Timestamp(pub i64);
 
 impl Timestamp {
@@ -203,12 +177,6 @@ impl Timestamp {
 impl fmt::Display for Timestamp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:.3}", self.moment())
-    }
-}
-
-impl Serialize for Timestamp {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
     }
 }
 
@@ -268,10 +236,10 @@ mod tests {
 
     #[test]
     fn labels_are_printable_and_short() {
-        assert!(Label::try_from("run 7, f/8, \u{3b1} = 3".to_owned()).is_ok());
-        assert!(Label::try_from("../../etc/passwd".to_owned()).is_ok(), "a label is not a path");
+        assert!("run 7, f/8, \u{3b1} = 3".parse::<Label>().is_ok());
+        assert!("../../etc/passwd".parse::<Label>().is_ok(), "a label is not a path");
         for bad in ["", "  ", "a\nb", "a\0b", "\u{1b}[31m", &"x".repeat(201)] {
-            assert!(Label::try_from(bad.to_owned()).is_err(), "{bad:?}");
+            assert!(bad.parse::<Label>().is_err(), "{bad:?}");
         }
     }
 

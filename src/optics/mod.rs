@@ -3,6 +3,8 @@
 //! Knows arrays only. Everything random comes from a ChaCha generator with a stated seed, so
 //! that a simulation can be repeated bit for bit.
 
+#![warn(missing_docs)]
+
 mod axis;
 mod calibration;
 mod camera;

@@ -90,7 +90,7 @@ impl Recipe {
         let cost = CostRecord::sum(snapshots.iter().map(|(_, record)| &record.run.cost));
         let mut seconds_by_task = BTreeMap::new();
         for (kind, seconds) in &seconds {
-            *seconds_by_task.entry(kind.name()).or_insert(0.0) += seconds;
+            *seconds_by_task.entry(kind.into_str()).or_insert(0.0) += seconds;
         }
         let entry = |(snapshot, record): (u32, SnapshotRecord)| {
             let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
@@ -254,7 +254,7 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
     let recipe = &content.recipe;
     let mut shared = vec![
         ("program".to_owned(), format!("sci-recon {}", recipe.program_version)),
-        ("algorithm".to_owned(), recipe.algorithm.name().to_owned()),
+        ("algorithm".to_owned(), recipe.algorithm.into_str().to_owned()),
         ("snapshot".to_owned(), content.snapshot.to_string()),
         ("masksSha256".to_owned(), recipe.inputs.masks_sha256.to_string()),
         ("measurementSha256".to_owned(), recipe.inputs.measurement_sha256.to_string()),
@@ -290,7 +290,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         pilot: None,
         shape: SceneShape { frames, height: 20, width: 24, snapshots: 2 },
         inputs: Inputs { masks_sha256: hash, measurement_sha256: hash },
-        models: ModelRecord::of(&Algorithm::PnpTvFastDvdNet.default_schedule()),
+        models: ModelRecord::of(&Algorithm::PnpTvFastdvdnet.default_schedule()),
         scale: ScaleRecord { masks_full_scale: 1.0, measurement_full_scale: 255.0, white: 0.9 },
         tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),
         warnings: Vec::new(),

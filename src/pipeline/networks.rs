@@ -348,7 +348,7 @@ mod tests {
 
     #[test]
     fn a_gpu_computes_with_floating_point_and_the_records_say_so() {
-        let schedule = Algorithm::PnpFastDvdNet.default_schedule();
+        let schedule = Algorithm::PnpFastdvdnet.default_schedule();
         let names = |device| -> Vec<String> {
             let records = NetworkSource::new(None, device).records(&schedule).unwrap();
             records.into_iter().map(|record| record.name).collect()
@@ -362,7 +362,7 @@ mod tests {
         let carried = NetworkSource::new(None, Device::Cpu);
         let folder = tempfile::tempdir().unwrap();
         let own = carried.clone().with_models(Some(folder.path().into()));
-        let schedule = Algorithm::PnpFfdNet.default_schedule();
+        let schedule = Algorithm::PnpFfdnet.default_schedule();
         let error = own.records(&schedule).unwrap_err().to_string();
         assert!(error.contains("ffdnet-gray/model.onnx"), "{error}");
 

@@ -32,7 +32,7 @@ pub fn decide(
         iterations: finding.iterations,
         planned_temporal_weight: stage.temporal_weight.unwrap_or(0.0),
         temporal_weight: finding.temporal_weight,
-        end: finding.end.name().into(),
+        end: finding.end.to_string(),
         error_before: finding.before,
         error_after: finding.after,
     };

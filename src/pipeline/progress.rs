@@ -289,7 +289,7 @@ mod tests {
             let progress =
                 Progress { stage: 0, done: 1, planned: 2, residual, change, sigma, deep };
             let expected = if deep { "deep" } else { prior.name() };
-            assert_eq!(stage(&progress).name(), expected);
+            assert_eq!(stage(&progress).to_string(), expected);
         }
     }
 }

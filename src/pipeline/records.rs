@@ -89,7 +89,7 @@ impl From<&Outcome> for TileRecord {
             tv_iterations: outcome.tv_iterations,
             denoiser_passes: outcome.denoiser_passes,
             residual: outcome.residual,
-            stop_reason: outcome.stop_reason.name().into(),
+            stop_reason: outcome.stop_reason.to_string(),
         }
     }
 }

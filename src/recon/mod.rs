@@ -5,6 +5,8 @@
 //! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes (frame, row, column); frames
 //! and masks live on \[0,1\].
 
+#![warn(missing_docs)]
+
 mod defaults;
 pub mod error;
 pub mod learned;

@@ -16,6 +16,7 @@ use super::prior::Networks;
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::solver::{Observer, Run};
+use strum::Display;
 
 /// Side of the piece that the pilot is run on: a tenth of a tile.
 pub const SIDE: usize = 96;
@@ -64,28 +65,18 @@ pub struct StageFinding {
 }
 
 /// Why a stage has as many iterations as it has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[strum(serialize_all = "snake_case")]
 pub enum StageEnd {
     /// Its number is fixed.
     Fixed,
     /// All that may be were done, and paid.
+    #[strum(serialize = "max-iterations")]
     Planned,
     /// Those that followed raised the error.
     Converged,
     /// The iteration left the finite numbers soon after.
     Diverged,
-}
-
-impl StageEnd {
-    /// Name for records.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Fixed => "fixed",
-            Self::Planned => "max-iterations",
-            Self::Converged => "converged",
-            Self::Diverged => "diverged",
-        }
-    }
 }
 
 /// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use sha2::Digest;
 
 use super::error::StoreError;
+use super::rows::sql;
 use super::{Store, dir, identity, on_files};
 use crate::job::Sha256;
 
@@ -45,8 +46,7 @@ impl Store {
         })
         .await?;
         let database = frozen.join("sci-recon.db");
-        sqlx::query("VACUUM INTO ?")
-            .bind(database.to_string_lossy().into_owned())
+        sql!("VACUUM INTO ?", [database.to_string_lossy().into_owned()])
             .execute(&self.readers)
             .await?;
         let expected = self.expected_hashes().await?;
@@ -67,21 +67,17 @@ impl Store {
 
     /// The hashes on record of result files, by their place in the data folder.
     async fn expected_hashes(&self) -> Result<HashMap<PathBuf, Sha256>, StoreError> {
-        use sqlx::Row;
-        let rows = sqlx::query("SELECT job, snapshot, name, sha256 FROM result_files")
-            .fetch_all(&self.readers)
-            .await?;
-        let read = |row: &sqlx::sqlite::SqliteRow| {
-            let (job, name): (String, String) = (row.try_get("job")?, row.try_get("name")?);
-            let folder = match row.try_get::<i64, _>("snapshot")? {
-                -1 => PathBuf::from("results").join(job),
-                snapshot => {
-                    PathBuf::from("results").join(job).join(format!("snapshot_{snapshot:04}"))
-                }
-            };
-            Ok((folder.join(name), super::rows::parsed(row, "sha256")?))
+        let rows: Vec<(String, i64, String, Sha256)> =
+            sqlx::query_as("SELECT job, snapshot, name, sha256 FROM result_files")
+                .fetch_all(&self.readers)
+                .await?;
+        let place = |job: String, snapshot: i64| match snapshot {
+            -1 => PathBuf::from("results").join(job),
+            snapshot => PathBuf::from("results").join(job).join(format!("snapshot_{snapshot:04}")),
         };
-        rows.iter().map(read).collect()
+        let read =
+            |(job, snapshot, name, sha256)| (place(job, snapshot).join::<String>(name), sha256);
+        Ok(rows.into_iter().map(read).collect())
     }
 }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, SystemTime};
 use futures_util::TryStreamExt;
 
 use super::error::StoreError;
-use super::rows::parsed;
+use super::rows::{sql, sql_scalar};
 use super::{DataDir, Store, dir, on_files};
 use crate::job::{JobId, PartialId, Sha256, Timestamp};
 
@@ -86,18 +86,18 @@ impl Store {
 
     async fn known_things(&self) -> Result<HashSet<Thing>, StoreError> {
         let mut known = HashSet::new();
-        let mut rows = sqlx::query("SELECT sha256 FROM blobs").fetch(&self.readers);
-        while let Some(row) = rows.try_next().await? {
-            known.insert(Thing::Blob(parsed(&row, "sha256")?));
+        let mut rows = sqlx::query_scalar("SELECT sha256 FROM blobs").fetch(&self.readers);
+        while let Some(sha256) = rows.try_next().await? {
+            known.insert(Thing::Blob(sha256));
         }
-        let mut rows = sqlx::query("SELECT id FROM jobs").fetch(&self.readers);
-        while let Some(row) = rows.try_next().await? {
-            known.insert(Thing::Results(parsed(&row, "id")?));
+        let mut rows = sqlx::query_scalar("SELECT id FROM jobs").fetch(&self.readers);
+        while let Some(id) = rows.try_next().await? {
+            known.insert(Thing::Results(id));
         }
-        let mut rows =
-            sqlx::query("SELECT id FROM partials WHERE result IS NULL").fetch(&self.readers);
-        while let Some(row) = rows.try_next().await? {
-            known.insert(Thing::Partial(parsed(&row, "id")?));
+        let partials = "SELECT id FROM partials WHERE result IS NULL";
+        let mut rows = sqlx::query_scalar(partials).fetch(&self.readers);
+        while let Some(id) = rows.try_next().await? {
+            known.insert(Thing::Partial(id));
         }
         Ok(known)
     }
@@ -109,19 +109,19 @@ impl Store {
         before: Timestamp,
         until_free: u64,
     ) -> Result<usize, StoreError> {
-        let rows = sqlx::query(
+        let ended = sql_scalar!(
             // A job that has not ended has no time at which it did.
             "SELECT id FROM jobs WHERE finished_at < ? ORDER BY finished_at, id",
+            [before]
         )
-        .bind(before.0)
         .fetch_all(&self.readers)
         .await?;
         let mut removed = 0;
-        for row in &rows {
+        for id in ended {
             if self.dir().disk()?.0 >= until_free {
                 break;
             }
-            match self.remove_job(parsed(row, "id")?).await {
+            match self.remove_job(id).await {
                 Ok(()) => removed += 1,
                 // Taken up again or deleted meanwhile.
                 Err(StoreError::NotFinal(_) | StoreError::NotFound { .. }) => {}
@@ -138,12 +138,12 @@ async fn is_known(
 ) -> Result<bool, StoreError> {
     let query = match thing {
         Thing::Blob(sha256) => {
-            sqlx::query("SELECT 1 FROM blobs WHERE sha256 = ?").bind(sha256.to_string())
+            sql!("SELECT 1 FROM blobs WHERE sha256 = ?", [sha256])
         }
-        Thing::Results(job) => sqlx::query("SELECT 1 FROM jobs WHERE id = ?").bind(job.to_string()),
+        Thing::Results(job) => sql!("SELECT 1 FROM jobs WHERE id = ?", [job]),
         Thing::Partial(id) => {
             let query = "SELECT 1 FROM partials WHERE id = ? AND result IS NULL";
-            sqlx::query(query).bind(id.to_string())
+            sql!(query, [id])
         }
     };
     Ok(query.fetch_optional(connection).await?.is_some())

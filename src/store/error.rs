@@ -134,6 +134,11 @@ fn unready(id: crate::job::CalibrationId, error: Option<&str>) -> String {
 }
 
 impl StoreError {
+    /// There is no such thing of this kind.
+    pub(super) fn missing(what: &'static str, id: impl ToString) -> Self {
+        Self::NotFound { what, id: id.to_string() }
+    }
+
     /// Wraps an I/O error with what was tried on what.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();

@@ -13,12 +13,12 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
-use sqlx::{ConnectOptions, Connection, Row};
+use sqlx::{ConnectOptions, Connection};
 use uuid::Uuid;
 
 use super::dir::{self, DataDir, on_files};
 use super::error::StoreError;
-use super::rows::parsed;
+use super::rows::sql;
 
 /// Who opens a data folder, and so what may become of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -191,8 +191,13 @@ async fn ask(connection: &mut SqliteConnection) -> Result<Database, StoreError> 
 }
 
 async fn identity(connection: &mut SqliteConnection) -> Result<Option<(Uuid, i64)>, StoreError> {
-    let row = sqlx::query("SELECT id, generation FROM folder").fetch_optional(connection).await?;
-    row.as_ref().map(|row| Ok((parsed(row, "id")?, row.try_get("generation")?))).transpose()
+    let row: Option<(String, i64)> =
+        sqlx::query_as("SELECT id, generation FROM folder").fetch_optional(connection).await?;
+    let read = |(id, generation): (String, _)| match id.parse() {
+        Ok(id) => Ok((id, generation)),
+        Err(_) => Err(StoreError::Corrupt { column: "id", value: id }),
+    };
+    row.map(read).transpose()
 }
 
 /// Gives a folder without an identifier one, and takes the database for right in any case.
@@ -201,12 +206,13 @@ pub(super) async fn settle(
     connection: &mut SqliteConnection,
 ) -> Result<(), StoreError> {
     let last = read(dir)?.and_then(Result::ok).map_or(0, |marker| marker.generation);
-    sqlx::query("INSERT INTO folder (one, id, generation) VALUES (1, ?, 0) ON CONFLICT DO NOTHING")
-        .bind(Uuid::now_v7().to_string())
-        .execute(&mut *connection)
-        .await?;
-    sqlx::query("UPDATE folder SET generation = max(generation, ?)")
-        .bind(last)
+    sql!(
+        "INSERT INTO folder (one, id, generation) VALUES (1, ?, 0) ON CONFLICT DO NOTHING",
+        [Uuid::now_v7().to_string()]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!("UPDATE folder SET generation = max(generation, ?)", [last])
         .execute(&mut *connection)
         .await?;
     // The identifier is then in the database itself, also if its write-ahead log is lost.

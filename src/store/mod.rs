@@ -41,9 +41,8 @@ pub(crate) use dir::on_files;
 pub use error::StoreError;
 pub use identity::Purpose;
 pub use queue::{
-    CalibrationDone, CalibrationInputs, CalibrationTask, ClaimedTask, Completion, Heartbeat,
-    JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Step,
-    Work, WorkerEnd,
+    CalibrationDone, CalibrationTask, ClaimedTask, Completion, Heartbeat, JobMark, JobProgress,
+    JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Work, WorkerEnd,
 };
 pub use rows::Page;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};

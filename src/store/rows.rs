@@ -1,15 +1,17 @@
-//! From columns to types, with an error that names the column; pages; and what rows refer to.
+//! Statements, how types lie in columns, pages, and what rows refer to.
 
-use std::fmt::Display;
-use std::str::FromStr;
-
-use serde::Serialize;
 use serde::de::DeserializeOwned;
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
+use sqlx::encode::IsNull;
+use sqlx::error::BoxDynError;
+use sqlx::sqlite::{Sqlite, SqliteArgumentsBuffer, SqliteRow, SqliteTypeInfo, SqliteValueRef};
+use sqlx::types::Json;
+use sqlx::{Decode, Encode, Row, SqliteConnection, Type};
 
 use super::error::StoreError;
-use crate::job::{CalibrationId, MeasurementId, ModelId, Sha256};
+use crate::job::{
+    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sha256,
+    TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
+};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -21,83 +23,94 @@ pub struct Page<T> {
 }
 
 impl<T> Page<T> {
-    /// A page of at most `limit` items from up to `limit + 1` rows.
-    pub(super) fn cut(
-        rows: &[SqliteRow],
-        limit: u32,
-        read: impl Fn(&SqliteRow) -> Result<T, StoreError>,
-    ) -> Result<Self, StoreError> {
+    /// A page of at most `limit` items of up to `limit + 1`.
+    pub(super) fn cut(mut items: Vec<T>, limit: u32) -> Self {
         let limit = usize::try_from(limit).unwrap_or(usize::MAX);
-        let items = rows.iter().take(limit).map(read).collect::<Result<_, _>>()?;
-        Ok(Self { items, more: rows.len() > limit })
+        let more = items.len() > limit;
+        items.truncate(limit);
+        Self { items, more }
     }
 }
 
-/// The column as text, parsed.
-pub(super) fn parsed<T: FromStr>(row: &SqliteRow, column: &'static str) -> Result<T, StoreError> {
-    let value: String = row.try_get(column)?;
-    value.parse().map_err(|_| StoreError::Corrupt { column, value })
+/// A statement with the values for its places, in order.
+macro_rules! sql {
+    ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query($text)$(.bind($value))* };
 }
 
-/// As [`parsed`], for a column that may be empty.
-pub(super) fn parsed_if<T: FromStr>(
-    row: &SqliteRow,
-    column: &'static str,
-) -> Result<Option<T>, StoreError> {
-    let value: Option<String> = row.try_get(column)?;
-    let parse = |value: String| value.parse().map_err(|_| StoreError::Corrupt { column, value });
-    value.map(parse).transpose()
+/// As `sql!`, for rows that are read as a type.
+macro_rules! sql_as {
+    ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query_as($text)$(.bind($value))* };
 }
 
-/// The column as a whole number of another type.
-pub(super) fn number<T: TryFrom<i64>>(
-    row: &SqliteRow,
-    column: &'static str,
-) -> Result<T, StoreError> {
+/// As `sql!`, for rows of one column.
+macro_rules! sql_scalar {
+    ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query_scalar($text)$(.bind($value))* };
+}
+
+pub(super) use {sql, sql_as, sql_scalar};
+
+/// How a type lies in a column: as another one, and how it becomes that one and is read of it.
+macro_rules! column {
+    ($($type:ty),* as $other:ty, $write:expr, $read:expr) => {$(
+        impl Type<Sqlite> for $type {
+            fn type_info() -> SqliteTypeInfo {
+                <$other as Type<Sqlite>>::type_info()
+            }
+
+            fn compatible(found: &SqliteTypeInfo) -> bool {
+                <$other as Type<Sqlite>>::compatible(found)
+            }
+        }
+
+        impl Encode<'_, Sqlite> for $type {
+            fn encode_by_ref(&self, to: &mut SqliteArgumentsBuffer) -> Result<IsNull, BoxDynError> {
+                let write: fn(&Self) -> $other = $write;
+                write(self).encode(to)
+            }
+        }
+
+        impl Decode<'_, Sqlite> for $type {
+            fn decode(value: SqliteValueRef<'_>) -> Result<Self, BoxDynError> {
+                let read: fn($other) -> Result<Self, BoxDynError> = $read;
+                read(Decode::<Sqlite>::decode(value)?)
+            }
+        }
+    )*};
+}
+
+column!(Timestamp as i64, |time| time.0, |millis| Ok(Timestamp(millis)));
+column!(
+    Sha256,
+    Lab,
+    Label,
+    Role,
+    CalibrationId,
+    MeasurementId,
+    ModelId,
+    JobId,
+    TaskId,
+    PartialId,
+    TokenId,
+    WorkerId,
+    JobState,
+    TaskState,
+    TaskStage as String,
+    ToString::to_string,
+    |text| Ok(text.parse()?)
+);
+
+/// The column as a length.
+pub(super) fn number(row: &SqliteRow, column: &'static str) -> Result<usize, StoreError> {
     let value: i64 = row.try_get(column)?;
-    value.try_into().map_err(|_| corrupt(column, value))
+    value.try_into().map_err(|_| StoreError::Corrupt { column, value: value.to_string() })
 }
 
-/// As [`number`], for a column that may be empty.
-pub(super) fn number_if<T: TryFrom<i64>>(
+/// The column as a list in JSON; an empty one where there is none.
+pub(super) fn list<T: DeserializeOwned>(
     row: &SqliteRow,
-    column: &'static str,
-) -> Result<Option<T>, StoreError> {
-    let value: Option<i64> = row.try_get(column)?;
-    value.map(|value| value.try_into().map_err(|_| corrupt(column, value))).transpose()
-}
-
-/// The column as a number of the precision that arrays have.
-#[allow(clippy::cast_possible_truncation)] // it was an f32 when it was stored
-pub(super) fn single(row: &SqliteRow, column: &'static str) -> Result<f32, StoreError> {
-    Ok(row.try_get::<f64, _>(column)? as f32)
-}
-
-/// The column as JSON of a type.
-pub(super) fn json<T: DeserializeOwned>(
-    row: &SqliteRow,
-    column: &'static str,
-) -> Result<T, StoreError> {
-    let value: String = row.try_get(column)?;
-    serde_json::from_str(&value).map_err(|_| StoreError::Corrupt { column, value })
-}
-
-/// As [`json`], for a column that may be empty.
-pub(super) fn json_if<T: DeserializeOwned>(
-    row: &SqliteRow,
-    column: &'static str,
-) -> Result<Option<T>, StoreError> {
-    let value: Option<String> = row.try_get(column)?;
-    value.map(|_| json(row, column)).transpose()
-}
-
-/// A value as a column of JSON.
-pub(super) fn to_json(column: &'static str, value: &impl Serialize) -> Result<String, StoreError> {
-    serde_json::to_string(value).map_err(|error| corrupt(column, error))
-}
-
-fn corrupt(column: &'static str, value: impl Display) -> StoreError {
-    StoreError::Corrupt { column, value: value.to_string() }
+    column: &str,
+) -> Result<Vec<T>, sqlx::Error> {
+    Ok(row.try_get::<Option<Json<_>>, _>(column)?.map_or_else(Vec::new, |Json(list)| list))
 }
 
 /// A length or count as SQLite keeps it.
@@ -133,7 +146,7 @@ pub(super) async fn require(
             }
             Reference::Model(id) => ("model", "SELECT 1 FROM models WHERE id = ?", id.to_string()),
         };
-        let found = sqlx::query(query).bind(&id).fetch_optional(&mut *connection).await?;
+        let found = sql!(query, [id.as_str()]).fetch_optional(&mut *connection).await?;
         found.ok_or(StoreError::NotFound { what, id })?;
     }
     Ok(())
@@ -146,7 +159,6 @@ pub(super) async fn refuse_if_used(
     (what, id): (&'static str, String),
     (by, query): (&'static str, &'static str),
 ) -> Result<(), StoreError> {
-    let row = sqlx::query(query).bind(id).fetch_one(connection).await?;
-    let users = number(&row, "users")?;
+    let users = sql_scalar!(query, [id]).fetch_one(connection).await?;
     if users > 0 { Err(StoreError::InUse { what, by, users }) } else { Ok(()) }
 }

@@ -5,7 +5,7 @@ use sqlx::SqliteConnection;
 use super::Store;
 use super::error::StoreError;
 use super::queue::graph;
-use super::rows::{Reference, number, parsed, require};
+use super::rows::{Reference, require, sql_as};
 use super::staging::StagedBlob;
 use super::tables::blobs::Origin;
 use super::tables::calibrations::{self, Calibration, NewCalibration};
@@ -153,10 +153,8 @@ impl Store {
 
 /// Refuses a job if enough wait and run.
 async fn check_queue(connection: &mut SqliteConnection, most: u64) -> Result<(), StoreError> {
-    let row = sqlx::query("SELECT count(*) AS jobs FROM jobs WHERE finished_at IS NULL")
-        .fetch_one(connection)
-        .await?;
-    let jobs = number(&row, "jobs")?;
+    let jobs = "SELECT count(*) FROM jobs WHERE finished_at IS NULL";
+    let jobs = sqlx::query_scalar(jobs).fetch_one(connection).await?;
     if jobs < most { Ok(()) } else { Err(StoreError::QueueFull { jobs, most }) }
 }
 
@@ -172,15 +170,14 @@ async fn with_key(
     key: &str,
     request: Sha256,
 ) -> Result<Option<JobId>, StoreError> {
-    let row = sqlx::query("SELECT id, request FROM jobs WHERE idempotency_key = ?")
-        .bind(key_of(lab, key))
-        .fetch_optional(connection)
-        .await?;
-    let Some(row) = row else { return Ok(None) };
-    let job = parsed(&row, "id")?;
-    if parsed::<Sha256>(&row, "request")? == request {
-        Ok(Some(job))
-    } else {
-        Err(StoreError::KeyReused { key: key.to_owned(), job })
+    let found: Option<(JobId, Sha256)> =
+        sql_as!("SELECT id, request FROM jobs WHERE idempotency_key = ?", [key_of(lab, key)])
+            .fetch_optional(connection)
+            .await?;
+    match found {
+        Some((job, asked)) if asked != request => {
+            Err(StoreError::KeyReused { key: key.to_owned(), job })
+        }
+        found => Ok(found.map(|(job, _)| job)),
     }
 }

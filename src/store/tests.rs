@@ -180,7 +180,7 @@ impl Lab {
                 Product::Files(folder, vec![file])
             }
         };
-        let record = json!({"kind": task.kind.name()});
+        let record = json!({"kind": task.kind.into_str()});
         let progress = TaskProgress { fraction: 0.5, ..TaskProgress::START };
         self.store.complete(&task.lease, Completion { progress, record, product }).await.unwrap()
     }
@@ -304,7 +304,7 @@ async fn a_silent_worker_loses_its_task_and_what_it_says_later_is_refused() {
     tokio::time::sleep(Duration::from_millis(20)).await;
     let again = lab.claim().await.unwrap();
     assert_eq!((again.lease.task, again.lease.attempt), (late.lease.task, 2));
-    let beat = lab.store.heartbeat(&late.lease, TaskProgress::START).await.unwrap();
+    let beat = lab.store.heartbeat(&late.lease, TaskProgress::START, None).await.unwrap();
     assert_eq!(beat, Heartbeat::Lost);
     assert_eq!(lab.work(&late).await, Heartbeat::Lost);
     lab.store.fail(&late.lease, "too late", false).await.unwrap();
@@ -329,9 +329,9 @@ async fn cancel_stops_running_tasks_at_their_heartbeat() {
     lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(lab.state(job).await, JobState::Cancelling);
     assert!(lab.store.delete_job(&crate::job::Lab::local(), job).await.is_err());
-    let beat = lab.store.heartbeat(&task.lease, TaskProgress::START).await.unwrap();
+    let beat = lab.store.heartbeat(&task.lease, TaskProgress::START, None).await.unwrap();
     assert_eq!(beat, Heartbeat::Cancelled);
-    lab.store.cancelled(&task.lease).await.unwrap();
+    lab.store.give_back(&task.lease).await.unwrap();
     assert_eq!(lab.state(job).await, JobState::Cancelled);
     assert!(lab.claim().await.is_none());
     lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
@@ -395,8 +395,8 @@ async fn tiles_wait_for_the_pilot_and_cost_what_it_leaves_of_them() {
     let pilot = task.step().pilot.clone();
     assert_eq!((task.kind, pilot), (tile(0, 0), Some(json!({"kind": "pilot"}))));
     lab.store.cancel_job(&crate::job::Lab::local(), job).await.unwrap();
-    lab.store.cancelled(&task.lease).await.unwrap();
-    lab.store.cancelled(&preview.lease).await.unwrap();
+    lab.store.give_back(&task.lease).await.unwrap();
+    lab.store.give_back(&preview.lease).await.unwrap();
     lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
     let left = [TaskKind::Preview { snapshot: 1 }, tile(0, 0), tile(0, 1)];
     assert_eq!(lab.work_off().await[..3], left, "the pilot is not done again");

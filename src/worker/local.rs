@@ -20,8 +20,8 @@ use crate::pipeline::pilot::full_schedule;
 use crate::pipeline::records::{PilotRecord, PreparedRecord};
 use crate::pipeline::tile::TileInput;
 use crate::store::{
-    CalibrationInputs, CalibrationTask, ClaimedTask, Completion, Heartbeat, JobTask, Lease,
-    Product, StagedBlob, Step, Store, StoreError, TaskRecord, TileResult, Work,
+    ClaimedTask, Completion, Heartbeat, JobTask, Lease, Product, StagedBlob, Store, StoreError,
+    TaskRecord, TileResult, Work,
 };
 
 /// The store, and who works for it.
@@ -42,56 +42,61 @@ impl Local {
     }
 
     /// All that a task needs, at the attempt of this number.
-    fn input(&self, work: &Work, attempt: u32) -> Result<TaskInput, TaskError> {
+    fn input(&self, work: &Work, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
         match work {
-            Work::Job(task) => self.step(task, attempt),
-            Work::Calibration(CalibrationTask { name, inputs, .. }) => Ok(match inputs {
-                CalibrationInputs::Masks(masks) => TaskInput::Report(masks.clone()),
-                CalibrationInputs::Captures(captures) => TaskInput::Captures {
-                    name: name.clone(),
+            Work::Job(task) => self.step(task, kind, attempt),
+            Work::Calibration(task) => match &task.captures {
+                Some(captures) => Ok(TaskInput::Captures {
+                    name: task.name.clone(),
                     files: captures.map(|upload| self.path(*upload)),
                     scratch: self.store.staged_path().map_err(failed)?,
                     masks: self.store.blob_writer().map_err(failed)?,
-                },
-            }),
+                }),
+                None => {
+                    let masks = task.masks.ok_or_else(|| not_possible(kind))?;
+                    Ok(TaskInput::Report(self.path(masks)))
+                }
+            },
         }
     }
 
-    fn step(&self, task: &JobTask, attempt: u32) -> Result<TaskInput, TaskError> {
+    fn step(&self, task: &JobTask, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
         let JobTask { job, spec, calibration, measurement, .. } = task;
         let arrays = self.arrays(calibration.prepared, measurement.prepared);
         let folder = || self.store.staged_dir().map_err(failed);
-        Ok(match &task.step {
-            Step::Prepare => TaskInput::Prepare { arrays, snapshots: spec.snapshots },
-            Step::Preview { snapshot } => TaskInput::Preview {
-                arrays,
-                shape: spec.shape,
-                snapshot: *snapshot,
-                white: white(task)?,
-            },
-            Step::Pilot => TaskInput::Pilot {
+        Ok(match kind {
+            TaskKind::Prepare => TaskInput::Prepare { arrays, snapshots: spec.snapshots },
+            TaskKind::Preview { snapshot } => {
+                TaskInput::Preview { arrays, shape: spec.shape, snapshot, white: white(task)? }
+            }
+            TaskKind::Pilot => TaskInput::Pilot {
                 arrays,
                 snapshot: spec.snapshots.first,
                 white: white(task)?,
                 schedule: spec.schedule.clone(),
             },
-            Step::Tile { snapshot, tile } => {
-                TaskInput::Tile(Box::new(tile_task(task, *snapshot, *tile)?))
+            TaskKind::Tile { snapshot, tile } => {
+                TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
             }
-            Step::Assemble { snapshot, tiles } => TaskInput::Assemble {
+            TaskKind::Assemble { snapshot } => TaskInput::Assemble {
                 job: *job,
                 recipe: Box::new(recipe(task)?),
-                snapshot: *snapshot,
-                tiles: tiles.iter().map(stored_tile).collect::<Result<_, _>>()?,
+                snapshot,
+                tiles: task
+                    .tiles
+                    .iter()
+                    .map(|tile| self.stored_tile(tile))
+                    .collect::<Result<_, _>>()?,
                 folder: folder()?,
             },
-            Step::Manifest { records } => TaskInput::Manifest {
+            TaskKind::Manifest => TaskInput::Manifest {
                 job: *job,
                 spec: Box::new(spec.clone()),
                 recipe: Box::new(recipe(task)?),
-                tasks: tasks(records, attempt)?,
+                tasks: tasks(&task.records, attempt)?,
                 folder: folder()?,
             },
+            TaskKind::Calibration => return Err(not_possible(kind).into()),
         })
     }
 
@@ -116,6 +121,12 @@ impl Local {
         Ok(blob.map_err(IntoInnerError::into_error)?.finish()?)
     }
 
+    fn stored_tile(&self, stored: &TileResult) -> Result<StoredTile, PipelineError> {
+        let TileResult { tile, sha256, record } = stored;
+        let record = parsed("tile", record)?;
+        Ok(StoredTile { tile: *tile, path: self.path(*sha256), sha256: *sha256, record })
+    }
+
     fn path(&self, sha256: Sha256) -> std::path::PathBuf {
         self.store.dir().blob(&sha256)
     }
@@ -133,15 +144,18 @@ impl Transport for Local {
     async fn claim(&self) -> Result<Option<Claim>, TransportError> {
         let Some(task) = self.store.claim(self.worker, LEASE).await? else { return Ok(None) };
         let ClaimedTask { lease, kind, cost, work } = task;
-        let (id, kind) = (lease.task, kind.name());
+        let (id, name) = (lease.task, kind.into_str());
         let span = match &work {
-            Work::Job(task) => tracing::info_span!("task", job = %task.job, kind, task = %id),
-            Work::Calibration(CalibrationTask { calibration, .. }) => {
-                tracing::info_span!("task", %calibration, kind, task = %id)
+            Work::Job(task) => {
+                tracing::info_span!("task", job = %task.job, kind = name, task = %id)
+            }
+            Work::Calibration(task) => {
+                tracing::info_span!("task", calibration = %task.calibration, kind = name, task = %id)
             }
         };
         let here = self.clone();
-        let input = tokio::task::spawn_blocking(move || here.input(&work, lease.attempt)).await?;
+        let input = move || here.input(&work, kind, lease.attempt);
+        let input = tokio::task::spawn_blocking(input).await?;
         Ok(Some(Claim { lease, span, cost, input }))
     }
 
@@ -151,7 +165,7 @@ impl Transport for Local {
         progress: TaskProgress,
         history: Option<&str>,
     ) -> Result<Heartbeat, TransportError> {
-        Ok(self.store.heartbeat_with(lease, progress, history).await?)
+        Ok(self.store.heartbeat(lease, progress, history).await?)
     }
 
     async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError> {
@@ -165,12 +179,8 @@ impl Transport for Local {
         Ok(self.store.fail(lease, reason, retry).await?)
     }
 
-    async fn release(&self, lease: &Lease) -> Result<(), TransportError> {
-        Ok(self.store.release_task(lease).await?)
-    }
-
-    async fn cancelled(&self, lease: &Lease) -> Result<(), TransportError> {
-        Ok(self.store.cancelled(lease).await?)
+    async fn give_back(&self, lease: &Lease) -> Result<(), TransportError> {
+        Ok(self.store.give_back(lease).await?)
     }
 
     async fn redo(&self, lease: &Lease, tiles: &[u32]) -> Result<(), TransportError> {
@@ -193,6 +203,11 @@ fn failed(error: StoreError) -> TaskError {
     TaskError::Transport(error.into())
 }
 
+fn not_possible(kind: TaskKind) -> PipelineError {
+    let problem = format!("a {} has nothing to begin with", kind.into_str());
+    PipelineError::Record { what: "task", problem }
+}
+
 /// A record that this program wrote.
 fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, PipelineError> {
     T::deserialize(record).map_err(PipelineError::record(what))
@@ -207,12 +222,6 @@ fn white(task: &JobTask) -> Result<f32, PipelineError> {
 /// What the pilot found; none before it, and for a job without one.
 fn pilot(task: &JobTask) -> Result<Option<PilotRecord>, PipelineError> {
     parsed("pilot", task.pilot.as_ref().unwrap_or(&Value::Null))
-}
-
-fn stored_tile(stored: &TileResult) -> Result<StoredTile, PipelineError> {
-    let TileResult { tile, path, sha256, record } = stored;
-    let record = parsed("tile", record)?;
-    Ok(StoredTile { tile: *tile, path: path.clone(), sha256: *sha256, record })
 }
 
 fn tile_task(task: &JobTask, snapshot: u32, index: u32) -> Result<TileTask, PipelineError> {

@@ -123,7 +123,7 @@ fn facts(name: Option<Label>, made: &Calibrated, masks: Sha256) -> NewCalibratio
         name,
         masks,
         format: "captures".into(),
-        sample: made.sample.name().to_owned(),
+        sample: made.sample.to_string(),
         frames: report.frames,
         height: report.height,
         width: report.width,

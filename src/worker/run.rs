@@ -154,7 +154,7 @@ impl<T: Transport> Worker<T> {
             WorkerError::Stalled(_) => {
                 said(self.transport.fail(lease, &error.to_string(), true).await);
             }
-            WorkerError::Unfinished => said(self.transport.release(lease).await),
+            WorkerError::Unfinished => said(self.transport.give_back(lease).await),
             // Who started this process learns how it ended.
             WorkerError::Panicked | WorkerError::Transport(_) => {}
         }
@@ -189,18 +189,13 @@ impl<T: Transport> Worker<T> {
     /// Tells that a task has stopped as it was asked to.
     async fn stopped(&self, lease: &Lease, reason: Option<Reason>) {
         match reason {
-            Some(Reason::Cancelled) => {
-                tracing::info!("cancelled");
-                said(self.transport.cancelled(lease).await);
-            }
             Some(Reason::Lost) => {
-                tracing::warn!("the task is another worker's now, or nobody's");
+                return tracing::warn!("the task is another worker's now, or nobody's");
             }
-            Some(Reason::Shutdown) | None => {
-                tracing::info!("given back");
-                said(self.transport.release(lease).await);
-            }
+            Some(Reason::Cancelled) => tracing::info!("cancelled"),
+            Some(Reason::Shutdown) | None => tracing::info!("given back"),
         }
+        said(self.transport.give_back(lease).await);
     }
 
     fn start(

@@ -56,11 +56,8 @@ pub trait Transport: Clone + Send + 'static {
     /// Tells why a task could not be done, and whether another attempt may succeed.
     async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError>;
 
-    /// Gives a task back unharmed.
-    async fn release(&self, lease: &Lease) -> Result<(), TransportError>;
-
-    /// Tells that a cancelled task has stopped.
-    async fn cancelled(&self, lease: &Lease) -> Result<(), TransportError>;
+    /// Gives a task back unharmed: the worker is to end, or the job was cancelled.
+    async fn give_back(&self, lease: &Lease) -> Result<(), TransportError>;
 
     /// Has tiles done again that an assembly, which is given back, found damaged.
     async fn redo(&self, lease: &Lease, tiles: &[u32]) -> Result<(), TransportError>;

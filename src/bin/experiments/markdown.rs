@@ -40,7 +40,7 @@ pub fn line(row: &Row) -> String {
         "{}, Cr {}, {scale}x{scale}, {}: {} dB, SSIM {:.4}, {:.1} CPU-seconds",
         key.clip,
         key.compression_ratio,
-        key.algorithm.name(),
+        key.algorithm.into_str(),
         decibels(row.psnr_db),
         row.ssim,
         row.cpu_seconds,
@@ -152,7 +152,7 @@ fn table_of(
 ) -> String {
     let head = ["Scale", "Algorithm"].map(String::from).into_iter().chain(columns).collect();
     let row = |group: &Group<'_>| {
-        let names = [format!("{0}x{0}", group.scale), group.algorithm.name().to_owned()];
+        let names = [format!("{0}x{0}", group.scale), group.algorithm.into_str().to_owned()];
         names.into_iter().chain(cells(group)).collect()
     };
     table(head, groups.iter().map(row))

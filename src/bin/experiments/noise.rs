@@ -43,7 +43,7 @@ pub struct Arguments {
           default_values_t = [0.0, 2.5, 5.0, 10.0, 15.0, 20.0])]
     sigmas: Vec<f32>,
     /// The algorithm.
-    #[arg(long, value_name = "NAME", default_value = Algorithm::GapTv.name(),
+    #[arg(long, value_name = "NAME", default_value = Algorithm::GapTv.into_str(),
           value_parser = algorithms())]
     algorithm: Algorithm,
     #[command(flatten)]
@@ -103,7 +103,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let record = Record {
         schema: "sci-recon/bench-noise/1",
         program_version: env!("CARGO_PKG_VERSION"),
-        algorithm: algorithm.name(),
+        algorithm: algorithm.into_str(),
         compression_ratio: frames,
         seed,
         clips: clips.into_iter().map(|clip| clip.name).collect(),

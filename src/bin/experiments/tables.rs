@@ -31,7 +31,7 @@ pub struct Arguments {
     cr: Vec<u16>,
     /// The algorithms, in the order of the tables' rows.
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = algorithms(),
-          default_values = PAPER.map(Algorithm::name))]
+          default_values = PAPER.map(|algorithm| algorithm.into_str()))]
     algorithms: Vec<Algorithm>,
     /// Also a row `learned` of this network: an ONNX file as for `reconstruct --model`. At scales and
     /// ratios that it does not take there is no row.
@@ -60,7 +60,7 @@ pub struct Arguments {
 }
 
 /// The algorithms of the paper's tables that need no network of their own for each set of masks.
-const PAPER: [Algorithm; 3] = [Algorithm::GapTv, Algorithm::PnpFfdNet, Algorithm::PnpTvFastDvdNet];
+const PAPER: [Algorithm; 3] = [Algorithm::GapTv, Algorithm::PnpFfdnet, Algorithm::PnpTvFastdvdnet];
 
 /// What can't be done at the largest scale and ratio is told before anything is computed.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
@@ -98,7 +98,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
                 let snapshot = bench.snapshot(&masks, clip)?;
                 for &algorithm in &layout.algorithms {
                     if let Some(why) = bench.obstacle(algorithm, ratio.into(), scale.into()) {
-                        eprintln!("{}, no {}: {why}", clip.name, algorithm.name());
+                        eprintln!("{}, no {}: {why}", clip.name, algorithm.into_str());
                         continue;
                     }
                     let key = bench.key(&snapshot, algorithm)?;

@@ -25,7 +25,7 @@ const REPORT: &str = "demo.json";
 /// What the demo makes in its folder.
 const PARTS: [&str; 4] = ["input", "service", "frames", "service.log"];
 /// What the demo compares.
-const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastDvdNet];
+const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastdvdnet];
 /// Time between looks at the jobs.
 const POLL: Duration = Duration::from_millis(250);
 
@@ -91,7 +91,7 @@ async fn through_http(
     let body = json!({"calibration": calibration, "data": measurement});
     let measurement = client.create("/v1/measurements", &body).await?;
     let mut jobs = Vec::new();
-    for name in COMPARED.map(Algorithm::name) {
+    for name in COMPARED.map(|algorithm| algorithm.into_str()) {
         let body = json!({"measurement": measurement, "algorithm": name, "label": "demo"});
         jobs.push((name, client.create("/v1/jobs", &body).await?));
     }

@@ -213,7 +213,7 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiErro
         let tile = plan.tile(done.tile as usize)?;
         let (rows, columns) =
             (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
-        Some(DoneTile { rows, columns, path: done.path })
+        Some(DoneTile { rows, columns, path: app.store.dir().blob(&done.sha256) })
     };
     let tiles = done.into_iter().filter_map(place).collect();
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };

@@ -11,6 +11,7 @@ use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
 use state::{Change, State};
+use strum::Display;
 
 /// Values of a strip of all frames: three arrays of them (frames, masks, projection) stay in a
 /// second-level cache.
@@ -59,23 +60,14 @@ impl Observer for () {
     }
 }
 
-/// Why a reconstruction ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Why a reconstruction ended; by name `converged` or `max-iterations`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[strum(serialize_all = "kebab-case")]
 pub enum StopReason {
     /// The last stage's change fell below its tolerance.
     Converged,
     /// All planned iterations were done.
     MaxIterations,
-}
-
-impl StopReason {
-    /// Name for records: `converged` or `max-iterations`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Converged => "converged",
-            Self::MaxIterations => "max-iterations",
-        }
-    }
 }
 
 /// A reconstructed snapshot.

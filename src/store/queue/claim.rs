@@ -1,20 +1,20 @@
 //! How a worker gets a task, with all that it needs to do it.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
+use sqlx::types::Json;
+use sqlx::{FromRow, Row, SqliteConnection};
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
 use crate::job::{
-    CalibrationId, Captures, JobId, JobSpec, JobState, Label, TaskKind, TaskStage, TaskState,
-    Timestamp, WorkerId,
+    CalibrationId, Captures, JobId, JobSpec, JobState, Label, Sha256, TaskKind, TaskStage,
+    TaskState, Timestamp, WorkerId,
 };
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{json, json_if, number, parsed, parsed_if};
+use crate::store::rows::{sql, sql_as};
 use crate::store::tables::calibrations::Calibration;
 use crate::store::tables::measurements::Measurement;
 use crate::store::tables::tasks::{self, Owner, TaskRecord, TileResult};
@@ -43,7 +43,7 @@ pub enum Work {
     /// A step of a job.
     Job(Box<JobTask>),
     /// A calibration's masks, or the report on them.
-    Calibration(CalibrationTask),
+    Calibration(Box<CalibrationTask>),
 }
 
 /// A step of a job.
@@ -61,61 +61,24 @@ pub struct JobTask {
     pub prepared: Option<Value>,
     /// What its pilot recorded, if it has one that is done.
     pub pilot: Option<Value>,
-    /// Which step.
-    pub step: Step,
-}
-
-/// Which step of a job, with what it needs of the steps before it.
-#[derive(Debug, Clone)]
-pub enum Step {
-    /// Estimate the scale of the scene.
-    Prepare,
-    /// Reconstruct a snapshot coarsely.
-    Preview {
-        /// The snapshot's index.
-        snapshot: u32,
-    },
-    /// Find out how many iterations pay.
-    Pilot,
-    /// Reconstruct a tile.
-    Tile {
-        /// The snapshot's index.
-        snapshot: u32,
-        /// The tile's index in the plan.
-        tile: u32,
-    },
-    /// Blend the tiles of a snapshot and write its frames.
-    Assemble {
-        /// The snapshot's index.
-        snapshot: u32,
-        /// All its tiles, in the order of the plan.
-        tiles: Vec<TileResult>,
-    },
-    /// Write the manifest.
-    Manifest {
-        /// Of all other tasks of the job, in order.
-        records: Vec<TaskRecord>,
-    },
+    /// For an assembly: all tiles of its snapshot, in the order of the plan.
+    pub tiles: Vec<TileResult>,
+    /// For the manifest: all other tasks of the job, in order.
+    pub records: Vec<TaskRecord>,
 }
 
 /// What is to be done for a calibration.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, FromRow)]
 pub struct CalibrationTask {
     /// The calibration.
     pub calibration: CalibrationId,
     /// The user's name for it.
     pub name: Option<Label>,
-    /// What there is to begin with.
-    pub inputs: CalibrationInputs,
-}
-
-/// What a calibration begins with.
-#[derive(Debug, Clone)]
-pub enum CalibrationInputs {
-    /// Captures: masks are to be made of them, and a report.
-    Captures(Captures),
-    /// Masks, a planar array at this place: a report is to be made.
-    Masks(PathBuf),
+    /// Captures, of which masks are to be made; none where only a report on the masks is.
+    #[sqlx(json(nullable))]
+    pub captures: Option<Captures>,
+    /// The masks, a planar array, if they are there.
+    pub masks: Option<Sha256>,
 }
 
 impl Store {
@@ -137,15 +100,14 @@ impl Store {
             return Ok(None);
         };
         let lease =
-            Lease { task: parsed(&row, "id")?, attempt: number(&row, "attempt")?, worker, length };
+            Lease { task: row.try_get("id")?, attempt: row.try_get("attempt")?, worker, length };
         let (owner, kind) = (tasks::owner(&row)?, tasks::kind(&row)?);
-        sqlx::query("INSERT INTO attempts (task, attempt, worker, started_at) VALUES (?, ?, ?, ?)")
-            .bind(lease.task.to_string())
-            .bind(lease.attempt)
-            .bind(worker.to_string())
-            .bind(now)
-            .execute(&mut *transaction)
-            .await?;
+        sql!(
+            "INSERT INTO attempts (task, attempt, worker, started_at) VALUES (?, ?, ?, ?)",
+            [lease.task, lease.attempt, worker, now]
+        )
+        .execute(&mut *transaction)
+        .await?;
         if let Owner::Job(job) = owner
             && jobs::state(&mut transaction, job).await? == JobState::Queued
         {
@@ -168,78 +130,60 @@ impl Store {
 
     /// Looks without the lock: most of the time there is nothing to do.
     async fn may_have_work(&self, now: i64) -> Result<bool, StoreError> {
-        let found = sqlx::query(
+        let found = sql!(
             "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = ?1
                                         AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4)
                  OR EXISTS (SELECT 1 FROM tasks WHERE state = ?2
                                 AND lease_until NOT BETWEEN ?3 AND ?3 + ?5)",
+            [TaskState::Ready, TaskState::Running, now, LONGEST_PAUSE, LONGEST_LEASE]
         )
-        .bind(TaskState::Ready.name())
-        .bind(TaskState::Running.name())
-        .bind(now)
-        .bind(LONGEST_PAUSE)
-        .bind(LONGEST_LEASE)
         .fetch_optional(&self.readers)
         .await?;
         Ok(found.is_some())
     }
 
     async fn job_task(&self, job: JobId, kind: TaskKind) -> Result<Work, StoreError> {
-        let found = sqlx::query(
-            "SELECT spec, (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
+        let facts = sql_as!(
+            "SELECT spec,
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
                  (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot
              FROM jobs WHERE id = ?",
-        )
-        .bind(job.to_string())
-        .fetch_one(&self.readers)
-        .await?;
-        let spec: JobSpec = json(&found, "spec")?;
+            [job]
+        );
+        type Record = Option<Json<Value>>;
+        let (Json(spec), prepared, pilot): (Json<JobSpec>, Record, Record) =
+            facts.fetch_one(&self.readers).await?;
         let calibration = self.find_calibration(None, spec.calibration).await?;
         let measurement = self.find_measurement(None, spec.measurement).await?;
-        let record = |column| {
-            let text: Option<String> = found.try_get(column)?;
-            Ok::<_, StoreError>(text.and_then(|text| serde_json::from_str(&text).ok()))
-        };
-        let step = match kind {
-            TaskKind::Prepare => Step::Prepare,
-            TaskKind::Preview { snapshot } => Step::Preview { snapshot },
-            TaskKind::Pilot => Step::Pilot,
-            TaskKind::Tile { snapshot, tile } => Step::Tile { snapshot, tile },
-            TaskKind::Assemble { snapshot } => {
-                Step::Assemble { snapshot, tiles: self.tile_results(job, snapshot).await? }
-            }
-            TaskKind::Manifest => Step::Manifest { records: self.task_records(job).await? },
-            TaskKind::Calibration => {
-                let value = kind.name().to_owned();
-                return Err(StoreError::Corrupt { column: "kind", value });
-            }
-        };
+        let (mut tiles, mut records) = (Vec::new(), Vec::new());
+        match kind {
+            TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
+            TaskKind::Manifest => records = self.task_records(job).await?,
+            _ => {}
+        }
+        let (prepared, pilot) = (prepared.map(|json| json.0), pilot.map(|json| json.0));
         Ok(Work::Job(Box::new(JobTask {
             job,
             spec,
             calibration,
             measurement,
-            prepared: record("prepared")?,
-            pilot: record("pilot")?,
-            step,
+            prepared,
+            pilot,
+            tiles,
+            records,
         })))
     }
 
     async fn calibration_task(&self, id: CalibrationId) -> Result<Work, StoreError> {
-        let row = sqlx::query(
-            "SELECT name, captures, (SELECT prepared FROM calibrations WHERE id = calibration) AS masks
+        let task = sql_as!(
+            "SELECT calibration, name, captures,
+                 (SELECT prepared FROM calibrations WHERE id = calibration) AS masks
              FROM calibration_requests WHERE calibration = ?",
-        )
-        .bind(id.to_string())
-        .fetch_optional(&self.readers)
-        .await?
-        .ok_or_else(|| StoreError::NotFound { what: "calibration", id: id.to_string() })?;
-        let inputs = match json_if(&row, "captures")? {
-            Some(captures) => CalibrationInputs::Captures(captures),
-            None => CalibrationInputs::Masks(self.dir().blob(&parsed(&row, "masks")?)),
-        };
-        let name = parsed_if(&row, "name")?;
-        Ok(Work::Calibration(CalibrationTask { calibration: id, name, inputs }))
+            [id]
+        );
+        let task = task.fetch_optional(&self.readers).await?;
+        let task = task.ok_or_else(|| StoreError::missing("calibration", id))?;
+        Ok(Work::Calibration(Box::new(task)))
     }
 }
 
@@ -250,21 +194,23 @@ async fn take(
     length: Duration,
     now: i64,
 ) -> Result<Option<SqliteRow>, StoreError> {
-    let row = sqlx::query(
+    let row = sql!(
         "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
              stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
          WHERE id = (SELECT id FROM tasks
                      WHERE state = ?5 AND ready_at NOT BETWEEN ?6 + 1 AND ?6 + ?7
                      ORDER BY priority DESC, job, ordinal, id LIMIT 1)
          RETURNING id, job, calibration, kind, snapshot, tile, attempt, cost",
+        [
+            TaskState::Running,
+            worker,
+            Lease::until(length, now),
+            TaskStage::Reading,
+            TaskState::Ready,
+            now,
+            LONGEST_PAUSE
+        ]
     )
-    .bind(TaskState::Running.name())
-    .bind(worker.to_string())
-    .bind(Lease::until(length, now))
-    .bind(TaskStage::Reading.name())
-    .bind(TaskState::Ready.name())
-    .bind(now)
-    .bind(LONGEST_PAUSE)
     .fetch_optional(connection)
     .await?;
     Ok(row)

@@ -6,10 +6,11 @@ use sqlx::SqliteConnection;
 use super::lease::{self, Heartbeat, Lease, Outcome};
 use super::{graph, job};
 use crate::job::{
-    CalibrationId, CalibrationReport, JobId, ResultFile, TaskKind, TaskProgress, TaskState,
+    CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind, TaskProgress, TaskState,
     Timestamp,
 };
 use crate::store::error::StoreError;
+use crate::store::rows::sql;
 use crate::store::staging::{StagedBlob, StagedDir};
 use crate::store::tables::blobs::Origin;
 use crate::store::tables::calibrations::{self, NewCalibration};
@@ -75,7 +76,7 @@ impl Store {
                 graph::scale_tiles(&mut transaction, job, share).await?;
             }
             (Owner::Job(_), Product::Tile(staged)) => {
-                result = Some(staged.sha256().to_string());
+                result = Some(staged.sha256());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }
             (Owner::Job(job), Product::Files(staged, files)) => {
@@ -86,7 +87,7 @@ impl Store {
                 self.calibrated(&mut transaction, id, *done).await?;
             }
             (Owner::Job(_), Product::Calibration(_)) | (Owner::Calibration(_), _) => {
-                let value = kind.name().to_owned();
+                let value = kind.into_str().to_owned();
                 return Err(StoreError::Corrupt { column: "kind", value });
             }
         }
@@ -144,32 +145,36 @@ async fn finish(
     lease: &Lease,
     progress: &TaskProgress,
     record: &Value,
-    result: Option<String>,
+    result: Option<Sha256>,
 ) -> Result<(), StoreError> {
-    sqlx::query(
+    let TaskProgress { iterations, passes, fraction, .. } = *progress;
+    sql!(
         "UPDATE tasks SET state = ?9, worker = NULL, lease_until = NULL, stage = NULL,
              iterations = ?1, passes = ?2, fraction = ?3, record = ?4, result = ?5,
-             seconds = (?6 - (SELECT started_at FROM attempts WHERE task = id AND attempt = ?8)) / 1000.0
+             seconds = (?6 - (SELECT started_at FROM attempts
+                              WHERE task = id AND attempt = ?8)) / 1000.0
          WHERE id = ?7",
+        [
+            iterations,
+            passes,
+            fraction.clamp(0.0, 1.0),
+            record,
+            result,
+            Timestamp::now(),
+            lease.task,
+            lease.attempt,
+            TaskState::Done
+        ]
     )
-    .bind(progress.iterations)
-    .bind(progress.passes)
-    .bind(progress.fraction.clamp(0.0, 1.0))
-    .bind(record.to_string())
-    .bind(result)
-    .bind(Timestamp::now().0)
-    .bind(lease.task.to_string())
-    .bind(lease.attempt)
-    .bind(TaskState::Done.name())
     .execute(&mut *connection)
     .await?;
-    sqlx::query(
+    sql!(
         "INSERT INTO totals (kind, tasks, seconds, iterations, passes)
              SELECT kind, 1, coalesce(seconds, 0), iterations, passes FROM tasks WHERE id = ?
          ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
              iterations = iterations + excluded.iterations, passes = passes + excluded.passes",
+        [lease.task]
     )
-    .bind(lease.task.to_string())
     .execute(&mut *connection)
     .await?;
     lease::end_attempt(connection, lease.task, Outcome::Done, None).await

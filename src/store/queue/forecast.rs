@@ -8,7 +8,7 @@ use sqlx::{AssertSqlSafe, Row};
 use crate::job::{JobId, JobState, TaskState};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::parsed;
+use crate::store::rows::sql_as;
 
 /// Workers that were silent for longer do not count.
 const WORKER_AGE: Duration = Duration::from_secs(15);
@@ -83,7 +83,8 @@ impl Store {
     /// What is ahead of every unfinished job; none if there is no such job.
     pub(in crate::store) async fn forecast(&self) -> Result<Option<Forecast>, StoreError> {
         // Only states that stand in the text let SQLite see that the index holds all that is asked for.
-        let left = [TaskState::Blocked, TaskState::Ready, TaskState::Running].map(TaskState::name);
+        let left = [TaskState::Blocked, TaskState::Ready, TaskState::Running]
+            .map(|state| state.into_str());
         let query = format!(
             "SELECT job, sum(cost * (1 - fraction)) AS cost,
                  (SELECT state FROM jobs WHERE id = job) AS state
@@ -98,9 +99,9 @@ impl Store {
         }
         let (mut cost, mut waiting, mut ahead) = (0.0, 0, HashMap::with_capacity(rows.len()));
         for row in &rows {
-            let waits = parsed::<JobState>(row, "state")? == JobState::Queued;
+            let waits = row.try_get::<JobState, _>("state")? == JobState::Queued;
             waiting += usize::from(waits);
-            ahead.insert(parsed(row, "job")?, Ahead { cost, position: waits.then_some(waiting) });
+            ahead.insert(row.try_get("job")?, Ahead { cost, position: waits.then_some(waiting) });
             cost += row.try_get::<f64, _>("cost")?;
         }
         let workers = self.live_workers(WORKER_AGE).await?.len();
@@ -114,29 +115,24 @@ impl Store {
     /// Seconds that a planned CPU-second of a tile has taken in each job that runs, what converged
     /// early included.
     async fn own_rates(&self) -> Result<HashMap<JobId, f64>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT job, sum(seconds) / sum(cost) AS rate FROM tasks
+        let rates: Vec<(JobId, f64)> = sql_as!(
+            "SELECT job, sum(seconds) / sum(cost) FROM tasks
              WHERE job IN (SELECT id FROM jobs WHERE state = ?)
                AND kind = 'tile' AND state = ? AND seconds > 0
              GROUP BY job HAVING sum(cost) > 0",
+            [JobState::Running, TaskState::Done]
         )
-        .bind(JobState::Running.name())
-        .bind(TaskState::Done.name())
         .fetch_all(&self.readers)
         .await?;
-        rows.iter().map(|row| Ok((parsed(row, "job")?, row.try_get("rate")?))).collect()
+        Ok(rates.into_iter().collect())
     }
 
     /// Seconds that a planned CPU-second takes on this machine: measured on tasks that are done, by what
     /// they really did and not by what was planned; 1 before there are any.
     async fn seconds_per_cost(&self, of_last_tasks: &'static str) -> Result<f64, StoreError> {
-        let row = sqlx::query(of_last_tasks)
-            .bind(TaskState::Done.name())
-            .fetch_one(&self.readers)
-            .await?;
-        let seconds: Option<f64> = row.try_get("seconds")?;
-        let spent: Option<f64> = row.try_get("spent")?;
-        Ok(match (seconds, spent) {
+        let sums: (Option<f64>, Option<f64>) =
+            sql_as!(of_last_tasks, [TaskState::Done]).fetch_one(&self.readers).await?;
+        Ok(match sums {
             (Some(seconds), Some(spent)) if spent > 0.0 && seconds > 0.0 => seconds / spent,
             _ => 1.0,
         })

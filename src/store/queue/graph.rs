@@ -5,6 +5,7 @@ use sqlx::SqliteConnection;
 
 use crate::job::{CalibrationId, JobId, JobSpec, TaskId, TaskKind, TaskState};
 use crate::store::error::StoreError;
+use crate::store::rows::sql;
 use crate::store::tables::tasks;
 
 /// Above that of every job: people wait for calibrations before they measure.
@@ -25,19 +26,17 @@ pub(in crate::store) async fn insert(
         .enumerate()
         .map(|(ordinal, (kind, cost))| {
             let id = TaskId::new().to_string();
-            let state = first_state(kind).name();
-            json!([id, ordinal, kind.name(), kind.snapshot(), kind.tile(), state, cost])
+            let state = first_state(kind).into_str();
+            json!([id, ordinal, kind.into_str(), kind.snapshot(), kind.tile(), state, cost])
         })
         .collect();
-    sqlx::query(
+    sql!(
         "INSERT INTO tasks (id, job, ordinal, kind, snapshot, tile, state, priority, cost)
-         SELECT value ->> 0, ?1, value ->> 1, value ->> 2, value ->> 3, value ->> 4, value ->> 5, ?2,
-                value ->> 6
+         SELECT value ->> 0, ?1, value ->> 1, value ->> 2, value ->> 3, value ->> 4, value ->> 5,
+             ?2, value ->> 6
          FROM json_each(?3)",
+        [job, spec.priority, Value::from(rows).to_string()]
     )
-    .bind(job.to_string())
-    .bind(spec.priority)
-    .bind(Value::from(rows).to_string())
     .execute(connection)
     .await?;
     Ok(())
@@ -48,15 +47,17 @@ pub(in crate::store) async fn insert_calibration(
     connection: &mut SqliteConnection,
     calibration: CalibrationId,
 ) -> Result<(), StoreError> {
-    sqlx::query(
+    sql!(
         "INSERT INTO tasks (id, calibration, ordinal, kind, state, priority, cost)
          VALUES (?, ?, 0, ?, ?, ?, 0)",
+        [
+            TaskId::new(),
+            calibration,
+            TaskKind::Calibration.into_str(),
+            first_state(TaskKind::Calibration),
+            CALIBRATION_PRIORITY
+        ]
     )
-    .bind(TaskId::new().to_string())
-    .bind(calibration.to_string())
-    .bind(TaskKind::Calibration.name())
-    .bind(first_state(TaskKind::Calibration).name())
-    .bind(CALIBRATION_PRIORITY)
     .execute(connection)
     .await?;
     Ok(())
@@ -80,9 +81,7 @@ pub(super) async fn scale_tiles(
     job: JobId,
     share: f64,
 ) -> Result<(), StoreError> {
-    sqlx::query("UPDATE tasks SET cost = cost * ? WHERE job = ? AND kind = 'tile'")
-        .bind(share)
-        .bind(job.to_string())
+    sql!("UPDATE tasks SET cost = cost * ? WHERE job = ? AND kind = 'tile'", [share, job])
         .execute(connection)
         .await?;
     Ok(())
@@ -120,12 +119,7 @@ pub(super) async fn unblock(
         }
         TaskKind::Manifest | TaskKind::Calibration => return Ok(()),
     };
-    sqlx::query(query)
-        .bind(job.to_string())
-        .bind(done.snapshot())
-        .bind(TaskState::Blocked.name())
-        .bind(TaskState::Ready.name())
-        .bind(TaskState::Done.name())
+    sql!(query, [job, done.snapshot(), TaskState::Blocked, TaskState::Ready, TaskState::Done])
         .execute(connection)
         .await?;
     Ok(())
@@ -137,24 +131,19 @@ pub(super) async fn restart(
     connection: &mut SqliteConnection,
     job: JobId,
 ) -> Result<(), StoreError> {
-    sqlx::query(
+    sql!(
         "UPDATE tasks SET failures = 0, losses = 0, ready_at = 0,
              state = CASE kind WHEN 'prepare' THEN ?2 ELSE ?3 END
          WHERE job = ?1 AND state IN (?4, ?5)",
+        [job, TaskState::Ready, TaskState::Blocked, TaskState::Failed, TaskState::Cancelled]
     )
-    .bind(job.to_string())
-    .bind(TaskState::Ready.name())
-    .bind(TaskState::Blocked.name())
-    .bind(TaskState::Failed.name())
-    .bind(TaskState::Cancelled.name())
     .execute(&mut *connection)
     .await?;
-    let done = sqlx::query(
+    let done = sql!(
         "SELECT kind, snapshot, min(tile) AS tile FROM tasks WHERE job = ? AND state = ?
          GROUP BY kind, snapshot",
+        [job, TaskState::Done]
     )
-    .bind(job.to_string())
-    .bind(TaskState::Done.name())
     .fetch_all(&mut *connection)
     .await?;
     for row in &done {
@@ -168,12 +157,11 @@ pub(super) async fn cancel_waiting(
     connection: &mut SqliteConnection,
     job: JobId,
 ) -> Result<(), StoreError> {
-    sqlx::query("UPDATE tasks SET state = ? WHERE job = ? AND state IN (?, ?)")
-        .bind(TaskState::Cancelled.name())
-        .bind(job.to_string())
-        .bind(TaskState::Blocked.name())
-        .bind(TaskState::Ready.name())
-        .execute(connection)
-        .await?;
+    sql!(
+        "UPDATE tasks SET state = ? WHERE job = ? AND state IN (?, ?)",
+        [TaskState::Cancelled, job, TaskState::Blocked, TaskState::Ready]
+    )
+    .execute(connection)
+    .await?;
     Ok(())
 }

@@ -5,7 +5,7 @@ use sqlx::SqliteConnection;
 use super::graph;
 use crate::job::{JobId, JobState, Lab, TaskState};
 use crate::store::error::StoreError;
-use crate::store::rows::{number, parsed};
+use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::jobs;
 use crate::store::{Store, dir, on_files};
 
@@ -60,10 +60,7 @@ impl Store {
             return Err(StoreError::NotFinal(state));
         }
         self.drop_tiles(&mut transaction, id).await?;
-        sqlx::query("DELETE FROM jobs WHERE id = ?")
-            .bind(id.to_string())
-            .execute(&mut *transaction)
-            .await?;
+        sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
         let folder = self.dir().results(id);
         // Under the lock and before the commit, so that no row is left whose files are gone for
         // longer than a crash takes; a second DELETE then removes the row.
@@ -91,17 +88,13 @@ impl Store {
         transaction: &mut SqliteConnection,
         id: JobId,
     ) -> Result<(), StoreError> {
-        let rows =
-            sqlx::query("SELECT DISTINCT result FROM tasks WHERE job = ? AND result IS NOT NULL")
-                .bind(id.to_string())
-                .fetch_all(&mut *transaction)
-                .await?;
-        sqlx::query("UPDATE tasks SET result = NULL WHERE job = ?")
-            .bind(id.to_string())
+        let results = "SELECT DISTINCT result FROM tasks WHERE job = ? AND result IS NOT NULL";
+        let results = sql_scalar!(results, [id]).fetch_all(&mut *transaction).await?;
+        sql!("UPDATE tasks SET result = NULL WHERE job = ?", [id])
             .execute(&mut *transaction)
             .await?;
-        for row in &rows {
-            self.release(transaction, parsed(row, "result")?).await?;
+        for result in results {
+            self.release(transaction, result).await?;
         }
         Ok(())
     }
@@ -139,10 +132,6 @@ pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Resu
 }
 
 async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64, StoreError> {
-    let row = sqlx::query("SELECT count(*) AS n FROM tasks WHERE job = ? AND state = ?")
-        .bind(id.to_string())
-        .bind(TaskState::Running.name())
-        .fetch_one(connection)
-        .await?;
-    number(&row, "n")
+    let count = "SELECT count(*) FROM tasks WHERE job = ? AND state = ?";
+    Ok(sql_scalar!(count, [id, TaskState::Running]).fetch_one(connection).await?)
 }

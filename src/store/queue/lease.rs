@@ -7,13 +7,14 @@
 
 use std::time::Duration;
 
-use sqlx::SqliteConnection;
+use sqlx::{Row, SqliteConnection};
+use strum::Display;
 
 use super::job;
 use crate::job::{JobState, TaskId, TaskKind, TaskProgress, TaskState, Timestamp, WorkerId};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{number, parsed, parsed_if};
+use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::tasks::{self, Owner};
 use crate::store::tables::workers;
 
@@ -49,7 +50,7 @@ impl Lease {
 pub enum Heartbeat {
     /// Go on; the lease is renewed.
     Continue,
-    /// The job is not wanted any more: stop, and call [`Store::cancelled`].
+    /// The job is not wanted any more: stop, and call [`Store::give_back`].
     Cancelled,
     /// The task is someone else's, as the lease ran out, or it was deleted with its calibration: stop,
     /// and drop everything.
@@ -81,7 +82,8 @@ pub(super) enum Loss {
 }
 
 /// How an attempt ended.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Display)]
+#[strum(serialize_all = "snake_case")]
 pub(super) enum Outcome {
     Done,
     Failed,
@@ -91,32 +93,11 @@ pub(super) enum Outcome {
     Released,
 }
 
-impl Outcome {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Done => "done",
-            Self::Failed => "failed",
-            Self::Crashed => "crashed",
-            Self::Lost => "lost",
-            Self::Cancelled => "cancelled",
-            Self::Released => "released",
-        }
-    }
-}
-
 impl Store {
-    /// Renews a lease, notes the progress, and asks whether to go on.
+    /// Renews a lease, notes the progress and how the solver went (JSON as
+    /// [`TileHistory::points`](crate::store::TileHistory) has it; without one, what was noted stays),
+    /// and asks whether to go on.
     pub async fn heartbeat(
-        &self,
-        lease: &Lease,
-        progress: TaskProgress,
-    ) -> Result<Heartbeat, StoreError> {
-        self.heartbeat_with(lease, progress, None).await
-    }
-
-    /// As [`Store::heartbeat`], and notes how the solver went: JSON as
-    /// [`TileHistory::points`](crate::store::TileHistory) has it. Without one, what was noted stays.
-    pub async fn heartbeat_with(
         &self,
         lease: &Lease,
         progress: TaskProgress,
@@ -124,26 +105,28 @@ impl Store {
     ) -> Result<Heartbeat, StoreError> {
         let mut transaction = self.write().await?;
         workers::seen(&mut transaction, lease.worker).await?;
-        let row = sqlx::query(
+        let row = sql!(
             "UPDATE tasks SET lease_until = ?, stage = ?, iterations = ?, passes = ?, fraction = ?,
                  history = coalesce(?, history)
              WHERE id = ? AND attempt = ? AND state = ?
              RETURNING (SELECT state FROM jobs WHERE id = tasks.job) AS job_state",
+            [
+                Lease::until(lease.length, Timestamp::now().0),
+                progress.stage,
+                progress.iterations,
+                progress.passes,
+                progress.fraction.clamp(0.0, 1.0),
+                history,
+                lease.task,
+                lease.attempt,
+                TaskState::Running
+            ]
         )
-        .bind(Lease::until(lease.length, Timestamp::now().0))
-        .bind(progress.stage.name())
-        .bind(progress.iterations)
-        .bind(progress.passes)
-        .bind(progress.fraction.clamp(0.0, 1.0))
-        .bind(history)
-        .bind(lease.task.to_string())
-        .bind(lease.attempt)
-        .bind(TaskState::Running.name())
         .fetch_optional(&mut *transaction)
         .await?;
         transaction.commit().await?;
         let Some(row) = row else { return Ok(Heartbeat::Lost) };
-        Ok(match parsed_if(&row, "job_state")? {
+        Ok(match row.try_get("job_state")? {
             None | Some(JobState::Queued | JobState::Running) => Heartbeat::Continue,
             Some(_) => Heartbeat::Cancelled,
         })
@@ -160,13 +143,9 @@ impl Store {
         self.part(lease, &Loss::Failed(reason.to_owned(), retryable)).await
     }
 
-    /// Records that the worker has stopped because the job was cancelled.
-    pub async fn cancelled(&self, lease: &Lease) -> Result<(), StoreError> {
-        self.part(lease, &Loss::Released).await
-    }
-
-    /// Gives a task back unharmed, as at a shutdown; the attempt does not count against it.
-    pub async fn release_task(&self, lease: &Lease) -> Result<(), StoreError> {
+    /// Gives a task back unharmed, as at a shutdown or when its job was cancelled; the attempt does not
+    /// count against it.
+    pub async fn give_back(&self, lease: &Lease) -> Result<(), StoreError> {
         self.part(lease, &Loss::Released).await
     }
 
@@ -186,39 +165,34 @@ impl Store {
         let Some((Owner::Job(job), kind)) = held(&mut transaction, lease).await? else {
             return Ok(());
         };
-        let row = sqlx::query(
-            "SELECT coalesce(max(failures), 0) AS worst FROM tasks
+        let worst: u32 = sql_scalar!(
+            "SELECT coalesce(max(failures), 0) FROM tasks
              WHERE job = ? AND kind = 'tile' AND snapshot = ?",
+            [job, kind.snapshot()]
         )
-        .bind(job.to_string())
-        .bind(kind.snapshot())
         .fetch_one(&mut *transaction)
         .await?;
-        if number::<u32>(&row, "worst")? >= MAX_FAILURES {
+        if worst >= MAX_FAILURES {
             let reason = format!("stored tiles {damaged:?} are damaged, again: is the disk sound?");
             lose(&mut transaction, lease.task, &Loss::Failed(reason, false)).await?;
             return Ok(transaction.commit().await?);
         }
         lose(&mut transaction, lease.task, &Loss::Released).await?;
         for tile in damaged {
-            sqlx::query(
+            sql!(
                 "UPDATE tasks SET state = ?, result = NULL, failures = failures + 1
                  WHERE job = ? AND kind = 'tile' AND snapshot = ? AND tile = ? AND state = ?",
+                [TaskState::Ready, job, kind.snapshot(), tile, TaskState::Done]
             )
-            .bind(TaskState::Ready.name())
-            .bind(job.to_string())
-            .bind(kind.snapshot())
-            .bind(tile)
-            .bind(TaskState::Done.name())
             .execute(&mut *transaction)
             .await?;
         }
-        sqlx::query("UPDATE tasks SET state = ? WHERE id = ? AND state = ?")
-            .bind(TaskState::Blocked.name())
-            .bind(lease.task.to_string())
-            .bind(TaskState::Ready.name())
-            .execute(&mut *transaction)
-            .await?;
+        sql!(
+            "UPDATE tasks SET state = ? WHERE id = ? AND state = ?",
+            [TaskState::Blocked, lease.task, TaskState::Ready]
+        )
+        .execute(&mut *transaction)
+        .await?;
         transaction.commit().await?;
         Ok(())
     }
@@ -231,13 +205,10 @@ impl Store {
             WorkerEnd::Crashed(how) => Loss::Crashed(format!("the worker process died: {how}")),
         };
         let mut transaction = self.write().await?;
-        let tasks = sqlx::query("SELECT id FROM tasks WHERE worker = ? AND state = ?")
-            .bind(id.to_string())
-            .bind(TaskState::Running.name())
-            .fetch_all(&mut *transaction)
-            .await?;
-        for row in &tasks {
-            lose(&mut transaction, parsed(row, "id")?, &loss).await?;
+        let tasks = "SELECT id FROM tasks WHERE worker = ? AND state = ?";
+        let tasks = sql_scalar!(tasks, [id, TaskState::Running]);
+        for task in tasks.fetch_all(&mut *transaction).await? {
+            lose(&mut transaction, task, &loss).await?;
         }
         workers::remove(&mut transaction, id).await?;
         transaction.commit().await?;
@@ -251,13 +222,11 @@ pub(super) async fn held(
     connection: &mut SqliteConnection,
     lease: &Lease,
 ) -> Result<Option<(Owner, TaskKind)>, StoreError> {
-    let row = sqlx::query(
+    let row = sql!(
         "SELECT job, calibration, kind, snapshot, tile FROM tasks
          WHERE id = ? AND attempt = ? AND state = ?",
+        [lease.task, lease.attempt, TaskState::Running]
     )
-    .bind(lease.task.to_string())
-    .bind(lease.attempt)
-    .bind(TaskState::Running.name())
     .fetch_optional(connection)
     .await?;
     row.map(|row| Ok((tasks::owner(&row)?, tasks::kind(&row)?))).transpose()
@@ -265,16 +234,11 @@ pub(super) async fn held(
 
 /// Takes back the tasks of workers that have fallen silent.
 pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<(), StoreError> {
-    let rows =
-        sqlx::query("SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?")
-            .bind(TaskState::Running.name())
-            .bind(now)
-            .bind(now + LONGEST_LEASE)
-            .fetch_all(&mut *connection)
-            .await?;
-    for row in &rows {
-        let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
-        lose(connection, parsed(row, "id")?, &silent).await?;
+    let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
+    let tasks = "SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?";
+    let tasks = sql_scalar!(tasks, [TaskState::Running, now, now + LONGEST_LEASE]);
+    for task in tasks.fetch_all(&mut *connection).await? {
+        lose(connection, task, &silent).await?;
     }
     Ok(())
 }
@@ -286,14 +250,11 @@ pub(super) async fn end_attempt(
     outcome: Outcome,
     reason: Option<&str>,
 ) -> Result<(), StoreError> {
-    sqlx::query(
+    sql!(
         "UPDATE attempts SET ended_at = ?, outcome = ?, reason = ?
          WHERE task = ? AND attempt = (SELECT attempt FROM tasks WHERE id = task)",
+        [Timestamp::now(), outcome.to_string(), reason, task]
     )
-    .bind(Timestamp::now().0)
-    .bind(outcome.name())
-    .bind(reason)
-    .bind(task.to_string())
     .execute(connection)
     .await?;
     Ok(())
@@ -306,15 +267,14 @@ async fn lose(
     task: TaskId,
     loss: &Loss,
 ) -> Result<(), StoreError> {
-    let row = sqlx::query(
+    let row = sql!(
         "SELECT job, calibration, kind, snapshot, tile, failures, losses FROM tasks WHERE id = ?",
+        [task]
     )
-    .bind(task.to_string())
     .fetch_one(&mut *connection)
     .await?;
     let owner = tasks::owner(&row)?;
-    let (mut failures, mut losses): (u32, u32) =
-        (number(&row, "failures")?, number(&row, "losses")?);
+    let (mut failures, mut losses): (u32, u32) = (row.try_get("failures")?, row.try_get("losses")?);
     let wanted = match owner {
         Owner::Job(job) => job::is_wanted(connection, job).await?,
         // Its task would have been deleted with it.
@@ -344,16 +304,12 @@ async fn lose(
         Loss::Crashed(_) | Loss::Failed(..) => Timestamp::now().0 + (1000 << failures),
         Loss::Released | Loss::Lost(_) => 0,
     };
-    sqlx::query(
+    sql!(
         "UPDATE tasks SET state = ?, worker = NULL, lease_until = NULL, stage = NULL, fraction = 0,
              iterations = 0, passes = 0, failures = ?, losses = ?, ready_at = ?
          WHERE id = ?",
+        [state, failures, losses, ready_at, task]
     )
-    .bind(state.name())
-    .bind(failures)
-    .bind(losses)
-    .bind(ready_at)
-    .bind(task.to_string())
     .execute(&mut *connection)
     .await?;
     // A calibration has failed when its only task has; the reason is that of the task's last attempt.

@@ -13,7 +13,7 @@ mod job;
 mod lease;
 mod progress;
 
-pub use claim::{CalibrationInputs, CalibrationTask, ClaimedTask, JobTask, Step, Work};
+pub use claim::{CalibrationTask, ClaimedTask, JobTask, Work};
 pub use complete::{CalibrationDone, Completion, Product};
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, WorkerEnd};
 pub use progress::{JobMark, JobProgress, ProgressStage};

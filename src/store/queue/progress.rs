@@ -15,7 +15,7 @@ use super::forecast::{Forecast, Left};
 use crate::job::{JobId, JobState, Lab, TaskStage, TaskState};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{number, parsed};
+use crate::store::rows::sql;
 use crate::store::tables::jobs::Job;
 
 /// What a job is doing.
@@ -79,15 +79,16 @@ impl Store {
     /// How far a job is.
     pub async fn progress(&self, job: &Job) -> Result<JobProgress, StoreError> {
         let mut all = self.progress_of(std::slice::from_ref(job)).await?;
-        all.pop().ok_or(StoreError::NotFound { what: "job", id: job.id.to_string() })
+        all.pop().ok_or(StoreError::missing("job", job.id))
     }
 
     /// How far each of these jobs is, in their order: a whole page costs as many statements as one.
     pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>, StoreError> {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
-        let rows = sqlx::query(
+        let rows = sql!(
             "SELECT job, sum(cost) AS cost,
-                 sum(CASE state WHEN ?2 THEN cost WHEN ?3 THEN cost * fraction ELSE 0.0 END) AS cost_done,
+                 sum(CASE state WHEN ?2 THEN cost WHEN ?3 THEN cost * fraction ELSE 0.0 END)
+                     AS cost_done,
                  sum(left) FILTER (WHERE kind = 'tile') AS tiles_left,
                  max(left) FILTER (WHERE kind = 'tile') AS tiles_longest,
                  sum(left) FILTER (WHERE kind <> 'tile') AS others_left,
@@ -104,19 +105,21 @@ impl Store {
              FROM (SELECT *, CASE state WHEN ?2 THEN 0.0 ELSE cost * (1 - fraction) END AS left
                    FROM tasks WHERE job IN (SELECT value FROM json_each(?1)))
              GROUP BY job",
+            [
+                Value::from(ids).to_string(),
+                TaskState::Done,
+                TaskState::Running,
+                TaskStage::Deep,
+                TaskStage::Nonlocal
+            ]
         )
-        .bind(Value::from(ids).to_string())
-        .bind(TaskState::Done.name())
-        .bind(TaskState::Running.name())
-        .bind(TaskStage::Deep.name())
-        .bind(TaskStage::Nonlocal.name())
         .fetch_all(&self.readers)
         .await?;
         let by_job: Result<HashMap<JobId, &SqliteRow>, StoreError> =
-            rows.iter().map(|row| Ok((parsed(row, "job")?, row))).collect();
+            rows.iter().map(|row| Ok((row.try_get("job")?, row))).collect();
         let (by_job, waits) = (by_job?, |job: &Job| has_eta(job.state));
         let forecast = if jobs.iter().any(waits) { self.forecast().await? } else { None };
-        let gone = |id: JobId| StoreError::NotFound { what: "job", id: id.to_string() };
+        let gone = |id: JobId| StoreError::missing("job", id);
         jobs.iter()
             .map(|job| {
                 let row = by_job.get(&job.id).ok_or_else(|| gone(job.id))?;
@@ -130,22 +133,22 @@ impl Store {
         let rows = sqlx::query("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
         let mut marks = HashMap::with_capacity(rows.len());
         for row in &rows {
-            let state = parsed(row, "state")?;
+            let state = row.try_get("state")?;
             marks.insert(
-                (parsed(row, "lab")?, parsed(row, "id")?),
+                (row.try_get("lab")?, row.try_get("id")?),
                 JobMark { state, tasks: 0, iterations: 0, fraction: 0.0 },
             );
         }
-        let rows = sqlx::query(
+        let rows = sql!(
             "SELECT job, (SELECT lab FROM jobs WHERE id = job) AS lab, count(*) AS tasks,
                  sum(ordinal) AS ordinals, sum(iterations) AS iterations, sum(fraction) AS fraction
              FROM tasks WHERE state = ? AND job IS NOT NULL GROUP BY job",
+            [TaskState::Running]
         )
-        .bind(TaskState::Running.name())
         .fetch_all(&self.readers)
         .await?;
         for row in &rows {
-            if let Some(mark) = marks.get_mut(&(parsed(row, "lab")?, parsed(row, "job")?)) {
+            if let Some(mark) = marks.get_mut(&(row.try_get("lab")?, row.try_get("job")?)) {
                 // Which tasks run, and not only how many: one may have ended and another begun.
                 mark.tasks =
                     row.try_get::<i64, _>("tasks")? << 32 ^ row.try_get::<i64, _>("ordinals")?;
@@ -181,18 +184,18 @@ fn progress(
         percent: if job.state == JobState::Succeeded { 100.0 } else { round(share * 100.0, 2) },
         eta_seconds: eta.map(|seconds| round(seconds, 1)),
         queue_position: forecast.and_then(|forecast| forecast.position(job.id)),
-        tiles_done: number(row, "tiles_done")?,
-        tiles_total: number(row, "tiles_total")?,
-        tiles_running: number(row, "tiles_running")?,
-        snapshots_done: number(row, "snapshots_done")?,
-        previews_done: number(row, "previews_done")?,
-        iterations_done: number(row, "iterations")?,
-        passes_done: number(row, "passes")?,
+        tiles_done: row.try_get("tiles_done")?,
+        tiles_total: row.try_get("tiles_total")?,
+        tiles_running: row.try_get("tiles_running")?,
+        snapshots_done: row.try_get("snapshots_done")?,
+        previews_done: row.try_get("previews_done")?,
+        iterations_done: row.try_get("iterations")?,
+        passes_done: row.try_get("passes")?,
     })
 }
 
 fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage, StoreError> {
-    let count = |column| number::<u64>(row, column);
+    let count = |column| row.try_get::<u64, _>(column);
     Ok(match state {
         JobState::Queued => ProgressStage::Waiting,
         JobState::Succeeded | JobState::Failed | JobState::Cancelled => ProgressStage::Ended,

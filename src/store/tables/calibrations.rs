@@ -5,18 +5,18 @@
 
 use serde::Serialize;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
+use sqlx::types::Json;
+use sqlx::{FromRow, Row, SqliteConnection};
 
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timestamp};
 use crate::store::Store;
 use crate::store::error::StoreError;
 use crate::store::rows::{
-    Page, Reference, integer, json, number, parsed, parsed_if, refuse_if_used, require, single,
-    to_json,
+    Page, Reference, integer, refuse_if_used, require, sql, sql_as, sql_scalar,
 };
 
 /// What is known of a calibration when its masks have been checked.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct NewCalibration {
     /// The user's name for it.
     pub name: Option<Label>,
@@ -27,10 +27,11 @@ pub struct NewCalibration {
     /// Sample type of the upload, such as `uint16`.
     pub sample: String,
     /// Mask frames (B).
+    #[sqlx(try_from = "i64")]
     pub frames: usize,
-    /// Rows.
+    #[sqlx(try_from = "i64")]
     pub height: usize,
-    /// Columns.
+    #[sqlx(try_from = "i64")]
     pub width: usize,
     /// The stored number that means 1.
     pub full_scale: f32,
@@ -43,7 +44,7 @@ pub struct NewCalibration {
 }
 
 /// A calibration on record.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Calibration {
     /// Its identifier.
     pub id: CalibrationId,
@@ -54,6 +55,7 @@ pub struct Calibration {
     pub created_at: Timestamp,
     /// What is known of it.
     #[serde(flatten)]
+    #[sqlx(flatten)]
     pub facts: NewCalibration,
 }
 
@@ -99,13 +101,13 @@ impl Store {
         lab: Option<&Lab>,
         id: CalibrationId,
     ) -> Result<Calibration, StoreError> {
-        let row =
-            sqlx::query("SELECT * FROM calibrations WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)")
-                .bind(id.to_string())
-                .bind(lab.map(Lab::as_str))
-                .fetch_optional(&self.readers)
-                .await?;
-        row.as_ref().map(calibration).transpose()?.ok_or_else(|| not_found(id))
+        let calibration = sql_as!(
+            "SELECT * FROM calibrations WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)",
+            [id, lab]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        calibration.ok_or_else(|| StoreError::missing("calibration", id))
     }
 
     /// The lab's calibration with this identifier if its masks are not there; none otherwise.
@@ -134,22 +136,19 @@ impl Store {
         after: Option<CalibrationId>,
         limit: u32,
     ) -> Result<Page<Unready>, StoreError> {
-        let rows = sqlx::query(
+        let rows = sql!(
             "SELECT calibration, name, captures, created_at, state, fraction,
-                 (SELECT reason FROM attempts WHERE task = tasks.id AND attempt = tasks.attempt) AS reason
+                 (SELECT reason FROM attempts
+                  WHERE task = tasks.id AND attempt = tasks.attempt) AS reason
              FROM calibration_requests JOIN tasks USING (calibration)
              WHERE lab = ?1 AND captures IS NOT NULL AND state <> ?2
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR calibration < ?4)
              ORDER BY calibration DESC LIMIT ?5",
+            [lab, TaskState::Done, only, after, i64::from(limit) + 1]
         )
-        .bind(lab.as_str())
-        .bind(TaskState::Done.name())
-        .bind(only.map(|id| id.to_string()))
-        .bind(after.map(|id| id.to_string()))
-        .bind(i64::from(limit) + 1)
         .fetch_all(&self.readers)
         .await?;
-        Page::cut(&rows, limit, unready)
+        Ok(Page::cut(rows.iter().map(unready).collect::<Result<_, _>>()?, limit))
     }
 
     /// A page of the lab's calibrations, newest first, older than `after`.
@@ -159,16 +158,14 @@ impl Store {
         after: Option<CalibrationId>,
         limit: u32,
     ) -> Result<Page<Calibration>, StoreError> {
-        let rows = sqlx::query(
+        let items = sql_as!(
             "SELECT * FROM calibrations WHERE lab = ?1 AND (?2 IS NULL OR id < ?2)
              ORDER BY id DESC LIMIT ?3",
+            [lab, after, i64::from(limit) + 1]
         )
-        .bind(lab.as_str())
-        .bind(after.map(|id| id.to_string()))
-        .bind(i64::from(limit) + 1)
         .fetch_all(&self.readers)
         .await?;
-        Page::cut(&rows, limit, calibration)
+        Ok(Page::cut(items, limit))
     }
 
     /// Deletes a calibration that no measurement and no model refers to.
@@ -179,13 +176,11 @@ impl Store {
         let mut transaction = self.write().await?;
         // Its task goes with it: a worker that has it in hand finds that nobody wants it any more.
         let asked =
-            sqlx::query("DELETE FROM calibration_requests WHERE calibration = ? AND lab = ?")
-                .bind(id.to_string())
-                .bind(lab.as_str())
+            sql!("DELETE FROM calibration_requests WHERE calibration = ? AND lab = ?", [id, lab])
                 .execute(&mut *transaction)
                 .await?;
         if asked.rows_affected() == 0 {
-            return Err(not_found(id));
+            return Err(StoreError::missing("calibration", id));
         }
         for users in [
             ("measurements", "SELECT count(*) AS users FROM measurements WHERE calibration = ?"),
@@ -193,12 +188,10 @@ impl Store {
         ] {
             refuse_if_used(&mut transaction, ("calibration", id.to_string()), users).await?;
         }
-        let row = sqlx::query("DELETE FROM calibrations WHERE id = ? RETURNING prepared")
-            .bind(id.to_string())
-            .fetch_optional(&mut *transaction)
-            .await?;
-        if let Some(row) = row {
-            self.release(&mut transaction, parsed(&row, "prepared")?).await?;
+        let prepared =
+            sql_scalar!("DELETE FROM calibrations WHERE id = ? RETURNING prepared", [id]);
+        if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
+            self.release(&mut transaction, prepared).await?;
         }
         transaction.commit().await?;
         Ok(())
@@ -212,15 +205,10 @@ pub(in crate::store) async fn insert_made(
     prepared: Sha256,
     facts: NewCalibration,
 ) -> Result<(), StoreError> {
-    let row = sqlx::query("SELECT lab, created_at FROM calibration_requests WHERE calibration = ?")
-        .bind(id.to_string())
-        .fetch_one(&mut *connection)
-        .await?;
-    let created_at = Timestamp(row.try_get("created_at")?);
-    let calibration = Calibration { id, prepared, created_at, facts };
-    insert(connection, &parsed(&row, "lab")?, &calibration).await?;
-    sqlx::query("DELETE FROM calibration_captures WHERE calibration = ?")
-        .bind(id.to_string())
+    let request = "SELECT lab, created_at FROM calibration_requests WHERE calibration = ?";
+    let (lab, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
+    insert(connection, &lab, &Calibration { id, prepared, created_at, facts }).await?;
+    sql!("DELETE FROM calibration_captures WHERE calibration = ?", [id])
         .execute(connection)
         .await?;
     Ok(())
@@ -234,25 +222,20 @@ pub(in crate::store) async fn insert_request(
     name: Option<&Label>,
     captures: Option<&Captures>,
 ) -> Result<(), StoreError> {
-    sqlx::query(
+    sql!(
         "INSERT INTO calibration_requests (calibration, lab, name, captures, created_at)
          VALUES (?, ?, ?, ?, ?)",
+        [id, lab, name, captures.map(Json), Timestamp::now()]
     )
-    .bind(id.to_string())
-    .bind(lab.as_str())
-    .bind(name.map(Label::as_str))
-    .bind(captures.map(|captures| to_json("captures", captures)).transpose()?)
-    .bind(Timestamp::now().0)
     .execute(&mut *connection)
     .await?;
     for (_, upload) in captures.iter().flat_map(|captures| captures.uploads()) {
         require(connection, &[Reference::Blob(upload)]).await?;
-        sqlx::query(
+        sql!(
             "INSERT INTO calibration_captures (calibration, sha256) VALUES (?, ?)
              ON CONFLICT DO NOTHING",
+            [id, upload]
         )
-        .bind(id.to_string())
-        .bind(upload.to_string())
         .execute(&mut *connection)
         .await?;
     }
@@ -266,66 +249,43 @@ pub(in crate::store) async fn insert(
     calibration: &Calibration,
 ) -> Result<(), StoreError> {
     let facts = &calibration.facts;
-    sqlx::query(
+    sql!(
         "INSERT INTO calibrations (lab, id, name, masks, prepared, format, sample, frames, height,
              width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            lab,
+            calibration.id,
+            &facts.name,
+            facts.masks,
+            calibration.prepared,
+            &facts.format,
+            &facts.sample,
+            integer(facts.frames),
+            integer(facts.height),
+            integer(facts.width),
+            facts.full_scale,
+            facts.mask_mean,
+            integer(facts.dead_pixels),
+            integer(facts.clipped_negatives),
+            calibration.created_at
+        ]
     )
-    .bind(lab.as_str())
-    .bind(calibration.id.to_string())
-    .bind(facts.name.as_ref().map(Label::as_str))
-    .bind(facts.masks.to_string())
-    .bind(calibration.prepared.to_string())
-    .bind(&facts.format)
-    .bind(&facts.sample)
-    .bind(integer(facts.frames))
-    .bind(integer(facts.height))
-    .bind(integer(facts.width))
-    .bind(f64::from(facts.full_scale))
-    .bind(facts.mask_mean)
-    .bind(integer(facts.dead_pixels))
-    .bind(integer(facts.clipped_negatives))
-    .bind(calibration.created_at.0)
     .execute(connection)
     .await?;
     Ok(())
 }
 
-fn calibration(row: &SqliteRow) -> Result<Calibration, StoreError> {
-    Ok(Calibration {
-        id: parsed(row, "id")?,
-        prepared: parsed(row, "prepared")?,
-        created_at: Timestamp(row.try_get("created_at")?),
-        facts: NewCalibration {
-            name: parsed_if(row, "name")?,
-            masks: parsed(row, "masks")?,
-            format: row.try_get("format")?,
-            sample: row.try_get("sample")?,
-            frames: number(row, "frames")?,
-            height: number(row, "height")?,
-            width: number(row, "width")?,
-            full_scale: single(row, "full_scale")?,
-            mask_mean: row.try_get("mask_mean")?,
-            dead_pixels: number(row, "dead_pixels")?,
-            clipped_negatives: number(row, "clipped_negatives")?,
-        },
-    })
-}
-
 fn unready(row: &SqliteRow) -> Result<Unready, StoreError> {
-    let captures: Captures = json(row, "captures")?;
-    let failed = parsed::<TaskState>(row, "state")? == TaskState::Failed;
+    let Json(captures): Json<Captures> = row.try_get("captures")?;
+    let failed = row.try_get::<TaskState, _>("state")? == TaskState::Failed;
     Ok(Unready {
-        id: parsed(row, "calibration")?,
-        name: parsed_if(row, "name")?,
+        id: row.try_get("calibration")?,
+        name: row.try_get("name")?,
         frames: captures.masks.len(),
         fraction: row.try_get("fraction")?,
         // The reason of the last attempt; one that is tried again is none for a user.
         error: if failed { row.try_get("reason")? } else { None },
-        created_at: Timestamp(row.try_get("created_at")?),
+        created_at: row.try_get("created_at")?,
     })
-}
-
-fn not_found(id: CalibrationId) -> StoreError {
-    StoreError::NotFound { what: "calibration", id: id.to_string() }
 }

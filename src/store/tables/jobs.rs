@@ -1,23 +1,24 @@
 //! Table `jobs`. What becomes of a job is the queue's business.
 
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
+use sqlx::types::Json;
+use sqlx::{FromRow, SqliteConnection};
 
 use crate::job::{
     CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, Timestamp,
 };
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{Page, integer, json, number, parsed, to_json};
+use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 
 /// A job on record.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct Job {
     /// Its identifier.
     pub id: JobId,
     /// Whose it is.
     pub lab: Lab,
     /// What is to be done.
+    #[sqlx(json)]
     pub spec: JobSpec,
     /// Where it stands.
     pub state: JobState,
@@ -54,12 +55,8 @@ impl Store {
     /// # Errors
     /// [`StoreError::NotFound`].
     pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job, StoreError> {
-        let row = sqlx::query("SELECT * FROM jobs WHERE id = ? AND lab = ?")
-            .bind(id.to_string())
-            .bind(lab.as_str())
-            .fetch_optional(&self.readers)
-            .await?;
-        row.as_ref().map(job).transpose()?.ok_or_else(|| not_found(id))
+        let job = sql_as!("SELECT * FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
+        job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
     /// A page of the lab's jobs, newest first.
@@ -69,7 +66,7 @@ impl Store {
         filter: &JobFilter,
         limit: u32,
     ) -> Result<Page<Job>, StoreError> {
-        let rows = sqlx::query(
+        let items = sql_as!(
             "SELECT * FROM jobs
              WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state = ?2)
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
@@ -77,26 +74,26 @@ impl Store {
                AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
              AND lab = ?8
              ORDER BY id DESC LIMIT ?7",
+            [
+                filter.after,
+                filter.state,
+                filter.calibration,
+                filter.measurement,
+                &filter.label,
+                &filter.search,
+                i64::from(limit) + 1,
+                lab
+            ]
         )
-        .bind(filter.after.map(|id| id.to_string()))
-        .bind(filter.state.map(JobState::name))
-        .bind(filter.calibration.map(|id| id.to_string()))
-        .bind(filter.measurement.map(|id| id.to_string()))
-        .bind(filter.label.as_ref().map(Label::as_str))
-        .bind(filter.search.as_ref().map(Label::as_str))
-        .bind(i64::from(limit) + 1)
-        .bind(lab.as_str())
         .fetch_all(&self.readers)
         .await?;
-        Page::cut(&rows, limit, job)
+        Ok(Page::cut(items, limit))
     }
 
     /// The number of jobs in each state.
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>, StoreError> {
-        let rows = sqlx::query("SELECT state, count(*) AS jobs FROM jobs GROUP BY state")
-            .fetch_all(&self.readers)
-            .await?;
-        rows.iter().map(|row| Ok((parsed(row, "state")?, number(row, "jobs")?))).collect()
+        let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
+        Ok(sqlx::query_as(counts).fetch_all(&self.readers).await?)
     }
 }
 
@@ -108,24 +105,26 @@ pub(in crate::store) async fn insert(
     spec: &JobSpec,
     (request, key): (Sha256, Option<String>),
 ) -> Result<(), StoreError> {
-    sqlx::query(
+    sql!(
         "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
              idempotency_key, request, created_at, lab, disk_bytes, model)
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            id,
+            spec.calibration,
+            spec.measurement,
+            &spec.label,
+            Json(spec),
+            JobState::Queued,
+            spec.priority,
+            key,
+            request,
+            Timestamp::now(),
+            lab,
+            integer(spec.disk_bytes()),
+            spec.model.as_ref().map(|model| model.id)
+        ]
     )
-    .bind(id.to_string())
-    .bind(spec.calibration.to_string())
-    .bind(spec.measurement.to_string())
-    .bind(spec.label.as_ref().map(Label::as_str))
-    .bind(to_json("spec", spec)?)
-    .bind(JobState::Queued.name())
-    .bind(spec.priority)
-    .bind(key)
-    .bind(request.to_string())
-    .bind(Timestamp::now().0)
-    .bind(lab.as_str())
-    .bind(integer(spec.disk_bytes()))
-    .bind(spec.model.as_ref().map(|model| model.id.to_string()))
     .execute(connection)
     .await?;
     Ok(())
@@ -136,12 +135,8 @@ pub(in crate::store) async fn state(
     connection: &mut SqliteConnection,
     id: JobId,
 ) -> Result<JobState, StoreError> {
-    let row = sqlx::query("SELECT state FROM jobs WHERE id = ?")
-        .bind(id.to_string())
-        .fetch_optional(connection)
-        .await?
-        .ok_or_else(|| not_found(id))?;
-    parsed(&row, "state")
+    let state = sql_scalar!("SELECT state FROM jobs WHERE id = ?", [id]);
+    state.fetch_optional(connection).await?.ok_or_else(|| StoreError::missing("job", id))
 }
 
 /// Takes a legal step to another state and notes the time.
@@ -152,36 +147,15 @@ pub(in crate::store) async fn set_state(
     error: Option<&str>,
 ) -> Result<(), StoreError> {
     let to = state(connection, id).await?.step(to)?;
-    let now = Timestamp::now().0;
-    sqlx::query(
+    let now = Timestamp::now();
+    sql!(
         "UPDATE jobs SET state = ?1, error = ?2,
              started_at = coalesce(started_at, ?3),
              finished_at = ?4
          WHERE id = ?5",
+        [to, error, (to == JobState::Running).then_some(now), to.is_final().then_some(now), id]
     )
-    .bind(to.name())
-    .bind(error)
-    .bind((to == JobState::Running).then_some(now))
-    .bind(to.is_final().then_some(now))
-    .bind(id.to_string())
     .execute(connection)
     .await?;
     Ok(())
-}
-
-fn job(row: &SqliteRow) -> Result<Job, StoreError> {
-    Ok(Job {
-        id: parsed(row, "id")?,
-        lab: parsed(row, "lab")?,
-        spec: json(row, "spec")?,
-        state: parsed(row, "state")?,
-        error: row.try_get("error")?,
-        created_at: Timestamp(row.try_get("created_at")?),
-        started_at: row.try_get::<Option<i64>, _>("started_at")?.map(Timestamp),
-        finished_at: row.try_get::<Option<i64>, _>("finished_at")?.map(Timestamp),
-    })
-}
-
-fn not_found(id: JobId) -> StoreError {
-    StoreError::NotFound { what: "job", id: id.to_string() }
 }

@@ -2,14 +2,13 @@
 
 use serde::Serialize;
 use sqlx::sqlite::SqliteRow;
+use sqlx::types::Json;
 use sqlx::{Row, SqliteConnection};
 
 use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{
-    Page, integer, json_if, number, parsed, parsed_if, refuse_if_used, single, to_json,
-};
+use crate::store::rows::{Page, integer, list, number, refuse_if_used, sql, sql_scalar};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -85,13 +84,13 @@ impl Store {
         lab: Option<&Lab>,
         id: MeasurementId,
     ) -> Result<Measurement, StoreError> {
-        let row =
-            sqlx::query("SELECT * FROM measurements WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)")
-                .bind(id.to_string())
-                .bind(lab.map(Lab::as_str))
-                .fetch_optional(&self.readers)
-                .await?;
-        row.as_ref().map(measurement).transpose()?.ok_or_else(|| not_found(id))
+        let row = sql!(
+            "SELECT * FROM measurements WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)",
+            [id, lab]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        measurement(&row.ok_or_else(|| StoreError::missing("measurement", id))?)
     }
 
     /// A page of the lab's measurements, newest first.
@@ -101,18 +100,15 @@ impl Store {
         filter: MeasurementFilter,
         limit: u32,
     ) -> Result<Page<Measurement>, StoreError> {
-        let rows = sqlx::query(
+        let rows = sql!(
             "SELECT * FROM measurements
              WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
              ORDER BY id DESC LIMIT ?4",
+            [lab, filter.after, filter.calibration, i64::from(limit) + 1]
         )
-        .bind(lab.as_str())
-        .bind(filter.after.map(|id| id.to_string()))
-        .bind(filter.calibration.map(|id| id.to_string()))
-        .bind(i64::from(limit) + 1)
         .fetch_all(&self.readers)
         .await?;
-        Page::cut(&rows, limit, measurement)
+        Ok(Page::cut(rows.iter().map(measurement).collect::<Result<_, _>>()?, limit))
     }
 
     /// Deletes a measurement that no job refers to.
@@ -124,12 +120,11 @@ impl Store {
         let mut transaction = self.write().await?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE measurement = ?";
         refuse_if_used(&mut transaction, ("measurement", id.to_string()), ("jobs", jobs)).await?;
-        let row = sqlx::query("DELETE FROM measurements WHERE id = ? RETURNING prepared")
-            .bind(id.to_string())
-            .fetch_optional(&mut *transaction)
-            .await?
-            .ok_or_else(|| not_found(id))?;
-        self.release(&mut transaction, parsed(&row, "prepared")?).await?;
+        let prepared =
+            sql_scalar!("DELETE FROM measurements WHERE id = ? RETURNING prepared", [id]);
+        let prepared = prepared.fetch_optional(&mut *transaction).await?;
+        let prepared = prepared.ok_or_else(|| StoreError::missing("measurement", id))?;
+        self.release(&mut transaction, prepared).await?;
         transaction.commit().await?;
         Ok(())
     }
@@ -142,28 +137,31 @@ pub(in crate::store) async fn insert(
     measurement: &Measurement,
 ) -> Result<(), StoreError> {
     let facts = &measurement.facts;
-    sqlx::query(
+    sql!(
         "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
-             snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings, created_at)
+             snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings,
+             created_at)
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            lab,
+            measurement.id,
+            &facts.name,
+            facts.calibration,
+            facts.data,
+            measurement.prepared,
+            &facts.format,
+            &facts.sample,
+            facts.snapshots,
+            integer(facts.height),
+            integer(facts.width),
+            facts.full_scale,
+            facts.camera_fps,
+            facts.exposure_s,
+            Json(&facts.dark),
+            Json(&facts.warnings),
+            measurement.created_at
+        ]
     )
-    .bind(lab.as_str())
-    .bind(measurement.id.to_string())
-    .bind(facts.name.as_ref().map(Label::as_str))
-    .bind(facts.calibration.to_string())
-    .bind(facts.data.to_string())
-    .bind(measurement.prepared.to_string())
-    .bind(&facts.format)
-    .bind(&facts.sample)
-    .bind(i64::from(facts.snapshots))
-    .bind(integer(facts.height))
-    .bind(integer(facts.width))
-    .bind(f64::from(facts.full_scale))
-    .bind(facts.camera_fps)
-    .bind(facts.exposure_s)
-    .bind(to_json("dark", &facts.dark)?)
-    .bind(to_json("warnings", &facts.warnings)?)
-    .bind(measurement.created_at.0)
     .execute(connection)
     .await?;
     Ok(())
@@ -171,27 +169,23 @@ pub(in crate::store) async fn insert(
 
 fn measurement(row: &SqliteRow) -> Result<Measurement, StoreError> {
     Ok(Measurement {
-        id: parsed(row, "id")?,
-        prepared: parsed(row, "prepared")?,
-        created_at: Timestamp(row.try_get("created_at")?),
+        id: row.try_get("id")?,
+        prepared: row.try_get("prepared")?,
+        created_at: row.try_get("created_at")?,
         facts: NewMeasurement {
-            name: parsed_if(row, "name")?,
-            calibration: parsed(row, "calibration")?,
-            data: parsed(row, "data")?,
+            name: row.try_get("name")?,
+            calibration: row.try_get("calibration")?,
+            data: row.try_get("data")?,
             format: row.try_get("format")?,
             sample: row.try_get("sample")?,
-            snapshots: number(row, "snapshots")?,
+            snapshots: row.try_get("snapshots")?,
             height: number(row, "height")?,
             width: number(row, "width")?,
-            full_scale: single(row, "full_scale")?,
+            full_scale: row.try_get("full_scale")?,
             camera_fps: row.try_get("camera_fps")?,
             exposure_s: row.try_get("exposure_s")?,
-            dark: json_if(row, "dark")?.unwrap_or_default(),
-            warnings: json_if(row, "warnings")?.unwrap_or_default(),
+            dark: list(row, "dark")?,
+            warnings: list(row, "warnings")?,
         },
     })
-}
-
-fn not_found(id: MeasurementId) -> StoreError {
-    StoreError::NotFound { what: "measurement", id: id.to_string() }
 }

@@ -1,16 +1,16 @@
 //! Table `models`.
 
 use serde::Serialize;
-use sqlx::Row;
-use sqlx::sqlite::SqliteRow;
+use sqlx::FromRow;
+use sqlx::types::Json;
 
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{Page, Reference, json, parsed, parsed_if, refuse_if_used, require};
+use crate::store::rows::{Page, Reference, refuse_if_used, require, sql, sql_as};
 
 /// What is known of an end-to-end network when it has been checked.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct NewModel {
     /// The user's name for it.
     pub name: Option<Label>,
@@ -20,11 +20,12 @@ pub struct NewModel {
     pub file: Sha256,
     /// What its check has found.
     #[serde(flatten)]
+    #[sqlx(json)]
     pub facts: ModelFacts,
 }
 
 /// An end-to-end network on record.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Model {
     /// Its identifier.
     pub id: ModelId,
@@ -32,6 +33,7 @@ pub struct Model {
     pub created_at: Timestamp,
     /// What is known of it.
     #[serde(flatten)]
+    #[sqlx(flatten)]
     pub content: NewModel,
 }
 
@@ -63,17 +65,11 @@ impl Store {
         let mut transaction = self.write().await?;
         let references = [Reference::Calibration(*calibration), Reference::Blob(*file)];
         require(&mut transaction, &references).await?;
-        sqlx::query(
+        sql!(
             "INSERT INTO models (id, lab, name, calibration, file, facts, created_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [model.id, lab, &name, calibration, file, Json(facts), model.created_at]
         )
-        .bind(model.id.to_string())
-        .bind(lab.as_str())
-        .bind(name.as_ref().map(Label::as_str))
-        .bind(calibration.to_string())
-        .bind(file.to_string())
-        .bind(serde_json::json!(facts).to_string())
-        .bind(model.created_at.0)
         .execute(&mut *transaction)
         .await?;
         transaction.commit().await?;
@@ -85,12 +81,8 @@ impl Store {
     /// # Errors
     /// [`StoreError::NotFound`].
     pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model, StoreError> {
-        let row = sqlx::query("SELECT * FROM models WHERE id = ? AND lab = ?")
-            .bind(id.to_string())
-            .bind(lab.as_str())
-            .fetch_optional(&self.readers)
-            .await?;
-        row.as_ref().map(model).transpose()?.ok_or_else(|| not_found(id))
+        let model = sql_as!("SELECT * FROM models WHERE id = ? AND lab = ?", [id, lab]);
+        model.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("model", id))
     }
 
     /// A page of the lab's models, newest first.
@@ -100,18 +92,15 @@ impl Store {
         filter: ModelFilter,
         limit: u32,
     ) -> Result<Page<Model>, StoreError> {
-        let rows = sqlx::query(
+        let items = sql_as!(
             "SELECT * FROM models
              WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
              ORDER BY id DESC LIMIT ?4",
+            [lab, filter.after, filter.calibration, i64::from(limit) + 1]
         )
-        .bind(lab.as_str())
-        .bind(filter.after.map(|id| id.to_string()))
-        .bind(filter.calibration.map(|id| id.to_string()))
-        .bind(i64::from(limit) + 1)
         .fetch_all(&self.readers)
         .await?;
-        Page::cut(&rows, limit, model)
+        Ok(Page::cut(items, limit))
     }
 
     /// Deletes a model that no job refers to. Its file is left to [`Self::collect`].
@@ -123,31 +112,12 @@ impl Store {
         let mut transaction = self.write().await?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE model = ?";
         refuse_if_used(&mut transaction, ("model", id.to_string()), ("jobs", jobs)).await?;
-        let deleted = sqlx::query("DELETE FROM models WHERE id = ?")
-            .bind(id.to_string())
-            .execute(&mut *transaction)
-            .await?;
+        let deleted =
+            sql!("DELETE FROM models WHERE id = ?", [id]).execute(&mut *transaction).await?;
         if deleted.rows_affected() == 0 {
-            return Err(not_found(id));
+            return Err(StoreError::missing("model", id));
         }
         transaction.commit().await?;
         Ok(())
     }
-}
-
-fn model(row: &SqliteRow) -> Result<Model, StoreError> {
-    Ok(Model {
-        id: parsed(row, "id")?,
-        created_at: Timestamp(row.try_get("created_at")?),
-        content: NewModel {
-            name: parsed_if(row, "name")?,
-            calibration: parsed(row, "calibration")?,
-            file: parsed(row, "file")?,
-            facts: json(row, "facts")?,
-        },
-    })
-}
-
-fn not_found(id: ModelId) -> StoreError {
-    StoreError::NotFound { what: "model", id: id.to_string() }
 }

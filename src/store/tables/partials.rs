@@ -6,16 +6,15 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use sqlx::Row;
-use sqlx::sqlite::SqliteRow;
+use sqlx::FromRow;
 
 use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::error::StoreError;
-use crate::store::rows::{integer, number, parsed, parsed_if};
+use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 use crate::store::{Store, dir, on_files};
 
 /// An upload to be begun.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, FromRow)]
 pub struct NewPartial {
     /// Whose it is.
     pub lab: Lab,
@@ -30,11 +29,12 @@ pub struct NewPartial {
 }
 
 /// An upload that was begun.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, FromRow)]
 pub struct Partial {
     /// Its identifier.
     pub id: PartialId,
     /// What was said when it was begun.
+    #[sqlx(flatten)]
     pub facts: NewPartial,
     /// Bytes that are on the disk.
     pub received: u64,
@@ -145,17 +145,19 @@ impl Store {
             Ok(file)
         })
         .await?;
-        sqlx::query(
+        sql!(
             "INSERT INTO partials (id, lab, token, length, metadata, expected, expires_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [
+                id,
+                &facts.lab,
+                facts.token,
+                integer(facts.length),
+                &facts.metadata,
+                facts.expected,
+                expires_at
+            ]
         )
-        .bind(id.to_string())
-        .bind(facts.lab.as_str())
-        .bind(facts.token.map(|id| id.to_string()))
-        .bind(integer(facts.length))
-        .bind(&facts.metadata)
-        .bind(facts.expected.map(|hash| hash.to_string()))
-        .bind(expires_at.0)
         .execute(&self.writer)
         .await?;
         Ok(Partial { id, facts, received: 0, result: None, expires_at })
@@ -166,13 +168,13 @@ impl Store {
     /// # Errors
     /// [`StoreError::NotFound`].
     pub async fn partial(&self, lab: &Lab, id: PartialId) -> Result<Partial, StoreError> {
-        let row = sqlx::query("SELECT * FROM partials WHERE id = ? AND lab = ? AND expires_at > ?")
-            .bind(id.to_string())
-            .bind(lab.as_str())
-            .bind(Timestamp::now().0)
-            .fetch_optional(&self.readers)
-            .await?;
-        row.as_ref().map(partial).transpose()?.ok_or_else(|| not_found(id))
+        let partial = sql_as!(
+            "SELECT * FROM partials WHERE id = ? AND lab = ? AND expires_at > ?",
+            [id, lab, Timestamp::now()]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        partial.ok_or_else(|| StoreError::missing("upload", id))
     }
 
     /// Takes an upload for this request alone, unless another one has it.
@@ -226,17 +228,14 @@ impl Store {
     ) -> Result<(), StoreError> {
         let upload = &mut partial.upload;
         let (received, expires_at) = (upload.received + bytes, after(age));
-        let changed = sqlx::query(
+        let changed = sql!(
             "UPDATE partials SET received = ?, expires_at = ? WHERE id = ? AND received = ?",
+            [integer(received), expires_at, upload.id, integer(upload.received)]
         )
-        .bind(integer(received))
-        .bind(expires_at.0)
-        .bind(upload.id.to_string())
-        .bind(integer(upload.received))
         .execute(&self.writer)
         .await?;
         if changed.rows_affected() == 0 {
-            return Err(not_found(upload.id));
+            return Err(StoreError::missing("upload", upload.id));
         }
         (upload.received, upload.expires_at) = (received, expires_at);
         Ok(())
@@ -264,9 +263,7 @@ impl Store {
             return Err(StoreError::HashMismatch { expected, found });
         }
         self.store_upload(&upload.facts.lab, upload.facts.token, staged).await?;
-        sqlx::query("UPDATE partials SET result = ? WHERE id = ?")
-            .bind(found.to_string())
-            .bind(upload.id.to_string())
+        sql!("UPDATE partials SET result = ? WHERE id = ?", [found, upload.id])
             .execute(&self.writer)
             .await?;
         on_files(move || dir::remove(&path)).await?;
@@ -287,32 +284,26 @@ impl Store {
 
     /// Removes the row and the file, whose lock must be held.
     async fn end_partial(&self, id: PartialId) -> Result<(), StoreError> {
-        sqlx::query("DELETE FROM partials WHERE id = ?")
-            .bind(id.to_string())
-            .execute(&self.writer)
-            .await?;
+        sql!("DELETE FROM partials WHERE id = ?", [id]).execute(&self.writer).await?;
         let path = self.dir().partial(id);
         on_files(move || dir::remove(&path)).await
     }
 
     /// Ends the uploads that have expired, but none to which a piece is being written. Says how many.
     pub async fn expire_partials(&self) -> Result<usize, StoreError> {
-        let rows = sqlx::query("SELECT id FROM partials WHERE expires_at <= ?")
-            .bind(Timestamp::now().0)
-            .fetch_all(&self.readers)
-            .await?;
+        let due = sql_scalar!("SELECT id FROM partials WHERE expires_at <= ?", [Timestamp::now()]);
         let mut ended = 0;
-        for row in &rows {
-            let id: PartialId = parsed(row, "id")?;
+        for id in due.fetch_all(&self.readers).await? {
             let path = self.dir().partial(id);
             let lock = on_files(move || lock(&path)).await?;
             // A piece may have come before the lock was taken.
-            let is_due = sqlx::query("SELECT 1 FROM partials WHERE id = ? AND expires_at <= ?")
-                .bind(id.to_string())
-                .bind(Timestamp::now().0)
-                .fetch_optional(&self.readers)
-                .await?
-                .is_some();
+            let is_due = sql!(
+                "SELECT 1 FROM partials WHERE id = ? AND expires_at <= ?",
+                [id, Timestamp::now()]
+            )
+            .fetch_optional(&self.readers)
+            .await?
+            .is_some();
             if is_due && !matches!(lock, Lock::Busy) {
                 self.end_partial(id).await?;
                 ended += 1;
@@ -324,17 +315,16 @@ impl Store {
     /// Bytes of the disk that were promised and are not written: the rest of uploads in pieces, and
     /// of jobs what is not assembled.
     pub async fn promised_bytes(&self) -> Result<u64, StoreError> {
-        let row = sqlx::query(
+        let bytes: f64 = sql_scalar!(
             "SELECT (SELECT coalesce(sum(length - received), 0) FROM partials WHERE result IS NULL)
                   + (SELECT coalesce(sum(disk_bytes * (
                          SELECT count(*) FILTER (WHERE state <> ?) * 1.0 / count(*)
                          FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
-                     FROM jobs WHERE finished_at IS NULL) AS bytes",
+                     FROM jobs WHERE finished_at IS NULL)",
+            [TaskState::Done]
         )
-        .bind(TaskState::Done.name())
         .fetch_one(&self.readers)
         .await?;
-        let bytes: f64 = row.try_get("bytes")?;
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a sum of bytes
         Ok(bytes as u64)
     }
@@ -345,26 +335,6 @@ fn after(age: Duration) -> Timestamp {
     Timestamp(Timestamp::now().0.saturating_add(age))
 }
 
-fn partial(row: &SqliteRow) -> Result<Partial, StoreError> {
-    Ok(Partial {
-        id: parsed(row, "id")?,
-        facts: NewPartial {
-            lab: parsed(row, "lab")?,
-            token: parsed_if(row, "token")?,
-            length: number(row, "length")?,
-            metadata: row.try_get("metadata")?,
-            expected: parsed_if(row, "expected")?,
-        },
-        received: number(row, "received")?,
-        result: parsed_if(row, "result")?,
-        expires_at: Timestamp(row.try_get("expires_at")?),
-    })
-}
-
 fn short(upload: &Partial, found: u64) -> StoreError {
     StoreError::Short { id: upload.id, found, recorded: upload.received }
-}
-
-fn not_found(id: PartialId) -> StoreError {
-    StoreError::NotFound { what: "upload", id: id.to_string() }
 }

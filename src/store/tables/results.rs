@@ -7,7 +7,7 @@ use sqlx::{Row, SqliteConnection};
 
 use crate::job::{JobId, ResultFile};
 use crate::store::error::StoreError;
-use crate::store::rows::{integer, number, parsed};
+use crate::store::rows::{integer, sql};
 use crate::store::{Job, Store};
 
 /// The snapshot of files that belong to the whole job.
@@ -24,15 +24,13 @@ impl Store {
         snapshot: Option<u32>,
         name: &str,
     ) -> Result<(ResultFile, PathBuf), StoreError> {
-        let row =
-            sqlx::query("SELECT * FROM result_files WHERE job = ? AND snapshot = ? AND name = ?")
-                .bind(job.id.to_string())
-                .bind(snapshot.map_or(WHOLE_JOB, i64::from))
-                .bind(name)
-                .fetch_optional(&self.readers)
-                .await?;
-        let not_found = || StoreError::NotFound { what: "result file", id: name.to_owned() };
-        let file = row.as_ref().map(result_file).transpose()?.ok_or_else(not_found)?;
+        let row = sql!(
+            "SELECT * FROM result_files WHERE job = ? AND snapshot = ? AND name = ?",
+            [job.id, snapshot.map_or(WHOLE_JOB, i64::from), name]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        let file = result_file(&row.ok_or_else(|| StoreError::missing("result file", name))?)?;
         let folder = match snapshot {
             Some(snapshot) => self.dir().snapshot_results(job.id, snapshot),
             None => self.dir().results(job.id),
@@ -48,12 +46,12 @@ impl Store {
         job: &Job,
         snapshot: Option<u32>,
     ) -> Result<Vec<ResultFile>, StoreError> {
-        let rows =
-            sqlx::query("SELECT * FROM result_files WHERE job = ? AND snapshot = ? ORDER BY name")
-                .bind(job.id.to_string())
-                .bind(snapshot.map_or(WHOLE_JOB, i64::from))
-                .fetch_all(&self.readers)
-                .await?;
+        let rows = sql!(
+            "SELECT * FROM result_files WHERE job = ? AND snapshot = ? ORDER BY name",
+            [job.id, snapshot.map_or(WHOLE_JOB, i64::from)]
+        )
+        .fetch_all(&self.readers)
+        .await?;
         rows.iter().map(result_file).collect()
     }
 }
@@ -66,20 +64,14 @@ pub(in crate::store) async fn record(
     files: &[ResultFile],
 ) -> Result<(), StoreError> {
     let snapshot = snapshot.map_or(WHOLE_JOB, i64::from);
-    sqlx::query("DELETE FROM result_files WHERE job = ? AND snapshot = ?")
-        .bind(job.to_string())
-        .bind(snapshot)
+    sql!("DELETE FROM result_files WHERE job = ? AND snapshot = ?", [job, snapshot])
         .execute(&mut *connection)
         .await?;
     for file in files {
-        sqlx::query(
+        sql!(
             "INSERT INTO result_files (job, snapshot, name, size, sha256) VALUES (?, ?, ?, ?, ?)",
+            [job, snapshot, &file.name, integer(file.size), file.sha256]
         )
-        .bind(job.to_string())
-        .bind(snapshot)
-        .bind(&file.name)
-        .bind(integer(file.size))
-        .bind(file.sha256.to_string())
         .execute(&mut *connection)
         .await?;
     }
@@ -89,7 +81,7 @@ pub(in crate::store) async fn record(
 fn result_file(row: &SqliteRow) -> Result<ResultFile, StoreError> {
     Ok(ResultFile {
         name: row.try_get("name")?,
-        size: number(row, "size")?,
-        sha256: parsed(row, "sha256")?,
+        size: row.try_get("size")?,
+        sha256: row.try_get("sha256")?,
     })
 }

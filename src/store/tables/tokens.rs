@@ -1,15 +1,14 @@
 //! Table `tokens`: who may come in.
 
-use sqlx::Row;
-use sqlx::sqlite::SqliteRow;
+use sqlx::{FromRow, Row};
 
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{integer, number, number_if, parsed, parsed_if};
+use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 
 /// A token on record, without the secret.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, FromRow)]
 pub struct Token {
     /// Its identifier, which is no secret.
     pub id: TokenId,
@@ -30,17 +29,19 @@ pub struct Token {
 impl Store {
     /// Records a token by the hash of its secret.
     pub async fn add_token(&self, token: &Token, secret: &Secret) -> Result<(), StoreError> {
-        sqlx::query(
+        sql!(
             "INSERT INTO tokens (id, hash, lab, role, note, max_bytes, created_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [
+                token.id,
+                secret.hash(),
+                &token.lab,
+                token.role,
+                &token.note,
+                token.max_bytes.map(integer),
+                token.created_at
+            ]
         )
-        .bind(token.id.to_string())
-        .bind(secret.hash().to_string())
-        .bind(token.lab.as_str())
-        .bind(token.role.name())
-        .bind(token.note.as_ref().map(Label::as_str))
-        .bind(token.max_bytes.map(integer))
-        .bind(token.created_at.0)
         .execute(&self.writer)
         .await?;
         Ok(())
@@ -48,11 +49,8 @@ impl Store {
 
     /// The token with this secret, unless it was revoked.
     pub async fn token(&self, secret: &Secret) -> Result<Option<Token>, StoreError> {
-        let row = sqlx::query("SELECT * FROM tokens WHERE hash = ? AND revoked_at IS NULL")
-            .bind(secret.hash().to_string())
-            .fetch_optional(&self.readers)
-            .await?;
-        row.as_ref().map(token).transpose()
+        let token = "SELECT * FROM tokens WHERE hash = ? AND revoked_at IS NULL";
+        Ok(sql_as!(token, [secret.hash()]).fetch_optional(&self.readers).await?)
     }
 
     /// All tokens, oldest first, each with the bytes that it keeps here.
@@ -66,7 +64,7 @@ impl Store {
         )
         .fetch_all(&self.readers)
         .await?;
-        rows.iter().map(|row| Ok((token(row)?, number(row, "bytes")?))).collect()
+        rows.iter().map(|row| Ok((Token::from_row(row)?, row.try_get("bytes")?))).collect()
     }
 
     /// Revokes a token, for ever. A second time changes nothing.
@@ -74,14 +72,14 @@ impl Store {
     /// # Errors
     /// [`StoreError::NotFound`].
     pub async fn revoke_token(&self, id: TokenId) -> Result<(), StoreError> {
-        let changed =
-            sqlx::query("UPDATE tokens SET revoked_at = coalesce(revoked_at, ?) WHERE id = ?")
-                .bind(Timestamp::now().0)
-                .bind(id.to_string())
-                .execute(&self.writer)
-                .await?;
+        let changed = sql!(
+            "UPDATE tokens SET revoked_at = coalesce(revoked_at, ?) WHERE id = ?",
+            [Timestamp::now(), id]
+        )
+        .execute(&self.writer)
+        .await?;
         if changed.rows_affected() == 0 {
-            return Err(StoreError::NotFound { what: "token", id: id.to_string() });
+            return Err(StoreError::missing("token", id));
         }
         Ok(())
     }
@@ -95,27 +93,15 @@ impl Store {
 
     /// Bytes of uploads that a token keeps here, or has begun.
     pub async fn token_bytes(&self, id: TokenId) -> Result<u64, StoreError> {
-        let row = sqlx::query(
+        let bytes = sql_scalar!(
             "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
                      WHERE token = ?1)
                   + (SELECT coalesce(sum(length), 0) FROM partials
-                     WHERE token = ?1 AND result IS NULL) AS bytes",
+                     WHERE token = ?1 AND result IS NULL)",
+            [id]
         )
-        .bind(id.to_string())
         .fetch_one(&self.readers)
         .await?;
-        number(&row, "bytes")
+        Ok(bytes)
     }
-}
-
-fn token(row: &SqliteRow) -> Result<Token, StoreError> {
-    Ok(Token {
-        id: parsed(row, "id")?,
-        lab: parsed(row, "lab")?,
-        role: parsed(row, "role")?,
-        note: parsed_if(row, "note")?,
-        max_bytes: number_if(row, "max_bytes")?,
-        created_at: Timestamp(row.try_get("created_at")?),
-        revoked_at: row.try_get::<Option<i64>, _>("revoked_at")?.map(Timestamp),
-    })
 }

@@ -4,12 +4,12 @@ use std::time::Duration;
 
 use serde::Serialize;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
+use sqlx::{FromRow, Row, SqliteConnection};
 
 use crate::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
 use crate::store::Store;
 use crate::store::error::StoreError;
-use crate::store::rows::{number, number_if, parsed, parsed_if};
+use crate::store::rows::{sql, sql_scalar};
 
 /// A worker process on record.
 #[derive(Debug, Clone, Serialize)]
@@ -29,7 +29,7 @@ pub struct WorkerRow {
 }
 
 /// A task in a worker's hands.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, FromRow)]
 pub struct WorkerTask {
     /// The job; none for a calibration's.
     pub job: Option<JobId>,
@@ -48,16 +48,12 @@ pub struct WorkerTask {
 impl Store {
     /// Records that a worker has started.
     pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<(), StoreError> {
-        let now = Timestamp::now().0;
-        sqlx::query(
+        let now = Timestamp::now();
+        sql!(
             "INSERT INTO workers (id, pid, version, started_at, seen_at) VALUES (?, ?, ?, ?, ?)
              ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
+            [id, pid, env!("CARGO_PKG_VERSION"), now, now]
         )
-        .bind(id.to_string())
-        .bind(i64::from(pid))
-        .bind(env!("CARGO_PKG_VERSION"))
-        .bind(now)
-        .bind(now)
         .execute(&self.writer)
         .await?;
         Ok(())
@@ -70,13 +66,13 @@ impl Store {
 
     /// The workers that gave a sign of life within `age`.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT workers.id, pid, version, started_at, seen_at, job, calibration, kind, snapshot, tile, stage
+        let rows = sql!(
+            "SELECT workers.id, pid, version, started_at, seen_at,
+                 job, calibration, kind, snapshot, tile, stage
              FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
              WHERE seen_at >= ? ORDER BY workers.id",
+            [TaskState::Running, since(age)]
         )
-        .bind(TaskState::Running.name())
-        .bind(since(age))
         .fetch_all(&self.readers)
         .await?;
         rows.iter().map(worker).collect()
@@ -84,19 +80,13 @@ impl Store {
 
     /// The last sign of life of a worker; none if it is not on record.
     pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>, StoreError> {
-        let row = sqlx::query("SELECT seen_at FROM workers WHERE id = ?")
-            .bind(id.to_string())
-            .fetch_optional(&self.readers)
-            .await?;
-        row.map(|row| Ok(Timestamp(row.try_get("seen_at")?))).transpose()
+        let seen = sql_scalar!("SELECT seen_at FROM workers WHERE id = ?", [id]);
+        Ok(seen.fetch_optional(&self.readers).await?)
     }
 
     /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
     pub async fn forget_workers(&self, age: Duration) -> Result<(), StoreError> {
-        sqlx::query("DELETE FROM workers WHERE seen_at < ?")
-            .bind(since(age))
-            .execute(&self.writer)
-            .await?;
+        sql!("DELETE FROM workers WHERE seen_at < ?", [since(age)]).execute(&self.writer).await?;
         Ok(())
     }
 }
@@ -106,10 +96,7 @@ pub(in crate::store) async fn remove(
     connection: &mut SqliteConnection,
     id: WorkerId,
 ) -> Result<(), StoreError> {
-    sqlx::query("DELETE FROM workers WHERE id = ?")
-        .bind(id.to_string())
-        .execute(connection)
-        .await?;
+    sql!("DELETE FROM workers WHERE id = ?", [id]).execute(connection).await?;
     Ok(())
 }
 
@@ -118,9 +105,7 @@ pub(in crate::store) async fn seen(
     connection: &mut SqliteConnection,
     id: WorkerId,
 ) -> Result<(), StoreError> {
-    sqlx::query("UPDATE workers SET seen_at = ? WHERE id = ?")
-        .bind(Timestamp::now().0)
-        .bind(id.to_string())
+    sql!("UPDATE workers SET seen_at = ? WHERE id = ?", [Timestamp::now(), id])
         .execute(connection)
         .await?;
     Ok(())
@@ -131,23 +116,13 @@ fn since(age: Duration) -> i64 {
 }
 
 fn worker(row: &SqliteRow) -> Result<WorkerRow, StoreError> {
+    let has_task = row.try_get::<Option<String>, _>("kind")?.is_some();
     Ok(WorkerRow {
-        id: parsed(row, "id")?,
-        pid: number(row, "pid")?,
+        id: row.try_get("id")?,
+        pid: row.try_get("pid")?,
         version: row.try_get("version")?,
-        started_at: Timestamp(row.try_get("started_at")?),
-        seen_at: Timestamp(row.try_get("seen_at")?),
-        task: row.try_get::<Option<_>, _>("kind")?.map(|kind| task(row, kind)).transpose()?,
-    })
-}
-
-fn task(row: &SqliteRow, kind: String) -> Result<WorkerTask, StoreError> {
-    Ok(WorkerTask {
-        job: parsed_if(row, "job")?,
-        calibration: parsed_if(row, "calibration")?,
-        kind,
-        snapshot: number_if(row, "snapshot")?,
-        tile: number_if(row, "tile")?,
-        stage: row.try_get("stage")?,
+        started_at: row.try_get("started_at")?,
+        seen_at: row.try_get("seen_at")?,
+        task: has_task.then(|| WorkerTask::from_row(row)).transpose()?,
     })
 }

@@ -7,8 +7,8 @@ use serde_json::json;
 use super::{LEASE, Lab};
 use crate::job::{CalibrationId, Captures, TaskKind, TaskProgress, TaskState};
 use crate::store::{
-    CalibrationDone, CalibrationInputs, ClaimedTask, Completion, Heartbeat, MAX_FAILURES,
-    NewCalibration, Product, StoreError, Unready, Work, WorkerEnd,
+    CalibrationDone, ClaimedTask, Completion, Heartbeat, MAX_FAILURES, NewCalibration, Product,
+    StoreError, Unready, Work, WorkerEnd,
 };
 
 /// What a worker makes of masks that are there.
@@ -90,12 +90,11 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     let task = lab.claim().await.unwrap();
     let Work::Calibration(calibration) = &task.work else { panic!() };
     assert_eq!((task.kind, calibration.calibration), (TaskKind::Calibration, first));
-    assert!(matches!(&calibration.inputs, CalibrationInputs::Captures(captures)
-        if captures.masks.len() == 2));
+    assert_eq!(calibration.captures.as_ref().unwrap().masks.len(), 2);
     let worker = lab.store.live_workers(LEASE).await.unwrap().remove(0).task.unwrap();
     assert_eq!((worker.job, worker.calibration), (None, Some(first)));
     let half = TaskProgress { fraction: 0.5, ..TaskProgress::START };
-    assert_eq!(lab.store.heartbeat(&task.lease, half).await.unwrap(), Heartbeat::Continue);
+    assert_eq!(lab.store.heartbeat(&task.lease, half, None).await.unwrap(), Heartbeat::Continue);
     let shown = lab.unready(first).await.unwrap();
     assert_eq!((shown.frames, shown.fraction, shown.error), (2, 0.5, None));
     let refused = lab.store.calibration(&local, first).await;
@@ -128,10 +127,10 @@ async fn who_works_on_a_deleted_calibration_is_told_to_stop() {
     lab.store.delete_calibration(&local, id).await.unwrap();
     let again = lab.store.delete_calibration(&local, id).await;
     assert!(matches!(again, Err(StoreError::NotFound { .. })));
-    let beat = lab.store.heartbeat(&task.lease, TaskProgress::START).await.unwrap();
+    let beat = lab.store.heartbeat(&task.lease, TaskProgress::START, None).await.unwrap();
     assert_eq!(beat, Heartbeat::Lost);
     assert_eq!(lab.made(&task).await, Heartbeat::Lost);
-    lab.store.release_task(&task.lease).await.unwrap();
+    lab.store.give_back(&task.lease).await.unwrap();
     assert!(lab.claim().await.is_none());
     assert!(matches!(lab.store.calibration(&local, id).await, Err(StoreError::NotFound { .. })));
     // Six uploads, and what was made of two.

@@ -14,9 +14,9 @@ async fn an_error_that_no_repetition_helps_fails_the_job_at_once() {
     let failed = lab.store.job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(failed.state, JobState::Failed);
     assert_eq!(failed.error.unwrap(), "tile 0 of snapshot 0: the masks are gone");
-    let beat = lab.store.heartbeat(&sibling.lease, TaskProgress::START).await.unwrap();
+    let beat = lab.store.heartbeat(&sibling.lease, TaskProgress::START, None).await.unwrap();
     assert_eq!(beat, Heartbeat::Cancelled, "the others need not go on");
-    lab.store.cancelled(&sibling.lease).await.unwrap();
+    lab.store.give_back(&sibling.lease).await.unwrap();
     lab.store.retry_job(&crate::job::Lab::local(), job).await.unwrap();
     assert_eq!(lab.work_off().await.len(), 7, "all but what was done");
     assert_eq!(lab.state(job).await, JobState::Succeeded);
@@ -46,7 +46,7 @@ async fn a_task_that_is_interrupted_is_not_given_up_for_a_long_time() {
     }
     for _ in 0..5 {
         let task = lab.claim().await.unwrap();
-        lab.store.release_task(&task.lease).await.unwrap();
+        lab.store.give_back(&task.lease).await.unwrap();
     }
     assert_eq!(lab.state(job).await, JobState::Running, "giving back is no loss");
     lab.claim().await.unwrap();

@@ -2,9 +2,10 @@
 
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
+use strum::VariantArray;
 
 use crate::job::{Lab, TaskState, WorkerId};
-use crate::store::{CalibrationInputs, Purpose, Store, Work};
+use crate::store::{Purpose, Store, Work};
 
 /// The last migration before calibrations became tasks.
 const BEFORE: i64 = 70;
@@ -105,7 +106,7 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
     let lease = std::time::Duration::from_secs(60);
     while let Some(task) = store.claim(WorkerId::new(), lease).await.unwrap() {
         let Work::Calibration(calibration) = task.work else { panic!() };
-        assert!(matches!(calibration.inputs, CalibrationInputs::Captures(_)));
+        assert!(calibration.captures.is_some());
         claimed.push((calibration.calibration.to_string(), task.lease.attempt));
     }
     assert_eq!(claimed, [(id(1), 2), (id(2), 3), (id(5), 1)]);
@@ -138,7 +139,8 @@ async fn the_states_of_tasks_are_those_of_the_table() {
     let folder = tempfile::tempdir().unwrap();
     let store =
         Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
-    let names = TaskState::ALL.map(|state| format!("'{}'", state.name())).join(", ");
+    let names =
+        TaskState::VARIANTS.iter().map(|state| format!("'{state}'")).collect::<Vec<_>>().join(", ");
     let table: String = sqlx::query_scalar("SELECT sql FROM sqlite_master WHERE name = 'tasks'")
         .fetch_one(&store.readers)
         .await
