@@ -170,9 +170,6 @@ pub enum ConfigError {
 
 impl ServeArguments {
     /// Checks what can't be checked field by field; `open` says that there are no tokens.
-    ///
-    /// # Errors
-    /// See [`ConfigError`].
     pub fn check(&self, open: bool) -> Result<(), ConfigError> {
         if open && !self.listen.ip().is_loopback() && !self.allow_remote {
             return Err(ConfigError::Remote(self.listen));

@@ -40,9 +40,6 @@ struct Index {
 }
 
 /// Runs the command.
-///
-/// # Errors
-/// Captures that can't be used, or files that can't be written.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let files = read_index(&arguments.captures)?;
     let out = &arguments.out;

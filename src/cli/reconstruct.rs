@@ -102,9 +102,6 @@ struct Setup {
 }
 
 /// Runs the command.
-///
-/// # Errors
-/// Input that can't be used, or a failure on the way.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());

@@ -31,7 +31,6 @@ pub enum ServeError {
     /// The store can't be opened.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The address can't be had.
     #[error("can't listen at {address}: {source}")]
     Listen {
         /// The address.
@@ -39,15 +38,8 @@ pub enum ServeError {
         /// Why.
         source: std::io::Error,
     },
-    /// The operating system refused something else.
     #[error("can't {action}: {source}")]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// Why it failed.
-        source: std::io::Error,
-    },
-    /// The figures can't be counted.
+    Io { action: &'static str, source: std::io::Error },
     #[error("can't count figures: {0}")]
     Metrics(#[from] metrics_exporter_prometheus::BuildError),
 }

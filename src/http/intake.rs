@@ -1,8 +1,6 @@
 //! Uploads on their way to a calibration or measurement: what passes the checks of [`crate::intake`] is
 //! written as a prepared array. Blocks; one at a time runs, where blocking is allowed.
 
-use std::io::BufWriter;
-
 use super::app::App;
 use super::error::{ApiError, Code};
 use crate::formats::mat::SceneArray;
@@ -51,7 +49,7 @@ pub(super) fn masks(
     let (info, full_scale) = (opened.info, opened.full_scale.value());
     let mut writer = writer(store, &info)?;
     let found = intake::masks(opened, |mask| writer.write_frame(mask))?;
-    Ok(Prepared { info, full_scale, found, file: finish(writer)? })
+    Ok(Prepared { info, full_scale, found, file: writer.finish()?.finish()? })
 }
 
 /// Writes a measurement with its dark subtracted and its full scale divided out, and checks it
@@ -77,22 +75,12 @@ pub(super) fn measurement(
     }
     let mut writer = writer(store, &info)?;
     let saturated = intake::measurement(opened, exposure, limits, |y| writer.write_frame(y))?;
-    let file = finish(writer)?;
+    let file = writer.finish()?.finish()?;
     let masks = store.dir().blob(&calibration.prepared);
     let found = intake::judge(&masks, file.path(), saturated.as_deref(), limits)?;
     Ok(Prepared { info, full_scale, found, file })
 }
 
-type Writer = StackWriter<BufWriter<BlobWriter>>;
-
-fn writer(store: &Store, info: &StackInfo) -> Result<Writer, ApiError> {
-    let buffered = BufWriter::with_capacity(256 * 1024, store.blob_writer()?);
-    Ok(planar::writer(buffered, info.frames, info.height, info.width)?)
-}
-
-fn finish(writer: Writer) -> Result<StagedBlob, ApiError> {
-    let buffered = writer.finish()?;
-    // `finish` has flushed, so this only unwraps.
-    let inner = buffered.into_inner().map_err(|error| ApiError::internal(error.error()))?;
-    Ok(inner.finish()?)
+fn writer(store: &Store, info: &StackInfo) -> Result<StackWriter<BlobWriter>, ApiError> {
+    Ok(planar::writer(store.blob_writer()?, info.frames, info.height, info.width)?)
 }

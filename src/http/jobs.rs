@@ -33,7 +33,6 @@ pub(super) struct JobBody {
     schedule: Schedule,
     tile: TileSpec,
     priority: i32,
-    /// What the check of the measurement found.
     warnings: Vec<Finding>,
     error: Option<String>,
     created_at: Timestamp,

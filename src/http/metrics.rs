@@ -15,9 +15,6 @@ pub struct Metrics(PrometheusHandle);
 
 impl Metrics {
     /// Begins to count, for the whole process; a second call gives the same figures.
-    ///
-    /// # Errors
-    /// If another recorder counts already.
     pub fn install() -> Result<Self, BuildError> {
         static HANDLE: OnceLock<PrometheusHandle> = OnceLock::new();
         if let Some(handle) = HANDLE.get() {

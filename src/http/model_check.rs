@@ -58,9 +58,7 @@ impl Checker {
     }
 
     /// Checks whether an upload is a network for these masks, and runs it once; one check at a time.
-    ///
-    /// # Errors
-    /// 422 with what it has and what is needed; 503 if no network can be run here.
+    /// Errors: 422 with what it has and what is needed; 503 if no network can be run here.
     pub(super) async fn check(
         &self,
         file: &Path,

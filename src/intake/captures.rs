@@ -60,9 +60,7 @@ pub struct Report {
 /// Their scale is known only after the last of them: until then they lie in `scratch`, a file that is
 /// there. Then `open` is asked for the writer of such a stack, and each mask is written. Returns what is
 /// known of the masks, and what the writer wrote to.
-///
-/// # Errors
-/// Captures or patterns that can't be read or used; I/O; a stop; those of `open`.
+/// Errors: captures or patterns that can't be read or used; I/O; a stop; those of `open`.
 pub fn calibrate<W: Write>(
     files: &CaptureFiles,
     limits: &Limits,
@@ -82,17 +80,13 @@ pub fn calibrate<W: Write>(
 }
 
 /// The report on masks \[B,H,W\] on \[0,1\] that were sent as such.
-///
-/// # Errors
-/// Masks that can't be read; a stop.
+/// Errors: masks that can't be read; a stop.
 pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report, IntakeError> {
     tell(&study(masks, 1.0, progress)?, None, None)
 }
 
 /// Looks at the headers of captures: they must be stacks of one size, before hours of averaging.
-///
-/// # Errors
-/// Files that can't be read, or differ in size, by their place in a request.
+/// Errors: files that can't be read, or differ in size, by their place in a request.
 pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<(), IntakeError> {
     let mut first = None;
     for (place, paths) in files.lists() {

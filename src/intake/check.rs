@@ -31,10 +31,8 @@ pub struct Exposure {
 }
 
 /// Hands each mask on \[0,1\] to `sink`.
-///
-/// # Errors
-/// Whatever is wrong with the file; values outside the scale; masks without an open pixel; those of
-/// `sink`. What it received must be thrown away then.
+/// Errors: whatever is wrong with the file; values outside the scale; masks without an open pixel;
+/// those of `sink`. What it received must be thrown away then.
 pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
@@ -45,10 +43,8 @@ pub fn masks(
 
 /// Hands each snapshot, less its dark and divided by the full scale, to `sink`. Tells the share of full
 /// pixels of each; none if nobody knows when they are.
-///
-/// # Errors
-/// Whatever is wrong with the file; a dark of another size; snapshots that are 0 everywhere; those of
-/// `sink`. What it received must be thrown away then.
+/// Errors: whatever is wrong with the file; a dark of another size; snapshots that are 0
+/// everywhere; those of `sink`. What it received must be thrown away then.
 pub fn measurement(
     opened: Opened,
     exposure: &Exposure,
@@ -116,9 +112,6 @@ impl FrameReader for Exposed {
 
 /// Holds samples of snapshots \[S,H,W\] against masks \[B,H,W\], both as prepared files. `saturated` is
 /// the share of full pixels of each snapshot.
-///
-/// # Errors
-/// Files that can't be read.
 pub fn judge(
     masks: &Path,
     snapshots: &Path,

@@ -6,7 +6,6 @@ use crate::formats::FormatError;
 /// the request, or a name and path, as the caller has called it; empty where there is but one.
 #[derive(Debug, thiserror::Error)]
 pub enum IntakeError {
-    /// It can't be read, or its values can't be.
     #[error("{}{source}", prefix(.place))]
     Format {
         /// Which file.
@@ -14,7 +13,6 @@ pub enum IntakeError {
         /// What is wrong with it.
         source: FormatError,
     },
-    /// It has another size than it should.
     #[error("{}{detail}", prefix(.place))]
     Size {
         /// Which file.
@@ -22,7 +20,6 @@ pub enum IntakeError {
         /// Both sizes.
         detail: String,
     },
-    /// It can be read, but not used.
     #[error("{}{detail}", prefix(.place))]
     Content {
         /// Which file.
@@ -30,7 +27,6 @@ pub enum IntakeError {
         /// What is wrong with it.
         detail: String,
     },
-    /// The caller has asked to stop.
     #[error("stopped")]
     Stopped,
 }

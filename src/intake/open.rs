@@ -58,9 +58,8 @@ impl<'a> Source<'a> {
     }
 
     /// Opens it.
-    ///
-    /// # Errors
-    /// No file, or none of a format that is read; larger than the limits; no such array; no full scale.
+    /// Errors: no file, or none of a format that is read; larger than the limits; no such array; no
+    /// full scale.
     pub fn open(&self) -> Result<Opened, IntakeError> {
         let opened = match mat::is_mat(self.path) {
             Ok(true) => mat::open_array(self.path, self.array, &self.limits),
@@ -79,9 +78,6 @@ impl<'a> Source<'a> {
 
 impl Opened {
     /// The next frame \[H,W\] divided by the full scale; none after the last.
-    ///
-    /// # Errors
-    /// Whatever is wrong with its bytes.
     pub fn next_frame(&mut self) -> Result<Option<Array2<f32>>, IntakeError> {
         let frame = self.reader.next_frame().map_err(IntakeError::format(&self.name))?;
         Ok(frame.map(|frame| frame / self.full_scale.value()))

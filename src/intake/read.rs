@@ -25,9 +25,6 @@ pub struct Scaled<T> {
 }
 
 /// Masks \[B,H,W\] on \[0,1\], checked.
-///
-/// # Errors
-/// A file that can't be read, or holds no masks.
 pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>, IntakeError> {
     let opened = source.open()?;
     let full_scale = opened.full_scale.value();
@@ -37,9 +34,6 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>, IntakeErro
 }
 
 /// Snapshot `index` \[H,W\] of a measurement, checked, and how many there are.
-///
-/// # Errors
-/// A file that can't be read, or has no such snapshot.
 pub fn read_snapshot(
     source: &Source<'_>,
     index: usize,
@@ -66,9 +60,7 @@ pub fn read_snapshot(
 
 /// The true frames \[B,H,W\] of one snapshot, of a file that has those of this snapshot or of all. A .mat
 /// scene may go without; another file may not.
-///
-/// # Errors
-/// A file that can't be read; other sizes.
+/// Errors: A file that can't be read; other sizes.
 pub fn read_truth(
     source: &Source<'_>,
     (frames, height, width): (usize, usize, usize),
@@ -102,9 +94,7 @@ pub fn read_truth(
 
 /// Frames \[T,H,W\] of a file, of an npz archive, or of a folder of pictures in the order of their
 /// names, divided by the full scale; all finite.
-///
-/// # Errors
-/// Files that can't be read; pictures of different sizes.
+/// Errors: files that can't be read; pictures of different sizes.
 pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>, IntakeError> {
     let source = |path| Source::file(path, SceneArray::Truth, full_scale);
     if path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("npz")) {

@@ -18,19 +18,13 @@ use crate::recon::schedule::Schedule;
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case", const_into_str)]
 pub enum Algorithm {
-    /// GAP with total variation.
     GapTv,
     /// GAP with total variation in space and, where it pays, in time.
     GapTv3d,
-    /// ADMM with total variation.
     AdmmTv,
-    /// GAP with total variation, then with the nonlocal prior.
     PnpNonlocal,
-    /// GAP with total variation, then with FFDNet.
     PnpFfdnet,
-    /// GAP with total variation, then with FastDVDNet.
     PnpFastdvdnet,
-    /// GAP with total variation, with FastDVDNet, then with the nonlocal prior.
     PnpTvFastdvdnet,
     /// A network from measurement and masks to frames, trained for one calibration.
     Learned,

@@ -67,9 +67,7 @@ impl Captures {
     }
 
     /// Refuses lists that are empty or too long.
-    ///
-    /// # Errors
-    /// All that is wrong, each with its place.
+    /// Errors: all that is wrong, each with its place.
     pub fn check(&self) -> Result<(), Vec<InvalidField>> {
         let mut errors = Vec::new();
         if self.masks.is_empty() || self.masks.len() > MOST {

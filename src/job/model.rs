@@ -8,7 +8,6 @@ use crate::recon::schedule::Schedule;
 /// A tensor that a network takes or gives.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ModelTensor {
-    /// Its name.
     pub name: String,
     /// Its sides; null for one that may have any length.
     pub shape: Vec<Option<usize>>,
@@ -17,9 +16,7 @@ pub struct ModelTensor {
 /// A run on zeros: what it took, for the plans of jobs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ModelTrial {
-    /// Rows of the picture.
     pub height: usize,
-    /// Columns.
     pub width: usize,
     /// Processor seconds of the run, without loading the network.
     pub cpu_seconds: f64,
@@ -30,13 +27,10 @@ pub struct ModelTrial {
 /// What the check of a network has found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ModelFacts {
-    /// The inputs.
     pub inputs: Vec<ModelTensor>,
-    /// The outputs.
     pub outputs: Vec<ModelTensor>,
     /// True if it takes pictures of the calibration's size only, so that they can't be cut.
     pub fixed_size: bool,
-    /// The run on zeros.
     pub trial: ModelTrial,
 }
 
@@ -44,7 +38,6 @@ pub struct ModelFacts {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelVerdict {
-    /// It can be used.
     Fits(ModelFacts),
     /// It can't, and why.
     Refused(String),
@@ -53,11 +46,9 @@ pub enum ModelVerdict {
 /// The network of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobModel {
-    /// Its identifier.
     pub id: ModelId,
     /// The calibration that it was registered for.
     pub calibration: CalibrationId,
-    /// The user's name for it.
     pub name: Option<Label>,
     /// Hash of its ONNX file.
     pub sha256: Sha256,

@@ -12,11 +12,9 @@ use crate::optics::{self, CaptureFigures, MaskFigures, PatternFigures};
 pub struct Finding {
     /// Its name, which never changes, for programs to rely on.
     pub code: String,
-    /// How bad it is.
     pub severity: Severity,
     /// What was seen, with its numbers.
     pub detail: String,
-    /// What to do.
     pub remedy: String,
     /// The patterns or frames that it is about, counted from 0.
     pub frames: Vec<usize>,
@@ -62,28 +60,20 @@ impl Grade {
 pub struct CalibrationReport {
     /// Name and version of this form.
     pub schema: String,
-    /// The verdict.
     pub grade: Grade,
-    /// Why it is not better, and what to do.
     pub findings: Vec<Finding>,
-    /// Masks (B).
     pub frames: usize,
-    /// Rows.
     pub height: usize,
-    /// Columns.
     pub width: usize,
-    /// Figures of the masks.
     pub masks: MaskReport,
     /// Figures of the captures that they were made of; none for masks that were sent.
     pub captures: Option<CaptureReport>,
-    /// Names of the pictures.
     pub maps: Vec<String>,
 }
 
 /// Figures of masks on \[0,1\].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MaskReport {
-    /// Mean of all values.
     pub mean: f64,
     /// Mean over the pixels of the standard deviation over the frames.
     pub deviation: f64,
@@ -91,7 +81,6 @@ pub struct MaskReport {
     pub percentile_1: f64,
     /// 99 % of all values lie below this.
     pub percentile_99: f64,
-    /// Mean of each mask.
     pub frame_means: Vec<f64>,
     /// Correlation of each mask with each other.
     pub correlation: Vec<Vec<f64>>,
@@ -101,7 +90,6 @@ pub struct MaskReport {
     pub correlation_largest: Option<f64>,
     /// Smallest, mean and largest sum of squares of a pixel: the gram diagonal.
     pub gram: [f64; 3],
-    /// Pixels that are dark in all masks.
     pub dead_pixels: u64,
     /// Pixels that are open in all masks.
     pub stuck_pixels: u64,
@@ -120,9 +108,7 @@ pub struct CaptureReport {
     pub noise: Option<f64>,
     /// Mean deviation over the frames over that noise, in decibels: what is left of the dynamic range.
     pub dynamic_range_db: Option<f64>,
-    /// Mean of the white.
     pub white_level: f64,
-    /// Mean of the black.
     pub black_level: f64,
     /// Mean of the black with mask; none for Eq. 7.
     pub black_with_mask_level: Option<f64>,
@@ -134,7 +120,6 @@ pub struct CaptureReport {
     pub denominator_not_positive: f64,
     /// Share of further pixels whose white is hardly above their black.
     pub denominator_too_dark: f64,
-    /// Of each pattern.
     pub patterns: Vec<PatternReport>,
 }
 
@@ -149,7 +134,6 @@ pub struct PatternReport {
     pub negative: f64,
     /// Standard deviation that noise gives a mask value.
     pub noise: Option<f64>,
-    /// Share of full pixels.
     pub saturated: Option<f64>,
     /// Change of the light during the repeats, as a share.
     pub drift: f64,

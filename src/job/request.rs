@@ -27,7 +27,6 @@ const SNAPSHOT_BYTES: u64 = 1 << 20;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(try_from = "SelectionJson", into = "SelectionJson")]
 pub enum SnapshotSelection {
-    /// All snapshots of the measurement.
     #[default]
     All,
     /// The snapshot with this index, from 0.
@@ -73,7 +72,6 @@ impl From<SnapshotSelection> for SelectionJson {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct JobRequest {
-    /// The measurement to be reconstructed.
     pub measurement: MeasurementId,
     /// If given, it must be the measurement's own calibration: a check, not a choice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -81,7 +79,6 @@ pub struct JobRequest {
     /// The snapshots; all where it is left out.
     #[serde(default)]
     pub snapshots: SnapshotSelection,
-    /// The algorithm.
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -106,26 +103,18 @@ pub struct JobRequest {
 pub struct JobSpec {
     /// The calibration of the measurement.
     pub calibration: CalibrationId,
-    /// The measurement.
     pub measurement: MeasurementId,
-    /// The sizes of both.
     pub shape: SceneShape,
-    /// The snapshots to be reconstructed.
     pub snapshots: SnapshotRange,
-    /// The algorithm.
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`]; none for all others.
     #[serde(default)]
     pub model: Option<JobModel>,
     /// The schedule; without stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
-    /// The tiles.
     pub tile: TileSpec,
-    /// The priority.
     pub priority: i32,
-    /// The label.
     pub label: Option<Label>,
-    /// What the check of the measurement found.
     #[serde(default)]
     pub warnings: Vec<Finding>,
 }
@@ -133,9 +122,7 @@ pub struct JobSpec {
 impl JobRequest {
     /// Checks the request against the measurement and the model that it names, and fills in the
     /// defaults.
-    ///
-    /// # Errors
-    /// All that is wrong, each with its place in the request.
+    /// Errors: all that is wrong, each with its place in the request.
     pub fn resolve(
         self,
         calibration: CalibrationId,

@@ -28,7 +28,6 @@ impl SnapshotRange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TileSpec {
-    /// The largest side of a tile.
     pub size: usize,
     /// The least that neighbours share.
     pub overlap: usize,
@@ -45,12 +44,8 @@ impl TileSpec {
 /// The sizes of a measurement and its calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneShape {
-    /// Frames that one snapshot codes (B).
     pub frames: usize,
-    /// Rows.
     pub height: usize,
-    /// Columns.
     pub width: usize,
-    /// Snapshots of the measurement (S).
     pub snapshots: u32,
 }

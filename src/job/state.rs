@@ -39,9 +39,7 @@ pub enum JobState {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("a job that is {from} can't become {to}")]
 pub struct IllegalTransition {
-    /// The state that the job is in.
     pub from: JobState,
-    /// The state that was asked for.
     pub to: JobState,
 }
 
@@ -53,9 +51,6 @@ impl JobState {
     }
 
     /// The state `to`, if the step there is legal.
-    ///
-    /// # Errors
-    /// [`IllegalTransition`] names both states.
     pub fn step(self, to: Self) -> Result<Self, IllegalTransition> {
         use JobState::{Cancelled, Cancelling, Failed, Queued, Running, Succeeded};
         let legal = matches!(

@@ -26,24 +26,19 @@ pub enum TaskKind {
     Prepare,
     /// Reconstruct one snapshot coarsely, to be looked at until its tiles are done.
     Preview {
-        /// The snapshot's index.
         snapshot: u32,
     },
     /// Find out how many iterations of an adaptive schedule pay. Tiles wait for it.
     Pilot,
-    /// Reconstruct one tile of one snapshot.
     Tile {
-        /// The snapshot's index.
         snapshot: u32,
         /// The tile's index in the plan.
         tile: u32,
     },
     /// Blend the tiles of one snapshot and write its frames.
     Assemble {
-        /// The snapshot's index.
         snapshot: u32,
     },
-    /// Write the manifest of the job.
     Manifest,
     /// Make the masks of a calibration from its captures, and the report on them.
     Calibration,
@@ -88,9 +83,6 @@ impl TaskKind {
 
 impl JobSpec {
     /// The tasks of the job with their planned CPU-seconds, in the order in which they are handed out.
-    ///
-    /// # Errors
-    /// If the scene can't be cut into tiles.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn tasks(&self) -> Result<Vec<(TaskKind, f64)>, ReconError> {
         let tiles = self.tile_plan()?;
@@ -166,7 +158,6 @@ pub enum TaskState {
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum TaskStage {
-    /// Reading inputs.
     Reading,
     /// Iterations with total variation as the prior.
     Tv,
@@ -174,14 +165,12 @@ pub enum TaskStage {
     Deep,
     /// Iterations with the nonlocal prior.
     Nonlocal,
-    /// Blending and writing.
     Writing,
 }
 
 /// How far a running task is.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TaskProgress {
-    /// What it is doing now.
     pub stage: TaskStage,
     /// Solver iterations done so far.
     pub iterations: u32,
@@ -203,8 +192,6 @@ impl TaskProgress {
 pub struct ResultFile {
     /// Its path below the folder of the snapshot or job, such as `frames/frame_0001.exr`.
     pub name: String,
-    /// Its size in bytes.
     pub size: u64,
-    /// The hash of its bytes.
     pub sha256: Sha256,
 }

@@ -27,7 +27,6 @@ impl InvalidText {
 pub struct InvalidField {
     /// JSON pointer (RFC 6901) into the request.
     pub pointer: String,
-    /// What is wrong and what would be right.
     pub detail: String,
 }
 
@@ -103,9 +102,6 @@ impl Sha256 {
     }
 
     /// The hash and the number of the bytes that are left to read.
-    ///
-    /// # Errors
-    /// Those of reading.
     pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
         use sha2::Digest;
         let mut hasher = sha2::Sha256::new();

@@ -28,9 +28,7 @@ pub struct StoredTile {
 }
 
 /// Refuses tiles of which one is missing, or whose bytes are not those that were stored.
-///
-/// # Errors
-/// [`PipelineError::Damaged`] with the tiles that should be done again.
+/// Errors: [`PipelineError::Damaged`] with the tiles that should be done again.
 pub fn verify(
     plan: &TilePlan,
     tiles: &[StoredTile],

@@ -22,7 +22,6 @@ pub enum PipelineError {
     /// An array or a frame can't be read or written.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// A file of the result can't be written.
     #[error("the result's {name}: {source}")]
     File { name: String, source: io::Error },
     /// The output folder holds something that is not an earlier result.
@@ -31,7 +30,6 @@ pub enum PipelineError {
          there: name a new folder"
     )]
     Foreign { name: String },
-    /// Stored tiles are not what was stored.
     #[error("the stored results of tiles {0:?} are damaged")]
     Damaged(Vec<u32>),
     /// A prepared array is not what was stored.
@@ -40,10 +38,8 @@ pub enum PipelineError {
          calibration and the measurement anew"
     )]
     Corrupt { what: &'static str, sha256: Sha256 },
-    /// A snapshot without light.
     #[error("snapshot {snapshot}: {source}")]
     Snapshot { snapshot: u32, source: ReconError },
-    /// A record in the database is not what this program writes.
     #[error("the record of the {what} can't be used: {problem}")]
     Record { what: &'static str, problem: String },
     #[error("a computing thread ended unexpectedly")]

@@ -59,7 +59,6 @@ const FFDNET_GRAY: Model = Model {
 /// A network, as it stands in manifests.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ModelRecord {
-    /// Its name.
     pub name: String,
     /// SHA-256 of its ONNX files, one after the other.
     pub sha256: String,
@@ -143,7 +142,6 @@ pub enum NetworkError {
          scripts/fetch-onnxruntime.sh"
     )]
     Missing(String),
-    /// A network in a folder of one's own.
     #[error("model {}: {reason}", path.display())]
     Model {
         /// The file.
@@ -151,7 +149,6 @@ pub enum NetworkError {
         /// What is wrong with it.
         reason: io::Error,
     },
-    /// The file of an end-to-end network is not what it was.
     #[error("the network's file is damaged: its hash should be {expected}, but is {found}")]
     Damaged {
         /// The hash that it should have.
@@ -236,9 +233,7 @@ impl NetworkSource {
     }
 
     /// An end-to-end network with a session of its own, for one thread.
-    ///
-    /// # Errors
-    /// No library; a file that can't be read, or holds no network that can be run.
+    /// Errors: no library; a file that can't be read, or holds no network that can be run.
     pub fn end_to_end(&self, file: &ModelFile) -> Result<EndToEndNetwork, NetworkError> {
         Ok(EndToEndNetwork::load(&self.runtime()?, &file.read()?)?)
     }

@@ -23,9 +23,7 @@ pub struct PilotRecord {
     pub row: usize,
     /// First column.
     pub column: usize,
-    /// Rows.
     pub height: usize,
-    /// Columns.
     pub width: usize,
     /// The stages of the schedule that was asked for.
     pub stages: Vec<StageRecord>,

@@ -71,9 +71,7 @@ pub type TileProgress<'a> = &'a (dyn Fn(usize, f64) + Sync);
 
 /// Solves all tiles of a snapshot on up to `threads` threads, one denoiser a thread; an adaptive
 /// schedule is decided before. The result does not depend on the number of threads.
-///
-/// # Errors
-/// The first failure of any tile; the others stop at their next iteration.
+/// Errors: the first failure of any tile; the others stop at their next iteration.
 pub fn solve(
     input: &SnapshotInput<'_>,
     network: &NetworkSource,

@@ -74,9 +74,7 @@ impl TileInput {
 
 /// Reconstructs one tile by the iterations of a schedule. The frames \[B,h,w\] are on the scale of
 /// the measurement.
-///
-/// # Errors
-/// As [`solver::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
+/// Errors: as [`solver::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct_tile(
     input: TileInput,
     schedule: &Schedule,

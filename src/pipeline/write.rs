@@ -29,9 +29,7 @@ const NAMES: [&str; 5] = [FRAMES, PNGS, STACK, ARRAY, MANIFEST];
 /// `frame(k)` is asked once for each frame, in order; memory holds one.
 ///
 /// Returns all files, the manifest last.
-///
-/// # Errors
-/// Those of `frame`, and those of writing. A folder that was begun stays behind.
+/// Errors: those of `frame`, and those of writing. A folder that was begun stays behind.
 pub fn write_result(
     folder: &Path,
     mut manifest: Manifest,
@@ -96,9 +94,7 @@ pub fn check_output(folder: &Path) -> Result<(), PipelineError> {
 
 /// Moves the result in `made` to `folder`, in place of an earlier result; other files there
 /// stay. Both must be on one file system.
-///
-/// # Errors
-/// As [`check_output`], or a file can't be moved.
+/// Errors: as [`check_output`], or a file can't be moved.
 pub fn replace_result(made: &Path, folder: &Path) -> Result<(), PipelineError> {
     check_output(folder)?;
     // The old manifest goes last and the new one comes last: what lies beside a manifest

@@ -21,7 +21,6 @@ use crate::job::Sha256;
 pub struct Backup {
     /// Files that were copied, the database among them.
     pub files: u64,
-    /// Their bytes.
     pub bytes: u64,
     /// Blobs and results whose bytes are not those on record.
     pub damaged: Vec<String>,
@@ -29,9 +28,6 @@ pub struct Backup {
 
 impl Store {
     /// Copies everything into the new folder `to`. A damaged file is copied and named.
-    ///
-    /// # Errors
-    /// If `to` is there already, or something can't be read or written.
     pub async fn backup(&self, to: &Path) -> Result<Backup, StoreError> {
         let to = to.to_owned();
         fs::create_dir(&to).map_err(StoreError::io("make the folder", &to))?;

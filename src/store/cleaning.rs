@@ -33,9 +33,8 @@ enum Thing {
 
 impl Store {
     /// Moves blobs, results and partial uploads that no row knows of to `quarantine/TIME`. Says how many.
-    ///
-    /// # Errors
-    /// [`StoreError::Refused`] if they are too many, unless `all` is set: nothing is moved then.
+    /// Errors: [`StoreError::Refused`] if they are too many, unless `all` is set: nothing is moved
+    /// then.
     pub async fn quarantine_orphans(&self, all: bool) -> Result<usize, StoreError> {
         // 1. Without the lock: nearly all are known.
         let known = self.known_things().await?;

@@ -116,9 +116,6 @@ impl DataDir {
     }
 
     /// Removes what dead processes left in `tmp`: whatever nobody holds the lock of. Says how much.
-    ///
-    /// # Errors
-    /// If the folder can't be read.
     pub fn sweep_tmp(&self) -> Result<usize, StoreError> {
         let tmp = self.tmp();
         let mut removed = 0;
@@ -137,9 +134,6 @@ impl DataDir {
     }
 
     /// Bytes that are free on the disk of this folder, and its size.
-    ///
-    /// # Errors
-    /// If the file system does not say.
     pub fn disk(&self) -> Result<(u64, u64), StoreError> {
         let stat = rustix::fs::statvfs(&*self.root).map_err(|error| {
             StoreError::io("ask for the free space of", &self.root)(error.into())

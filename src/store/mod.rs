@@ -10,7 +10,8 @@
 //!
 //! # Errors
 //! Every function that asks the database fails if the database does, and every one that changes files
-//! fails if the disk does ([`StoreError`]). Their descriptions name only what else can go wrong.
+//! fails if the disk does ([`StoreError`]). What a lab has nothing under is `NotFound`, and what others
+//! refer to is not deleted (`InUse`). Their descriptions name only what else can go wrong.
 
 mod backup;
 mod cleaning;
@@ -78,10 +79,8 @@ pub(crate) type WriteTransaction = sqlx::Transaction<'static, Sqlite>;
 
 impl Store {
     /// Opens the store in `root`.
-    ///
-    /// # Errors
-    /// If the folder is none, is another server's, or does not belong to its database; if it can't be
-    /// written; or if a newer version of this program has changed the database.
+    /// Errors: if the folder is none, is another server's, or does not belong to its database; if
+    /// it can't be written; or if a newer version of this program has changed the database.
     pub async fn open(root: &Path, purpose: Purpose) -> Result<Self, StoreError> {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };

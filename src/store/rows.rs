@@ -18,7 +18,6 @@ use crate::job::{
 pub struct Page<T> {
     /// The items, newest first.
     pub items: Vec<T>,
-    /// True if there are more.
     pub more: bool,
 }
 

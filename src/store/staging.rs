@@ -4,7 +4,7 @@
 //! left. What is dropped before it is stored is removed.
 
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::Digest;
@@ -52,6 +52,7 @@ impl Store {
         let path = &staged.0.path;
         let file = File::options().write(true).open(path);
         let file = file.map_err(StoreError::io("open", path))?;
+        let file = BufWriter::with_capacity(256 * 1024, file);
         Ok(BlobWriter { file, temporary: staged.0, hasher: sha2::Sha256::new(), size: 0 })
     }
 
@@ -83,11 +84,11 @@ impl Store {
     }
 }
 
-/// A file that is hashed while it is written. It does not buffer.
+/// A file that is hashed while it is written.
 #[derive(Debug)]
 pub struct BlobWriter {
     temporary: Temporary,
-    file: File,
+    file: BufWriter<File>,
     hasher: sha2::Sha256,
     size: u64,
 }
@@ -100,11 +101,9 @@ impl BlobWriter {
     }
 
     /// Brings the file to the disk.
-    ///
-    /// # Errors
-    /// If that fails; the file is removed then.
-    pub fn finish(self) -> Result<StagedBlob, StoreError> {
-        self.file.sync_all().map_err(StoreError::io("write to the disk", &self.temporary.path))?;
+    pub fn finish(mut self) -> Result<StagedBlob, StoreError> {
+        let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
+        synced.map_err(StoreError::io("write to the disk", &self.temporary.path))?;
         let sha256 = Sha256::new(self.hasher.finalize().into());
         Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
     }
@@ -135,9 +134,6 @@ impl StagedPath {
     }
 
     /// Reads the file back to hash it, and brings it to the disk.
-    ///
-    /// # Errors
-    /// If that fails; the file is removed then.
     pub fn finish(self) -> Result<StagedBlob, StoreError> {
         let path = &self.0.path;
         let mut file = File::open(path).map_err(StoreError::io("open", path))?;

@@ -20,9 +20,7 @@ use crate::job::{
 pub struct NewJob {
     /// So many jobs may wait and run, with this one.
     pub most_jobs: u64,
-    /// Whose it is.
     pub lab: Lab,
-    /// What is to be done.
     pub spec: JobSpec,
     /// The hash of the request as it was sent.
     pub request: Sha256,
@@ -33,7 +31,6 @@ pub struct NewJob {
 /// What became of a [`NewJob`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Inserted {
-    /// It was accepted.
     New(JobId),
     /// The same request with the same key was accepted before.
     Before(JobId),
@@ -41,10 +38,8 @@ pub enum Inserted {
 
 impl Store {
     /// Accepts a job: the job and its tasks, or nothing.
-    ///
-    /// # Errors
-    /// [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::NotFound`] if the
-    /// measurement or the model is gone.
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::NotFound`] if
+    /// the measurement or the model is gone.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted, StoreError> {
         let mut transaction = self.write().await?;
         if let Some(key) = &new.idempotency_key
@@ -65,9 +60,7 @@ impl Store {
     }
 
     /// The job that the lab made with this key, if it made one.
-    ///
-    /// # Errors
-    /// [`StoreError::KeyReused`] if it asked for another one with it.
+    /// Errors: [`StoreError::KeyReused`] if it asked for another one with it.
     pub async fn job_with_key(
         &self,
         lab: &Lab,
@@ -79,9 +72,6 @@ impl Store {
     }
 
     /// Records a calibration and puts its prepared masks in place. Its report is made by a worker.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the upload is gone.
     pub async fn add_calibration(
         &self,
         lab: &Lab,
@@ -107,9 +97,6 @@ impl Store {
     }
 
     /// Records a calibration whose masks, and their report, are to be made of captures.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if an upload is gone.
     pub async fn add_captures(
         &self,
         lab: &Lab,
@@ -125,9 +112,6 @@ impl Store {
     }
 
     /// Records a measurement and puts its prepared snapshots in place.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the upload or the calibration is gone.
     pub async fn add_measurement(
         &self,
         lab: &Lab,

@@ -1,7 +1,5 @@
 //! The store of the same machine, as a worker sees it.
 
-use std::io::{BufWriter, IntoInnerError};
-
 use ndarray::ArrayView3;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -50,7 +48,7 @@ impl Local {
                     name: task.name.clone(),
                     files: captures.map(|upload| self.path(*upload)),
                     scratch: self.store.staged_path().map_err(failed)?,
-                    masks: self.store.blob_writer().map_err(failed)?,
+                    masks: Box::new(self.store.blob_writer().map_err(failed)?),
                 }),
                 None => {
                     let masks = task.masks.ok_or_else(|| not_possible(kind))?;
@@ -114,11 +112,9 @@ impl Local {
     /// Frames \[B,h,w\] as a prepared array.
     fn staged(&self, frames: ArrayView3<'_, f32>) -> Result<StagedBlob, TransportError> {
         let (count, height, width) = frames.dim();
-        let blob = BufWriter::new(self.store.blob_writer()?);
-        let mut writer = planar::writer(blob, count, height, width)?;
+        let mut writer = planar::writer(self.store.blob_writer()?, count, height, width)?;
         frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
-        let blob = writer.finish()?.into_inner();
-        Ok(blob.map_err(IntoInnerError::into_error)?.finish()?)
+        Ok(writer.finish()?.finish()?)
     }
 
     fn stored_tile(&self, stored: &TileResult) -> Result<StoredTile, PipelineError> {

@@ -1,7 +1,5 @@
 //! Does one task, whatever its kind.
 
-use std::io::{BufWriter, IntoInnerError};
-
 use ndarray::Array3;
 use serde::Serialize;
 use serde_json::Value;
@@ -80,16 +78,13 @@ pub(super) fn perform(
             (Value::Null, Output::Files(folder, vec![file]))
         }
         TaskInput::Captures { name, files, scratch, masks } => {
-            let masks = BufWriter::with_capacity(256 * 1024, masks);
             let open =
                 |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
             let limits = Limits::default();
             let (made, masks) = calibrate(&files, &limits, scratch.path(), open, &mut |share| {
                 tell(share, monitor)
             })?;
-            let masks = masks.into_inner().map_err(IntoInnerError::into_error);
-            let masks =
-                masks.map_err(TransportError::from)?.finish().map_err(TransportError::from)?;
+            let masks = masks.finish().map_err(TransportError::from)?;
             let facts = facts(name, &made, masks.sha256());
             (Value::Null, calibration(Some((facts, masks)), made.report, monitor))
         }

@@ -43,13 +43,11 @@ pub enum WorkerError {
     /// Not even that the worker is there can be told.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// A task took the computing thread down.
     #[error("the computing thread panicked")]
     Panicked,
     /// A task hangs, as native code may, and nothing but the end of the process ends it.
     #[error("the task made no progress for {} seconds", .0.as_secs())]
     Stalled(Duration),
-    /// The worker was to end, and its task did not come to the end of an iteration in time.
     #[error("the task was given back in the middle of an iteration")]
     Unfinished,
 }
@@ -89,11 +87,9 @@ impl<T: Transport> Worker<T> {
     }
 
     /// Works until it is told to stop.
-    ///
-    /// # Errors
-    /// See [`WorkerError`]. A failure of a task or a passing one of the database is none. After
-    /// [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still runs: the
-    /// process must end.
+    /// Errors: see [`WorkerError`]. A failure of a task or a passing one of the database is none.
+    /// After [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still
+    /// runs: the process must end.
     pub async fn run(mut self) -> Result<(), WorkerError> {
         self.transport.started().await?;
         tracing::info!("waiting for tasks");

@@ -74,7 +74,6 @@ pub trait Transport: Clone + Send + 'static {
 pub struct Claim {
     /// The right to it, to be shown with every message about it.
     pub lease: Lease,
-    /// For logs.
     pub span: tracing::Span,
     /// Its planned processor time in seconds.
     pub cost: f64,
@@ -86,12 +85,23 @@ pub struct Claim {
 #[derive(Debug)]
 pub enum TaskInput {
     /// Estimate the white level of a job.
-    Prepare { arrays: Arrays, snapshots: SnapshotRange },
-    /// Reconstruct a snapshot coarsely.
-    Preview { arrays: Arrays, shape: SceneShape, snapshot: u32, white: f32 },
+    Prepare {
+        arrays: Arrays,
+        snapshots: SnapshotRange,
+    },
+    Preview {
+        arrays: Arrays,
+        shape: SceneShape,
+        snapshot: u32,
+        white: f32,
+    },
     /// Find out how many iterations of an adaptive schedule pay.
-    Pilot { arrays: Arrays, snapshot: u32, white: f32, schedule: Schedule },
-    /// Reconstruct a tile.
+    Pilot {
+        arrays: Arrays,
+        snapshot: u32,
+        white: f32,
+        schedule: Schedule,
+    },
     Tile(Box<TileTask>),
     /// Blend all tiles of a snapshot, and write its frames to the folder.
     Assemble {
@@ -101,7 +111,6 @@ pub enum TaskInput {
         tiles: Vec<StoredTile>,
         folder: StagedDir,
     },
-    /// Write the manifest of a job to the folder.
     Manifest {
         job: JobId,
         spec: Box<JobSpec>,
@@ -110,7 +119,12 @@ pub enum TaskInput {
         folder: StagedDir,
     },
     /// Make masks of captures, and a report on them; they lie in `scratch` until their scale is known.
-    Captures { name: Option<Label>, files: CaptureFiles, scratch: StagedPath, masks: BlobWriter },
+    Captures {
+        name: Option<Label>,
+        files: CaptureFiles,
+        scratch: StagedPath,
+        masks: Box<BlobWriter>,
+    },
     /// Make a report on masks, a prepared array at this place.
     Report(PathBuf),
 }
@@ -145,7 +159,6 @@ pub struct Done {
 /// What a task has made.
 #[derive(Debug)]
 pub enum Output {
-    /// Nothing but its record.
     Record,
     /// The share of their planned cost that the tiles still have, on \[0,1\].
     TileCost(f64),

@@ -32,7 +32,6 @@ struct Index {
 
 #[derive(Debug, Serialize)]
 struct Measurement {
-    /// The snapshots.
     data: String,
     /// The LCoS all black, at the exposure of the measurement.
     dark: Vec<String>,

@@ -16,9 +16,7 @@ type Read = dyn Fn(Range<usize>, Range<usize>) -> Result<Array2<f32>, FormatErro
 
 /// A picture of which windows can be read.
 pub(in crate::http) struct Picture {
-    /// Rows.
     pub(super) height: usize,
-    /// Columns.
     pub(super) width: usize,
     /// Names the content: where this text is the same, so are the values.
     pub(super) identity: String,

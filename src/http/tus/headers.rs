@@ -11,9 +11,6 @@ const MAX_METADATA: usize = 4096;
 pub const ALGORITHMS: &str = "sha1,sha256";
 
 /// The pairs of an `Upload-Metadata`: names, and values that are any bytes.
-///
-/// # Errors
-/// Says what is wrong with the text.
 pub fn metadata(text: &str) -> Result<Vec<(&str, Vec<u8>)>, String> {
     if text.len() > MAX_METADATA {
         return Err(format!("Upload-Metadata has {} bytes, more than {MAX_METADATA}", text.len()));
@@ -46,9 +43,6 @@ enum Hasher {
 
 impl Checksum {
     /// From an `Upload-Checksum`: the algorithm, a space, and the checksum in base64.
-    ///
-    /// # Errors
-    /// Says what is wrong with the text.
     pub fn parse(text: &str) -> Result<Self, String> {
         let form = || "Upload-Checksum must be sha1 or sha256, a space, and the sum in base64";
         let (name, value) = text.split_once(' ').ok_or_else(form)?;

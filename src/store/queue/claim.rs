@@ -29,18 +29,15 @@ const LONGEST_PAUSE: i64 = 60_000;
 pub struct ClaimedTask {
     /// The right to it, to be shown with every message about it.
     pub lease: Lease,
-    /// What it is, for logs.
     pub kind: TaskKind,
     /// Its planned processor time in seconds; 0 for a calibration.
     pub cost: f64,
-    /// What is to be done.
     pub work: Work,
 }
 
 /// What is to be done.
 #[derive(Debug, Clone)]
 pub enum Work {
-    /// A step of a job.
     Job(Box<JobTask>),
     /// A calibration's masks, or the report on them.
     Calibration(Box<CalibrationTask>),
@@ -49,13 +46,9 @@ pub enum Work {
 /// A step of a job.
 #[derive(Debug, Clone)]
 pub struct JobTask {
-    /// The job.
     pub job: JobId,
-    /// What the job is.
     pub spec: JobSpec,
-    /// The calibration's record.
     pub calibration: Calibration,
-    /// The measurement's record.
     pub measurement: Measurement,
     /// What the job's prepare task recorded; none for that task itself.
     pub prepared: Option<Value>,
@@ -70,9 +63,7 @@ pub struct JobTask {
 /// What is to be done for a calibration.
 #[derive(Debug, Clone, FromRow)]
 pub struct CalibrationTask {
-    /// The calibration.
     pub calibration: CalibrationId,
-    /// The user's name for it.
     pub name: Option<Label>,
     /// Captures, of which masks are to be made; none where only a report on the masks is.
     #[sqlx(json(nullable))]

@@ -26,7 +26,6 @@ pub struct Completion {
     pub progress: TaskProgress,
     /// What is to be remembered of it, for the manifest.
     pub record: Value,
-    /// What it has made.
     pub product: Product,
 }
 
@@ -37,11 +36,9 @@ pub enum Product {
     Record,
     /// The share of their planned cost that the tiles still have, on \[0,1\] (pilot).
     TileCost(f64),
-    /// The reconstructed tile, or preview.
     Tile(StagedBlob),
     /// The files of a snapshot (assemble) or of the job (manifest), which are on the disk.
     Files(StagedDir, Vec<ResultFile>),
-    /// The masks and the report of a calibration.
     Calibration(Box<CalibrationDone>),
 }
 
@@ -50,7 +47,6 @@ pub enum Product {
 pub struct CalibrationDone {
     /// The masks and what is known of them, if they were made of captures.
     pub masks: Option<(NewCalibration, StagedBlob)>,
-    /// The report.
     pub report: CalibrationReport,
     /// Pictures by name, as PNG.
     pub maps: Vec<(String, Vec<u8>)>,

@@ -26,7 +26,6 @@ const LAST_OTHERS: &str = "SELECT sum(seconds) AS seconds, sum(cost) AS spent FR
 /// What is ahead of every unfinished job.
 #[derive(Debug)]
 pub(in crate::store) struct Forecast {
-    /// Workers that live.
     workers: u32,
     /// Seconds that a planned CPU-second of a tile takes.
     rate: f64,

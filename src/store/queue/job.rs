@@ -12,9 +12,7 @@ use crate::store::{Store, dir, on_files};
 impl Store {
     /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
     /// Cancelling twice is no error.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has succeeded or failed.
+    /// Errors: [`StoreError::State`] if the job has succeeded or failed.
     pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
         self.job(lab, id).await?;
         let mut transaction = self.write().await?;
@@ -31,9 +29,7 @@ impl Store {
     }
 
     /// Takes up a failed or cancelled job again. What is done stays done.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::State`] if the job has not failed or been cancelled.
+    /// Errors: [`StoreError::State`] if the job has not failed or been cancelled.
     pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
         self.job(lab, id).await?;
         let mut transaction = self.write().await?;
@@ -44,9 +40,7 @@ impl Store {
     }
 
     /// Deletes a job that has come to its end, with all that it has made.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::NotFinal`] if it still runs or waits.
+    /// Errors: [`StoreError::NotFinal`] if it still runs or waits.
     pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
         self.job(lab, id).await?;
         self.remove_job(id).await

@@ -28,11 +28,9 @@ pub(super) const LONGEST_LEASE: i64 = 600_000;
 /// The right to work on a task, until it runs out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lease {
-    /// The task.
     pub task: TaskId,
     /// The number of this attempt, from 1.
     pub attempt: u32,
-    /// Who holds it.
     pub worker: WorkerId,
     /// For how long each heartbeat renews it.
     pub length: Duration,
@@ -71,11 +69,9 @@ pub enum WorkerEnd {
 /// How a worker and its task were parted.
 #[derive(Debug)]
 pub(super) enum Loss {
-    /// Given back unharmed.
     Released,
     /// The worker was killed or fell silent.
     Lost(String),
-    /// The worker died of a fault.
     Crashed(String),
     /// The worker told an error; true if another attempt could do better.
     Failed(String, bool),

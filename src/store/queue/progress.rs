@@ -41,7 +41,6 @@ pub enum ProgressStage {
 /// How far a job is.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JobProgress {
-    /// What it is doing.
     pub stage: ProgressStage,
     /// The share of the planned cost that is behind it, in percent.
     pub percent: f64,
@@ -50,9 +49,7 @@ pub struct JobProgress {
     /// Its place among the jobs that wait, from 1 for the next to be taken up; none if it does not
     /// wait.
     pub queue_position: Option<usize>,
-    /// Tiles done.
     pub tiles_done: u64,
-    /// Tiles in all.
     pub tiles_total: u64,
     /// Tiles that a worker has in hand.
     pub tiles_running: u64,

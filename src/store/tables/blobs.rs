@@ -15,7 +15,6 @@ use crate::store::{Store, dir, on_files};
 pub struct Blob {
     /// The hash of its bytes, which is its address.
     pub sha256: Sha256,
-    /// Its size in bytes.
     pub size: u64,
     /// When the lab first sent it.
     pub created_at: Timestamp,
@@ -25,7 +24,6 @@ pub struct Blob {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 #[strum(serialize_all = "snake_case")]
 pub enum Origin {
-    /// A user sent it.
     Upload,
     /// It was derived from an upload.
     Prepared,
@@ -62,9 +60,6 @@ impl Store {
     }
 
     /// The file with this hash, if the lab has uploaded it.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
     pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob, StoreError> {
         let mut connection = self.readers.acquire().await?;
         held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))

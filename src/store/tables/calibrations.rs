@@ -18,15 +18,11 @@ use crate::store::rows::{
 /// What is known of a calibration when its masks have been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct NewCalibration {
-    /// The user's name for it.
     pub name: Option<Label>,
     /// The upload with the masks.
     pub masks: Sha256,
-    /// Format of the upload, such as `npy`.
     pub format: String,
-    /// Sample type of the upload, such as `uint16`.
     pub sample: String,
-    /// Mask frames (B).
     #[sqlx(try_from = "i64")]
     pub frames: usize,
     #[sqlx(try_from = "i64")]
@@ -46,14 +42,11 @@ pub struct NewCalibration {
 /// A calibration on record.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Calibration {
-    /// Its identifier.
     pub id: CalibrationId,
     /// Hash of the prepared masks: a planar file of f32 [B, H, W] on [0, 1].
     #[serde(skip)]
     pub prepared: Sha256,
-    /// When it was made.
     pub created_at: Timestamp,
-    /// What is known of it.
     #[serde(flatten)]
     #[sqlx(flatten)]
     pub facts: NewCalibration,
@@ -62,25 +55,19 @@ pub struct Calibration {
 /// A calibration whose masks are not there.
 #[derive(Debug, Clone)]
 pub struct Unready {
-    /// Its identifier.
     pub id: CalibrationId,
-    /// The user's name for it.
     pub name: Option<Label>,
-    /// Its patterns.
     pub frames: usize,
     /// How much of the work is done, on \[0,1\].
     pub fraction: f64,
     /// Why there will be no masks; none while they are made.
     pub error: Option<String>,
-    /// When it was asked for.
     pub created_at: Timestamp,
 }
 
 impl Store {
     /// The lab's calibration with this identifier.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`StoreError::Unready`] if its masks are not there.
+    /// Errors: [`StoreError::Unready`] if its masks are not there.
     pub async fn calibration(
         &self,
         lab: &Lab,
@@ -169,9 +156,6 @@ impl Store {
     }
 
     /// Deletes a calibration that no measurement and no model refers to.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`], [`StoreError::InUse`].
     pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
         let mut transaction = self.write().await?;
         // Its task goes with it: a worker that has it in hand finds that nobody wants it any more.

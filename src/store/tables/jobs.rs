@@ -13,35 +13,24 @@ use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 /// A job on record.
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct Job {
-    /// Its identifier.
     pub id: JobId,
-    /// Whose it is.
     pub lab: Lab,
-    /// What is to be done.
     #[sqlx(json)]
     pub spec: JobSpec,
-    /// Where it stands.
     pub state: JobState,
-    /// Why it failed.
     pub error: Option<String>,
-    /// When it was accepted.
     pub created_at: Timestamp,
     /// When its first task was claimed.
     pub started_at: Option<Timestamp>,
-    /// When it came to an end.
     pub finished_at: Option<Timestamp>,
 }
 
 /// Which jobs a list holds.
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
-    /// Only those in this state.
     pub state: Option<JobState>,
-    /// Only those of this calibration.
     pub calibration: Option<CalibrationId>,
-    /// Only those of this measurement.
     pub measurement: Option<MeasurementId>,
-    /// Only those with this very label.
     pub label: Option<Label>,
     /// Only those with this text in the label or the identifier, in upper or lower case.
     pub search: Option<Label>,
@@ -51,9 +40,6 @@ pub struct JobFilter {
 
 impl Store {
     /// The lab's job with this identifier.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
     pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job, StoreError> {
         let job = sql_as!("SELECT * FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))

@@ -13,21 +13,15 @@ use crate::store::rows::{Page, integer, list, number, refuse_if_used, sql, sql_s
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NewMeasurement {
-    /// The user's name for it.
     pub name: Option<Label>,
     /// The calibration that it was taken with.
     pub calibration: CalibrationId,
     /// The upload with the snapshots.
     pub data: Sha256,
-    /// Format of the upload, such as `tiff`.
     pub format: String,
-    /// Sample type of the upload, such as `uint16`.
     pub sample: String,
-    /// Snapshots (S).
     pub snapshots: u32,
-    /// Rows.
     pub height: usize,
-    /// Columns.
     pub width: usize,
     /// The stored number that means 1, where the scene's sum of frames is up to B.
     pub full_scale: f32,
@@ -44,14 +38,11 @@ pub struct NewMeasurement {
 /// A measurement on record.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Measurement {
-    /// Its identifier.
     pub id: MeasurementId,
     /// Hash of the prepared snapshots: a planar file of f32 [S, H, W], full scale divided out.
     #[serde(skip)]
     pub prepared: Sha256,
-    /// When it was made.
     pub created_at: Timestamp,
-    /// What is known of it.
     #[serde(flatten)]
     pub facts: NewMeasurement,
 }
@@ -59,7 +50,6 @@ pub struct Measurement {
 /// Which measurements a list holds.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct MeasurementFilter {
-    /// Only those of this calibration.
     pub calibration: Option<CalibrationId>,
     /// Only those older than this one.
     pub after: Option<MeasurementId>,
@@ -67,9 +57,6 @@ pub struct MeasurementFilter {
 
 impl Store {
     /// The lab's measurement with this identifier.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
     pub async fn measurement(
         &self,
         lab: &Lab,
@@ -112,9 +99,6 @@ impl Store {
     }
 
     /// Deletes a measurement that no job refers to.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`], [`StoreError::InUse`].
     pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<(), StoreError> {
         self.measurement(lab, id).await?;
         let mut transaction = self.write().await?;

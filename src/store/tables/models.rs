@@ -12,13 +12,11 @@ use crate::store::rows::{Page, Reference, refuse_if_used, require, sql, sql_as};
 /// What is known of an end-to-end network when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct NewModel {
-    /// The user's name for it.
     pub name: Option<Label>,
     /// The calibration that it was trained for.
     pub calibration: CalibrationId,
     /// The upload with the ONNX file.
     pub file: Sha256,
-    /// What its check has found.
     #[serde(flatten)]
     #[sqlx(json)]
     pub facts: ModelFacts,
@@ -27,11 +25,8 @@ pub struct NewModel {
 /// An end-to-end network on record.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Model {
-    /// Its identifier.
     pub id: ModelId,
-    /// When it was registered.
     pub created_at: Timestamp,
-    /// What is known of it.
     #[serde(flatten)]
     #[sqlx(flatten)]
     pub content: NewModel,
@@ -40,7 +35,6 @@ pub struct Model {
 /// Which models a list holds.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ModelFilter {
-    /// Only those of this calibration.
     pub calibration: Option<CalibrationId>,
     /// Only those older than this one.
     pub after: Option<ModelId>,
@@ -56,9 +50,6 @@ impl From<Model> for JobModel {
 
 impl Store {
     /// Records a network.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the calibration or the upload is gone.
     pub async fn add_model(&self, lab: &Lab, content: NewModel) -> Result<Model, StoreError> {
         let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
         let NewModel { name, calibration, file, facts } = &model.content;
@@ -77,9 +68,6 @@ impl Store {
     }
 
     /// The lab's model with this identifier.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
     pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model, StoreError> {
         let model = sql_as!("SELECT * FROM models WHERE id = ? AND lab = ?", [id, lab]);
         model.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("model", id))
@@ -104,9 +92,6 @@ impl Store {
     }
 
     /// Deletes a model that no job refers to. Its file is left to [`Self::collect`].
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`], [`StoreError::InUse`].
     pub async fn delete_model(&self, lab: &Lab, id: ModelId) -> Result<(), StoreError> {
         self.model(lab, id).await?;
         let mut transaction = self.write().await?;

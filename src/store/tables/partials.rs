@@ -16,7 +16,6 @@ use crate::store::{Store, dir, on_files};
 /// An upload to be begun.
 #[derive(Debug, Clone, FromRow)]
 pub struct NewPartial {
-    /// Whose it is.
     pub lab: Lab,
     /// Whose limit it counts against.
     pub token: Option<TokenId>,
@@ -31,7 +30,6 @@ pub struct NewPartial {
 /// An upload that was begun.
 #[derive(Debug, Clone, FromRow)]
 pub struct Partial {
-    /// Its identifier.
     pub id: PartialId,
     /// What was said when it was begun.
     #[sqlx(flatten)]
@@ -164,9 +162,6 @@ impl Store {
     }
 
     /// The lab's upload with this identifier, unless it has expired.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
     pub async fn partial(&self, lab: &Lab, id: PartialId) -> Result<Partial, StoreError> {
         let partial = sql_as!(
             "SELECT * FROM partials WHERE id = ? AND lab = ? AND expires_at > ?",
@@ -178,9 +173,8 @@ impl Store {
     }
 
     /// Takes an upload for this request alone, unless another one has it.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if it is gone; [`StoreError::Short`] if bytes on record are lost.
+    /// Errors: [`StoreError::NotFound`] if it is gone; [`StoreError::Short`] if bytes on record are
+    /// lost.
     pub async fn open_partial(&self, lab: &Lab, id: PartialId) -> Result<FoundPartial, StoreError> {
         let upload = self.partial(lab, id).await?;
         if upload.result.is_some() {
@@ -204,9 +198,6 @@ impl Store {
     }
 
     /// Bytes of an upload's file as it lies on the disk; 0 if there is none.
-    ///
-    /// # Errors
-    /// If the file can't be looked at.
     pub async fn partial_bytes(&self, id: PartialId) -> Result<u64, StoreError> {
         let path = self.dir().partial(id);
         on_files(move || match std::fs::metadata(&path) {
@@ -217,9 +208,6 @@ impl Store {
     }
 
     /// Records that `bytes` more are on the disk, and puts off the end.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the upload was ended meanwhile.
     pub async fn advance_partial(
         &self,
         partial: &mut PartialFile,
@@ -243,10 +231,8 @@ impl Store {
 
     /// Moves an upload of which all bytes are there into the store, as an upload of its lab. Its
     /// hash is that of the file as it lies on the disk.
-    ///
-    /// # Errors
-    /// [`StoreError::HashMismatch`] if the client named another hash; the upload is ended then.
-    /// [`StoreError::Short`] if the file has not the length that was announced.
+    /// Errors: [`StoreError::HashMismatch`] if the client named another hash; the upload is ended
+    /// then. [`StoreError::Short`] if the file has not the length that was announced.
     pub async fn finish_partial(&self, partial: PartialFile) -> Result<Partial, StoreError> {
         // The file is open, and so locked, until the upload is stored and its row says so.
         let PartialFile { mut upload, file, path } = partial;

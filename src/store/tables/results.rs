@@ -15,9 +15,7 @@ const WHOLE_JOB: i64 = -1;
 
 impl Store {
     /// A result file of a snapshot (or, with none, of the whole job), and where it lies.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`] if the job has not made it, or not yet.
+    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet.
     pub async fn result_file(
         &self,
         job: &Job,

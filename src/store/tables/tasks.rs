@@ -38,7 +38,6 @@ pub struct TileResult {
 /// What is known of a task that is done.
 #[derive(Debug, Clone)]
 pub struct TaskRecord {
-    /// What it was.
     pub kind: TaskKind,
     /// What the worker told about it.
     pub record: Value,
@@ -53,9 +52,7 @@ pub struct TaskRecord {
 pub struct TileState {
     /// Its index in the plan.
     pub tile: u32,
-    /// State of its task.
     pub state: TaskState,
-    /// What its worker is doing.
     pub stage: Option<String>,
     /// Iterations of the attempt that runs or ran last.
     pub iterations: u32,
@@ -63,7 +60,6 @@ pub struct TileState {
     pub passes: u32,
     /// The share of the planned cost that is behind it.
     pub fraction: f64,
-    /// How often workers took it up.
     #[sqlx(rename = "attempt")]
     pub attempts: u32,
     /// `||y - H v|| / ||y||` of a tile that is done.
@@ -75,7 +71,6 @@ pub struct TileState {
 pub struct TileHistory {
     /// The tile's index in the plan.
     pub tile: u32,
-    /// State of its task.
     pub state: TaskState,
     /// \[iteration, residual, change, sigma or null\], by iteration; many iterations are thinned out.
     #[sqlx(json, rename = "history")]
@@ -85,15 +80,11 @@ pub struct TileHistory {
 /// What has been done in all by tasks of a kind, those of deleted jobs with them.
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct TaskTotals {
-    /// The kind of task.
     pub kind: String,
-    /// Tasks done.
     pub tasks: u64,
     /// Seconds of their successful attempts.
     pub seconds: f64,
-    /// Solver iterations.
     pub iterations: u64,
-    /// Passes of the deep denoiser.
     pub passes: u64,
 }
 

@@ -12,17 +12,13 @@ use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 pub struct Token {
     /// Its identifier, which is no secret.
     pub id: TokenId,
-    /// Whose data it opens.
     pub lab: Lab,
-    /// What it is good for.
     pub role: Role,
     /// Whom it was given to.
     pub note: Option<Label>,
     /// Bytes of uploads that it may keep here; none: no limit.
     pub max_bytes: Option<u64>,
-    /// When it was made.
     pub created_at: Timestamp,
-    /// When it was revoked, if it was.
     pub revoked_at: Option<Timestamp>,
 }
 
@@ -68,9 +64,6 @@ impl Store {
     }
 
     /// Revokes a token, for ever. A second time changes nothing.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
     pub async fn revoke_token(&self, id: TokenId) -> Result<(), StoreError> {
         let changed = sql!(
             "UPDATE tokens SET revoked_at = coalesce(revoked_at, ?) WHERE id = ?",

@@ -14,17 +14,11 @@ use crate::store::rows::{sql, sql_scalar};
 /// A worker process on record.
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerRow {
-    /// Its identifier.
     pub id: WorkerId,
-    /// Its process.
     pub pid: u32,
-    /// The version of its program.
     pub version: String,
-    /// When it started.
     pub started_at: Timestamp,
-    /// Its last sign of life.
     pub seen_at: Timestamp,
-    /// What it has in hand.
     pub task: Option<WorkerTask>,
 }
 
@@ -35,13 +29,9 @@ pub struct WorkerTask {
     pub job: Option<JobId>,
     /// The calibration; none for a job's.
     pub calibration: Option<CalibrationId>,
-    /// The kind of task.
     pub kind: String,
-    /// The snapshot, if it is about one.
     pub snapshot: Option<u32>,
-    /// The tile, if it is one.
     pub tile: Option<u32>,
-    /// What it is doing.
     pub stage: Option<String>,
 }
 
