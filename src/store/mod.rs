@@ -49,7 +49,7 @@ pub use rows::Page;
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
-    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model,
+    Blob, Calibration, FoundPartial, Job, JobFilter, LabRow, Measurement, MeasurementFilter, Model,
     ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
     PartialFile, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
     Unready, WorkerRow, WorkerTask,
@@ -62,6 +62,8 @@ pub struct Store {
     /// One connection: within a process, writers wait for each other here and not in SQLite.
     writer: SqlitePool,
     readers: SqlitePool,
+    /// What is ahead of every job, as it was a moment ago.
+    forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
     /// The lock of the server, if this is its store.
     _server: Option<Arc<File>>,
 }
@@ -114,7 +116,7 @@ impl Store {
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
-        let store = Self { dir, writer, readers, _server: server };
+        let store = Self { dir, writer, readers, forecast: Arc::default(), _server: server };
         if serves {
             identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
             store.write_marker().await?;

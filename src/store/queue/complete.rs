@@ -15,8 +15,8 @@ use crate::store::staging::{StagedBlob, StagedDir};
 use crate::store::tables::blobs::Origin;
 use crate::store::tables::calibrations::{self, NewCalibration};
 use crate::store::tables::reports;
-use crate::store::tables::results;
 use crate::store::tables::tasks::Owner;
+use crate::store::tables::{results, sums};
 use crate::store::{Store, dir, on_files};
 
 /// The end of a task.
@@ -94,6 +94,7 @@ impl Store {
                 self.succeed(&mut transaction, job).await?;
             }
             job::settle(&mut transaction, job).await?;
+            sums::recount(&mut transaction, job).await?;
         }
         transaction.commit().await?;
         Ok(Heartbeat::Continue)
@@ -165,10 +166,13 @@ async fn finish(
     .execute(&mut *connection)
     .await?;
     sql!(
-        "INSERT INTO totals (kind, tasks, seconds, iterations, passes)
-             SELECT kind, 1, coalesce(seconds, 0), iterations, passes FROM tasks WHERE id = ?
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
+             SELECT kind, 1, coalesce(seconds, 0), iterations, passes, coalesce(seconds, 0),
+                 iif(kind = 'tile', cost * fraction, cost) FROM tasks WHERE id = ?
          ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
-             iterations = iterations + excluded.iterations, passes = passes + excluded.passes",
+             iterations = iterations + excluded.iterations, passes = passes + excluded.passes,
+             recent_seconds = 0.97 * recent_seconds + excluded.recent_seconds,
+             recent_cost = 0.97 * recent_cost + excluded.recent_cost",
         [lease.task]
     )
     .execute(&mut *connection)

@@ -16,7 +16,7 @@ use crate::store::Store;
 use crate::store::error::StoreError;
 use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::tasks::{self, Owner};
-use crate::store::tables::workers;
+use crate::store::tables::{sums, workers};
 
 /// So many failures of a task, and it is given up, and its job or calibration with it.
 pub const MAX_FAILURES: u32 = 3;
@@ -189,6 +189,7 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
+        sums::recount(&mut transaction, job).await?;
         transaction.commit().await?;
         Ok(())
     }
