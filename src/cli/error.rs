@@ -11,6 +11,9 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::networks::NetworkError;
 use crate::recon::ReconError;
 
+/// What the functions of this folder give.
+pub type Result<T, E = CliError> = std::result::Result<T, E>;
+
 /// Why a command failed, as a sentence for the user.
 #[derive(Debug, thiserror::Error)]
 pub enum CliError {

@@ -13,6 +13,7 @@ use super::CliError;
 use super::arguments::{NetworkArguments, ScheduleArguments};
 use super::learned::{Learned, plan};
 use super::progress::SnapshotBar;
+use crate::cli::error::Result;
 use crate::formats::mat::SceneArray;
 use crate::intake::{Scaled, Source, read_masks, read_snapshot, read_truth};
 use crate::job::{Algorithm, SceneShape, Schedule, Sha256};
@@ -102,7 +103,7 @@ struct Setup {
 }
 
 /// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
     let input = Input::read(arguments)?;
@@ -145,7 +146,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
 }
 
 /// The network of `--model`.
-fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Learned>, CliError> {
+fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Learned>> {
     let Some(path) = &arguments.model else { return Ok(None) };
     match arguments.schedule.algorithm {
         Algorithm::Learned => Learned::open(path, network).map(Some),
@@ -163,7 +164,7 @@ struct Sources<'a> {
 }
 
 impl<'a> Sources<'a> {
-    fn new(arguments: &'a Arguments) -> Result<Self, CliError> {
+    fn new(arguments: &'a Arguments) -> Result<Self> {
         let scene = arguments.scene.as_deref();
         let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
         let missing = || CliError::Input("name --masks and --measurement, or a --scene".into());
@@ -184,7 +185,7 @@ impl<'a> Sources<'a> {
     }
 }
 
-fn sha256(path: &Path) -> Result<Sha256, CliError> {
+fn sha256(path: &Path) -> Result<Sha256> {
     let hashed = File::open(path).and_then(|mut file| Sha256::of_reader(&mut file));
     Ok(hashed.map_err(|error| CliError::file("read", path, &error))?.0)
 }
@@ -198,7 +199,7 @@ struct Input<'a> {
 }
 
 impl<'a> Input<'a> {
-    fn read(arguments: &'a Arguments) -> Result<Self, CliError> {
+    fn read(arguments: &'a Arguments) -> Result<Self> {
         let sources = Sources::new(arguments)?;
         let masks = read_masks(&sources.masks)?;
         let (measurement, snapshots) = read_snapshot(&sources.measurement, arguments.snapshot)?;
@@ -220,7 +221,7 @@ impl<'a> Input<'a> {
     }
 
     /// White level and tiles.
-    fn solve(&self, setup: &Setup) -> Result<(f32, Solved), CliError> {
+    fn solve(&self, setup: &Setup) -> Result<(f32, Solved)> {
         let (masks, measurement) = (self.masks.array.view(), self.measurement.array.view());
         let white = white(masks, measurement)?;
         let solver = match &setup.model {
@@ -235,7 +236,7 @@ impl<'a> Input<'a> {
     }
 
     /// What the manifest tells.
-    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe, CliError> {
+    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
         let (frames, height, width) = self.masks.array.dim();
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule)?;
@@ -263,7 +264,7 @@ impl<'a> Input<'a> {
     }
 }
 
-fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Result<(), CliError> {
+fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(failed)?;
     // A failure on the way leaves an earlier result as it was.
@@ -316,7 +317,7 @@ impl Report {
     }
 
     /// Prints it as the user asked for.
-    fn print(&self, arguments: &Arguments) -> Result<(), CliError> {
+    fn print(&self, arguments: &Arguments) -> Result<()> {
         if arguments.json {
             let text = serde_json::to_string(self)
                 .map_err(|error| CliError::Failure(format!("the report: {error}")))?;

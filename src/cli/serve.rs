@@ -32,12 +32,7 @@ pub enum ServeError {
     #[error(transparent)]
     Store(#[from] StoreError),
     #[error("can't listen at {address}: {source}")]
-    Listen {
-        /// The address.
-        address: SocketAddr,
-        /// Why.
-        source: std::io::Error,
-    },
+    Listen { address: SocketAddr, source: std::io::Error },
     #[error("can't {action}: {source}")]
     Io { action: &'static str, source: std::io::Error },
     #[error("can't count figures: {0}")]

@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use headers::authorization::{Authorization, Bearer};
 use headers::{Cookie, HeaderMapExt};
 
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use crate::job::{Lab, Role, Secret, TokenId};
 use crate::store::Store;
 
@@ -45,7 +45,6 @@ impl Rule {
 pub(super) struct Access {
     /// Whose data are seen.
     pub(super) lab: Lab,
-    /// The token, if the service has tokens.
     pub(super) token: Option<TokenId>,
     /// Bytes of uploads that the token may keep here.
     pub(super) max_bytes: Option<u64>,
@@ -54,7 +53,7 @@ pub(super) struct Access {
 impl<S: Send + Sync> FromRequestParts<S> for Access {
     type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self> {
         // Without the guard nobody is let in: a public route has no data of a lab.
         parts.extensions.get().cloned().ok_or_else(missing)
     }
@@ -78,7 +77,7 @@ pub(super) async fn guard(
     }
 }
 
-async fn admit(store: &Store, secret: Option<Secret>, role: Role) -> Result<Access, ApiError> {
+async fn admit(store: &Store, secret: Option<Secret>, role: Role) -> Result<Access> {
     let token = match &secret {
         Some(secret) => store.token(secret).await?,
         None => None,

@@ -57,7 +57,6 @@ static CHECKSUM_STATUS: LazyLock<StatusCode> =
 
 impl Code {
     /// The table: status, stable name, title, and whether the same request may succeed later.
-    #[must_use]
     #[rustfmt::skip]
     pub fn row(self) -> (StatusCode, &'static str, &'static str, bool) {
         use StatusCode as S;
@@ -99,6 +98,9 @@ impl Code {
     }
 }
 
+/// What the functions of this folder give.
+pub type Result<T, E = ApiError> = std::result::Result<T, E>;
+
 /// An error on its way to the user.
 #[derive(Debug)]
 pub struct ApiError {
@@ -135,7 +137,6 @@ impl ApiError {
     }
 
     /// A request with fields that are wrong.
-    #[must_use]
     pub fn fields(code: Code, errors: Vec<InvalidField>) -> Self {
         let texts: Vec<&str> = errors.iter().map(|error| error.detail.as_str()).collect();
         Self { errors: errors.clone(), ..Self::new(code, texts.join("; ")) }
@@ -147,7 +148,6 @@ impl ApiError {
     }
 
     /// What a request names and is not there is an error of the request.
-    #[must_use]
     pub fn reference(pointer: &str, error: StoreError) -> Self {
         match error {
             StoreError::NotFound { .. } => Self::field(pointer, error.to_string()),
@@ -156,14 +156,12 @@ impl ApiError {
     }
 
     /// The same error with the place in the request.
-    #[must_use]
     pub fn at(mut self, pointer: &str) -> Self {
         self.errors = vec![InvalidField::new(pointer, self.detail.clone())];
         self
     }
 
     /// The same error with a header in the answer.
-    #[must_use]
     pub fn with_header(mut self, name: HeaderName, value: HeaderValue) -> Self {
         self.headers.push((name, value));
         self

@@ -1,15 +1,12 @@
 //! `/v1/measurements`: coded snapshots.
 
 use axum::Json;
-use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use super::access::Access;
-use super::app::App;
-use super::error::{ApiError, Code};
-use super::extract::{Body, Params, QueryOf};
+use super::error::{ApiError, Code, Result};
+use super::extract::{Body, Caller, Params, QueryOf};
 use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody};
 use crate::formats::StackInfo;
@@ -22,9 +19,7 @@ use crate::store::{Measurement, MeasurementFilter, NewMeasurement};
 #[serde(deny_unknown_fields)]
 pub(super) struct MeasurementRequest {
     name: Option<Label>,
-    /// The calibration that it was taken with.
     calibration: CalibrationId,
-    /// The upload with the snapshots.
     data: Sha256,
     /// Captures of the dark, the LCoS all black, at the measurement's exposure: their average is
     /// subtracted.
@@ -32,7 +27,6 @@ pub(super) struct MeasurementRequest {
     dark: Vec<Sha256>,
     /// The stored number from which on a pixel is full.
     saturation: Option<u32>,
-    /// The stored number that means 1.
     full_scale: Option<f32>,
     /// Snapshots in a second.
     camera_fps: Option<f64>,
@@ -51,10 +45,9 @@ pub(super) struct ListQuery {
 
 /// `POST /v1/measurements`
 pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Body(request): Body<MeasurementRequest>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     check_times(&request)?;
     let (data, full_scale) = (request.data, request.full_scale);
     let calibration = app.store.calibration(&access.lab, request.calibration).await;
@@ -82,7 +75,7 @@ pub(super) async fn create(
 }
 
 /// Refuses times that can't be: they become the times of frames.
-fn check_times(request: &MeasurementRequest) -> Result<(), ApiError> {
+fn check_times(request: &MeasurementRequest) -> Result<()> {
     let checks = [
         ("/camera_fps", request.camera_fps, 1e9, "snapshots in a second"),
         ("/exposure_s", request.exposure_s, 1e5, "seconds"),
@@ -125,10 +118,9 @@ fn facts(
 
 /// `GET /v1/measurements`
 pub(super) async fn list(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<Measurement>>, ApiError> {
+) -> Result<Json<PageBody<Measurement>>> {
     let filter = MeasurementFilter { calibration: query.calibration, after: query.cursor };
     let page = app.store.measurements(&access.lab, filter, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
@@ -136,19 +128,17 @@ pub(super) async fn list(
 
 /// `GET /v1/measurements/{measurement}`
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
-) -> Result<Json<Measurement>, ApiError> {
+) -> Result<Json<Measurement>> {
     Ok(Json(app.store.measurement(&access.lab, id).await?))
 }
 
 /// `DELETE /v1/measurements/{measurement}`
 pub(super) async fn delete(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<StatusCode> {
     app.store.delete_measurement(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

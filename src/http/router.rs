@@ -21,7 +21,6 @@ use super::{
 const JSON_BYTES: usize = 256 * 1024;
 
 /// All routes.
-#[must_use]
 #[rustfmt::skip]
 pub fn routes() -> Vec<Route> {
     use Route as R;

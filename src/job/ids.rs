@@ -23,7 +23,6 @@ macro_rules! identifier {
 
         impl $name {
             /// A new identifier, greater than all those made before it in this process.
-            #[must_use]
             #[allow(clippy::new_without_default)] // two calls differ: a default should not
             pub fn new() -> Self {
                 Self(Uuid::now_v7())

@@ -5,7 +5,7 @@ use rand::Rng;
 use rand_distr::{Distribution, Normal, Poisson};
 use serde::{Deserialize, Serialize};
 
-use super::OpticsError;
+use super::{OpticsError, Result};
 
 /// A camera and the light that it works in. Signals are shares of the full well.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -48,7 +48,7 @@ impl Camera {
     ///
     /// # Errors
     /// [`OpticsError::Parameter`] with the name of the first one that is wrong.
-    pub fn check(&self) -> Result<(), OpticsError> {
+    pub fn check(&self) -> Result<()> {
         let refused = |name, value: f64, range| {
             Err(OpticsError::Parameter { name, value: value.to_string(), range })
         };
@@ -96,7 +96,7 @@ impl Camera {
         light: ArrayView2<'_, f32>,
         background: f64,
         rng: &mut impl Rng,
-    ) -> Result<Array2<u16>, OpticsError> {
+    ) -> Result<Array2<u16>> {
         self.check()?;
         let read = Normal::new(0.0, self.read_noise_e).map_err(|error| impossible(&error))?;
         let unit = f64::from(self.saturation()) / self.full_well_e;
@@ -130,10 +130,7 @@ fn impossible(error: &dyn std::fmt::Display) -> OpticsError {
 ///
 /// # Errors
 /// A share outside \[0,1).
-pub fn illumination(
-    (height, width): (usize, usize),
-    vignetting: f64,
-) -> Result<Array2<f32>, OpticsError> {
+pub fn illumination((height, width): (usize, usize), vignetting: f64) -> Result<Array2<f32>> {
     if !(0.0..1.0).contains(&vignetting) {
         return Err(OpticsError::Parameter {
             name: "light vignetting",

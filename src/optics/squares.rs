@@ -2,7 +2,7 @@
 
 use ndarray::Array3;
 
-use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, OpticsError, check_size, generator};
+use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, Result, check_size, generator};
 
 /// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them: the paper's
 /// simulation.
@@ -19,7 +19,7 @@ pub fn random_squares(
     height: usize,
     width: usize,
     seed: u64,
-) -> Result<(Array3<f32>, Multiplexing), OpticsError> {
+) -> Result<(Array3<f32>, Multiplexing)> {
     check_size(frames, height, width)?;
     let grid = ApertureGrid::for_frames(frames);
     let mut rng = generator(seed);

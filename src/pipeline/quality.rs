@@ -41,7 +41,6 @@ pub struct Quality {
     pub psnr: f64,
     /// Mean over the frames; none if one of them has none.
     pub ssim: Option<f64>,
-    /// Each of them.
     pub frames: Vec<FrameQuality>,
 }
 

@@ -11,7 +11,7 @@ use std::ops::Range;
 use ndarray::{ArrayView2, ArrayView3, s};
 use rand::{Rng, SeedableRng};
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 use super::prior::Networks;
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
@@ -92,7 +92,7 @@ pub fn run(
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-) -> Result<Vec<StageFinding>, ReconError> {
+) -> Result<Vec<StageFinding>> {
     schedule.validate()?;
     let held_out = HeldOut::of(&op, y);
     let op = op.without(&held_out.pixels);
@@ -152,12 +152,7 @@ impl Watch<'_, '_> {
         self.held_out.error(self.op, self.y, run.frames())
     }
 
-    fn stage(
-        &mut self,
-        stage: &Stage,
-        run: &mut Run<'_>,
-        before: f64,
-    ) -> Result<StageFinding, ReconError> {
+    fn stage(&mut self, stage: &Stage, run: &mut Run<'_>, before: f64) -> Result<StageFinding> {
         let fixed = stage.sigma.is_none();
         let temporal_weight = stage.temporal_weight.unwrap_or(0.0);
         let mut end = if fixed { StageEnd::Fixed } else { StageEnd::Planned };

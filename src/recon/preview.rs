@@ -7,7 +7,7 @@
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 
-use super::error::{ReconError, shape_text};
+use super::error::{ReconError, Result, shape_text};
 use super::prior::tv::TotalVariation;
 use super::schedule::Schedule;
 use super::sensing::SensingOperator;
@@ -41,7 +41,7 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
 ///
 /// # Errors
 /// As [`solver::reconstruct`].
-pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>, ReconError> {
+pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
     Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
 }
@@ -83,7 +83,7 @@ impl Blocks {
         &mut self,
         masks: ArrayView3<'_, f32>,
         y: ArrayView2<'_, f32>,
-    ) -> Result<Array2<f32>, ReconError> {
+    ) -> Result<Array2<f32>> {
         let (frames, height, width) = masks.dim();
         if y.dim() != (height, width) || frames != self.frames || height > self.side {
             return Err(ReconError::Shape {

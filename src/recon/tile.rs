@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 
 /// One tile: the pixels `row..row+height` x `column..column+width`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,12 +61,7 @@ impl TilePlan {
     ///
     /// # Errors
     /// `size` below 16 or above 8192, or `overlap` of more than half of `size`.
-    pub fn new(
-        height: usize,
-        width: usize,
-        size: usize,
-        overlap: usize,
-    ) -> Result<Self, ReconError> {
+    pub fn new(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
         if height == 0 || width == 0 {
             return Err(ReconError::Shape {
                 what: "a picture to be tiled",

@@ -4,6 +4,9 @@ use std::path::{Path, PathBuf};
 
 use crate::job::IllegalTransition;
 
+/// What the functions of this folder give.
+pub type Result<T, E = StoreError> = std::result::Result<T, E>;
+
 /// An error of the store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
@@ -78,7 +81,6 @@ impl StoreError {
     }
 
     /// True if the disk is full or a quota is used up.
-    #[must_use]
     pub fn is_disk_full(&self) -> bool {
         use std::io::ErrorKind::{QuotaExceeded, StorageFull};
         match self {

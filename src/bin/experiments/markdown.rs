@@ -6,7 +6,6 @@ use super::record::Row;
 
 /// What the tables show.
 pub struct Layout {
-    /// The columns.
     pub clips: Vec<String>,
     /// The rows of each scale.
     pub algorithms: Vec<Algorithm>,

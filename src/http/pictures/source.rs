@@ -13,9 +13,7 @@ use crate::formats::{FormatError, Limits, npy, planar};
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
 pub(super) struct Stack {
-    /// Frames, rows and columns.
     pub(super) shape: (usize, usize, usize),
-    /// Names the content.
     pub(super) identity: String,
     pub(super) files: Files,
 }
@@ -23,9 +21,7 @@ pub(super) struct Stack {
 /// The files of a stack.
 #[derive(Debug, Clone)]
 pub(super) enum Files {
-    /// A prepared array.
     Prepared(PathBuf),
-    /// The frames of a result.
     Frames(PathBuf),
     /// Tiles of an unfinished result, on the preview; NaN where there is neither.
     Tiles(Arc<Unfinished>),

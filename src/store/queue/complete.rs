@@ -9,7 +9,7 @@ use crate::job::{
     CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind, TaskProgress, TaskState,
     Timestamp,
 };
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::staging::{StagedBlob, StagedDir};
 use crate::store::tables::blobs::Origin;
@@ -56,11 +56,7 @@ impl Store {
     /// Stores what a task has made and moves its job on. Says [`Heartbeat::Lost`] if the lease has
     /// run out and the task was claimed again, or it was deleted; nothing is stored then. If this
     /// fails, the task is still the worker's.
-    pub async fn complete(
-        &self,
-        lease: &Lease,
-        completion: Completion,
-    ) -> Result<Heartbeat, StoreError> {
+    pub async fn complete(&self, lease: &Lease, completion: Completion) -> Result<Heartbeat> {
         let mut transaction = self.write().await?;
         let Some((owner, kind)) = lease::held(&mut transaction, lease).await? else {
             return Ok(Heartbeat::Lost);
@@ -106,7 +102,7 @@ impl Store {
         kind: TaskKind,
         staged: StagedDir,
         files: Vec<ResultFile>,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         let folder = self.dir().results(job);
         let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));
         on_files(move || {
@@ -125,7 +121,7 @@ impl Store {
         transaction: &mut SqliteConnection,
         id: CalibrationId,
         done: CalibrationDone,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         if let Some((facts, staged)) = done.masks {
             let prepared = staged.sha256();
             self.publish(transaction, staged, Origin::Prepared).await?;
@@ -142,7 +138,7 @@ async fn finish(
     progress: &TaskProgress,
     record: &Value,
     result: Option<Sha256>,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let TaskProgress { iterations, passes, fraction, .. } = *progress;
     sql!(
         "UPDATE tasks SET state = ?9, worker = NULL, lease_until = NULL, stage = NULL,

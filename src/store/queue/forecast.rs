@@ -7,7 +7,7 @@ use sqlx::{AssertSqlSafe, Row};
 
 use crate::job::{JobId, JobState, TaskState};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 use crate::store::rows::sql_as;
 
 /// Workers that were silent for longer do not count.
@@ -25,7 +25,7 @@ const LAST_OTHERS: &str = "SELECT sum(seconds) AS seconds, sum(cost) AS spent FR
 
 /// What is ahead of every unfinished job.
 #[derive(Debug)]
-pub(in crate::store) struct Forecast {
+pub struct Forecast {
     workers: u32,
     /// Seconds that a planned CPU-second of a tile takes.
     rate: f64,
@@ -38,7 +38,7 @@ pub(in crate::store) struct Forecast {
 
 /// Planned CPU-seconds that are left of some tasks of a job.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::store) struct Left {
+pub struct Left {
     /// Of all of them.
     pub(in crate::store) sum: f64,
     /// Of the one that has most left.
@@ -80,7 +80,7 @@ impl Forecast {
 
 impl Store {
     /// What is ahead of every unfinished job; none if there is no such job.
-    pub(in crate::store) async fn forecast(&self) -> Result<Option<Forecast>, StoreError> {
+    pub(in crate::store) async fn forecast(&self) -> Result<Option<Forecast>> {
         // Only states that stand in the text let SQLite see that the index holds all that is asked for.
         let left = [TaskState::Blocked, TaskState::Ready, TaskState::Running]
             .map(|state| state.into_str());
@@ -113,7 +113,7 @@ impl Store {
 
     /// Seconds that a planned CPU-second of a tile has taken in each job that runs, what converged
     /// early included.
-    async fn own_rates(&self) -> Result<HashMap<JobId, f64>, StoreError> {
+    async fn own_rates(&self) -> Result<HashMap<JobId, f64>> {
         let rates: Vec<(JobId, f64)> = sql_as!(
             "SELECT job, sum(seconds) / sum(cost) FROM tasks
              WHERE job IN (SELECT id FROM jobs WHERE state = ?)
@@ -128,7 +128,7 @@ impl Store {
 
     /// Seconds that a planned CPU-second takes on this machine: measured on tasks that are done, by what
     /// they really did and not by what was planned; 1 before there are any.
-    async fn seconds_per_cost(&self, of_last_tasks: &'static str) -> Result<f64, StoreError> {
+    async fn seconds_per_cost(&self, of_last_tasks: &'static str) -> Result<f64> {
         let sums: (Option<f64>, Option<f64>) =
             sql_as!(of_last_tasks, [TaskState::Done]).fetch_one(&self.readers).await?;
         Ok(match sums {

@@ -14,7 +14,7 @@ use sqlx::sqlite::SqliteRow;
 use super::forecast::{Forecast, Left};
 use crate::job::{JobId, JobState, Lab, TaskStage, TaskState};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::tables::jobs::Job;
 
@@ -74,13 +74,13 @@ pub struct JobMark {
 
 impl Store {
     /// How far a job is.
-    pub async fn progress(&self, job: &Job) -> Result<JobProgress, StoreError> {
+    pub async fn progress(&self, job: &Job) -> Result<JobProgress> {
         let mut all = self.progress_of(std::slice::from_ref(job)).await?;
         all.pop().ok_or(StoreError::missing("job", job.id))
     }
 
     /// How far each of these jobs is, in their order: a whole page costs as many statements as one.
-    pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>, StoreError> {
+    pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>> {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
         let rows = sql!(
             "SELECT job, sum(cost) AS cost,
@@ -112,7 +112,7 @@ impl Store {
         )
         .fetch_all(&self.readers)
         .await?;
-        let by_job: Result<HashMap<JobId, &SqliteRow>, StoreError> =
+        let by_job: Result<HashMap<JobId, &SqliteRow>> =
             rows.iter().map(|row| Ok((row.try_get("job")?, row))).collect();
         let (by_job, waits) = (by_job?, |job: &Job| has_eta(job.state));
         let forecast = if jobs.iter().any(waits) { self.forecast().await? } else { None };
@@ -126,7 +126,7 @@ impl Store {
     }
 
     /// The marks of all jobs, and whose they are. Reads indexes and the tasks that run.
-    pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>, StoreError> {
+    pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>> {
         let rows = sqlx::query("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
         let mut marks = HashMap::with_capacity(rows.len());
         for row in &rows {
@@ -161,13 +161,9 @@ fn has_eta(state: JobState) -> bool {
     matches!(state, JobState::Queued | JobState::Running)
 }
 
-fn progress(
-    job: &Job,
-    row: &SqliteRow,
-    forecast: Option<&Forecast>,
-) -> Result<JobProgress, StoreError> {
+fn progress(job: &Job, row: &SqliteRow, forecast: Option<&Forecast>) -> Result<JobProgress> {
     let (cost, done): (f64, f64) = (row.try_get("cost")?, row.try_get("cost_done")?);
-    let left = |sum, longest| -> Result<Left, StoreError> {
+    let left = |sum, longest| -> Result<Left> {
         Ok(Left { sum: row.try_get(sum)?, longest: row.try_get(longest)? })
     };
     let (tiles, others) =
@@ -191,7 +187,7 @@ fn progress(
     })
 }
 
-fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage, StoreError> {
+fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage> {
     let count = |column| row.try_get::<u64, _>(column);
     Ok(match state {
         JobState::Queued => ProgressStage::Waiting,
