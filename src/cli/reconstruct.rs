@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{NetworkArguments, ScheduleArguments};
-use super::learned::{Learned, plan};
+use super::model::{Model, plan};
 use super::progress::SnapshotBar;
 use crate::cli::error::Result;
 use crate::formats::mat::SceneArray;
@@ -98,7 +98,7 @@ struct Setup {
     snapshot: usize,
     plan: TilePlan,
     network: NetworkSource,
-    model: Option<Learned>,
+    model: Option<Model>,
     threads: usize,
 }
 
@@ -111,7 +111,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         check_output(out)?;
     }
     let algorithm = arguments.schedule.algorithm;
-    let model = learned(arguments, &network)?;
+    let model = model(arguments, &network)?;
     let cut = (arguments.tile, arguments.overlap);
     let plan = plan(algorithm, cut, model.as_ref(), input.masks.array.dim())?;
     let cores = thread::available_parallelism().map_or(1, usize::from);
@@ -146,10 +146,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 }
 
 /// The network of `--model`.
-fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Learned>> {
+fn model(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Model>> {
     let Some(path) = &arguments.model else { return Ok(None) };
     match arguments.schedule.algorithm {
-        Algorithm::Learned => Learned::open(path, network).map(Some),
+        Algorithm::Learned => Model::open(path, network).map(Some),
         other => Err(CliError::Input(format!(
             "{} takes no --model; ask for --algorithm learned",
             other.into_str()
@@ -240,7 +240,7 @@ impl<'a> Input<'a> {
         let (frames, height, width) = self.masks.array.dim();
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule)?;
-        models.extend(setup.model.as_ref().map(Learned::record));
+        models.extend(setup.model.as_ref().map(Model::record));
         Ok(Recipe {
             program_version: VERSION,
             algorithm: setup.algorithm,

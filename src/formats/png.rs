@@ -87,9 +87,8 @@ pub fn write_u16(path: &Path, frame: ArrayView2<'_, f32>, black: f32, white: f32
 
 /// An 8-bit grey PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
 /// outside; NaN becomes 0. `frame` has the axes (row, column).
-///
-/// # Errors
-/// [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without pixels.
+/// Errors: [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without
+/// pixels.
 pub fn encode_u8(frame: ArrayView2<'_, f32>, black: f32, white: f32) -> Result<Vec<u8>> {
     let factor = 255.0 / (white - black);
     let bytes: Vec<u8> = frame.iter().map(|v| ((v - black) * factor).round() as u8).collect();

@@ -41,38 +41,25 @@ pub(super) struct JobBody {
 
 impl JobBody {
     fn new(job: Job, progress: JobProgress) -> Self {
-        let JobSpec {
-            calibration,
-            measurement,
-            shape,
-            snapshots,
-            algorithm,
-            model,
-            schedule,
-            tile,
-            priority,
-            label,
-            warnings,
-        } = job.spec;
-        let Job { id, state, error, created_at, started_at, finished_at, .. } = job;
+        let spec = job.spec;
         Self {
-            id,
-            state,
-            label,
-            calibration,
-            measurement,
-            shape,
-            snapshots,
-            algorithm,
-            model: model.map(|model| model.id),
-            schedule,
-            tile,
-            priority,
-            warnings,
-            error,
-            created_at,
-            started_at,
-            finished_at,
+            id: job.id,
+            state: job.state,
+            label: spec.label,
+            calibration: spec.calibration,
+            measurement: spec.measurement,
+            shape: spec.shape,
+            snapshots: spec.snapshots,
+            algorithm: spec.algorithm,
+            model: spec.model.map(|model| model.id),
+            schedule: spec.schedule,
+            tile: spec.tile,
+            priority: spec.priority,
+            warnings: spec.warnings,
+            error: job.error,
+            created_at: job.created_at,
+            started_at: job.started_at,
+            finished_at: job.finished_at,
             progress,
         }
     }

@@ -56,7 +56,7 @@ pub fn read_snapshot(source: &Source<'_>, index: usize) -> Result<(Scaled<Array2
 
 /// The true frames \[B,H,W\] of one snapshot, of a file that has those of this snapshot or of all. A .mat
 /// scene may go without; another file may not.
-/// Errors: A file that can't be read; other sizes.
+/// Errors: a file that can't be read; other sizes.
 pub fn read_truth(
     source: &Source<'_>,
     (frames, height, width): (usize, usize, usize),

@@ -50,9 +50,7 @@ impl Repeats {
     }
 
     /// Adds a capture.
-    ///
-    /// # Errors
-    /// Another size; numbers that are not finite.
+    /// Errors: another size; numbers that are not finite.
     pub fn add(&mut self, capture: ArrayView2<'_, f32>) -> Result<()> {
         if capture.dim() != self.sum.dim() {
             let ((a, b), (c, d)) = (capture.dim(), self.sum.dim());
@@ -81,9 +79,7 @@ impl Repeats {
     }
 
     /// The average.
-    ///
-    /// # Errors
-    /// No captures.
+    /// Errors: no captures.
     #[allow(clippy::cast_possible_truncation)] // to the precision of masks
     pub fn average(mut self) -> Result<Average> {
         let repeats = self.means.len();
@@ -196,9 +192,7 @@ impl Calibrator {
     }
 
     /// The mask of an averaged pattern.
-    ///
-    /// # Errors
-    /// A capture of another size.
+    /// Errors: a capture of another size.
     pub fn mask(&self, capture: &Average) -> Result<RawMask> {
         if capture.mean.dim() != self.denominator.dim() {
             let ((a, b), (c, d)) = (capture.mean.dim(), self.denominator.dim());

@@ -45,9 +45,7 @@ impl Default for Camera {
 
 impl Camera {
     /// Refuses numbers that can't be.
-    ///
-    /// # Errors
-    /// [`OpticsError::Parameter`] with the name of the first one that is wrong.
+    /// Errors: [`OpticsError::Parameter`] with the name of the first one that is wrong.
     pub fn check(&self) -> Result<()> {
         let refused = |name, value: f64, range| {
             Err(OpticsError::Parameter { name, value: value.to_string(), range })
@@ -88,9 +86,7 @@ impl Camera {
     /// A capture \[H,W\] of `light`, in shares of the full well on top of the background's share
     /// `background`: photons arrive by chance, reading adds noise, numbers are whole and end at
     /// [`Camera::saturation`].
-    ///
-    /// # Errors
-    /// Light that is no number.
+    /// Errors: light that is no number.
     pub fn capture(
         &self,
         light: ArrayView2<'_, f32>,
@@ -127,9 +123,7 @@ fn impossible(error: &dyn std::fmt::Display) -> OpticsError {
 
 /// Relative illumination \[H,W\] of a sensor that loses the share `vignetting` of the light at its
 /// corners, by the square of the distance from the centre.
-///
-/// # Errors
-/// A share outside \[0,1).
+/// Errors: a share outside \[0,1).
 pub fn illumination((height, width): (usize, usize), vignetting: f64) -> Result<Array2<f32>> {
     if !(0.0..1.0).contains(&vignetting) {
         return Err(OpticsError::Parameter {

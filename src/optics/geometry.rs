@@ -57,9 +57,7 @@ const FAR: f64 = 1000.0;
 
 impl Geometry {
     /// Refuses lengths that can't be.
-    ///
-    /// # Errors
-    /// [`OpticsError::Parameter`] with the name of the first one that is wrong.
+    /// Errors: [`OpticsError::Parameter`] with the name of the first one that is wrong.
     pub fn check(&self) -> Result<()> {
         let lengths = [
             ("lcos pitch_um", self.lcos_pitch_um),

@@ -7,9 +7,7 @@ use super::{Result, check_size, generator};
 
 /// `frames` binary masks of `height` x `width`, each pixel open with probability one half and
 /// independent of all others.
-///
-/// # Errors
-/// A size of 0.
+/// Errors: a size of 0.
 pub fn iid_masks(frames: usize, height: usize, width: usize, seed: u64) -> Result<Array3<f32>> {
     check_size(frames, height, width)?;
     let mut rng = generator(seed);

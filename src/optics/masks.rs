@@ -58,10 +58,8 @@ pub struct ProjectedMasks {
 
 impl HybridAperture {
     /// The masks of `patterns` \[B, rows, columns\] on a sensor of `size` (rows, columns).
-    ///
-    /// # Errors
-    /// A geometry, patterns or sizes that can't be; a lithography mask that is too small or has
-    /// values outside \[0,1\]; masks without light.
+    /// Errors: a geometry, patterns or sizes that can't be; a lithography mask that is too small or
+    /// has values outside \[0,1\]; masks without light.
     pub fn masks(
         &self,
         patterns: ArrayView3<'_, f32>,

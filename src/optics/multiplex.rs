@@ -55,9 +55,7 @@ pub struct Multiplexing {
 impl Multiplexing {
     /// Draws `frames` patterns of `apertures` sub-apertures until their matrix has the rank that is
     /// wanted.
-    ///
-    /// # Errors
-    /// Openings or a rank that can't be; no such matrix within the tries.
+    /// Errors: openings or a rank that can't be; no such matrix within the tries.
     pub fn random(frames: usize, apertures: usize, draw: Draw, rng: &mut impl Rng) -> Result<Self> {
         let wanted = draw.wanted(frames, apertures)?;
         let Draw { open, tries, .. } = draw;

@@ -55,9 +55,7 @@ impl Multiplexing {
 }
 
 /// `frames` patterns with one open sub-aperture each, all different: no multiplexing.
-///
-/// # Errors
-/// More frames than sub-apertures.
+/// Errors: more frames than sub-apertures.
 pub fn single_apertures(
     frames: usize,
     grid: ApertureGrid,
@@ -98,9 +96,7 @@ impl Default for Circle {
 
 impl Circle {
     /// `frames` patterns, each turned by 360/`frames` degrees against the one before.
-    ///
-    /// # Errors
-    /// No circle, or one that leaves the LCoS.
+    /// Errors: no circle, or one that leaves the LCoS.
     pub fn patterns(self, frames: usize, geometry: &Geometry) -> Result<Array3<f32>> {
         geometry.check()?;
         check_size(frames, geometry.lcos_rows, geometry.lcos_columns)?;
@@ -168,9 +164,7 @@ impl Circle {
 }
 
 /// Refuses patterns that are not `frames` transmissions on \[0,1\] with some light each.
-///
-/// # Errors
-/// Another number of patterns, values outside, a pattern that is closed everywhere.
+/// Errors: another number of patterns, values outside, a pattern that is closed everywhere.
 pub fn check_patterns(patterns: ArrayView3<'_, f32>, frames: usize) -> Result<()> {
     let (count, rows, columns) = patterns.dim();
     check_size(frames, rows, columns)?;

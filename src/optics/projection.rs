@@ -42,9 +42,7 @@ pub struct Projector {
 impl Projector {
     /// A projector of patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of
     /// `sensor` (rows, columns).
-    ///
-    /// # Errors
-    /// A geometry or size that can't be; cells too close for whole pixels.
+    /// Errors: a geometry or size that can't be; cells too close for whole pixels.
     pub fn new(
         geometry: &Geometry,
         cells: (usize, usize),
@@ -85,9 +83,7 @@ impl Projector {
     /// The mask \[H,W\] on the sensor: the sum, over the cells of `pattern`, of the cell's
     /// transmission times the lithography mask as seen through it. All open and no mask gives the
     /// number of cells.
-    ///
-    /// # Errors
-    /// Arrays that have not the sizes of [`Projector::new`] and [`Projector::mask_size`].
+    /// Errors: arrays that have not the sizes of [`Projector::new`] and [`Projector::mask_size`].
     pub fn project(
         &self,
         lithography: ArrayView2<'_, f32>,

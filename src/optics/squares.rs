@@ -11,9 +11,7 @@ use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, Result, check_size
 /// [`ApertureGrid::for_frames`], half of them open in each frame: the mask of a frame is the sum
 /// of the shifted lithography masks of its open sub-apertures (Eq. 1 of the paper), divided by
 /// the largest value of all frames.
-///
-/// # Errors
-/// A size of 0, or no multiplexing matrix of full rank within bounded tries.
+/// Errors: a size of 0, or no multiplexing matrix of full rank within bounded tries.
 pub fn random_squares(
     frames: usize,
     height: usize,

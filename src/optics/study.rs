@@ -85,9 +85,7 @@ impl MaskStudy {
     }
 
     /// Looks at the next rows \[B,rows,W\] of all masks, on \[0,1\].
-    ///
-    /// # Errors
-    /// A band that is not the next one of such masks.
+    /// Errors: a band that is not the next one of such masks.
     pub fn add(&mut self, band: ArrayView3<'_, f32>) -> Result<()> {
         let (frames, rows, width) = band.dim();
         let (height, expected) = self.mean.dim();
@@ -130,9 +128,7 @@ impl MaskStudy {
     }
 
     /// The figures.
-    ///
-    /// # Errors
-    /// Rows that are missing.
+    /// Errors: rows that are missing.
     pub fn finish(self) -> Result<MaskFigures> {
         let (height, width) = self.mean.dim();
         if self.next_row != height {

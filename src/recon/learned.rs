@@ -42,9 +42,7 @@ pub enum PictureSize {
 pub trait SnapshotNetwork {
     /// The frames \[B,H,W\] behind measurement `y` \[H,W\] through `masks` \[B,H,W\], where
     /// `y = sum_k C_k x_k` with frames `x_k` on \[0,1\]. All in standard layout.
-    ///
-    /// # Errors
-    /// The network fails, or gives something else than B finite frames.
+    /// Errors: the network fails, or gives something else than B finite frames.
     fn frames(&mut self, y: ArrayView2<'_, f32>, masks: ArrayView3<'_, f32>)
     -> Result<Array3<f32>>;
 }
@@ -59,9 +57,7 @@ pub const FRAMES: &str = "frames";
 impl Interface {
     /// Checks that the network takes a measurement through `frames` masks of `height` x `width`
     /// pixels and gives as many frames, all float32, and says whether it takes other sizes, too.
-    ///
-    /// # Errors
-    /// [`ReconError::Shape`] with what it has and what is needed.
+    /// Errors: [`ReconError::Shape`] with what it has and what is needed.
     pub fn check(&self, frames: usize, height: usize, width: usize) -> Result<PictureSize> {
         let names = |tensors: &[TensorInfo]| {
             let mut names: Vec<&str> = tensors.iter().map(|tensor| tensor.name.as_str()).collect();

@@ -83,9 +83,7 @@ pub enum StageEnd {
 /// and tells for every stage how many of its iterations pay. Stages of total variation alone, which
 /// cost next to nothing, are taken as they are, but for their part along time: it is left out if the
 /// stage's error is less without.
-///
-/// # Errors
-/// As [`super::solver::reconstruct`].
+/// Errors: as [`super::solver::reconstruct`].
 pub fn run(
     op: SensingOperator,
     y: ArrayView2<'_, f32>,

@@ -38,9 +38,7 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
 
 /// Frames \[B,H,W\] of a small picture, by a few iterations of GAP-TV. `y` is on the scale on which
 /// the scene is on \[0,1\].
-///
-/// # Errors
-/// As [`solver::reconstruct`].
+/// Errors: as [`solver::reconstruct`].
 pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
     Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
@@ -76,9 +74,7 @@ impl Blocks {
 
     /// One row of blocks: masks \[B,h,W\] and measurement \[h,W\] of at most `side` rows give frames
     /// \[B, W / side rounded up\]. The last block may be narrower.
-    ///
-    /// # Errors
-    /// Sizes that disagree.
+    /// Errors: sizes that disagree.
     pub fn row(
         &mut self,
         masks: ArrayView3<'_, f32>,

@@ -33,9 +33,7 @@ impl ScaleEstimator {
 
     /// The white level of the scene behind measurement `y` \[H,W\]: divide measurement (and
     /// so frames) by it before reconstruction, multiply frames by it after.
-    ///
-    /// # Errors
-    /// Sizes that differ, or a measurement without light.
+    /// Errors: sizes that differ, or a measurement without light.
     pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
         self.check("the measurement", y.shape())?;
         // Pixels with little light have a ratio of noise by almost nothing.

@@ -16,9 +16,7 @@ use crate::formats::{
 
 /// Opens an npy stack of shape (frame, row, column), float32, little-endian and in C order, of which
 /// windows are then read: the form in which this program writes frames.
-///
-/// # Errors
-/// Those of reading a header, and [`FormatError::Unsupported`] for another form.
+/// Errors: those of reading a header, and [`FormatError::Unsupported`] for another form.
 pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {
     let mut file = File::open(path).map_err(FormatError::io("open the array"))?;
     let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();

@@ -64,10 +64,8 @@ static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
 
 impl Runtime {
     /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`.
-    ///
-    /// # Errors
-    /// The library is missing or too old. A device that can't be had shows when a network is
-    /// loaded; there is no silent fall-back.
+    /// Errors: the library is missing or too old. A device that can't be had shows when a network
+    /// is loaded; there is no silent fall-back.
     pub fn open(library: &Path, device: Device) -> Result<Self> {
         let loaded = ENVIRONMENT.get_or_init(|| {
             let builder = ort::init_from(library).map_err(|error| {
@@ -179,9 +177,7 @@ pub struct EndToEndNetwork {
 
 impl EndToEndNetwork {
     /// Loads a network; [`Self::interface`] says whether it is one of this kind.
-    ///
-    /// # Errors
-    /// [`ReconError::Runtime`]: no network that ONNX Runtime takes.
+    /// Errors: [`ReconError::Runtime`]: no network that ONNX Runtime takes.
     pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self> {
         Ok(Self { session: runtime.session("of the file", model)? })
     }

@@ -91,9 +91,7 @@ pub struct Outcome {
 /// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
 /// variation and the learned denoiser costs what the acceleration gained. With `gamma` > 0 the
 /// operator's regularised inverse is used. Networks are asked for when a stage needs them.
-///
-/// # Errors
-/// Sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
+/// Errors: sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
 /// [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct(
     op: &SensingOperator,
@@ -217,9 +215,7 @@ impl<'a> Run<'a> {
     }
 
     /// Tells the observer of an iteration of the stage with this index.
-    ///
-    /// # Errors
-    /// [`ReconError::Cancelled`] if it says so.
+    /// Errors: [`ReconError::Cancelled`] if it says so.
     pub(super) fn tell(
         &self,
         (index, stage): (usize, &Stage),
@@ -243,9 +239,7 @@ impl<'a> Run<'a> {
     }
 
     /// Iteration `iteration` (from 0) of a stage.
-    ///
-    /// # Errors
-    /// A network that fails, or values that are no numbers any more.
+    /// Errors: a network that fails, or values that are no numbers any more.
     pub(super) fn iterate(&mut self, stage: &Stage, iteration: usize) -> Result<Step> {
         let (frames, height, width) = self.op.dim();
         let admm = self.state.multiplier.is_some();

@@ -10,13 +10,13 @@ use crate::recon::learned::{Interface, PictureSize};
 use crate::recon::tile::TilePlan;
 
 /// An end-to-end network for one size of masks.
-pub struct Learned {
+pub struct Model {
     name: String,
     pub file: ModelFile,
     interface: Interface,
 }
 
-impl Learned {
+impl Model {
     /// Loads the network once, to see what it takes.
     pub fn open(path: &Path, network: &NetworkSource) -> Result<Self> {
         let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
@@ -41,7 +41,7 @@ impl Learned {
 pub fn plan(
     algorithm: Algorithm,
     (tile, overlap): (Option<usize>, Option<usize>),
-    model: Option<&Learned>,
+    model: Option<&Model>,
     dim: (usize, usize, usize),
 ) -> Result<TilePlan> {
     let (_, height, width) = dim;
