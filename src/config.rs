@@ -156,7 +156,6 @@ pub enum LogFormat {
     Json,
 }
 
-/// A setting that can't be.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The service would be open to everyone.
@@ -177,14 +176,12 @@ impl ServeArguments {
         Ok(())
     }
 
-    /// Worker processes to run.
     #[must_use]
     pub fn worker_count(&self) -> usize {
         let cores = || std::thread::available_parallelism().map_or(1, usize::from);
         self.workers.unwrap_or_else(cores)
     }
 
-    /// The longest pause in an upload.
     #[must_use]
     pub fn upload_idle(&self) -> Duration {
         Duration::from_secs(self.upload_idle_seconds)
@@ -196,7 +193,6 @@ impl ServeArguments {
         Duration::from_secs(self.upload_hours.saturating_mul(3600))
     }
 
-    /// The longest time for an answer.
     #[must_use]
     pub fn request_time(&self) -> Duration {
         Duration::from_secs(self.request_seconds)

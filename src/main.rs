@@ -25,6 +25,7 @@ enum Command {
     Calibrate(cli::calibrate::Arguments),
     Demo(cli::demo::Arguments),
     Token(cli::token::Arguments),
+    Lab(cli::lab::Arguments),
     Backup(cli::backup::Arguments),
     CheckModel(cli::check_model::Arguments),
 }
@@ -40,6 +41,7 @@ fn main() -> ExitCode {
         Command::Simulate(arguments) => cli::simulate::run(&arguments),
         Command::Demo(arguments) => cli::demo::run(&arguments),
         Command::Token(arguments) => cli::token::run(&arguments),
+        Command::Lab(arguments) => cli::lab::run(&arguments),
         Command::Backup(arguments) => cli::backup::run(&arguments),
         Command::CheckModel(arguments) => cli::check_model::run(&arguments),
     };

@@ -40,7 +40,6 @@ struct Index {
     saturation: Option<u32>,
 }
 
-/// Runs the command.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let files = read_index(&arguments.captures)?;
     let out = &arguments.out;

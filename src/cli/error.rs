@@ -11,7 +11,6 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::networks::NetworkError;
 use crate::recon::ReconError;
 
-/// What the functions of this folder give.
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
 
 /// Why a command failed, as a sentence for the user.
@@ -26,7 +25,6 @@ pub enum CliError {
 }
 
 impl CliError {
-    /// The process's exit code.
     pub fn exit_code(&self) -> ExitCode {
         match self {
             Self::Input(_) => ExitCode::from(2),
@@ -34,7 +32,6 @@ impl CliError {
         }
     }
 
-    /// A file or folder that can't be read or written.
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
     }

@@ -60,7 +60,6 @@ enum Normalise {
     Throughput,
 }
 
-/// The aperture's patterns.
 #[derive(Debug, Serialize)]
 pub struct Apertures {
     rows: usize,
@@ -84,7 +83,6 @@ pub struct SimulatedMasks {
 }
 
 impl MaskArguments {
-    /// The name of the kind.
     pub fn pattern(&self) -> &'static str {
         match self.pattern {
             Pattern::Iid => "iid",
@@ -95,7 +93,6 @@ impl MaskArguments {
         }
     }
 
-    /// The optical parameters.
     pub fn optics(&self) -> Result<OpticsFile> {
         OpticsFile::read(self.optics.as_deref())
     }

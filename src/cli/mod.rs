@@ -13,6 +13,7 @@ pub mod backup;
 pub mod calibrate;
 pub mod check_model;
 pub mod demo;
+pub mod lab;
 pub mod optics;
 pub mod reconstruct;
 pub mod schedule;

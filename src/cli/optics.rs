@@ -205,7 +205,6 @@ struct Derived {
     blur_mask_pixels: f64,
 }
 
-/// Runs the command.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let Some(path) = &arguments.check else {
         print!("{DEFAULTS}");

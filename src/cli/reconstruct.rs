@@ -102,7 +102,6 @@ struct Setup {
     threads: usize,
 }
 
-/// Runs the command.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
@@ -190,7 +189,6 @@ fn sha256(path: &Path) -> Result<Sha256> {
     Ok(hashed.map_err(|error| CliError::file("read", path, &error))?.0)
 }
 
-/// The files' content.
 struct Input<'a> {
     sources: Sources<'a>,
     masks: Scaled<Array3<f32>>,
@@ -235,7 +233,6 @@ impl<'a> Input<'a> {
         Ok((white, solve(&input, &setup.network, setup.threads, &tell)?))
     }
 
-    /// What the manifest tells.
     fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
         let (frames, height, width) = self.masks.array.dim();
         let pilot = solved.pilot.clone();
@@ -316,7 +313,6 @@ impl Report {
         }
     }
 
-    /// Prints it as the user asked for.
     fn print(&self, arguments: &Arguments) -> Result<()> {
         if arguments.json {
             let text = serde_json::to_string(self)

@@ -14,7 +14,6 @@ pub struct Arguments {
     schedule: ScheduleArguments,
 }
 
-/// Runs the command.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     println!("{:#}", json!(schedule));

@@ -22,7 +22,6 @@ const DRAIN: Duration = Duration::from_secs(20);
 /// The file in the data folder that says where the service listens.
 const ADDRESS_FILE: &str = "server.json";
 
-/// Why the service could not start or go on.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// A setting is wrong.

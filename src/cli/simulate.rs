@@ -77,7 +77,6 @@ struct Record {
     apertures: Option<Apertures>,
 }
 
-/// Runs the command.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let frames = read_clip(&arguments.frames, arguments.full_scale)?;
     check_range(&arguments.frames, &frames)?;

@@ -54,7 +54,6 @@ struct Create {
     note: Option<Label>,
 }
 
-/// Does what the arguments say.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;

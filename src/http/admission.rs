@@ -104,7 +104,6 @@ impl Admission {
         self.check_disk(needed, what, needed).await
     }
 
-    /// Refuses an upload that is larger than any may be.
     pub(super) fn check_size(&self, length: u64) -> Result<()> {
         if length <= self.max_upload_bytes {
             return Ok(());

@@ -33,7 +33,6 @@ pub(super) struct ListQuery {
     cursor: Option<CalibrationId>,
 }
 
-/// Where a calibration stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 enum CalibrationState {
@@ -115,7 +114,6 @@ impl From<Unready> for CalibrationBody {
     }
 }
 
-/// `POST /v1/calibrations`
 pub(super) async fn create(
     Caller(app, access): Caller,
     Body(request): Body<CalibrationRequest>,
@@ -201,7 +199,6 @@ fn facts(
     }
 }
 
-/// `GET /v1/calibrations`
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
@@ -218,7 +215,6 @@ pub(super) async fn list(
     Ok(Json(PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item)))
 }
 
-/// `GET /v1/calibrations/{calibration}`
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
@@ -226,7 +222,6 @@ pub(super) async fn show(
     Ok(Json(body(&app, &access.lab, id).await?))
 }
 
-/// `DELETE /v1/calibrations/{calibration}`
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,

@@ -73,7 +73,6 @@ codes! {
     QuotaExceeded: StatusCode::INSUFFICIENT_STORAGE, "The token's limit is reached", false;
 }
 
-/// What the functions of this folder give.
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
 
 /// An error on its way to the user.
@@ -86,7 +85,6 @@ pub struct ApiError {
     headers: Vec<(HeaderName, HeaderValue)>,
 }
 
-/// The body of an error.
 #[derive(Debug, Serialize)]
 struct Problem<'a> {
     r#type: String,

@@ -41,7 +41,6 @@ struct Change {
 /// The version of each job, by lab and job.
 type Versions = HashMap<(Lab, JobId), JobMark>;
 
-/// What the listeners of each lab are told, as JSON.
 type Changes = Arc<HashMap<Lab, String>>;
 
 /// The stream of changes to which listeners subscribe.
@@ -122,7 +121,6 @@ impl Change {
     }
 }
 
-/// `GET /v1/events`
 pub(super) async fn listen(State(events): State<Events>, access: Access) -> Result<Response> {
     let slot = events.slots.clone().try_acquire_owned().map_err(|_| {
         ApiError::new(Code::Unavailable, "all places for listeners are taken; poll instead")

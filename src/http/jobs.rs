@@ -79,7 +79,6 @@ pub(super) struct ListQuery {
     search: Option<Label>,
 }
 
-/// `POST /v1/jobs`
 pub(super) async fn create(
     Caller(app, access): Caller,
     headers: HeaderMap,
@@ -204,7 +203,6 @@ pub(super) async fn show(
     conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }
 
-/// `POST /v1/jobs/{job}/cancel`
 pub(super) async fn cancel(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
@@ -213,7 +211,6 @@ pub(super) async fn cancel(
     accepted(&app, &access.lab, id).await
 }
 
-/// `POST /v1/jobs/{job}/retry`
 pub(super) async fn retry(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
@@ -227,7 +224,6 @@ async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response> {
     Ok((StatusCode::ACCEPTED, [retry_after], Json(body(app, lab, id).await?)).into_response())
 }
 
-/// `DELETE /v1/jobs/{job}`
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,

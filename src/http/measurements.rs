@@ -8,13 +8,12 @@ use serde::Deserialize;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf};
 use super::intake::{self, Prepared};
-use super::page::{Limit, PageBody};
+use super::page::{ListQuery, PageBody};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
 use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
-use crate::store::{Measurement, MeasurementFilter, NewMeasurement};
+use crate::store::{Filter, Measurement, NewMeasurement};
 
-/// The body of `POST /v1/measurements`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct MeasurementRequest {
@@ -34,16 +33,6 @@ pub(super) struct MeasurementRequest {
     exposure_s: Option<f64>,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<MeasurementId>,
-    calibration: Option<CalibrationId>,
-}
-
-/// `POST /v1/measurements`
 pub(super) async fn create(
     Caller(app, access): Caller,
     Body(request): Body<MeasurementRequest>,
@@ -116,17 +105,15 @@ fn facts(
     }
 }
 
-/// `GET /v1/measurements`
 pub(super) async fn list(
     Caller(app, access): Caller,
-    QueryOf(query): QueryOf<ListQuery>,
+    QueryOf(query): QueryOf<ListQuery<MeasurementId>>,
 ) -> Result<Json<PageBody<Measurement>>> {
-    let filter = MeasurementFilter { calibration: query.calibration, after: query.cursor };
+    let filter = Filter { calibration: query.calibration, after: query.cursor };
     let page = app.store.measurements(&access.lab, filter, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
-/// `GET /v1/measurements/{measurement}`
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
@@ -134,7 +121,6 @@ pub(super) async fn show(
     Ok(Json(app.store.measurement(&access.lab, id).await?))
 }
 
-/// `DELETE /v1/measurements/{measurement}`
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,

@@ -7,11 +7,10 @@ use serde::Deserialize;
 
 use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, Params, QueryOf};
-use super::page::{Limit, PageBody};
+use super::page::{ListQuery, PageBody};
 use crate::job::{CalibrationId, Label, ModelId, Sha256};
-use crate::store::{Model, ModelFilter, NewModel};
+use crate::store::{Filter, Model, NewModel};
 
-/// The body of `POST /v1/models`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ModelRequest {
@@ -20,16 +19,6 @@ pub(super) struct ModelRequest {
     file: Sha256,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<ModelId>,
-    calibration: Option<CalibrationId>,
-}
-
-/// `POST /v1/models`
 pub(super) async fn create(
     Caller(app, access): Caller,
     Body(request): Body<ModelRequest>,
@@ -48,17 +37,15 @@ pub(super) async fn create(
     Ok((StatusCode::CREATED, location, Json(model)).into_response())
 }
 
-/// `GET /v1/models`
 pub(super) async fn list(
     Caller(app, access): Caller,
-    QueryOf(query): QueryOf<ListQuery>,
+    QueryOf(query): QueryOf<ListQuery<ModelId>>,
 ) -> Result<Json<PageBody<Model>>> {
-    let filter = ModelFilter { calibration: query.calibration, after: query.cursor };
+    let filter = Filter { calibration: query.calibration, after: query.cursor };
     let page = app.store.models(&access.lab, filter, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
-/// `GET /v1/models/{model}`
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<ModelId>,
@@ -66,7 +53,6 @@ pub(super) async fn show(
     Ok(Json(app.store.model(&access.lab, id).await?))
 }
 
-/// `DELETE /v1/models/{model}`
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<ModelId>,

@@ -34,7 +34,6 @@ struct QualityBody {
     quality: Quality,
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/quality`
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params((id, snapshot)): Params<(JobId, u32)>,

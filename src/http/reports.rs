@@ -14,7 +14,6 @@ use crate::job::{CalibrationId, CalibrationReport, Lab};
 const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
 
-/// `GET /v1/calibrations/{calibration}/report.json`
 pub(super) async fn json(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
@@ -24,7 +23,6 @@ pub(super) async fn json(
     conditional::json(&report, &headers)
 }
 
-/// `GET /v1/calibrations/{calibration}/report.html`
 pub(super) async fn html(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
@@ -40,7 +38,6 @@ pub(super) async fn html(
     Ok(response)
 }
 
-/// `GET /v1/calibrations/{calibration}/maps/{name}`
 pub(super) async fn map(
     Caller(app, access): Caller,
     Params((id, name)): Params<(CalibrationId, String)>,
@@ -57,7 +54,6 @@ pub(super) async fn map(
     Ok(conditional::content(&headers, "image/png", png.ok_or_else(missing)?))
 }
 
-/// The report, if it is made.
 async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport> {
     // Whose it is, before what it holds.
     app.store.calibration(lab, id).await?;

@@ -35,7 +35,6 @@ struct FileBody {
     href: Option<String>,
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}`
 pub(super) async fn snapshot(
     Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
@@ -58,7 +57,6 @@ fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
     Some(format!("{base}/frames/{number}.{kind}"))
 }
 
-/// `GET /v1/jobs/{job}/manifest.json`
 pub(super) async fn job_manifest(
     Caller(app, access): Caller,
     Params(job): Params<JobId>,
@@ -200,7 +198,6 @@ fn disposition(job: JobId, snapshot: Option<u32>, name: &str) -> String {
     }
 }
 
-/// A header value made of characters that we chose.
 fn value(text: String) -> HeaderValue {
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }

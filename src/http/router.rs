@@ -20,7 +20,6 @@ use super::{
 /// The largest JSON body.
 const JSON_BYTES: usize = 256 * 1024;
 
-/// All routes.
 #[rustfmt::skip]
 pub fn routes() -> Vec<Route> {
     use Route as R;

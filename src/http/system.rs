@@ -63,7 +63,6 @@ struct LimitsBody {
     worker_memory_bytes: u64,
 }
 
-/// `GET /v1/system`
 pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>> {
     let settings = &app.settings;
     Ok(Json(SystemBody {
@@ -153,7 +152,6 @@ async fn workers_live(app: &App) -> Result<(), String> {
     if live == 0 { Err("no worker lives".to_owned()) } else { Ok(()) }
 }
 
-/// `GET /metrics`
 #[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
 pub(super) async fn metrics(State(app): State<App>) -> Result<Response> {
     for (state, count) in jobs(&app).await? {
@@ -185,7 +183,6 @@ pub(super) async fn metrics(State(app): State<App>) -> Result<Response> {
     Ok((kind, app.metrics.render()).into_response())
 }
 
-/// `GET /openapi.yaml`
 pub(super) async fn contract() -> Response {
     let kind = [(header::CONTENT_TYPE, "application/yaml")];
     (kind, include_str!("../../openapi.yaml")).into_response()

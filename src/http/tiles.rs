@@ -27,7 +27,6 @@ struct TileBody {
     state: TileState,
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles`
 pub(super) async fn list(
     Caller(app, access): Caller,
     Params((id, snapshot)): Params<(JobId, u32)>,
@@ -45,7 +44,6 @@ pub(super) async fn list(
     conditional::json(&body, &headers)
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history`
 pub(super) async fn history(
     Caller(app, access): Caller,
     Params((id, snapshot, tile)): Params<(JobId, u32, u32)>,

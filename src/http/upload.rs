@@ -90,7 +90,6 @@ where
     Ok(())
 }
 
-/// The next chunk, if there is one and it comes in time.
 pub(super) async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,

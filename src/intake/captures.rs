@@ -30,7 +30,6 @@ const PICTURE: usize = 640;
 /// The share of the work that averaging is; writing the masks and looking at them are a tenth each.
 const AVERAGING: f64 = 0.8;
 
-/// The files of captures.
 pub type CaptureFiles = Captures<PathBuf>;
 
 /// Hears how much of the work is done, on \[0,1\]; false asks to stop.
@@ -46,7 +45,6 @@ pub struct Calibrated {
     pub clipped_negatives: u64,
 }
 
-/// A report with its pictures.
 #[derive(Debug)]
 pub struct Report {
     /// What is known of the masks.

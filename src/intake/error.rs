@@ -2,7 +2,6 @@
 
 use crate::formats::FormatError;
 
-/// What the functions of this folder give.
 pub type Result<T, E = IntakeError> = std::result::Result<T, E>;
 
 /// Why a file, or what is in it, is refused. Each names the file by its `place`: a JSON pointer into

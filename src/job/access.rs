@@ -19,7 +19,6 @@ impl Lab {
         Self("local".into())
     }
 
-    /// Its name.
     pub fn as_str(&self) -> &str {
         &self.0
     }

@@ -59,7 +59,6 @@ pub struct JobModel {
 }
 
 impl ModelTrial {
-    /// Pixels of the picture.
     pub fn pixels(&self) -> usize {
         self.height * self.width
     }

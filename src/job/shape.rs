@@ -12,7 +12,6 @@ pub struct SnapshotRange {
 }
 
 impl SnapshotRange {
-    /// The indices.
     pub fn indices(self) -> impl Iterator<Item = u32> {
         self.first..self.first + self.count
     }

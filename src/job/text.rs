@@ -57,7 +57,6 @@ impl Label {
     /// The most characters that a label has.
     pub const MAX_CHARS: usize = 200;
 
-    /// The text of the label.
     pub fn as_str(&self) -> &str {
         &self.0
     }

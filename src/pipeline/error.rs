@@ -7,7 +7,6 @@ use crate::formats::FormatError;
 use crate::job::Sha256;
 use crate::recon::ReconError;
 
-/// What the functions of this folder give.
 pub type Result<T, E = PipelineError> = std::result::Result<T, E>;
 
 /// Why a step did not come to its end.

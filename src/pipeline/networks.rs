@@ -269,7 +269,6 @@ impl WarmNetworks {
         Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
 
-    /// Where they come from.
     pub fn source(&self) -> &NetworkSource {
         &self.source
     }

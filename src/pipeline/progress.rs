@@ -34,7 +34,6 @@ impl Monitor {
         self.progress.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Where the task stands.
     pub fn progress(&self) -> TaskProgress {
         self.lock().0
     }

@@ -9,7 +9,6 @@ use crate::recon::solver::Outcome;
 use crate::recon::tile::TilePlan;
 use crate::recon::{ReconError, metrics};
 
-/// How good one frame is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FrameQuality {
     /// The frame, from 1.

@@ -14,7 +14,6 @@ pub struct PreparedRecord {
     pub white: f32,
 }
 
-/// What the pilot found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PilotRecord {
     pub snapshot: usize,
@@ -64,7 +63,6 @@ impl StageRecord {
     }
 }
 
-/// What came of a tile.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TileRecord {
     /// Iterations whose prior had a total-variation part.
@@ -87,7 +85,6 @@ impl From<&Outcome> for TileRecord {
     }
 }
 
-/// The record of a tile's task.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTaskRecord {
     #[serde(flatten)]
@@ -121,7 +118,6 @@ impl CostRecord {
     }
 }
 
-/// What belongs to one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
     /// The job; none on the command line.

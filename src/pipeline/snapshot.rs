@@ -17,7 +17,6 @@ use crate::recon::schedule::Schedule;
 use crate::recon::solver::{Control, Observer, Outcome, Progress};
 use crate::recon::tile::TilePlan;
 
-/// What is to be solved.
 #[derive(Debug, Clone, Copy)]
 pub struct SnapshotInput<'a> {
     pub snapshot: usize,
@@ -31,7 +30,6 @@ pub struct SnapshotInput<'a> {
     pub plan: &'a TilePlan,
 }
 
-/// How tiles are solved.
 #[derive(Debug, Clone, Copy)]
 pub enum Solver<'a> {
     Schedule(&'a Schedule),

@@ -16,7 +16,6 @@ use super::rows::sql;
 use super::{Store, dir, identity, on_files};
 use crate::job::Sha256;
 
-/// What a backup holds.
 #[derive(Debug, Default)]
 pub struct Backup {
     /// Files that were copied, the database among them.

@@ -50,7 +50,6 @@ impl DataDir {
         sync_dir(&self.root)
     }
 
-    /// The folder itself.
     pub fn root(&self) -> &Path {
         &self.root
     }

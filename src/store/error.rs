@@ -4,10 +4,8 @@ use std::path::{Path, PathBuf};
 
 use crate::job::IllegalTransition;
 
-/// What the functions of this folder give.
 pub type Result<T, E = StoreError> = std::result::Result<T, E>;
 
-/// An error of the store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     #[error("the database failed: {0}")]

@@ -46,14 +46,13 @@ pub use queue::{
     CalibrationDone, CalibrationTask, ClaimedTask, Completion, Heartbeat, JobMark, JobProgress,
     JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Work, WorkerEnd,
 };
-pub use rows::Page;
+pub use rows::{Filter, Page};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
-    Blob, Calibration, FoundPartial, Job, JobFilter, Measurement, MeasurementFilter, Model,
-    ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
-    PartialFile, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
-    Unready, WorkerRow, WorkerTask,
+    Blob, Calibration, FoundPartial, Job, JobFilter, LabRow, Measurement, Model, NewCalibration,
+    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, TaskCounts, TaskRecord,
+    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerRow, WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.
@@ -63,6 +62,8 @@ pub struct Store {
     /// One connection: within a process, writers wait for each other here and not in SQLite.
     writer: SqlitePool,
     readers: SqlitePool,
+    /// What is ahead of every job, as it was a moment ago.
+    forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
     /// The lock of the server, if this is its store.
     _server: Option<Arc<File>>,
 }
@@ -115,7 +116,7 @@ impl Store {
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
-        let store = Self { dir, writer, readers, _server: server };
+        let store = Self { dir, writer, readers, forecast: Arc::default(), _server: server };
         if serves {
             identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
             store.write_marker().await?;
@@ -136,7 +137,6 @@ impl Store {
         on_files(move || identity::write(&root, &draft, &marker)).await
     }
 
-    /// Where the files are.
     pub fn dir(&self) -> &DataDir {
         &self.dir
     }

@@ -31,6 +31,14 @@ impl<T> Page<T> {
     }
 }
 
+/// Which things a list holds that belong to calibrations.
+#[derive(Debug, Clone, Copy)]
+pub struct Filter<Id> {
+    pub calibration: Option<CalibrationId>,
+    /// Only those older than this one.
+    pub after: Option<Id>,
+}
+
 /// A statement with the values for its places, in order.
 macro_rules! sql {
     ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query($text)$(.bind($value))* };

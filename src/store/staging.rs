@@ -90,7 +90,6 @@ pub struct BlobWriter {
 }
 
 impl BlobWriter {
-    /// Bytes written so far.
     pub fn size(&self) -> u64 {
         self.size
     }
@@ -146,12 +145,10 @@ pub struct StagedBlob {
 }
 
 impl StagedBlob {
-    /// The hash of its bytes.
     pub fn sha256(&self) -> Sha256 {
         self.sha256
     }
 
-    /// Its size in bytes.
     pub fn size(&self) -> u64 {
         self.size
     }
@@ -181,7 +178,6 @@ impl StagedBlob {
 pub struct StagedDir(Temporary);
 
 impl StagedDir {
-    /// The folder.
     pub fn path(&self) -> &Path {
         &self.0.path
     }

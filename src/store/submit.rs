@@ -15,7 +15,6 @@ use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp,
 };
 
-/// A job to be accepted.
 #[derive(Debug, Clone)]
 pub struct NewJob {
     /// So many jobs may wait and run, with this one.
@@ -54,7 +53,7 @@ impl Store {
         let id = JobId::new();
         let key = new.idempotency_key.as_ref().map(|key| key_of(&new.lab, key));
         jobs::insert(&mut transaction, id, &new.lab, &new.spec, (new.request, key)).await?;
-        graph::insert(&mut transaction, id, &new.spec).await?;
+        graph::insert(&mut transaction, &new.lab, id, &new.spec).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
@@ -91,7 +90,7 @@ impl Store {
         calibrations::insert(&mut transaction, lab, &calibration).await?;
         let name = facts.name.as_ref();
         calibrations::insert_request(&mut transaction, lab, id, name, None).await?;
-        graph::insert_calibration(&mut transaction, id).await?;
+        graph::insert_calibration(&mut transaction, lab, id).await?;
         transaction.commit().await?;
         Ok(calibration)
     }
@@ -106,7 +105,7 @@ impl Store {
         let id = CalibrationId::new();
         let mut transaction = self.write().await?;
         calibrations::insert_request(&mut transaction, lab, id, name, Some(captures)).await?;
-        graph::insert_calibration(&mut transaction, id).await?;
+        graph::insert_calibration(&mut transaction, lab, id).await?;
         transaction.commit().await?;
         Ok(id)
     }

@@ -4,6 +4,7 @@ mod calibrations;
 mod failures;
 mod keeping;
 mod migration;
+mod turns;
 
 use std::io::Write;
 use std::time::Duration;
@@ -121,6 +122,18 @@ impl Lab {
         key: Option<&str>,
         request: &[u8],
     ) -> Result<Inserted, StoreError> {
+        let local = crate::job::Lab::local();
+        self.add_for(&local, algorithm, priority, key, request).await
+    }
+
+    async fn add_for(
+        &self,
+        lab: &crate::job::Lab,
+        algorithm: Algorithm,
+        priority: i32,
+        key: Option<&str>,
+        request: &[u8],
+    ) -> Result<Inserted, StoreError> {
         let measurement = self
             .store
             .measurement(&crate::job::Lab::local(), self.measurement)
@@ -142,7 +155,7 @@ impl Lab {
         let spec = job.resolve(measurement.calibration, shape, None).unwrap();
         let new = NewJob {
             most_jobs: 1000,
-            lab: crate::job::Lab::local(),
+            lab: lab.clone(),
             spec,
             request: Sha256::of(request),
             idempotency_key: key.map(Into::into),

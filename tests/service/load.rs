@@ -119,3 +119,96 @@ async fn large_uploads_at_once_take_little_memory() {
     );
     assert!(ok);
 }
+
+#[tokio::test]
+#[ignore = "minutes; run by make load"]
+async fn a_long_queue_of_large_jobs_is_as_quick_as_a_short_one() {
+    // 729 tiles each.
+    let scene = Scene { frames: 4, height: 440, width: 440, snapshots: 1 };
+    long_queue("load_large_jobs", scene, setting("SCI_RECON_LOAD_LARGE", 800)).await;
+}
+
+#[tokio::test]
+#[ignore = "minutes; run by make load"]
+async fn a_long_queue_of_small_jobs_is_as_quick_as_a_short_one() {
+    let scene = Scene { frames: 4, height: 24, width: 24, snapshots: 1 };
+    long_queue("load_small_jobs", scene, setting("SCI_RECON_LOAD_SMALL", 20_000)).await;
+}
+
+/// Submits so many jobs, then has 50 clients ask for one of them and for the list once a second, while
+/// more jobs come.
+async fn long_queue(target: &str, scene: Scene, jobs: u64) {
+    const CLIENTS: u64 = 50;
+    const SUBMITTERS: u64 = 4;
+    let seconds = setting("SCI_RECON_LOAD_QUEUE_SECONDS", 30);
+    let app = TestApp::with(&["--workers", "0", "--max-jobs", "1000000"]).await;
+    let (_, measurement) = app.scene(&scene).await;
+    let app = &app;
+    let job = json!({"measurement": measurement, "algorithm": "gap-tv",
+                     "tile": {"size": 24, "overlap": 8}});
+    let submit = || {
+        let request = app.request(Method::POST, "/v1/jobs").json(&job);
+        async move {
+            let start = Instant::now();
+            let answer = request.send().await.unwrap();
+            let status = answer.status();
+            let job: Value = answer.json().await.unwrap();
+            assert_eq!(status, 201, "{job}");
+            (job["id"].as_str().unwrap().to_owned(), start.elapsed())
+        }
+    };
+    let started = Instant::now();
+    let fill = |_| async move {
+        let mut ids = Vec::new();
+        for _ in 0..jobs / SUBMITTERS {
+            ids.push(submit().await.0);
+        }
+        ids
+    };
+    let ids = futures_util::future::join_all((0..SUBMITTERS).map(fill)).await.concat();
+    let filled = started.elapsed();
+    let end = Instant::now() + Duration::from_secs(seconds);
+    let ids = &ids;
+    let ask = |path: String| async move {
+        let start = Instant::now();
+        let answer = app.request(Method::GET, &path).send().await.unwrap();
+        assert_eq!(answer.status(), 200);
+        answer.bytes().await.unwrap();
+        start.elapsed()
+    };
+    let poll = |client: u64| async move {
+        let mut times = Vec::new();
+        tokio::time::sleep(Duration::from_millis(client * 20)).await;
+        while Instant::now() < end {
+            let start = Instant::now();
+            let id = &ids[(client as usize * 7919) % ids.len()];
+            times.push(ask(format!("/v1/jobs/{id}")).await);
+            times.push(ask("/v1/jobs?limit=50".into()).await);
+            tokio::time::sleep(Duration::from_secs(1).saturating_sub(start.elapsed())).await;
+        }
+        times
+    };
+    let more = async {
+        let mut times = Vec::new();
+        while Instant::now() < end {
+            times.push(submit().await.1);
+            tokio::time::sleep(Duration::from_millis(500)).await;
+        }
+        times
+    };
+    let polled = futures_util::future::join_all((0..CLIENTS).map(poll));
+    let (polled, mut posts) = futures_util::future::join(polled, more).await;
+    let mut gets = polled.concat();
+    gets.sort();
+    posts.sort();
+    let (get, post) = (percentile(&gets, 99.0), percentile(&posts, 99.0));
+    let ok = get < 50.0 && post < 50.0;
+    println!(
+        "{}",
+        json!({"target": target, "ok": ok, "jobs": ids.len(), "seconds_to_fill": filled.as_secs_f64(),
+               "gets": gets.len(), "get_p50_ms": percentile(&gets, 50.0), "get_p99_ms": get,
+               "posts": posts.len(), "post_p50_ms": percentile(&posts, 50.0), "post_p99_ms": post,
+               "peak_memory_mib": app.peak_memory()})
+    );
+    assert!(ok);
+}

@@ -4,7 +4,6 @@ use sci_recon::job::Algorithm;
 
 use super::record::Row;
 
-/// What the tables show.
 pub struct Layout {
     pub clips: Vec<String>,
     /// The rows of each scale.

@@ -46,7 +46,6 @@ pub struct Masks {
     light: Array2<f32>,
 }
 
-/// A clip behind masks.
 pub struct Snapshot<'a> {
     clip: &'a str,
     masks: &'a Array3<f32>,

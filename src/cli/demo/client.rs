@@ -15,13 +15,11 @@ use crate::cli::error::Result;
 use crate::formats::{Limits, exr};
 use crate::job::{JobState, Sha256};
 
-/// Speaks to one service.
 pub(super) struct Client {
     url: String,
     http: reqwest::Client,
 }
 
-/// Where a job stands.
 pub(super) enum JobView {
     /// It waits or runs; the share on \[0,1\] that is done.
     Going(f64),
@@ -85,7 +83,6 @@ impl Client {
         Ok(json::<Created>(request).await?.id)
     }
 
-    /// Asks how a job is.
     pub(super) async fn job(&self, job: &str) -> Result<JobView> {
         let job: Job = json(self.get(&format!("/v1/jobs/{job}"))).await?;
         Ok(match (job.state, job.error) {

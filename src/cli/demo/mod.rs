@@ -41,7 +41,6 @@ pub struct Arguments {
     json: bool,
 }
 
-/// Runs the command.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let failed = |error: std::io::Error| CliError::Failure(format!("the runtime: {error}"));
     let out = fresh_folder(&arguments.out)?;

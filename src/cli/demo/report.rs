@@ -9,7 +9,6 @@ use crate::cli::CliError;
 use crate::cli::error::Result;
 use crate::pipeline::quality::{self, FrameQuality};
 
-/// The figures of one algorithm.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Quality {
     psnr_db: f64,

@@ -58,7 +58,6 @@ impl Service {
         Ok(Self { process, url: announced.url })
     }
 
-    /// Where it listens.
     pub(super) fn url(&self) -> &str {
         &self.url
     }

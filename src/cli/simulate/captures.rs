@@ -41,7 +41,6 @@ struct Measurement {
     saturation: u16,
 }
 
-/// A lab with a camera.
 pub(super) struct Lab<'a> {
     pub(super) camera: Camera,
     /// Relative light \[H,W\] of the white board.

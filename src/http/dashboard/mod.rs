@@ -95,12 +95,10 @@ fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
     encoder.finish()
 }
 
-/// `GET /`
 pub(super) async fn page(headers: HeaderMap) -> Result<Response> {
     send(PAGE, &headers)
 }
 
-/// `GET /dashboard/{file}`
 pub(super) async fn file(Params(name): Params<String>, headers: HeaderMap) -> Result<Response> {
     send(&name, &headers)
 }

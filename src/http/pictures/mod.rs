@@ -57,7 +57,6 @@ struct SpreadBody {
     high: f32,
 }
 
-/// Which tile of a picture.
 #[derive(Debug, Deserialize)]
 pub(super) struct TilePath {
     level: u32,
@@ -65,7 +64,6 @@ pub(super) struct TilePath {
     column: usize,
 }
 
-/// `GET .../pictures/{picture}`
 pub(super) async fn preview<N: Named>(
     Caller(app, access): Caller,
     Params(name): Params<N>,
@@ -91,7 +89,6 @@ pub(super) async fn preview<N: Named>(
     draw(&app, picture, region, window, &headers).await
 }
 
-/// `GET .../pictures/{picture}/tiles/{level}/{row}/{column}`
 pub(super) async fn tile<N: Named>(
     Caller(app, access): Caller,
     Params(name): Params<N>,
@@ -114,7 +111,6 @@ pub(super) async fn tile<N: Named>(
     draw(&app, picture, region, Some(window), &headers).await
 }
 
-/// `GET .../pictures/{picture}/spread`
 pub(super) async fn spread<N: Named>(
     Caller(app, access): Caller,
     Params(name): Params<N>,

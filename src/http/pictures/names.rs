@@ -31,7 +31,6 @@ enum JobPicture {
 #[serde(try_from = "String")]
 struct MeasurementPicture(usize);
 
-/// A picture of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 enum CalibrationPicture {

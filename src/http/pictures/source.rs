@@ -18,7 +18,6 @@ pub(super) struct Stack {
     pub(super) files: Files,
 }
 
-/// The files of a stack.
 #[derive(Debug, Clone)]
 pub(super) enum Files {
     Prepared(PathBuf),
@@ -89,7 +88,6 @@ impl Stack {
         }
     }
 
-    /// One frame.
     pub(super) fn frame(&self, k: usize) -> Picture {
         self.picture(&format!("frame {k}"), 1, move |stack, rows, columns| {
             Ok(first(stack.window(k..k + 1, rows, columns)?))
@@ -113,7 +111,6 @@ impl Stack {
         Picture { height: frames, ..picture }
     }
 
-    /// The mean of all frames.
     pub(super) fn mean(&self) -> Picture {
         let frames = self.shape.0;
         self.picture("mean", frames, move |stack, rows, columns| {

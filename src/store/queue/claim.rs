@@ -35,7 +35,6 @@ pub struct ClaimedTask {
     pub work: Work,
 }
 
-/// What is to be done.
 #[derive(Debug, Clone)]
 pub enum Work {
     Job(Box<JobTask>),
@@ -43,7 +42,6 @@ pub enum Work {
     Calibration(Box<CalibrationTask>),
 }
 
-/// A step of a job.
 #[derive(Debug, Clone)]
 pub struct JobTask {
     pub job: JobId,
@@ -60,7 +58,6 @@ pub struct JobTask {
     pub records: Vec<TaskRecord>,
 }
 
-/// What is to be done for a calibration.
 #[derive(Debug, Clone, FromRow)]
 pub struct CalibrationTask {
     pub calibration: CalibrationId,
@@ -73,7 +70,6 @@ pub struct CalibrationTask {
 }
 
 impl Store {
-    /// Hands out the next task, if there is one.
     pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
         let now = Timestamp::now().0;
         if !self.may_have_work(now).await? {
@@ -174,7 +170,8 @@ impl Store {
     }
 }
 
-/// One statement finds the next task, marks it and counts the attempt.
+/// One statement finds the next task, marks it and counts the attempt: of the highest priority, of the lab
+/// whose turn it is, of the jobs that have begun before others, of the oldest one.
 async fn take(
     connection: &mut SqliteConnection,
     worker: WorkerId,
@@ -184,21 +181,50 @@ async fn take(
     let row = sql!(
         "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
              stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
-         WHERE id = (SELECT id FROM tasks
-                     WHERE state = ?5 AND ready_at NOT BETWEEN ?6 + 1 AND ?6 + ?7
-                     ORDER BY priority DESC, job, ordinal, id LIMIT 1)
-         RETURNING id, job, calibration, kind, snapshot, tile, attempt, cost",
+         WHERE id = (
+             SELECT tasks.id FROM (
+                 -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
+                 SELECT finish, (SELECT id FROM tasks
+                                 WHERE state = 'ready' AND tasks.lab = labs.lab
+                                   AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
+                                 ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
+                 FROM labs
+                 UNION ALL
+                 SELECT finish, (SELECT id FROM tasks
+                                 WHERE state = 'ready' AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
+                                   AND job = (SELECT id FROM jobs
+                                              WHERE jobs.state = 'running' AND jobs.lab = labs.lab
+                                                AND EXISTS (SELECT 1 FROM tasks WHERE job = jobs.id
+                                                    AND state = 'ready'
+                                                    AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6)
+                                              ORDER BY priority DESC, id LIMIT 1)
+                                 ORDER BY ordinal LIMIT 1)
+                 FROM labs)
+             JOIN tasks ON tasks.id = task
+             LEFT JOIN jobs ON jobs.id = job
+             ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
+                 jobs.state = 'running' DESC, job, ordinal, tasks.id
+             LIMIT 1)
+         RETURNING id, job, calibration, lab, kind, snapshot, tile, attempt, cost",
         [
             TaskState::Running,
             worker,
             Lease::until(length, now),
             TaskStage::Reading,
-            TaskState::Ready,
             now,
             LONGEST_PAUSE
         ]
     )
-    .fetch_optional(connection)
+    .fetch_optional(&mut *connection)
     .await?;
-    Ok(row)
+    let Some(row) = row else { return Ok(None) };
+    // A lab that wanted nothing for a while begins where the others are: what it left them is not owed to it.
+    sql!(
+        "UPDATE labs SET start = max(finish, clock), finish = max(finish, clock) + ?2 / share
+         FROM (SELECT max(start) AS clock FROM labs) WHERE lab = ?1",
+        [row.try_get::<String, _>("lab")?, row.try_get::<f64, _>("cost")?]
+    )
+    .execute(connection)
+    .await?;
+    Ok(Some(row))
 }

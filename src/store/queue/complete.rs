@@ -15,11 +15,10 @@ use crate::store::staging::{StagedBlob, StagedDir};
 use crate::store::tables::blobs::Origin;
 use crate::store::tables::calibrations::{self, NewCalibration};
 use crate::store::tables::reports;
-use crate::store::tables::results;
 use crate::store::tables::tasks::Owner;
+use crate::store::tables::{results, sums};
 use crate::store::{Store, dir, on_files};
 
-/// The end of a task.
 #[derive(Debug)]
 pub struct Completion {
     /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
@@ -29,7 +28,6 @@ pub struct Completion {
     pub product: Product,
 }
 
-/// What a task has made.
 #[derive(Debug)]
 pub enum Product {
     /// Nothing but its record (prepare).
@@ -42,7 +40,6 @@ pub enum Product {
     Calibration(Box<CalibrationDone>),
 }
 
-/// What was made for a calibration.
 #[derive(Debug)]
 pub struct CalibrationDone {
     /// The masks and what is known of them, if they were made of captures.
@@ -90,6 +87,7 @@ impl Store {
                 self.succeed(&mut transaction, job).await?;
             }
             job::settle(&mut transaction, job).await?;
+            sums::recount(&mut transaction, job).await?;
         }
         transaction.commit().await?;
         Ok(Heartbeat::Continue)
@@ -131,7 +129,6 @@ impl Store {
     }
 }
 
-/// Marks a task done.
 async fn finish(
     connection: &mut SqliteConnection,
     lease: &Lease,
@@ -161,10 +158,13 @@ async fn finish(
     .execute(&mut *connection)
     .await?;
     sql!(
-        "INSERT INTO totals (kind, tasks, seconds, iterations, passes)
-             SELECT kind, 1, coalesce(seconds, 0), iterations, passes FROM tasks WHERE id = ?
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
+             SELECT kind, 1, coalesce(seconds, 0), iterations, passes, coalesce(seconds, 0),
+                 iif(kind = 'tile', cost * fraction, cost) FROM tasks WHERE id = ?
          ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
-             iterations = iterations + excluded.iterations, passes = passes + excluded.passes",
+             iterations = iterations + excluded.iterations, passes = passes + excluded.passes,
+             recent_seconds = 0.97 * recent_seconds + excluded.recent_seconds,
+             recent_cost = 0.97 * recent_cost + excluded.recent_cost",
         [lease.task]
     )
     .execute(&mut *connection)

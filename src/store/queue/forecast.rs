@@ -1,27 +1,25 @@
 //! The order in which waiting jobs are served, and what that means in seconds.
+//!
+//! A task of a higher priority goes first. At the same priority labs take turns by their shares, and a
+//! lab's jobs go one after the other: when the lab of a job has been served `w` CPU-seconds, another
+//! lab has been served `w` times the ratio of their shares, or all that it wanted.
 
-use std::collections::HashMap;
-use std::time::Duration;
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
-use sqlx::{AssertSqlSafe, Row};
+use sqlx::Row;
 
-use crate::job::{JobId, JobState, TaskState};
+use crate::job::{JobId, JobState};
 use crate::store::Store;
 use crate::store::error::Result;
-use crate::store::rows::sql_as;
 
 /// Workers that were silent for longer do not count.
 const WORKER_AGE: Duration = Duration::from_secs(15);
-
-/// What the last tiles took, and what they spent of the plan: they may converge early.
-const LAST_TILES: &str = "SELECT sum(seconds) AS seconds, sum(spent) AS spent FROM (
-    SELECT seconds, cost * fraction AS spent FROM tasks
-    WHERE state = ? AND kind = 'tile' ORDER BY job DESC, ordinal DESC LIMIT 32)";
-/// The same of tasks that mostly read and write.
-const LAST_OTHERS: &str = "SELECT sum(seconds) AS seconds, sum(cost) AS spent FROM (
-    SELECT seconds, cost FROM tasks
-    WHERE state = ? AND kind IN ('prepare', 'preview', 'assemble')
-    ORDER BY job DESC, ordinal DESC LIMIT 32)";
+/// A forecast is good for so long for each job in it, about twenty times as long as it takes to make: it
+/// costs a twentieth of a core, however many ask.
+const KEPT_PER_JOB: Duration = Duration::from_micros(50);
+const KEPT_AT_MOST: Duration = Duration::from_secs(1);
 
 /// What is ahead of every unfinished job.
 #[derive(Debug)]
@@ -31,9 +29,10 @@ pub struct Forecast {
     rate: f64,
     /// The same of all other tasks: reading and writing are not as fast as computing is.
     others_rate: f64,
-    /// The same for jobs with tiles that are done: their tiles converge about as early as each other.
-    own_rates: HashMap<JobId, f64>,
-    ahead: HashMap<JobId, Ahead>,
+    jobs: HashMap<JobId, Ahead>,
+    /// What is ahead of a job that was not there yet.
+    of_a_new_one: Ahead,
+    until: Instant,
 }
 
 /// Planned CPU-seconds that are left of some tasks of a job.
@@ -50,90 +49,195 @@ pub struct Left {
 struct Ahead {
     /// Planned CPU-seconds.
     cost: f64,
-    /// The job's place among those that wait, from 1; none if it does not wait.
-    position: Option<usize>,
+    /// The job's place among those that wait, from 1.
+    position: usize,
+}
+
+/// A job that has not ended.
+#[derive(Debug)]
+struct Unfinished {
+    id: JobId,
+    lab: usize,
+    priority: i64,
+    waits: bool,
+    /// Planned CPU-seconds that are left of it.
+    left: f64,
 }
 
 impl Forecast {
-    /// Seconds until a job ends, of whose tiles and other tasks so much is left; none if no worker
-    /// lives.
+    /// Seconds until a job ends, of whose tiles and other tasks so much is left; none if no worker lives.
+    /// `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge
+    /// about as early as each other.
     pub(in crate::store) fn eta_seconds(
         &self,
         job: JobId,
-        tiles: Left,
-        others: Left,
+        (tiles, others): (Left, Left),
+        own_rate: Option<f64>,
     ) -> Option<f64> {
         let workers = f64::from(self.workers);
-        let ahead = self.ahead.get(&job).map_or(0.0, |ahead| ahead.cost);
-        let own = self.own_rates.get(&job).unwrap_or(&self.rate);
+        let own = own_rate.unwrap_or(self.rate);
+        let ahead = self.ahead(job).cost;
         let left = self.rate * ahead + self.others_rate * others.sum + own * tiles.sum;
         let longest = (self.others_rate * others.longest).max(own * tiles.longest);
         let seconds = left / workers + (1.0 - 1.0 / workers) * longest;
         (self.workers > 0).then_some(seconds)
     }
 
-    /// The job's place among those that wait, from 1.
-    pub(in crate::store) fn position(&self, job: JobId) -> Option<usize> {
-        self.ahead.get(&job)?.position
+    /// The place of a job that waits among all that do, from 1.
+    pub(in crate::store) fn position(&self, job: JobId) -> usize {
+        self.ahead(job).position
+    }
+
+    fn ahead(&self, job: JobId) -> Ahead {
+        self.jobs.get(&job).copied().unwrap_or(self.of_a_new_one)
     }
 }
 
 impl Store {
-    /// What is ahead of every unfinished job; none if there is no such job.
-    pub(in crate::store) async fn forecast(&self) -> Result<Option<Forecast>> {
-        // Only states that stand in the text let SQLite see that the index holds all that is asked for.
-        let left = [TaskState::Blocked, TaskState::Ready, TaskState::Running]
-            .map(|state| state.into_str());
-        let query = format!(
-            "SELECT job, sum(cost * (1 - fraction)) AS cost,
-                 (SELECT state FROM jobs WHERE id = job) AS state
-             FROM tasks INDEXED BY tasks_left
-             WHERE state IN ('{}') AND job IS NOT NULL
-             GROUP BY priority, job ORDER BY priority DESC, job",
-            left.join("', '")
-        );
-        let rows = sqlx::query(AssertSqlSafe(query)).fetch_all(&self.readers).await?;
-        if rows.is_empty() {
-            return Ok(None);
+    /// What is ahead of every unfinished job, a moment ago or now.
+    pub(in crate::store) async fn forecast(&self) -> Result<Arc<Forecast>> {
+        let mut kept = self.forecast.lock().await;
+        if let Some(forecast) = kept.as_ref().filter(|forecast| Instant::now() < forecast.until) {
+            return Ok(forecast.clone());
         }
-        let (mut cost, mut waiting, mut ahead) = (0.0, 0, HashMap::with_capacity(rows.len()));
-        for row in &rows {
-            let waits = row.try_get::<JobState, _>("state")? == JobState::Queued;
-            waiting += usize::from(waits);
-            ahead.insert(row.try_get("job")?, Ahead { cost, position: waits.then_some(waiting) });
-            cost += row.try_get::<f64, _>("cost")?;
-        }
-        let workers = self.live_workers(WORKER_AGE).await?.len();
-        let workers = u32::try_from(workers).unwrap_or(u32::MAX);
-        let rate = self.seconds_per_cost(LAST_TILES).await?;
-        let others_rate = self.seconds_per_cost(LAST_OTHERS).await?;
-        let own_rates = self.own_rates().await?;
-        Ok(Some(Forecast { workers, rate, others_rate, own_rates, ahead }))
+        Ok(kept.insert(self.new_forecast().await?.into()).clone())
     }
 
-    /// Seconds that a planned CPU-second of a tile has taken in each job that runs, what converged
-    /// early included.
-    async fn own_rates(&self) -> Result<HashMap<JobId, f64>> {
-        let rates: Vec<(JobId, f64)> = sql_as!(
-            "SELECT job, sum(seconds) / sum(cost) FROM tasks
-             WHERE job IN (SELECT id FROM jobs WHERE state = ?)
-               AND kind = 'tile' AND state = ? AND seconds > 0
-             GROUP BY job HAVING sum(cost) > 0",
-            [JobState::Running, TaskState::Done]
+    async fn new_forecast(&self) -> Result<Forecast> {
+        let rows = sqlx::query(
+            "SELECT id, lab, priority, state, tiles_left + others_left AS left
+             FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
+             WHERE finished_at IS NULL ORDER BY id",
         )
         .fetch_all(&self.readers)
         .await?;
-        Ok(rates.into_iter().collect())
+        let (mut names, mut unfinished) = (HashMap::new(), Vec::with_capacity(rows.len()));
+        for row in &rows {
+            let lab: String = row.try_get("lab")?;
+            let next = names.len();
+            unfinished.push(Unfinished {
+                id: row.try_get("id")?,
+                lab: *names.entry(lab).or_insert(next),
+                priority: row.try_get("priority")?,
+                waits: row.try_get::<JobState, _>("state")? == JobState::Queued,
+                left: row.try_get("left")?,
+            });
+        }
+        let mut shares = vec![1.0; names.len()];
+        for row in sqlx::query("SELECT lab, share FROM labs").fetch_all(&self.readers).await? {
+            if let Some(lab) = names.get(&row.try_get::<String, _>("lab")?) {
+                shares[*lab] = row.try_get("share")?;
+            }
+        }
+        let jobs = ahead(&unfinished, &shares);
+        let workers = self.live_workers(WORKER_AGE).await?.len();
+        let of_a_new_one = Ahead {
+            cost: unfinished.iter().map(|job| job.left).sum(),
+            position: 1 + unfinished.iter().filter(|job| job.waits).count(),
+        };
+        let (rate, others_rate) = self.rates().await?;
+        Ok(Forecast {
+            workers: count(workers),
+            rate,
+            others_rate,
+            jobs,
+            of_a_new_one,
+            until: Instant::now() + (KEPT_PER_JOB * count(unfinished.len())).min(KEPT_AT_MOST),
+        })
     }
 
-    /// Seconds that a planned CPU-second takes on this machine: measured on tasks that are done, by what
-    /// they really did and not by what was planned; 1 before there are any.
-    async fn seconds_per_cost(&self, of_last_tasks: &'static str) -> Result<f64> {
-        let sums: (Option<f64>, Option<f64>) =
-            sql_as!(of_last_tasks, [TaskState::Done]).fetch_one(&self.readers).await?;
-        Ok(match sums {
-            (Some(seconds), Some(spent)) if spent > 0.0 && seconds > 0.0 => seconds / spent,
-            _ => 1.0,
-        })
+    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: measured on
+    /// the last tasks of a kind, by what they really did and not by what was planned; 1 before there are
+    /// any.
+    async fn rates(&self) -> Result<(f64, f64)> {
+        let row = sqlx::query(
+            "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
+                    / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
+                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
+                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
+             FROM totals",
+        )
+        .fetch_one(&self.readers)
+        .await?;
+        let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
+        Ok((rate(row.try_get("tiles")?), rate(row.try_get("others")?)))
+    }
+}
+
+fn count(things: usize) -> u32 {
+    u32::try_from(things).unwrap_or(u32::MAX)
+}
+
+/// What is ahead of each of these jobs, which stand in the order in which they came, with the shares of
+/// the labs.
+fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
+    let mut by_priority: BTreeMap<i64, Vec<&Unfinished>> = BTreeMap::new();
+    for job in jobs {
+        by_priority.entry(job.priority).or_default().push(job);
+    }
+    let (mut above, mut found) = (0.0, Vec::with_capacity(jobs.len()));
+    for jobs in by_priority.into_values().rev() {
+        let mut wanted = vec![0.0; shares.len()];
+        for job in &jobs {
+            wanted[job.lab] += job.left;
+        }
+        let mut earlier = vec![0.0; shares.len()];
+        for job in jobs {
+            let served = earlier[job.lab] + job.left;
+            let others: f64 = (0..shares.len())
+                .filter(|lab| *lab != job.lab)
+                .map(|lab| wanted[lab].min(served * shares[lab] / shares[job.lab]))
+                .sum();
+            found.push((job, above + earlier[job.lab] + others));
+            earlier[job.lab] = served;
+        }
+        above += wanted.iter().sum::<f64>();
+    }
+    // Who ends first is served first; a job that came earlier stands before an equal one.
+    found.sort_by(|(a, before_a), (b, before_b)| {
+        b.priority.cmp(&a.priority).then((before_a + a.left).total_cmp(&(before_b + b.left)))
+    });
+    let mut position = 1;
+    let mut placed = HashMap::with_capacity(found.len());
+    for (job, cost) in found {
+        placed.insert(job.id, Ahead { cost, position });
+        position += usize::from(job.waits);
+    }
+    placed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Ahead, JobId, Unfinished, ahead};
+
+    /// Planned seconds ahead of jobs, and their places, from lab, priority and what is left of each.
+    fn served(jobs: &[(usize, i64, f64)], shares: &[f64]) -> Vec<(f64, usize)> {
+        let jobs: Vec<_> = jobs
+            .iter()
+            .map(|&(lab, priority, left)| Unfinished {
+                id: JobId::new(),
+                lab,
+                priority,
+                waits: true,
+                left,
+            })
+            .collect();
+        let found = ahead(&jobs, shares);
+        let figures = |Ahead { cost, position }| (cost, position);
+        jobs.iter().map(|job| figures(found[&job.id])).collect()
+    }
+
+    #[test]
+    fn jobs_of_one_lab_wait_for_those_before_them_and_for_urgent_ones() {
+        let jobs = [(0, 0, 10.0), (0, 0, 20.0), (0, 5, 3.0)];
+        assert_eq!(served(&jobs, &[1.0]), [(3.0, 2), (13.0, 3), (0.0, 1)]);
+    }
+
+    #[test]
+    fn labs_are_served_side_by_side_by_their_shares() {
+        let jobs = [(0, 0, 60.0), (0, 0, 60.0), (1, 0, 30.0)];
+        // While the second lab gets its 30, the first one gets 30 too; it has had all by then that it wants.
+        assert_eq!(served(&jobs, &[1.0, 1.0]), [(30.0, 2), (90.0, 3), (30.0, 1)]);
+        assert_eq!(served(&jobs, &[1.0, 2.0])[2], (15.0, 1));
     }
 }

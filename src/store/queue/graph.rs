@@ -3,16 +3,20 @@
 use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 
-use crate::job::{CalibrationId, JobId, JobSpec, TaskId, TaskKind, TaskState};
+use crate::job::{CalibrationId, JobId, JobSpec, Lab, TaskId, TaskKind, TaskState};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
-use crate::store::tables::tasks;
+use crate::store::tables::{labs, sums, tasks};
 
 /// Above that of every job: people wait for calibrations before they measure.
 const CALIBRATION_PRIORITY: i32 = 1000;
 
-/// Writes the tasks of a job.
-pub async fn insert(connection: &mut SqliteConnection, job: JobId, spec: &JobSpec) -> Result<()> {
+pub async fn insert(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+    job: JobId,
+    spec: &JobSpec,
+) -> Result<()> {
     let tasks = spec
         .tasks()
         .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
@@ -27,36 +31,39 @@ pub async fn insert(connection: &mut SqliteConnection, job: JobId, spec: &JobSpe
         })
         .collect();
     sql!(
-        "INSERT INTO tasks (id, job, ordinal, kind, snapshot, tile, state, priority, cost)
-         SELECT value ->> 0, ?1, value ->> 1, value ->> 2, value ->> 3, value ->> 4, value ->> 5,
+        "INSERT INTO tasks (id, job, lab, ordinal, kind, snapshot, tile, state, priority, cost)
+         SELECT value ->> 0, ?1, ?4, value ->> 1, value ->> 2, value ->> 3, value ->> 4, value ->> 5,
              ?2, value ->> 6
          FROM json_each(?3)",
-        [job, spec.priority, Value::from(rows).to_string()]
+        [job, spec.priority, Value::from(rows).to_string(), lab]
     )
-    .execute(connection)
+    .execute(&mut *connection)
     .await?;
-    Ok(())
+    labs::know(connection, lab).await?;
+    sums::recount(connection, job).await
 }
 
 /// Writes the task of a calibration. Its cost is not planned: nothing is forecast from it.
 pub async fn insert_calibration(
     connection: &mut SqliteConnection,
+    lab: &Lab,
     calibration: CalibrationId,
 ) -> Result<()> {
     sql!(
-        "INSERT INTO tasks (id, calibration, ordinal, kind, state, priority, cost)
-         VALUES (?, ?, 0, ?, ?, ?, 0)",
+        "INSERT INTO tasks (id, calibration, lab, ordinal, kind, state, priority, cost)
+         VALUES (?, ?, ?, 0, ?, ?, ?, 0)",
         [
             TaskId::new(),
             calibration,
+            lab,
             TaskKind::Calibration.into_str(),
             first_state(TaskKind::Calibration),
             CALIBRATION_PRIORITY
         ]
     )
-    .execute(connection)
+    .execute(&mut *connection)
     .await?;
-    Ok(())
+    labs::know(connection, lab).await
 }
 
 /// The state of a task that waits for its turn alone, or for others.

@@ -95,7 +95,6 @@ pub(super) async fn is_wanted(connection: &mut SqliteConnection, id: JobId) -> R
     Ok(matches!(jobs::state(connection, id).await?, JobState::Queued | JobState::Running))
 }
 
-/// Marks a job as failed for this reason.
 pub(super) async fn fail(connection: &mut SqliteConnection, id: JobId, reason: &str) -> Result<()> {
     jobs::set_state(connection, id, JobState::Failed, Some(reason)).await?;
     graph::cancel_waiting(connection, id).await

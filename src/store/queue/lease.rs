@@ -16,7 +16,7 @@ use crate::store::Store;
 use crate::store::error::Result;
 use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::tasks::{self, Owner};
-use crate::store::tables::workers;
+use crate::store::tables::{sums, workers};
 
 /// So many failures of a task, and it is given up, and its job or calibration with it.
 pub const MAX_FAILURES: u32 = 3;
@@ -43,7 +43,6 @@ impl Lease {
     }
 }
 
-/// The answer to a heartbeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heartbeat {
     /// Go on; the lease is renewed.
@@ -77,7 +76,6 @@ pub(super) enum Loss {
     Failed(String, bool),
 }
 
-/// How an attempt ended.
 #[derive(Debug, Clone, Copy, Display)]
 #[strum(serialize_all = "snake_case")]
 pub(super) enum Outcome {
@@ -184,6 +182,7 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
+        sums::recount(&mut transaction, job).await?;
         transaction.commit().await?;
         Ok(())
     }

@@ -15,5 +15,6 @@ mod progress;
 
 pub use claim::{CalibrationTask, ClaimedTask, JobTask, Work};
 pub use complete::{CalibrationDone, Completion, Product};
+pub(super) use forecast::Forecast;
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, WorkerEnd};
 pub use progress::{JobMark, JobProgress, ProgressStage};

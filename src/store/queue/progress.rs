@@ -18,7 +18,6 @@ use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::tables::jobs::Job;
 
-/// What a job is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ProgressStage {
@@ -38,7 +37,6 @@ pub enum ProgressStage {
     Ended,
 }
 
-/// How far a job is.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JobProgress {
     pub stage: ProgressStage,
@@ -73,38 +71,32 @@ pub struct JobMark {
 }
 
 impl Store {
-    /// How far a job is.
     pub async fn progress(&self, job: &Job) -> Result<JobProgress> {
         let mut all = self.progress_of(std::slice::from_ref(job)).await?;
         all.pop().ok_or(StoreError::missing("job", job.id))
     }
 
-    /// How far each of these jobs is, in their order: a whole page costs as many statements as one.
+    /// How far each of these jobs is, in their order. Reads what their tasks add up to, and the tasks that
+    /// run: how many tasks there are, and how many jobs wait, makes no difference.
     pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>> {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
         let rows = sql!(
-            "SELECT job, sum(cost) AS cost,
-                 sum(CASE state WHEN ?2 THEN cost WHEN ?3 THEN cost * fraction ELSE 0.0 END)
-                     AS cost_done,
-                 sum(left) FILTER (WHERE kind = 'tile') AS tiles_left,
-                 max(left) FILTER (WHERE kind = 'tile') AS tiles_longest,
-                 sum(left) FILTER (WHERE kind <> 'tile') AS others_left,
-                 max(left) FILTER (WHERE kind <> 'tile') AS others_longest,
-                 count(*) FILTER (WHERE kind = 'tile') AS tiles_total,
-                 count(*) FILTER (WHERE kind = 'tile' AND state = ?2) AS tiles_done,
-                 count(*) FILTER (WHERE kind = 'tile' AND state = ?3) AS tiles_running,
-                 count(*) FILTER (WHERE kind = 'assemble' AND state = ?2) AS snapshots_done,
-                 count(*) FILTER (WHERE kind = 'preview' AND result IS NOT NULL) AS previews_done,
-                 count(*) FILTER (WHERE kind = 'prepare' AND state = ?2) AS prepared,
-                 count(*) FILTER (WHERE state = ?3 AND stage = ?4) AS deep,
-                 count(*) FILTER (WHERE state = ?3 AND stage = ?5) AS nonlocal,
-                 sum(iterations) AS iterations, sum(passes) AS passes
-             FROM (SELECT *, CASE state WHEN ?2 THEN 0.0 ELSE cost * (1 - fraction) END AS left
-                   FROM tasks WHERE job IN (SELECT value FROM json_each(?1)))
-             GROUP BY job",
+            "WITH running AS (
+                 SELECT job, sum(cost * fraction) AS spent,
+                     sum(iif(kind = 'tile', cost * fraction, 0.0)) AS tiles_spent,
+                     sum(kind = 'tile') AS tiles_running,
+                     sum(stage = ?3) AS deep, sum(stage = ?4) AS nonlocal,
+                     sum(iterations) AS iterations, sum(passes) AS passes
+                 FROM tasks WHERE state = ?2 AND job IS NOT NULL GROUP BY job)
+             SELECT sums.*, coalesce(spent, 0.0) AS spent, coalesce(tiles_spent, 0.0) AS tiles_spent,
+                 coalesce(tiles_running, 0) AS tiles_running,
+                 coalesce(deep, 0) AS deep, coalesce(nonlocal, 0) AS nonlocal,
+                 sums.iterations + coalesce(running.iterations, 0) AS all_iterations,
+                 sums.passes + coalesce(running.passes, 0) AS all_passes
+             FROM json_each(?1) JOIN job_sums AS sums ON sums.job = value
+             LEFT JOIN running ON running.job = sums.job",
             [
                 Value::from(ids).to_string(),
-                TaskState::Done,
                 TaskState::Running,
                 TaskStage::Deep,
                 TaskStage::Nonlocal
@@ -114,13 +106,17 @@ impl Store {
         .await?;
         let by_job: Result<HashMap<JobId, &SqliteRow>> =
             rows.iter().map(|row| Ok((row.try_get("job")?, row))).collect();
-        let (by_job, waits) = (by_job?, |job: &Job| has_eta(job.state));
-        let forecast = if jobs.iter().any(waits) { self.forecast().await? } else { None };
+        let by_job = by_job?;
+        let forecast = if jobs.iter().any(|job| has_eta(job.state)) {
+            Some(self.forecast().await?)
+        } else {
+            None
+        };
         let gone = |id: JobId| StoreError::missing("job", id);
         jobs.iter()
             .map(|job| {
                 let row = by_job.get(&job.id).ok_or_else(|| gone(job.id))?;
-                progress(job, row, forecast.as_ref())
+                progress(job, row, forecast.as_deref())
             })
             .collect()
     }
@@ -162,28 +158,37 @@ fn has_eta(state: JobState) -> bool {
 }
 
 fn progress(job: &Job, row: &SqliteRow, forecast: Option<&Forecast>) -> Result<JobProgress> {
-    let (cost, done): (f64, f64) = (row.try_get("cost")?, row.try_get("cost_done")?);
-    let left = |sum, longest| -> Result<Left> {
-        Ok(Left { sum: row.try_get(sum)?, longest: row.try_get(longest)? })
+    let figure = |column| row.try_get::<f64, _>(column);
+    let (cost, spent, tiles_spent) = (figure("cost")?, figure("spent")?, figure("tiles_spent")?);
+    let (tiles, others) = (figure("tiles_left")?, figure("others_left")?);
+    let done = cost - tiles - others + spent;
+    let left = |sum: f64, longest: f64| {
+        let sum = sum.max(0.0);
+        Left { sum, longest: longest.min(sum) }
     };
-    let (tiles, others) =
-        (left("tiles_left", "tiles_longest")?, left("others_left", "others_longest")?);
+    let left = (
+        left(tiles - tiles_spent, figure("tiles_longest")?),
+        left(others - (spent - tiles_spent), figure("others_longest")?),
+    );
+    let (tile_seconds, tile_cost) = (figure("tile_seconds")?, figure("tile_cost")?);
+    let own_rate = (tile_seconds > 0.0 && tile_cost > 0.0).then(|| tile_seconds / tile_cost);
     let forecast = forecast.filter(|_| has_eta(job.state));
-    let eta = forecast.and_then(|forecast| forecast.eta_seconds(job.id, tiles, others));
+    let eta = forecast.and_then(|forecast| forecast.eta_seconds(job.id, left, own_rate));
+    let waits = forecast.filter(|_| job.state == JobState::Queued);
     let share = if cost > 0.0 { done / cost } else { 0.0 };
     Ok(JobProgress {
         stage: stage(job.state, row)?,
         // Two digits: an ETag should not change with what nobody sees.
         percent: if job.state == JobState::Succeeded { 100.0 } else { round(share * 100.0, 2) },
         eta_seconds: eta.map(|seconds| round(seconds, 1)),
-        queue_position: forecast.and_then(|forecast| forecast.position(job.id)),
+        queue_position: waits.map(|forecast| forecast.position(job.id)),
         tiles_done: row.try_get("tiles_done")?,
         tiles_total: row.try_get("tiles_total")?,
         tiles_running: row.try_get("tiles_running")?,
         snapshots_done: row.try_get("snapshots_done")?,
         previews_done: row.try_get("previews_done")?,
-        iterations_done: row.try_get("iterations")?,
-        passes_done: row.try_get("passes")?,
+        iterations_done: row.try_get("all_iterations")?,
+        passes_done: row.try_get("all_passes")?,
     })
 }
 

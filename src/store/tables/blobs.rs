@@ -10,7 +10,6 @@ use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 use crate::store::staging::StagedBlob;
 use crate::store::{Store, dir, on_files};
 
-/// A stored file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
 pub struct Blob {
     /// The hash of its bytes, which is its address.
@@ -59,7 +58,6 @@ impl Store {
         Ok((blob, before.is_none()))
     }
 
-    /// The file with this hash, if the lab has uploaded it.
     pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob> {
         let mut connection = self.readers.acquire().await?;
         held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))

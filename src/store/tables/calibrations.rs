@@ -37,7 +37,6 @@ pub struct NewCalibration {
     pub clipped_negatives: u64,
 }
 
-/// A calibration on record.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Calibration {
     pub id: CalibrationId,
@@ -118,7 +117,7 @@ impl Store {
                  (SELECT reason FROM attempts
                   WHERE task = tasks.id AND attempt = tasks.attempt) AS reason
              FROM calibration_requests JOIN tasks USING (calibration)
-             WHERE lab = ?1 AND captures IS NOT NULL AND state <> ?2
+             WHERE calibration_requests.lab = ?1 AND captures IS NOT NULL AND state <> ?2
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR calibration < ?4)
              ORDER BY calibration DESC LIMIT ?5",
             [lab, TaskState::Done, only, after, i64::from(limit) + 1]

@@ -10,7 +10,6 @@ use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 
-/// A job on record.
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct Job {
     pub id: JobId,
@@ -25,7 +24,6 @@ pub struct Job {
     pub finished_at: Option<Timestamp>,
 }
 
-/// Which jobs a list holds.
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
     pub state: Option<JobState>,
@@ -39,13 +37,11 @@ pub struct JobFilter {
 }
 
 impl Store {
-    /// The lab's job with this identifier.
     pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job> {
         let job = sql_as!("SELECT * FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
-    /// A page of the lab's jobs, newest first.
     pub async fn jobs(&self, lab: &Lab, filter: &JobFilter, limit: u32) -> Result<Page<Job>> {
         let items = sql_as!(
             "SELECT * FROM jobs
@@ -71,7 +67,6 @@ impl Store {
         Ok(Page::cut(items, limit))
     }
 
-    /// The number of jobs in each state.
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
         let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
         Ok(sqlx::query_as(counts).fetch_all(&self.readers).await?)
@@ -111,7 +106,6 @@ pub async fn insert(
     Ok(())
 }
 
-/// The job's state.
 pub async fn state(connection: &mut SqliteConnection, id: JobId) -> Result<JobState> {
     let state = sql_scalar!("SELECT state FROM jobs WHERE id = ?", [id]);
     state.fetch_optional(connection).await?.ok_or_else(|| StoreError::missing("job", id))

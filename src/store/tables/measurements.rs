@@ -8,7 +8,7 @@ use sqlx::{Row, SqliteConnection};
 use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{Page, integer, list, number, refuse_if_used, sql, sql_scalar};
+use crate::store::rows::{Filter, Page, integer, list, number, refuse_if_used, sql, sql_scalar};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -33,7 +33,6 @@ pub struct NewMeasurement {
     pub warnings: Vec<Finding>,
 }
 
-/// A measurement on record.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Measurement {
     pub id: MeasurementId,
@@ -45,16 +44,7 @@ pub struct Measurement {
     pub facts: NewMeasurement,
 }
 
-/// Which measurements a list holds.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct MeasurementFilter {
-    pub calibration: Option<CalibrationId>,
-    /// Only those older than this one.
-    pub after: Option<MeasurementId>,
-}
-
 impl Store {
-    /// The lab's measurement with this identifier.
     pub async fn measurement(&self, lab: &Lab, id: MeasurementId) -> Result<Measurement> {
         self.find_measurement(Some(lab), id).await
     }
@@ -74,11 +64,10 @@ impl Store {
         measurement(&row.ok_or_else(|| StoreError::missing("measurement", id))?)
     }
 
-    /// A page of the lab's measurements, newest first.
     pub async fn measurements(
         &self,
         lab: &Lab,
-        filter: MeasurementFilter,
+        filter: Filter<MeasurementId>,
         limit: u32,
     ) -> Result<Page<Measurement>> {
         let rows = sql!(
@@ -108,7 +97,6 @@ impl Store {
     }
 }
 
-/// Writes the row of a measurement.
 pub async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,

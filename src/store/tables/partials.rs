@@ -13,7 +13,6 @@ use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 use crate::store::{Store, dir, on_files};
 
-/// An upload to be begun.
 #[derive(Debug, Clone, FromRow)]
 pub struct NewPartial {
     pub lab: Lab,
@@ -27,7 +26,6 @@ pub struct NewPartial {
     pub expected: Option<Sha256>,
 }
 
-/// An upload that was begun.
 #[derive(Debug, Clone, FromRow)]
 pub struct Partial {
     pub id: PartialId,

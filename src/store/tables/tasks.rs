@@ -22,7 +22,6 @@ pub enum Owner {
     Calibration(CalibrationId),
 }
 
-/// The stored result of a tile.
 #[derive(Debug, Clone, FromRow)]
 pub struct TileResult {
     pub tile: u32,
@@ -44,7 +43,6 @@ pub struct TaskRecord {
     pub attempt: u32,
 }
 
-/// A tile as it is worked on.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct TileState {
     pub tile: u32,
@@ -196,7 +194,6 @@ impl Store {
     }
 }
 
-/// The kind of the task in this row.
 pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
     let name: String = row.try_get("kind")?;
     TaskKind::from_parts(&name, row.try_get("snapshot")?, row.try_get("tile")?)

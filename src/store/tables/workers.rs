@@ -11,7 +11,6 @@ use crate::store::Store;
 use crate::store::error::Result;
 use crate::store::rows::{sql, sql_scalar};
 
-/// A worker process on record.
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerRow {
     pub id: WorkerId,
@@ -22,7 +21,6 @@ pub struct WorkerRow {
     pub task: Option<WorkerTask>,
 }
 
-/// A task in a worker's hands.
 #[derive(Debug, Clone, Serialize, FromRow)]
 pub struct WorkerTask {
     /// The job; none for a calibration's.
@@ -36,7 +34,6 @@ pub struct WorkerTask {
 }
 
 impl Store {
-    /// Records that a worker has started.
     pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<()> {
         let now = Timestamp::now();
         sql!(
@@ -81,13 +78,11 @@ impl Store {
     }
 }
 
-/// Forgets a worker that has ended.
 pub async fn remove(connection: &mut SqliteConnection, id: WorkerId) -> Result<()> {
     sql!("DELETE FROM workers WHERE id = ?", [id]).execute(connection).await?;
     Ok(())
 }
 
-/// Notes a sign of life.
 pub async fn seen(connection: &mut SqliteConnection, id: WorkerId) -> Result<()> {
     sql!("UPDATE workers SET seen_at = ? WHERE id = ?", [Timestamp::now(), id])
         .execute(connection)

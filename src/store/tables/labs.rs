@@ -1,0 +1,51 @@
+//! Table `labs`: the share of the machine that each has.
+
+use sqlx::{FromRow, SqliteConnection};
+
+use crate::job::Lab;
+use crate::store::Store;
+use crate::store::error::Result;
+use crate::store::rows::sql;
+
+#[derive(Debug, Clone, PartialEq, FromRow)]
+pub struct LabRow {
+    pub lab: Lab,
+    /// Its share of the machine, beside the shares of the others that want it.
+    pub share: f64,
+    /// Jobs that wait and run.
+    pub jobs: u64,
+    /// Planned CPU-seconds that are left of them.
+    pub cost_left: f64,
+}
+
+impl Store {
+    pub async fn labs(&self) -> Result<Vec<LabRow>> {
+        let rows = sqlx::query_as(
+            "SELECT labs.lab, share, count(jobs.id) AS jobs,
+                 coalesce(sum(tiles_left + others_left), 0.0) AS cost_left
+             FROM labs
+             LEFT JOIN jobs ON jobs.lab = labs.lab AND finished_at IS NULL
+             LEFT JOIN job_sums ON job = jobs.id
+             GROUP BY labs.lab ORDER BY labs.lab",
+        );
+        Ok(rows.fetch_all(&self.readers).await?)
+    }
+
+    /// Sets a lab's share of the machine, which is above 0. A lab that is not on record yet is put there.
+    pub async fn set_share(&self, lab: &Lab, share: f64) -> Result<()> {
+        sql!(
+            "INSERT INTO labs (lab, share) VALUES (?, ?)
+             ON CONFLICT (lab) DO UPDATE SET share = excluded.share",
+            [lab, share]
+        )
+        .execute(&self.writer)
+        .await?;
+        Ok(())
+    }
+}
+
+/// Puts a lab on record, if it is not there.
+pub async fn know(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
+    sql!("INSERT OR IGNORE INTO labs (lab) VALUES (?)", [lab]).execute(connection).await?;
+    Ok(())
+}
