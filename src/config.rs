@@ -31,6 +31,11 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_ALLOW_REMOTE")]
     pub allow_remote: bool,
 
+    /// Names, separated by commas, under which it is reached while there are no tokens, beside its addresses,
+    /// `localhost` and the name of the machine: a browser at a page with another name is refused.
+    #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
+    pub hosts: Vec<String>,
+
     /// Worker processes to run; 0 runs none, for workers that are started by hand [default: one
     /// for each core].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
@@ -156,7 +161,6 @@ pub enum LogFormat {
     Json,
 }
 
-/// A setting that can't be.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The service would be open to everyone.
@@ -177,14 +181,12 @@ impl ServeArguments {
         Ok(())
     }
 
-    /// Worker processes to run.
     #[must_use]
     pub fn worker_count(&self) -> usize {
         let cores = || std::thread::available_parallelism().map_or(1, usize::from);
         self.workers.unwrap_or_else(cores)
     }
 
-    /// The longest pause in an upload.
     #[must_use]
     pub fn upload_idle(&self) -> Duration {
         Duration::from_secs(self.upload_idle_seconds)
@@ -196,7 +198,6 @@ impl ServeArguments {
         Duration::from_secs(self.upload_hours.saturating_mul(3600))
     }
 
-    /// The longest time for an answer.
     #[must_use]
     pub fn request_time(&self) -> Duration {
         Duration::from_secs(self.request_seconds)

@@ -7,6 +7,7 @@ use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
+use crate::cli::error::Result;
 use crate::job::{Algorithm, InvalidField};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
@@ -42,7 +43,7 @@ pub struct NetworkArguments {
 
 impl ScheduleArguments {
     /// The schedule, checked; without stages for an algorithm that has none.
-    pub(super) fn resolve(&self) -> Result<Schedule, CliError> {
+    pub(super) fn resolve(&self) -> Result<Schedule> {
         if self.algorithm == Algorithm::Learned {
             if self.schedule.is_some() || self.iterations.is_some() {
                 let text = "learned runs one network once: it takes no --schedule or --iterations";
@@ -79,7 +80,7 @@ impl ScheduleArguments {
 
 impl NetworkArguments {
     /// The source of denoisers.
-    pub fn network(&self) -> Result<NetworkSource, CliError> {
+    pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable is one that is not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
         Ok(NetworkSource::new(library, Device::parse(&self.device)?))

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::CliError;
+use crate::cli::error::Result;
 use crate::store::{Purpose, Store};
 
 /// Copies a data folder while the service runs, and checks the hash of every file. To restore it,
@@ -20,7 +21,7 @@ pub struct Arguments {
 }
 
 /// Makes the copy and prints its figures as one JSON line.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     if arguments.out.exists() {
         let text = format!("{} is there already; name a new folder", arguments.out.display());
         return Err(CliError::Input(text));

@@ -8,6 +8,7 @@ use clap::Args;
 use serde::Deserialize;
 
 use super::{CliError, progress};
+use crate::cli::error::Result;
 use crate::formats::{FormatError, Limits, StackInfo, npy};
 use crate::intake::{CaptureFiles, Report, calibrate, report_page};
 
@@ -39,8 +40,7 @@ struct Index {
     saturation: Option<u32>,
 }
 
-/// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let files = read_index(&arguments.captures)?;
     let out = &arguments.out;
     fs::create_dir_all(out.join("maps")).map_err(|error| CliError::file("make", out, &error))?;
@@ -67,7 +67,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     write_report(arguments, &made.report)
 }
 
-fn write_report(arguments: &Arguments, made: &Report) -> Result<(), CliError> {
+fn write_report(arguments: &Arguments, made: &Report) -> Result<()> {
     let out = &arguments.out;
     let failed = |error| CliError::file("write", out, &error);
     let text = serde_json::to_string_pretty(&made.report)
@@ -89,7 +89,7 @@ fn write_report(arguments: &Arguments, made: &Report) -> Result<(), CliError> {
     fs::write(out.join("report.json"), text + "\n").map_err(failed)
 }
 
-fn read_index(path: &Path) -> Result<CaptureFiles, CliError> {
+fn read_index(path: &Path) -> Result<CaptureFiles> {
     let refused = |error: &dyn std::fmt::Display| {
         CliError::Input(format!("captures {}: {error}", path.display()))
     };

@@ -11,6 +11,7 @@ use rustix::process::{Resource, Rlimit};
 
 use super::CliError;
 use super::arguments::NetworkArguments;
+use crate::cli::error::Result;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
 use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
@@ -45,7 +46,7 @@ pub struct Arguments {
 }
 
 /// Runs the command. A network that can't be used is no failure of the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
     if let Some(bytes) = arguments.memory_bytes {

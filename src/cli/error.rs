@@ -11,6 +11,8 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::networks::NetworkError;
 use crate::recon::ReconError;
 
+pub type Result<T, E = CliError> = std::result::Result<T, E>;
+
 /// Why a command failed, as a sentence for the user.
 #[derive(Debug, thiserror::Error)]
 pub enum CliError {
@@ -23,7 +25,6 @@ pub enum CliError {
 }
 
 impl CliError {
-    /// The process's exit code.
     pub fn exit_code(&self) -> ExitCode {
         match self {
             Self::Input(_) => ExitCode::from(2),
@@ -31,7 +32,6 @@ impl CliError {
         }
     }
 
-    /// A file or folder that can't be read or written.
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
     }

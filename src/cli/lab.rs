@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use crate::cli::error::Result;
 use crate::job::Lab;
 use crate::store::{LabRow, Purpose, Store};
 
@@ -44,8 +45,7 @@ fn share(text: &str) -> Result<f64, String> {
     Err("a share is a number from 0.001 to 1000".into())
 }
 
-/// Does what the arguments say.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
     runtime.block_on(async {

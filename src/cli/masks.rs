@@ -7,6 +7,7 @@ use ndarray::{Array2, Array3, Axis};
 use serde::Serialize;
 
 use crate::cli::CliError;
+use crate::cli::error::Result;
 use crate::cli::optics::OpticsFile;
 use crate::intake::read_clip;
 use crate::optics::{
@@ -59,7 +60,6 @@ enum Normalise {
     Throughput,
 }
 
-/// The aperture's patterns.
 #[derive(Debug, Serialize)]
 pub struct Apertures {
     rows: usize,
@@ -83,7 +83,6 @@ pub struct SimulatedMasks {
 }
 
 impl MaskArguments {
-    /// The name of the kind.
     pub fn pattern(&self) -> &'static str {
         match self.pattern {
             Pattern::Iid => "iid",
@@ -94,8 +93,7 @@ impl MaskArguments {
         }
     }
 
-    /// The optical parameters.
-    pub fn optics(&self) -> Result<OpticsFile, CliError> {
+    pub fn optics(&self) -> Result<OpticsFile> {
         OpticsFile::read(self.optics.as_deref())
     }
 
@@ -105,7 +103,7 @@ impl MaskArguments {
         optics: &OpticsFile,
         (frames, height, width): (usize, usize, usize),
         seed: u64,
-    ) -> Result<SimulatedMasks, CliError> {
+    ) -> Result<SimulatedMasks> {
         if self.pattern == Pattern::Iid {
             let masks = iid_masks(frames, height, width, seed)?;
             let throughput = f64::from(masks.mean().unwrap_or(0.0));
@@ -135,7 +133,7 @@ impl MaskArguments {
         matches!(self.pattern, Pattern::RandomSquares | Pattern::SingleApertures)
     }
 
-    fn aperture(&self, optics: &OpticsFile) -> Result<HybridAperture, CliError> {
+    fn aperture(&self, optics: &OpticsFile) -> Result<HybridAperture> {
         let (placement, method) = if self.on_grid() {
             (optics.projection.placement, optics.projection.method)
         } else {
@@ -153,14 +151,14 @@ impl MaskArguments {
         })
     }
 
-    fn images(&self, frames: usize) -> Result<Array3<f32>, CliError> {
+    fn images(&self, frames: usize) -> Result<Array3<f32>> {
         let missing = || CliError::Input("--pattern images needs --images".into());
         let patterns = read_clip(self.images.as_deref().ok_or_else(missing)?, None)?;
         check_patterns(patterns.view(), frames)?;
         Ok(patterns)
     }
 
-    fn lithography(&self) -> Result<Option<Array2<f32>>, CliError> {
+    fn lithography(&self) -> Result<Option<Array2<f32>>> {
         let Some(path) = &self.lithography else { return Ok(None) };
         let stack = read_clip(path, None)?;
         match stack.dim().0 {

@@ -2,10 +2,10 @@
 
 mod arguments;
 mod error;
-mod learned;
 mod logging;
 mod maintenance;
 mod masks;
+mod model;
 mod progress;
 mod supervisor;
 
@@ -24,6 +24,6 @@ pub mod worker;
 
 pub use arguments::{NetworkArguments, algorithms};
 pub use error::CliError;
-pub use learned::{Learned, plan};
 pub use masks::{MaskArguments, SimulatedMasks};
+pub use model::{Model, plan};
 pub use optics::OpticsFile;

@@ -7,6 +7,7 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 
 use super::CliError;
+use crate::cli::error::Result;
 use crate::optics::{ApertureGrid, Camera, Circle, Draw, Geometry, Method, Placement};
 
 /// The file of the defaults, with a comment for each number.
@@ -132,7 +133,7 @@ struct Light {
 
 impl OpticsFile {
     /// Reads and checks a file; without one these are the defaults.
-    pub(super) fn read(path: Option<&Path>) -> Result<Self, CliError> {
+    pub(super) fn read(path: Option<&Path>) -> Result<Self> {
         let Some(path) = path else { return Ok(Self::default()) };
         let text = fs::read_to_string(path).map_err(|error| refused(path, &error))?;
         let file: Self = toml::from_str(&text).map_err(|error| refused(path, &error))?;
@@ -163,7 +164,7 @@ impl OpticsFile {
     }
 
     /// The grid of sub-apertures for snapshots of `frames` frames.
-    pub(super) fn grid(&self, frames: usize) -> Result<ApertureGrid, CliError> {
+    pub(super) fn grid(&self, frames: usize) -> Result<ApertureGrid> {
         let rule = ApertureGrid::for_frames(frames);
         match (self.sub_apertures.rows, self.sub_apertures.columns) {
             (None, None) => Ok(rule),
@@ -175,7 +176,7 @@ impl OpticsFile {
     }
 
     /// How random squares are drawn on a grid.
-    pub(super) fn draw(&self, grid: ApertureGrid) -> Result<Draw, CliError> {
+    pub(super) fn draw(&self, grid: ApertureGrid) -> Result<Draw> {
         let SubApertures { open_share, rank, tries, .. } = self.sub_apertures;
         if !(open_share > 0.0 && open_share <= 1.0) {
             return Err(CliError::Input(format!(
@@ -204,8 +205,7 @@ struct Derived {
     blur_mask_pixels: f64,
 }
 
-/// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let Some(path) = &arguments.check else {
         print!("{DEFAULTS}");
         return Ok(());

@@ -11,8 +11,9 @@ use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{NetworkArguments, ScheduleArguments};
-use super::learned::{Learned, plan};
+use super::model::{Model, plan};
 use super::progress::SnapshotBar;
+use crate::cli::error::Result;
 use crate::formats::mat::SceneArray;
 use crate::intake::{Scaled, Source, read_masks, read_snapshot, read_truth};
 use crate::job::{Algorithm, SceneShape, Schedule, Sha256};
@@ -97,12 +98,11 @@ struct Setup {
     snapshot: usize,
     plan: TilePlan,
     network: NetworkSource,
-    model: Option<Learned>,
+    model: Option<Model>,
     threads: usize,
 }
 
-/// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
     let input = Input::read(arguments)?;
@@ -110,7 +110,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         check_output(out)?;
     }
     let algorithm = arguments.schedule.algorithm;
-    let model = learned(arguments, &network)?;
+    let model = model(arguments, &network)?;
     let cut = (arguments.tile, arguments.overlap);
     let plan = plan(algorithm, cut, model.as_ref(), input.masks.array.dim())?;
     let cores = thread::available_parallelism().map_or(1, usize::from);
@@ -145,10 +145,10 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
 }
 
 /// The network of `--model`.
-fn learned(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Learned>, CliError> {
+fn model(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Model>> {
     let Some(path) = &arguments.model else { return Ok(None) };
     match arguments.schedule.algorithm {
-        Algorithm::Learned => Learned::open(path, network).map(Some),
+        Algorithm::Learned => Model::open(path, network).map(Some),
         other => Err(CliError::Input(format!(
             "{} takes no --model; ask for --algorithm learned",
             other.into_str()
@@ -163,7 +163,7 @@ struct Sources<'a> {
 }
 
 impl<'a> Sources<'a> {
-    fn new(arguments: &'a Arguments) -> Result<Self, CliError> {
+    fn new(arguments: &'a Arguments) -> Result<Self> {
         let scene = arguments.scene.as_deref();
         let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
         let missing = || CliError::Input("name --masks and --measurement, or a --scene".into());
@@ -184,12 +184,11 @@ impl<'a> Sources<'a> {
     }
 }
 
-fn sha256(path: &Path) -> Result<Sha256, CliError> {
+fn sha256(path: &Path) -> Result<Sha256> {
     let hashed = File::open(path).and_then(|mut file| Sha256::of_reader(&mut file));
     Ok(hashed.map_err(|error| CliError::file("read", path, &error))?.0)
 }
 
-/// The files' content.
 struct Input<'a> {
     sources: Sources<'a>,
     masks: Scaled<Array3<f32>>,
@@ -198,7 +197,7 @@ struct Input<'a> {
 }
 
 impl<'a> Input<'a> {
-    fn read(arguments: &'a Arguments) -> Result<Self, CliError> {
+    fn read(arguments: &'a Arguments) -> Result<Self> {
         let sources = Sources::new(arguments)?;
         let masks = read_masks(&sources.masks)?;
         let (measurement, snapshots) = read_snapshot(&sources.measurement, arguments.snapshot)?;
@@ -220,7 +219,7 @@ impl<'a> Input<'a> {
     }
 
     /// White level and tiles.
-    fn solve(&self, setup: &Setup) -> Result<(f32, Solved), CliError> {
+    fn solve(&self, setup: &Setup) -> Result<(f32, Solved)> {
         let (masks, measurement) = (self.masks.array.view(), self.measurement.array.view());
         let white = white(masks, measurement)?;
         let solver = match &setup.model {
@@ -234,12 +233,11 @@ impl<'a> Input<'a> {
         Ok((white, solve(&input, &setup.network, setup.threads, &tell)?))
     }
 
-    /// What the manifest tells.
-    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe, CliError> {
+    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
         let (frames, height, width) = self.masks.array.dim();
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule)?;
-        models.extend(setup.model.as_ref().map(Learned::record));
+        models.extend(setup.model.as_ref().map(Model::record));
         Ok(Recipe {
             program_version: VERSION,
             algorithm: setup.algorithm,
@@ -263,7 +261,7 @@ impl<'a> Input<'a> {
     }
 }
 
-fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Result<(), CliError> {
+fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(failed)?;
     // A failure on the way leaves an earlier result as it was.
@@ -315,8 +313,7 @@ impl Report {
         }
     }
 
-    /// Prints it as the user asked for.
-    fn print(&self, arguments: &Arguments) -> Result<(), CliError> {
+    fn print(&self, arguments: &Arguments) -> Result<()> {
         if arguments.json {
             let text = serde_json::to_string(self)
                 .map_err(|error| CliError::Failure(format!("the report: {error}")))?;

@@ -3,8 +3,8 @@
 use clap::Args;
 use serde_json::json;
 
-use super::CliError;
 use super::arguments::ScheduleArguments;
+use crate::cli::error::Result;
 
 /// Print the schedule of an algorithm as JSON: the start of a file for `reconstruct --schedule`, or
 /// of the field `schedule` of a job. With --schedule it checks a file of your own.
@@ -14,8 +14,7 @@ pub struct Arguments {
     schedule: ScheduleArguments,
 }
 
-/// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     println!("{:#}", json!(schedule));
     Ok(())

@@ -14,7 +14,7 @@ use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
-use crate::http::{App, Metrics, router};
+use crate::http::{App, Metrics, listen, router};
 use crate::store::{Purpose, Store, StoreError};
 
 /// How long open requests may take to end at a shutdown.
@@ -22,7 +22,6 @@ const DRAIN: Duration = Duration::from_secs(20);
 /// The file in the data folder that says where the service listens.
 const ADDRESS_FILE: &str = "server.json";
 
-/// Why the service could not start or go on.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// A setting is wrong.
@@ -32,12 +31,7 @@ pub enum ServeError {
     #[error(transparent)]
     Store(#[from] StoreError),
     #[error("can't listen at {address}: {source}")]
-    Listen {
-        /// The address.
-        address: SocketAddr,
-        /// Why.
-        source: std::io::Error,
-    },
+    Listen { address: SocketAddr, source: std::io::Error },
     #[error("can't {action}: {source}")]
     Io { action: &'static str, source: std::io::Error },
     #[error("can't count figures: {0}")]
@@ -90,9 +84,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     });
     // 5. The API.
     let service = router(App::new(store.clone(), settings, metrics, closing));
-    let server = axum::serve(listener, service).with_graceful_shutdown(stopped(stop.clone()));
     tokio::select! {
-        served = server => served.map_err(io("serve"))?,
+        () = listen(listener, service, stopped(stop.clone())) => {}
         () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
     }
     // 6. The end: workers give their tasks back.

@@ -12,6 +12,7 @@ use serde::Serialize;
 use super::CliError;
 use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
+use crate::cli::error::Result;
 use crate::formats::npy;
 use crate::intake::read_clip;
 use crate::optics::{OpticsError, illumination, measure, noisy};
@@ -76,8 +77,7 @@ struct Record {
     apertures: Option<Apertures>,
 }
 
-/// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let frames = read_clip(&arguments.frames, arguments.full_scale)?;
     check_range(&arguments.frames, &frames)?;
     let ratio = usize::from(arguments.compression_ratio);
@@ -138,7 +138,7 @@ fn measure_all(
     truth: ArrayView3<'_, f32>,
     sigma: f32,
     seed: u64,
-) -> Result<Vec<Array2<f32>>, CliError> {
+) -> Result<Vec<Array2<f32>>> {
     let clips = truth.axis_chunks_iter(ndarray::Axis(0), masks.dim().0);
     let mut snapshots = Vec::with_capacity(clips.len());
     for (index, clip) in clips.enumerate() {
@@ -155,7 +155,7 @@ fn write(
     snapshots: &[Array2<f32>],
     truth: ArrayView3<'_, f32>,
     record: &Record,
-) -> Result<(), CliError> {
+) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     npy::write_f32(&out.join("masks.npy"), masks.view())?;
     npy::write_f32(&out.join("truth.npy"), truth)?;
@@ -175,7 +175,7 @@ fn write(
 }
 
 /// A scene that is not on \[0,1\] has a full scale that somebody must state.
-fn check_range(path: &Path, frames: &Array3<f32>) -> Result<(), CliError> {
+fn check_range(path: &Path, frames: &Array3<f32>) -> Result<()> {
     let outside = |value: f32| !(-1e-6..=1.0 + 1e-6).contains(&value);
     let Some(((k, i, j), value)) = frames.indexed_iter().find(|(_, v)| outside(**v)) else {
         return Ok(());

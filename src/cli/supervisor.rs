@@ -28,7 +28,6 @@ const SILENCE: Duration = Duration::from_secs(30);
 /// A worker that lived for so long did not die of its start.
 const HEALTHY: Duration = Duration::from_secs(20);
 
-/// The worker processes of a server.
 pub(super) struct Supervisor {
     slots: JoinSet<()>,
 }
@@ -61,7 +60,6 @@ impl Supervisor {
     }
 }
 
-/// The place of one worker.
 struct Slot {
     store: Store,
     program: PathBuf,

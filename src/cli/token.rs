@@ -7,6 +7,7 @@ use clap::{Args, Subcommand};
 use rand::TryRngCore;
 
 use super::CliError;
+use crate::cli::error::Result;
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use crate::store::{Purpose, Store, StoreError, Token};
 
@@ -53,8 +54,7 @@ struct Create {
     note: Option<Label>,
 }
 
-/// Does what the arguments say.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
     runtime.block_on(async {
@@ -70,7 +70,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     })
 }
 
-async fn open(arguments: &Arguments) -> Result<Store, CliError> {
+async fn open(arguments: &Arguments) -> Result<Store> {
     let create = match &arguments.action {
         Action::Create(create) => Some(create.new),
         _ => None,
@@ -86,7 +86,7 @@ async fn open(arguments: &Arguments) -> Result<Store, CliError> {
     }
 }
 
-async fn act(store: &Store, action: &Action) -> Result<String, CliError> {
+async fn act(store: &Store, action: &Action) -> Result<String> {
     match action {
         Action::Create(create) => make(store, create).await,
         Action::List => Ok(table(&store.tokens().await?)),
@@ -97,7 +97,7 @@ async fn act(store: &Store, action: &Action) -> Result<String, CliError> {
     }
 }
 
-async fn make(store: &Store, create: &Create) -> Result<String, CliError> {
+async fn make(store: &Store, create: &Create) -> Result<String> {
     let mut bytes = [0; 32];
     rand::rngs::OsRng
         .try_fill_bytes(&mut bytes)

@@ -7,6 +7,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use super::{CliError, logging};
+use crate::cli::error::Result;
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
 use crate::pipeline::NetworkSource;
@@ -15,7 +16,7 @@ use crate::store::{Purpose, Store};
 use crate::worker::{Local, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
-pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
+pub fn run(settings: &WorkerArguments) -> Result<()> {
     logging::start(settings.log_format);
     stand_back(settings.engine.nice)?;
     let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
@@ -49,7 +50,7 @@ pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
 }
 
 /// Lowers the priority of this process, and so of all its threads.
-fn stand_back(nice: i32) -> Result<(), CliError> {
+fn stand_back(nice: i32) -> Result<()> {
     rustix::process::setpriority_process(None, nice)
         .map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
 }

@@ -4,6 +4,9 @@ use std::io;
 
 use super::Format;
 
+/// What the functions of this folder give.
+pub type Result<T, E = FormatError> = std::result::Result<T, E>;
+
 /// Why a file could not be read, written or accepted.
 ///
 /// Only [`FormatError::Io`] and [`FormatError::Internal`] are ours; everything else says what is

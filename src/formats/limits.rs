@@ -1,6 +1,7 @@
 //! How large a file may be. Checked before anything is allocated.
 
 use super::{Format, FormatError, StackInfo};
+use crate::formats::error::Result;
 
 /// The largest files and stacks that are read.
 ///
@@ -28,7 +29,7 @@ impl Default for Limits {
 
 impl Limits {
     /// Checks the length of a file. Errors: [`FormatError::OverLimit`].
-    pub(super) fn check_file(&self, format: Format, bytes: u64) -> Result<(), FormatError> {
+    pub(super) fn check_file(&self, format: Format, bytes: u64) -> Result<()> {
         within(format, "the file's length in bytes", bytes, self.max_file_bytes)
     }
 
@@ -40,7 +41,7 @@ impl Limits {
         frames: u64,
         height: u64,
         width: u64,
-    ) -> Result<(), FormatError> {
+    ) -> Result<()> {
         if frames == 0 || height == 0 || width == 0 {
             return Err(FormatError::malformed(
                 format,
@@ -56,12 +57,12 @@ impl Limits {
         within(format, "frames x height x width", voxels, self.max_voxels)
     }
 
-    pub(super) fn check_info(&self, info: &StackInfo) -> Result<(), FormatError> {
+    pub(super) fn check_info(&self, info: &StackInfo) -> Result<()> {
         self.check_shape(info.format, info.frames as u64, info.height as u64, info.width as u64)
     }
 }
 
-fn within(format: Format, what: &'static str, value: u64, limit: u64) -> Result<(), FormatError> {
+fn within(format: Format, what: &'static str, value: u64, limit: u64) -> Result<()> {
     if value > limit {
         return Err(FormatError::OverLimit { format, what, value, limit });
     }

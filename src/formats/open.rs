@@ -8,6 +8,7 @@ use ndarray::Array3;
 
 use super::format::describe;
 use super::{Format, FormatError, FrameReader, Limits, StackInfo, npy, png, tiff};
+use crate::formats::error::Result;
 
 const ACCEPTED: &str = "npy, TIFF, PNG (8 or 16 bit grey) and .mat level 5";
 
@@ -16,10 +17,7 @@ const ACCEPTED: &str = "npy, TIFF, PNG (8 or 16 bit grey) and .mat level 5";
 /// npy: (frame, row, column) or (row, column) of uint8, uint16, float32, float64 or bool. TIFF and
 /// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 8
 /// or 16 bit. Errors say what is wrong with the file; see [`FormatError`].
-pub fn open_stack(
-    path: &Path,
-    limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>, FormatError> {
+pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
     match format {
@@ -41,14 +39,12 @@ pub fn open_stack(
 /// Reads a whole stack into memory, axes (frame, row, column), values as stored.
 ///
 /// For files that are known to be small; large ones are read with [`open_stack`].
-pub fn read_stack(path: &Path, limits: &Limits) -> Result<(StackInfo, Array3<f32>), FormatError> {
+pub fn read_stack(path: &Path, limits: &Limits) -> Result<(StackInfo, Array3<f32>)> {
     collect(&mut *open_stack(path, limits)?)
 }
 
 /// Reads the remaining frames of a reader into one array.
-pub fn collect(
-    reader: &mut (dyn FrameReader + Send),
-) -> Result<(StackInfo, Array3<f32>), FormatError> {
+pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Array3<f32>)> {
     let info = *reader.info();
     // Grown frame by frame: a compressed file may promise far more than it then delivers.
     let mut values = Vec::new();
@@ -63,7 +59,7 @@ pub fn collect(
 }
 
 /// Opens a file and tells its length and format.
-pub(super) fn open(path: &Path) -> Result<(File, u64, Format), FormatError> {
+pub(super) fn open(path: &Path) -> Result<(File, u64, Format)> {
     let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
     let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
     let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };

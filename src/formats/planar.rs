@@ -16,6 +16,7 @@ use ndarray::Array3;
 use super::format::PLANAR_MAGIC;
 use super::samples::StackWriter;
 use super::{Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
+use crate::formats::error::Result;
 
 const VERSION: u32 = 1;
 const HEADER_BYTES: u64 = 32;
@@ -28,7 +29,7 @@ pub fn writer<W: Write>(
     frames: usize,
     height: usize,
     width: usize,
-) -> Result<StackWriter<W>, FormatError> {
+) -> Result<StackWriter<W>> {
     let mut header = PLANAR_MAGIC.to_vec();
     header.extend(VERSION.to_le_bytes());
     for axis in [frames, height, width] {
@@ -49,7 +50,7 @@ pub struct Reader {
 
 impl Reader {
     /// Opens `path` and checks its header against the limits and the file's length.
-    pub fn open(path: &Path, limits: &Limits) -> Result<Self, FormatError> {
+    pub fn open(path: &Path, limits: &Limits) -> Result<Self> {
         let file = File::open(path).map_err(FormatError::io("open the prepared array"))?;
         let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
         limits.check_file(Format::Planar, length)?;
@@ -99,7 +100,7 @@ impl Reader {
         frames: Range<usize>,
         rows: Range<usize>,
         columns: Range<usize>,
-    ) -> Result<Array3<f32>, FormatError> {
+    ) -> Result<Array3<f32>> {
         self.windows.read_window(frames, rows, columns)
     }
 }
@@ -111,11 +112,11 @@ pub fn read_window(
     rows: Range<usize>,
     columns: Range<usize>,
     limits: &Limits,
-) -> Result<Array3<f32>, FormatError> {
+) -> Result<Array3<f32>> {
     Reader::open(path, limits)?.read_window(frames, rows, columns)
 }
 
-fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo, FormatError> {
+fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo> {
     if !header.starts_with(PLANAR_MAGIC) {
         return Err(FormatError::malformed(Format::Planar, "the signature is wrong"));
     }

@@ -12,6 +12,7 @@ use ndarray::{Array2, ArrayView2};
 
 use super::samples::{self, ByteOrder};
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use crate::formats::error::Result;
 
 /// Deflate expands a byte to at most 1032.
 const MAX_EXPANSION: u64 = 1032;
@@ -28,7 +29,7 @@ pub(super) struct PngReader {
 impl PngReader {
     /// Reads the header of `file` (`length` bytes long) and checks it against the limits and the
     /// length. Gamma and colour profiles are not applied: the stored numbers count.
-    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self, FormatError> {
+    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self> {
         let decoder_limits = DecoderLimits { bytes: DECODER_BYTES };
         let mut decoder = Decoder::new_with_limits(BufReader::new(file), decoder_limits);
         decoder.set_transformations(Transformations::IDENTITY);
@@ -64,7 +65,7 @@ impl FrameReader for PngReader {
         &self.info
     }
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         let Some(mut decoder) = self.decoder.take() else {
             return Ok(None);
         };
@@ -79,26 +80,16 @@ impl FrameReader for PngReader {
 /// 65535, linear between, clipped outside; NaN becomes 0. `frame` has the axes (row, column).
 ///
 /// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
-pub fn write_u16(
-    path: &Path,
-    frame: ArrayView2<'_, f32>,
-    black: f32,
-    white: f32,
-) -> Result<(), FormatError> {
+pub fn write_u16(path: &Path, frame: ArrayView2<'_, f32>, black: f32, white: f32) -> Result<()> {
     let file = File::create(path).map_err(FormatError::io("create the PNG"))?;
     encode_u16(BufWriter::new(file), frame, black, white)
 }
 
 /// An 8-bit grey PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
 /// outside; NaN becomes 0. `frame` has the axes (row, column).
-///
-/// # Errors
-/// [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without pixels.
-pub fn encode_u8(
-    frame: ArrayView2<'_, f32>,
-    black: f32,
-    white: f32,
-) -> Result<Vec<u8>, FormatError> {
+/// Errors: [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without
+/// pixels.
+pub fn encode_u8(frame: ArrayView2<'_, f32>, black: f32, white: f32) -> Result<Vec<u8>> {
     let factor = 255.0 / (white - black);
     let bytes: Vec<u8> = frame.iter().map(|v| ((v - black) * factor).round() as u8).collect();
     let mut png = Vec::new();
@@ -111,7 +102,7 @@ fn encode_u16(
     frame: ArrayView2<'_, f32>,
     black: f32,
     white: f32,
-) -> Result<(), FormatError> {
+) -> Result<()> {
     let factor = 65535.0 / (white - black);
     let bytes: Vec<u8> =
         frame.iter().flat_map(|v| (((v - black) * factor).round() as u16).to_be_bytes()).collect();
@@ -124,7 +115,7 @@ fn encode(
     depth: BitDepth,
     (black, white): (f32, f32),
     bytes: &[u8],
-) -> Result<(), FormatError> {
+) -> Result<()> {
     if !(black.is_finite() && white.is_finite() && black < white) {
         return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
     }

@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use ndarray::{Array2, ArrayView2};
 
 use super::{FormatError, SampleType};
+use crate::formats::error::Result;
 
 /// The order of the bytes of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,11 +36,7 @@ pub(super) fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f3
 }
 
 /// A frame from its samples in row order.
-pub(super) fn frame(
-    height: usize,
-    width: usize,
-    samples: Vec<f32>,
-) -> Result<Array2<f32>, FormatError> {
+pub(super) fn frame(height: usize, width: usize, samples: Vec<f32>) -> Result<Array2<f32>> {
     let count = samples.len();
     Array2::from_shape_vec((height, width), samples).map_err(|_| {
         FormatError::Internal(format!("{count} samples for a frame of {height}x{width}"))
@@ -64,7 +61,7 @@ impl<W: Write> StackWriter<W> {
     }
 
     /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
-    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<()> {
         if frame.dim() != (self.height, self.width) || self.written == self.frames {
             return Err(FormatError::Internal(format!(
                 "frame {} of size {:?} written to a stack of {} frames of {}x{}",
@@ -90,7 +87,7 @@ impl<W: Write> StackWriter<W> {
     }
 
     /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
-    pub fn finish(mut self) -> Result<W, FormatError> {
+    pub fn finish(mut self) -> Result<W> {
         if self.written != self.frames {
             return Err(FormatError::Internal(format!(
                 "{} of {} frames written",

@@ -3,6 +3,7 @@
 use ndarray::Array2;
 
 use super::{Format, FormatError};
+use crate::formats::error::Result;
 use strum::Display;
 
 /// How one sample is stored in a file, by NumPy's names.
@@ -58,7 +59,7 @@ impl FullScale {
     pub const EIGHT_BIT: Self = Self(255.0);
 
     /// Errors: [`FormatError::FullScale`] for NaN, infinities, zero, negative and subnormal numbers.
-    pub fn new(value: f32) -> Result<Self, FormatError> {
+    pub fn new(value: f32) -> Result<Self> {
         // A subnormal scale would turn every ordinary value into an infinity.
         if value.is_normal() && value > 0.0 {
             Ok(Self(value))
@@ -124,7 +125,7 @@ pub trait FrameReader {
     /// The next frame (row, column) as stored, not scaled; `None` after the last.
     ///
     /// Errors: whatever is wrong with this frame's bytes. After an error the reader is spent.
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError>;
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>>;
 }
 
 impl<R: FrameReader + ?Sized> FrameReader for Box<R> {
@@ -132,7 +133,7 @@ impl<R: FrameReader + ?Sized> FrameReader for Box<R> {
         (**self).info()
     }
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         (**self).next_frame()
     }
 }

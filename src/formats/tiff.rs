@@ -11,6 +11,7 @@ use ::tiff::{ColorType, TiffError};
 use ndarray::Array2;
 
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
+use crate::formats::error::Result;
 use directory::malformed;
 
 const ACCEPTED_SAMPLES: &str =
@@ -34,7 +35,7 @@ pub(super) struct TiffReader {
 impl TiffReader {
     /// Checks all page headers of `file` (`length` bytes long) against the limits, the length and
     /// each other. Pixels are not read.
-    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self, FormatError> {
+    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self> {
         let frames = directory::count_pages(&file, length, limits)?;
         let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
         let first = read_page(&mut decoder, 0, length, limits)?;
@@ -65,7 +66,7 @@ impl FrameReader for TiffReader {
         &self.info
     }
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         let page = self.next;
         if page == self.info.frames {
             return Ok(None);
@@ -88,7 +89,7 @@ fn read_page(
     page: usize,
     length: u64,
     limits: &Limits,
-) -> Result<StackInfo, FormatError> {
+) -> Result<StackInfo> {
     let (width, height) = decoder.dimensions().map_err(|e| in_page(page, e))?;
     limits.check_shape(Format::Tiff, 1, height.into(), width.into())?;
     let sample = sample_type(decoder, page)?;
@@ -97,10 +98,7 @@ fn read_page(
     Ok(info)
 }
 
-fn sample_type(
-    decoder: &mut Decoder<BufReader<File>>,
-    page: usize,
-) -> Result<SampleType, FormatError> {
+fn sample_type(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<SampleType> {
     let tag = |decoder: &mut Decoder<_>, tag, default: u16| {
         decoder.find_tag_unsigned(tag).map(|v| v.unwrap_or(default)).map_err(|e| in_page(page, e))
     };
@@ -143,7 +141,7 @@ fn check_chunks(
     info: &StackInfo,
     length: u64,
     limits: &Limits,
-) -> Result<(), FormatError> {
+) -> Result<()> {
     let compression: u16 = decoder
         .find_tag_unsigned(Tag::Compression)
         .map_err(|e| in_page(page, e))?
@@ -190,10 +188,7 @@ fn check_chunks(
 }
 
 /// Offset and length of each strip or tile.
-fn chunk_ranges(
-    decoder: &mut Decoder<BufReader<File>>,
-    page: usize,
-) -> Result<Vec<(u64, u64)>, FormatError> {
+fn chunk_ranges(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<Vec<(u64, u64)>> {
     let mut find = |tag| decoder.find_tag_unsigned_vec::<u64>(tag).map_err(|e| in_page(page, e));
     let (offsets, counts) = match find(Tag::StripOffsets)? {
         Some(offsets) => (Some(offsets), find(Tag::StripByteCounts)?),

@@ -4,6 +4,7 @@
 use ndarray::{Array2, ArrayView2};
 
 use super::{FormatError, FrameReader, FullScale, StackInfo};
+use crate::formats::error::Result;
 
 /// Masks may exceed 1 by this much (rounding of their own normalisation); they are set to 1 then.
 const TOLERANCE: f32 = 1e-6;
@@ -36,8 +37,8 @@ struct Located {
 pub fn check_masks(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
-    mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
-) -> Result<MaskStatistics, FormatError> {
+    mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<()>,
+) -> Result<MaskStatistics> {
     let (info, scale) = (*reader.info(), full_scale.value());
     // True where some mask so far is open (its square is above 0).
     let mut open = Array2::from_elem((info.height, info.width), false);
@@ -104,8 +105,8 @@ pub fn check_masks(
 pub fn check_snapshots(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
-    mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
-) -> Result<(), FormatError> {
+    mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<()>,
+) -> Result<()> {
     let (info, scale) = (*reader.info(), full_scale.value());
     let mut snapshots = 0;
     while let Some(mut snapshot) = reader.next_frame()? {
@@ -139,7 +140,7 @@ fn not_finite(
     FormatError::NotFinite { subject, value, frame, row, column }
 }
 
-fn check_size(info: &StackInfo, next: usize, frame: &Array2<f32>) -> Result<(), FormatError> {
+fn check_size(info: &StackInfo, next: usize, frame: &Array2<f32>) -> Result<()> {
     if next < info.frames && frame.dim() == (info.height, info.width) {
         return Ok(());
     }
@@ -152,7 +153,7 @@ fn check_size(info: &StackInfo, next: usize, frame: &Array2<f32>) -> Result<(), 
     )))
 }
 
-fn check_count(promised: usize, seen: usize) -> Result<(), FormatError> {
+fn check_count(promised: usize, seen: usize) -> Result<()> {
     if promised == seen {
         return Ok(());
     }

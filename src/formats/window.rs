@@ -8,6 +8,7 @@ use ndarray::Array3;
 
 use super::samples::{self, ByteOrder};
 use super::{FormatError, SampleType, StackInfo};
+use crate::formats::error::Result;
 
 const SAMPLE_BYTES: u64 = 4;
 
@@ -39,7 +40,7 @@ impl WindowReader {
         frames: Range<usize>,
         rows: Range<usize>,
         columns: Range<usize>,
-    ) -> Result<Array3<f32>, FormatError> {
+    ) -> Result<Array3<f32>> {
         let (height, width) = (self.info.height, self.info.width);
         let inside = |range: &Range<usize>, axis| range.start <= range.end && range.end <= axis;
         if !(inside(&frames, self.info.frames) && inside(&rows, height) && inside(&columns, width))

@@ -2,17 +2,21 @@
 //!
 //! A service for which no token was ever made is open; all data are the lab `local`'s then.
 
+use std::net::IpAddr;
+
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::request::Parts;
+use axum::http::uri::Authority;
 use axum::http::{HeaderMap, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use headers::authorization::{Authorization, Bearer};
 use headers::{Cookie, HeaderMapExt};
+use rustix::system::uname;
 
-use super::error::{ApiError, Code};
+use super::app::App;
+use super::error::{ApiError, Code, Result};
 use crate::job::{Lab, Role, Secret, TokenId};
-use crate::store::Store;
 
 /// A page that can't set headers of its requests (for pictures and events, say) keeps the token in
 /// this cookie. It opens only what changes nothing, so that no foreign page can use it to do harm.
@@ -45,7 +49,6 @@ impl Rule {
 pub(super) struct Access {
     /// Whose data are seen.
     pub(super) lab: Lab,
-    /// The token, if the service has tokens.
     pub(super) token: Option<TokenId>,
     /// Bytes of uploads that the token may keep here.
     pub(super) max_bytes: Option<u64>,
@@ -54,7 +57,7 @@ pub(super) struct Access {
 impl<S: Send + Sync> FromRequestParts<S> for Access {
     type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self> {
         // Without the guard nobody is let in: a public route has no data of a lab.
         parts.extensions.get().cloned().ok_or_else(missing)
     }
@@ -62,13 +65,13 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
 
 /// Lets a request pass if its token may do what it wants.
 pub(super) async fn guard(
-    State((store, rule)): State<(Store, Rule)>,
+    State((app, rule)): State<(App, Rule)>,
     mut request: Request,
     next: Next,
 ) -> Response {
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
     let secret = secret(request.method(), request.headers());
-    match admit(&store, secret, role).await {
+    match admit(&app, secret, role, (request.method(), request.headers())).await {
         Ok(access) => {
             tracing::Span::current().record("lab", access.lab.as_str());
             request.extensions_mut().insert(access);
@@ -78,13 +81,20 @@ pub(super) async fn guard(
     }
 }
 
-async fn admit(store: &Store, secret: Option<Secret>, role: Role) -> Result<Access, ApiError> {
+async fn admit(
+    app: &App,
+    secret: Option<Secret>,
+    role: Role,
+    (method, headers): (&Method, &HeaderMap),
+) -> Result<Access> {
+    let store = &app.store;
     let token = match &secret {
         Some(secret) => store.token(secret).await?,
         None => None,
     };
     let Some(token) = token else {
         if store.is_open().await? {
+            check_site(method, headers, &app.settings.hosts)?;
             return Ok(Access { lab: Lab::local(), token: None, max_bytes: None });
         }
         return Err(missing());
@@ -94,6 +104,45 @@ async fn admit(store: &Store, secret: Option<Secret>, role: Role) -> Result<Acce
         return Err(ApiError::new(Code::Forbidden, detail));
     }
     Ok(Access { lab: token.lab, token: Some(token.id), max_bytes: token.max_bytes })
+}
+
+/// Refuses what a page of another site may have had a browser send: without tokens nothing else tells
+/// it from what the user wants. A name that was made to point here is known by the `Host` (DNS
+/// rebinding), a form or a script by the `Origin` or by `Sec-Fetch-Site`.
+fn check_site(method: &Method, headers: &HeaderMap, names: &[String]) -> Result<()> {
+    let foreign = |detail: String| Err(ApiError::new(Code::ForeignSite, detail));
+    let text = |name: &str| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
+    let host = text("host").unwrap_or("localhost");
+    if !is_own_name(host, names) {
+        return foreign(format!(
+            "there are no tokens, so this service answers only to its own names, and {host} is none \
+             of them; ask at its address, make a token, or start it with --host NAME"
+        ));
+    }
+    if method.is_safe() {
+        return Ok(());
+    }
+    let origin = text("origin").filter(|origin| {
+        origin.split_once("://").is_none_or(|(_, place)| !place.eq_ignore_ascii_case(host))
+    });
+    let site = text("sec-fetch-site").filter(|site| !["same-origin", "none"].contains(site));
+    match origin.or(site) {
+        Some(from) => foreign(format!("a page of {from} may not change anything here")),
+        None => Ok(()),
+    }
+}
+
+/// Whether this host, perhaps with a port, is an address, this machine, or one of the names.
+fn is_own_name(host: &str, names: &[String]) -> bool {
+    let name = host.parse::<Authority>().map(|place| place.host().to_ascii_lowercase());
+    let Ok(name) = name else { return false };
+    let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
+    let here = uname();
+    let here = here.nodename().to_str().unwrap_or("localhost");
+    address.is_ok()
+        || name == "localhost"
+        || name.eq_ignore_ascii_case(here)
+        || names.iter().any(|own| name.eq_ignore_ascii_case(own))
 }
 
 fn secret(method: &Method, headers: &HeaderMap) -> Option<Secret> {
@@ -117,10 +166,40 @@ fn missing() -> ApiError {
 mod tests {
     use axum::http::{HeaderMap, HeaderValue, Method};
 
-    use super::{Secret, secret};
+    use super::{Secret, check_site, secret};
 
     fn headers(name: &'static str, value: &str) -> HeaderMap {
         HeaderMap::from_iter([(name.parse().unwrap(), HeaderValue::from_str(value).unwrap())])
+    }
+
+    #[test]
+    fn pages_of_other_sites_are_told_by_what_browsers_say() {
+        let check = |method: Method, lines: &[(&'static str, &str)]| {
+            let lines = lines.iter().map(|(name, value)| headers(name, value));
+            let all: HeaderMap =
+                lines.flatten().map(|(name, value)| (name.unwrap(), value)).collect();
+            check_site(&method, &all, &["bench.example".into()]).is_ok()
+        };
+        for host in ["127.0.0.1:8080", "[::1]:8080", "LOCALHOST", "bench.example:80", "10.1.2.3"] {
+            assert!(check(Method::POST, &[("host", host)]), "{host}");
+        }
+        for host in ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example:8080", "a b"]
+        {
+            assert!(!check(Method::GET, &[("host", host)]), "{host}");
+        }
+        let own = ("host", "127.0.0.1:8080");
+        for line in [
+            ("origin", "http://evil.example"),
+            ("origin", "http://127.0.0.1:9090"),
+            ("origin", "null"),
+            ("sec-fetch-site", "cross-site"),
+            ("sec-fetch-site", "same-site"),
+        ] {
+            assert!(!check(Method::POST, &[own, line]), "{line:?}");
+            assert!(check(Method::GET, &[own, line]), "{line:?}: the page does not see the answer");
+        }
+        let page = [own, ("origin", "http://127.0.0.1:8080"), ("sec-fetch-site", "same-origin")];
+        assert!(check(Method::DELETE, &page));
     }
 
     #[test]

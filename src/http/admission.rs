@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::access::Access;
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use crate::config::ServeArguments;
 use crate::store::Store;
 
@@ -52,13 +52,13 @@ impl Admission {
     }
 
     /// Takes one of the slots for uploads.
-    pub(super) fn slot(&self) -> Result<OwnedSemaphorePermit, ApiError> {
+    pub(super) fn slot(&self) -> Result<OwnedSemaphorePermit> {
         self.slots.clone().try_acquire_owned().map_err(|_| {
             ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
         })
     }
 
-    pub(super) async fn reserve(&self, length: u64) -> Result<Reservation, ApiError> {
+    pub(super) async fn reserve(&self, length: u64) -> Result<Reservation> {
         let reserved = self.reserved.clone();
         // First the reservation and then the look: of two that want the last room, none gets too
         // much.
@@ -70,11 +70,7 @@ impl Admission {
 
     /// Takes bytes that are about to be written from a reservation; reserves more if they were not
     /// announced.
-    pub(super) async fn take(
-        &self,
-        reservation: &mut Reservation,
-        bytes: u64,
-    ) -> Result<(), ApiError> {
+    pub(super) async fn take(&self, reservation: &mut Reservation, bytes: u64) -> Result<()> {
         if bytes > reservation.left {
             let mut more = self.reserve(bytes.max(STEP)).await?;
             reservation.left += std::mem::take(&mut more.left);
@@ -86,7 +82,7 @@ impl Admission {
 
     /// Refuses `what` if the disk has no room for its `needed` bytes beside what is reserved for
     /// others. They are part of what is reserved unless `extra` says that they come on top.
-    async fn check_disk(&self, extra: u64, what: &str, needed: u64) -> Result<(), ApiError> {
+    async fn check_disk(&self, extra: u64, what: &str, needed: u64) -> Result<()> {
         let (free, _) = self.store.dir().disk()?;
         let reserved = self.store.promised_bytes().await? + self.reserved.load(Ordering::Acquire);
         let wanted = reserved.saturating_add(extra).saturating_add(self.min_free_bytes);
@@ -104,12 +100,11 @@ impl Admission {
 
     /// Refuses a job, or an upload in pieces, that the disk has no room for. What is accepted is
     /// reserved by the database.
-    pub(super) async fn check_room(&self, what: &str, needed: u64) -> Result<(), ApiError> {
+    pub(super) async fn check_room(&self, what: &str, needed: u64) -> Result<()> {
         self.check_disk(needed, what, needed).await
     }
 
-    /// Refuses an upload that is larger than any may be.
-    pub(super) fn check_size(&self, length: u64) -> Result<(), ApiError> {
+    pub(super) fn check_size(&self, length: u64) -> Result<()> {
         if length <= self.max_upload_bytes {
             return Ok(());
         }
@@ -118,7 +113,7 @@ impl Admission {
     }
 
     /// Refuses an upload that is too large, or with which the token would keep more than it may.
-    pub(super) async fn check_length(&self, access: &Access, length: u64) -> Result<(), ApiError> {
+    pub(super) async fn check_length(&self, access: &Access, length: u64) -> Result<()> {
         self.check_size(length)?;
         let (Some(token), Some(limit)) = (access.token, access.max_bytes) else { return Ok(()) };
         let kept = self.store.token_bytes(token).await?;

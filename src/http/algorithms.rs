@@ -24,7 +24,6 @@ pub(super) struct ListBody {
     items: Vec<AlgorithmBody>,
 }
 
-/// `GET /v1/algorithms`
 pub(super) async fn list() -> Json<ListBody> {
     let show = |name: Algorithm| {
         let schedule = name.default_schedule();

@@ -39,7 +39,6 @@ pub struct Services {
 impl App {
     /// The app on a store, with these settings. Answers that have no end of their own end with
     /// `closing`. Needs a runtime of tokio.
-    #[must_use]
     pub fn new(
         store: Store,
         settings: &ServeArguments,

@@ -2,7 +2,7 @@
 
 use axum::Json;
 use axum::body::Body;
-use axum::extract::{FromRequest, Multipart, Request, State};
+use axum::extract::{FromRequest, Multipart, Request};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ContentLength, HeaderMapExt};
@@ -11,19 +11,18 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::access::Access;
 use super::admission::Reservation;
 use super::app::App;
-use super::error::{ApiError, Code};
-use super::extract::Params;
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params};
 use super::upload;
 use crate::job::Sha256;
 use crate::store::{Blob, StagedBlob};
 
 /// `POST /v1/blobs`: the file as the raw body, or as the field `file` of a form.
 pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     headers: HeaderMap,
     request: Request,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let (_slot, room) = match begin(&app, &access, &headers).await {
         Ok(begun) => begun,
         Err(refusal) => return Err(refuse(refusal, &headers, request.into_body()).await),
@@ -38,12 +37,11 @@ pub(super) async fn create(
 
 /// `PUT /v1/blobs/{sha256}`: the raw body, which must have this hash.
 pub(super) async fn put(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
     headers: HeaderMap,
     body: Body,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let (_slot, room) = match begin(&app, &access, &headers).await {
         Ok(begun) => begun,
         Err(refusal) => return Err(refuse(refusal, &headers, body).await),
@@ -58,10 +56,9 @@ pub(super) async fn put(
 
 /// `GET /v1/blobs/{sha256}`: whether the file is there, and its size.
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
-) -> Result<Json<Blob>, ApiError> {
+) -> Result<Json<Blob>> {
     Ok(Json(app.store.upload(&access.lab, sha256).await?))
 }
 
@@ -71,7 +68,7 @@ async fn begin(
     app: &App,
     access: &Access,
     headers: &HeaderMap,
-) -> Result<(OwnedSemaphorePermit, Reservation), ApiError> {
+) -> Result<(OwnedSemaphorePermit, Reservation)> {
     let slot = app.admission.slot()?;
     let length = headers.typed_get::<ContentLength>().map_or(0, |length| length.0);
     app.admission.check_length(access, length).await?;
@@ -92,11 +89,7 @@ fn is_form(headers: &HeaderMap) -> bool {
     kind.is_some_and(|kind| kind.trim_start().to_ascii_lowercase().starts_with("multipart/"))
 }
 
-async fn receive_form(
-    app: &App,
-    room: Reservation,
-    request: Request,
-) -> Result<StagedBlob, ApiError> {
+async fn receive_form(app: &App, room: Reservation, request: Request) -> Result<StagedBlob> {
     let malformed = |text: String| ApiError::new(Code::MalformedRequest, text);
     let mut form = Multipart::from_request(request, app)
         .await
@@ -109,7 +102,7 @@ async fn receive_form(
     Err(malformed("the form has no field named file".into()))
 }
 
-async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response, ApiError> {
+async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response> {
     // Again, for an upload that did not say its length before.
     app.admission.check_length(access, staged.size()).await?;
     let (blob, new) = app.store.store_upload(&access.lab, access.token, staged).await?;

@@ -1,15 +1,13 @@
 //! `/v1/calibrations`: masks of optical settings.
 
 use axum::Json;
-use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
-use super::access::Access;
 use super::app::App;
-use super::error::{ApiError, Code};
-use super::extract::{Body, Params, QueryOf};
+use super::error::{ApiError, Code, Result};
+use super::extract::{Body, Caller, Params, QueryOf};
 use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody};
 use crate::formats::validate::MaskStatistics;
@@ -22,11 +20,8 @@ use crate::store::{Calibration, NewCalibration, Page, Unready};
 #[serde(deny_unknown_fields)]
 pub(super) struct CalibrationRequest {
     name: Option<Label>,
-    /// The upload with the masks.
     masks: Option<Sha256>,
-    /// The stored number that means 1.
     full_scale: Option<f32>,
-    /// Raw captures.
     captures: Option<Captures>,
 }
 
@@ -38,13 +33,11 @@ pub(super) struct ListQuery {
     cursor: Option<CalibrationId>,
 }
 
-/// Where a calibration stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 enum CalibrationState {
     /// Masks are made of captures.
     Preparing,
-    /// The masks are there.
     Ready,
     /// There will be none; `error` says why.
     Failed,
@@ -121,12 +114,10 @@ impl From<Unready> for CalibrationBody {
     }
 }
 
-/// `POST /v1/calibrations`
 pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Body(request): Body<CalibrationRequest>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let CalibrationRequest { name, masks, full_scale, captures } = request;
     let (status, body) = match (masks, captures) {
         (Some(masks), None) => {
@@ -151,7 +142,7 @@ async fn of_masks(
     name: Option<Label>,
     masks: Sha256,
     full_scale: Option<f32>,
-) -> Result<CalibrationBody, ApiError> {
+) -> Result<CalibrationBody> {
     app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
     let prepared =
         intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
@@ -166,7 +157,7 @@ async fn of_captures(
     lab: &Lab,
     name: Option<Label>,
     captures: Captures,
-) -> Result<CalibrationBody, ApiError> {
+) -> Result<CalibrationBody> {
     captures.check().map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     for (place, upload) in captures.uploads() {
         app.store.upload(lab, upload).await.map_err(|error| ApiError::reference(&place, error))?;
@@ -180,7 +171,7 @@ async fn of_captures(
     body(app, lab, id).await
 }
 
-async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody, ApiError> {
+async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody> {
     match app.store.unready(lab, id).await? {
         Some(unready) => Ok(unready.into()),
         None => Ok(app.store.calibration(lab, id).await?.into()),
@@ -208,12 +199,10 @@ fn facts(
     }
 }
 
-/// `GET /v1/calibrations`
 pub(super) async fn list(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<CalibrationBody>>, ApiError> {
+) -> Result<Json<PageBody<CalibrationBody>>> {
     let limit = query.limit.get();
     let ready = app.store.calibrations(&access.lab, query.cursor, limit).await?;
     let unready = app.store.all_unready(&access.lab, query.cursor, limit).await?;
@@ -226,21 +215,17 @@ pub(super) async fn list(
     Ok(Json(PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item)))
 }
 
-/// `GET /v1/calibrations/{calibration}`
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
-) -> Result<Json<CalibrationBody>, ApiError> {
+) -> Result<Json<CalibrationBody>> {
     Ok(Json(body(&app, &access.lab, id).await?))
 }
 
-/// `DELETE /v1/calibrations/{calibration}`
 pub(super) async fn delete(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<StatusCode> {
     app.store.delete_calibration(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

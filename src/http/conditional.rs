@@ -5,7 +5,7 @@ use axum::response::{IntoResponse, Response};
 use headers::{ETag, HeaderMapExt, IfNoneMatch};
 use serde::Serialize;
 
-use super::error::ApiError;
+use super::error::{ApiError, Result};
 use crate::job::Sha256;
 
 /// A strong ETag: the hash of the content.
@@ -31,7 +31,7 @@ pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -
     (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response()
 }
 
-pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response, ApiError> {
+pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response> {
     let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
     Ok(content(headers, "application/json", text))
 }

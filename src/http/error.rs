@@ -6,98 +6,75 @@ use axum::Json;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use strum::IntoStaticStr;
 
 use crate::formats::FormatError;
 use crate::intake::IntakeError;
 use crate::job::InvalidField;
 use crate::store::StoreError;
 
-/// What can be wrong. The name in [`Code::row`] never changes, for programs to rely on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[allow(missing_docs)] // the table says it
-pub enum Code {
-    MalformedJson,
-    MalformedRequest,
-    InvalidQuery,
-    EmptyBody,
-    Unauthorized,
-    Forbidden,
-    NotFound,
-    NotReady,
-    CalibrationNotReady,
-    MethodNotAllowed,
-    UploadStalled,
-    OffsetMismatch,
-    TusVersion,
-    UploadBusy,
-    UploadDamaged,
-    ChecksumMismatch,
-    InUse,
-    IllegalState,
-    TooLarge,
-    UnsupportedMediaType,
-    RangeNotSatisfiable,
-    InvalidRequest,
-    InvalidContent,
-    SizeMismatch,
-    HashMismatch,
-    IdempotencyKeyReused,
-    TooManyUploads,
-    QueueFull,
-    Internal,
-    Unavailable,
-    TimedOut,
-    InsufficientStorage,
-    QuotaExceeded,
-}
-
 /// tus 1.0 has a status of its own for this.
 static CHECKSUM_STATUS: LazyLock<StatusCode> =
     LazyLock::new(|| StatusCode::from_u16(460).unwrap_or(StatusCode::BAD_REQUEST));
 
-impl Code {
-    /// The table: status, stable name, title, and whether the same request may succeed later.
-    #[must_use]
-    #[rustfmt::skip]
-    pub fn row(self) -> (StatusCode, &'static str, &'static str, bool) {
-        use StatusCode as S;
-        match self {
-            Self::MalformedJson => (S::BAD_REQUEST, "malformed_json", "The body is not JSON", false),
-            Self::MalformedRequest => (S::BAD_REQUEST, "malformed_request", "The request can't be read", false),
-            Self::InvalidQuery => (S::BAD_REQUEST, "invalid_query", "A query parameter is wrong", false),
-            Self::EmptyBody => (S::BAD_REQUEST, "empty_body", "The body is empty", false),
-            Self::Unauthorized => (S::UNAUTHORIZED, "unauthorized", "Who is there?", false),
-            Self::Forbidden => (S::FORBIDDEN, "forbidden", "The token does not allow it", false),
-            Self::NotFound => (S::NOT_FOUND, "not_found", "There is no such thing", false),
-            Self::NotReady => (S::NOT_FOUND, "not_ready", "It is not there yet", true),
-            Self::CalibrationNotReady => (S::CONFLICT, "calibration_not_ready", "The masks are not there", true),
-            Self::MethodNotAllowed => (S::METHOD_NOT_ALLOWED, "method_not_allowed", "Not with this method", false),
-            Self::UploadStalled => (S::REQUEST_TIMEOUT, "upload_stalled", "The upload came to a halt", true),
-            Self::OffsetMismatch => (S::CONFLICT, "offset_mismatch", "The piece does not follow", false),
-            Self::TusVersion => (S::PRECONDITION_FAILED, "tus_version", "Not in this version of tus", false),
-            Self::UploadBusy => (S::LOCKED, "upload_busy", "Another request is at it", true),
-            Self::UploadDamaged => (S::GONE, "upload_damaged", "Bytes of the upload are lost", false),
-            Self::ChecksumMismatch => (*CHECKSUM_STATUS, "checksum_mismatch", "The piece has come damaged", true),
-            Self::InUse => (S::CONFLICT, "in_use", "Something else needs it", false),
-            Self::IllegalState => (S::CONFLICT, "illegal_state", "Not in this state", false),
-            Self::TooLarge => (S::PAYLOAD_TOO_LARGE, "too_large", "The body is too large", false),
-            Self::UnsupportedMediaType => (S::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", "Not in this media type", false),
-            Self::RangeNotSatisfiable => (S::RANGE_NOT_SATISFIABLE, "range_not_satisfiable", "The range is outside", false),
-            Self::InvalidRequest => (S::UNPROCESSABLE_ENTITY, "invalid_request", "The request does not fit", false),
-            Self::InvalidContent => (S::UNPROCESSABLE_ENTITY, "invalid_content", "The file does not fit", false),
-            Self::SizeMismatch => (S::UNPROCESSABLE_ENTITY, "size_mismatch", "The sizes do not fit", false),
-            Self::HashMismatch => (S::UNPROCESSABLE_ENTITY, "hash_mismatch", "The bytes are not those named", true),
-            Self::IdempotencyKeyReused => (S::UNPROCESSABLE_ENTITY, "idempotency_key_reused", "The key was used for another request", false),
-            Self::TooManyUploads => (S::TOO_MANY_REQUESTS, "too_many_uploads", "Too many uploads at once", true),
-            Self::QueueFull => (S::TOO_MANY_REQUESTS, "queue_full", "Enough jobs wait", true),
-            Self::Internal => (S::INTERNAL_SERVER_ERROR, "internal", "The service has failed", true),
-            Self::Unavailable => (S::SERVICE_UNAVAILABLE, "unavailable", "The service can't serve this now", true),
-            Self::TimedOut => (S::SERVICE_UNAVAILABLE, "timed_out", "The answer took too long", true),
-            Self::InsufficientStorage => (S::INSUFFICIENT_STORAGE, "insufficient_storage", "The disk is full", true),
-            Self::QuotaExceeded => (S::INSUFFICIENT_STORAGE, "quota_exceeded", "The token's limit is reached", false),
+/// What can be wrong, from a table of the status, the title, and whether the same request may succeed
+/// later. The name, which is the variant's in snake case, never changes, for programs to rely on.
+macro_rules! codes {
+    ($($code:ident: $status:expr, $title:literal, $retryable:literal;)*) => {
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+        #[strum(serialize_all = "snake_case", const_into_str)]
+        pub enum Code {
+            $($code,)*
         }
-    }
+
+        impl Code {
+            fn row(self) -> (StatusCode, &'static str, bool) {
+                match self {
+                    $(Self::$code => ($status, $title, $retryable),)*
+                }
+            }
+        }
+    };
 }
+
+codes! {
+    MalformedJson: StatusCode::BAD_REQUEST, "The body is not JSON", false;
+    MalformedRequest: StatusCode::BAD_REQUEST, "The request can't be read", false;
+    InvalidQuery: StatusCode::BAD_REQUEST, "A query parameter is wrong", false;
+    EmptyBody: StatusCode::BAD_REQUEST, "The body is empty", false;
+    Unauthorized: StatusCode::UNAUTHORIZED, "Who is there?", false;
+    Forbidden: StatusCode::FORBIDDEN, "The token does not allow it", false;
+    ForeignSite: StatusCode::FORBIDDEN, "Not for a page of another site", false;
+    NotFound: StatusCode::NOT_FOUND, "There is no such thing", false;
+    NotReady: StatusCode::NOT_FOUND, "It is not there yet", true;
+    CalibrationNotReady: StatusCode::CONFLICT, "The masks are not there", true;
+    MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Not with this method", false;
+    UploadStalled: StatusCode::REQUEST_TIMEOUT, "The upload came to a halt", true;
+    OffsetMismatch: StatusCode::CONFLICT, "The piece does not follow", false;
+    TusVersion: StatusCode::PRECONDITION_FAILED, "Not in this version of tus", false;
+    UploadBusy: StatusCode::LOCKED, "Another request is at it", true;
+    UploadDamaged: StatusCode::GONE, "Bytes of the upload are lost", false;
+    ChecksumMismatch: *CHECKSUM_STATUS, "The piece has come damaged", true;
+    InUse: StatusCode::CONFLICT, "Something else needs it", false;
+    IllegalState: StatusCode::CONFLICT, "Not in this state", false;
+    TooLarge: StatusCode::PAYLOAD_TOO_LARGE, "The body is too large", false;
+    UnsupportedMediaType: StatusCode::UNSUPPORTED_MEDIA_TYPE, "Not in this media type", false;
+    RangeNotSatisfiable: StatusCode::RANGE_NOT_SATISFIABLE, "The range is outside", false;
+    InvalidRequest: StatusCode::UNPROCESSABLE_ENTITY, "The request does not fit", false;
+    InvalidContent: StatusCode::UNPROCESSABLE_ENTITY, "The file does not fit", false;
+    SizeMismatch: StatusCode::UNPROCESSABLE_ENTITY, "The sizes do not fit", false;
+    HashMismatch: StatusCode::UNPROCESSABLE_ENTITY, "The bytes are not those named", true;
+    IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "The key was used for another request", false;
+    TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads at once", true;
+    QueueFull: StatusCode::TOO_MANY_REQUESTS, "Enough jobs wait", true;
+    Internal: StatusCode::INTERNAL_SERVER_ERROR, "The service has failed", true;
+    Unavailable: StatusCode::SERVICE_UNAVAILABLE, "The service can't serve this now", true;
+    TimedOut: StatusCode::SERVICE_UNAVAILABLE, "The answer took too long", true;
+    InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "The disk is full", true;
+    QuotaExceeded: StatusCode::INSUFFICIENT_STORAGE, "The token's limit is reached", false;
+}
+
+pub type Result<T, E = ApiError> = std::result::Result<T, E>;
 
 /// An error on its way to the user.
 #[derive(Debug)]
@@ -109,7 +86,6 @@ pub struct ApiError {
     headers: Vec<(HeaderName, HeaderValue)>,
 }
 
-/// The body of an error.
 #[derive(Debug, Serialize)]
 struct Problem<'a> {
     r#type: String,
@@ -135,7 +111,6 @@ impl ApiError {
     }
 
     /// A request with fields that are wrong.
-    #[must_use]
     pub fn fields(code: Code, errors: Vec<InvalidField>) -> Self {
         let texts: Vec<&str> = errors.iter().map(|error| error.detail.as_str()).collect();
         Self { errors: errors.clone(), ..Self::new(code, texts.join("; ")) }
@@ -147,7 +122,6 @@ impl ApiError {
     }
 
     /// What a request names and is not there is an error of the request.
-    #[must_use]
     pub fn reference(pointer: &str, error: StoreError) -> Self {
         match error {
             StoreError::NotFound { .. } => Self::field(pointer, error.to_string()),
@@ -156,14 +130,12 @@ impl ApiError {
     }
 
     /// The same error with the place in the request.
-    #[must_use]
     pub fn at(mut self, pointer: &str) -> Self {
         self.errors = vec![InvalidField::new(pointer, self.detail.clone())];
         self
     }
 
     /// The same error with a header in the answer.
-    #[must_use]
     pub fn with_header(mut self, name: HeaderName, value: HeaderValue) -> Self {
         self.headers.push((name, value));
         self
@@ -178,7 +150,8 @@ impl ApiError {
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
-        let (status, code, title, retryable) = self.code.row();
+        let (status, title, retryable) = self.code.row();
+        let code = self.code.into_str();
         let problem = Problem {
             r#type: format!("urn:sci-recon:problem:{code}"),
             title,

@@ -18,7 +18,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use crate::job::{JobId, Lab};
 use crate::store::{JobMark, Store};
 
@@ -32,9 +32,7 @@ const NAMED: usize = 200;
 /// What listeners are told.
 #[derive(Debug, Default, Serialize)]
 struct Change {
-    /// Jobs that are new or have changed.
     changed: Vec<JobId>,
-    /// Jobs that were deleted.
     deleted: Vec<JobId>,
     /// True if there are more than are named: read the list again.
     more: bool,
@@ -43,7 +41,6 @@ struct Change {
 /// The version of each job, by lab and job.
 type Versions = HashMap<(Lab, JobId), JobMark>;
 
-/// What the listeners of each lab are told, as JSON.
 type Changes = Arc<HashMap<Lab, String>>;
 
 /// The stream of changes to which listeners subscribe.
@@ -124,11 +121,7 @@ impl Change {
     }
 }
 
-/// `GET /v1/events`
-pub(super) async fn listen(
-    State(events): State<Events>,
-    access: Access,
-) -> Result<Response, ApiError> {
+pub(super) async fn listen(State(events): State<Events>, access: Access) -> Result<Response> {
     let slot = events.slots.clone().try_acquire_owned().map_err(|_| {
         ApiError::new(Code::Unavailable, "all places for listeners are taken; poll instead")
     })?;

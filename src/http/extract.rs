@@ -7,8 +7,21 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode, header};
 use serde::de::DeserializeOwned;
 
-use super::error::{ApiError, Code};
+use super::access::Access;
+use super::app::App;
+use super::error::{ApiError, Code, Result};
 use crate::job::InvalidField;
+
+/// The service, and for whom a request to it is.
+pub(super) struct Caller(pub(super) App, pub(super) Access);
+
+impl FromRequestParts<App> for Caller {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, app: &App) -> Result<Self> {
+        Ok(Self(app.clone(), Access::from_request_parts(parts, app).await?))
+    }
+}
 
 /// The parameters in the path. What has not the form of an identifier names nothing: 404.
 #[derive(Debug)]
@@ -21,7 +34,7 @@ where
 {
     type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self> {
         match Path::<T>::from_request_parts(parts, state).await {
             Ok(Path(params)) => Ok(Self(params)),
             Err(PathRejection::FailedToDeserializePathParams(error)) => {
@@ -43,7 +56,7 @@ where
 {
     type Rejection = ApiError;
 
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self> {
         match Query::<T>::from_request_parts(parts, state).await {
             Ok(Query(query)) => Ok(Self(query)),
             Err(QueryRejection::FailedToDeserializeQueryString(error)) => {
@@ -64,7 +77,7 @@ where
 {
     type Rejection = ApiError;
 
-    async fn from_request(request: Request, state: &S) -> Result<Self, ApiError> {
+    async fn from_request(request: Request, state: &S) -> Result<Self> {
         if !is_json(request.headers()) {
             let detail = "the body must be sent as Content-Type: application/json";
             return Err(ApiError::new(Code::UnsupportedMediaType, detail));
@@ -90,7 +103,7 @@ fn unreadable(error: BytesRejection) -> ApiError {
     ApiError::new(Code::MalformedRequest, error.body_text())
 }
 
-fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
+fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T> {
     let mut deserializer = serde_json::Deserializer::from_slice(bytes);
     let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {
         let pointer = pointer(error.path());
@@ -125,7 +138,7 @@ fn pointer(path: &serde_path_to_error::Path) -> String {
 }
 
 /// The `Idempotency-Key`, if there is one.
-pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, ApiError> {
+pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
     let Some(value) = headers.get("idempotency-key") else { return Ok(None) };
     match value.to_str() {
         Ok(key) if (1..=255).contains(&key.len()) => Ok(Some(key.to_owned())),

@@ -2,7 +2,7 @@
 //! written as a prepared array. Blocks; one at a time runs, where blocking is allowed.
 
 use super::app::App;
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use crate::formats::mat::SceneArray;
 use crate::formats::validate::MaskStatistics;
 use crate::formats::{Limits, StackInfo, StackWriter, planar};
@@ -13,18 +13,16 @@ use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
 /// What an upload turned out to be.
 pub(super) struct Prepared<T> {
     pub(super) info: StackInfo,
-    /// The stored number that means 1.
     pub(super) full_scale: f32,
-    /// What was found in it.
     pub(super) found: T,
     pub(super) file: StagedBlob,
 }
 
 /// Runs a check where it may block, after those that came before it.
-pub(super) async fn run<T, F>(app: &App, check: F) -> Result<T, ApiError>
+pub(super) async fn run<T, F>(app: &App, check: F) -> Result<T>
 where
     T: Send + 'static,
-    F: FnOnce(&Store, &Limits) -> Result<T, ApiError> + Send + 'static,
+    F: FnOnce(&Store, &Limits) -> Result<T> + Send + 'static,
 {
     let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
     let permit = app.intake.clone().acquire_owned().await.map_err(stopped)?;
@@ -43,7 +41,7 @@ pub(super) fn masks(
     limits: &Limits,
     upload: &Sha256,
     full_scale: Option<f32>,
-) -> Result<Prepared<MaskStatistics>, ApiError> {
+) -> Result<Prepared<MaskStatistics>> {
     let path = store.dir().blob(upload);
     let opened = Source::upload(&path, SceneArray::Masks, full_scale, *limits).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
@@ -61,7 +59,7 @@ pub(super) fn measurement(
     full_scale: Option<f32>,
     exposure: &Exposure,
     calibration: &Calibration,
-) -> Result<Prepared<Vec<Finding>>, ApiError> {
+) -> Result<Prepared<Vec<Finding>>> {
     let path = store.dir().blob(upload);
     let opened = Source::upload(&path, SceneArray::Measurements, full_scale, *limits).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
@@ -81,6 +79,6 @@ pub(super) fn measurement(
     Ok(Prepared { info, full_scale, found, file })
 }
 
-fn writer(store: &Store, info: &StackInfo) -> Result<StackWriter<BlobWriter>, ApiError> {
+fn writer(store: &Store, info: &StackInfo) -> Result<StackWriter<BlobWriter>> {
     Ok(planar::writer(store.blob_writer()?, info.frames, info.height, info.width)?)
 }

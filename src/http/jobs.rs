@@ -1,16 +1,14 @@
 //! `/v1/jobs`: asking for a reconstruction and watching it.
 
 use axum::Json;
-use axum::extract::State;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
-use super::access::Access;
 use super::app::App;
 use super::conditional;
-use super::error::{ApiError, Code};
-use super::extract::{Body, Params, QueryOf, idempotency_key};
+use super::error::{ApiError, Code, Result};
+use super::extract::{Body, Caller, Params, QueryOf, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
     Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
@@ -43,38 +41,25 @@ pub(super) struct JobBody {
 
 impl JobBody {
     fn new(job: Job, progress: JobProgress) -> Self {
-        let JobSpec {
-            calibration,
-            measurement,
-            shape,
-            snapshots,
-            algorithm,
-            model,
-            schedule,
-            tile,
-            priority,
-            label,
-            warnings,
-        } = job.spec;
-        let Job { id, state, error, created_at, started_at, finished_at, .. } = job;
+        let spec = job.spec;
         Self {
-            id,
-            state,
-            label,
-            calibration,
-            measurement,
-            shape,
-            snapshots,
-            algorithm,
-            model: model.map(|model| model.id),
-            schedule,
-            tile,
-            priority,
-            warnings,
-            error,
-            created_at,
-            started_at,
-            finished_at,
+            id: job.id,
+            state: job.state,
+            label: spec.label,
+            calibration: spec.calibration,
+            measurement: spec.measurement,
+            shape: spec.shape,
+            snapshots: spec.snapshots,
+            algorithm: spec.algorithm,
+            model: spec.model.map(|model| model.id),
+            schedule: spec.schedule,
+            tile: spec.tile,
+            priority: spec.priority,
+            warnings: spec.warnings,
+            error: job.error,
+            created_at: job.created_at,
+            started_at: job.started_at,
+            finished_at: job.finished_at,
             progress,
         }
     }
@@ -94,13 +79,11 @@ pub(super) struct ListQuery {
     search: Option<Label>,
 }
 
-/// `POST /v1/jobs`
 pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     headers: HeaderMap,
     Body(request): Body<JobRequest>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let idempotency_key = idempotency_key(&headers)?;
     // Hashed as it was understood, so that white space and the order of fields do not matter.
     let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
@@ -120,7 +103,7 @@ async fn insert(
     request: JobRequest,
     hash: Sha256,
     idempotency_key: Option<String>,
-) -> Result<Inserted, ApiError> {
+) -> Result<Inserted> {
     if let Some(key) = &idempotency_key
         && let Some(job) = app.store.job_with_key(&lab, key, hash).await?
     {
@@ -134,7 +117,7 @@ async fn insert(
 }
 
 /// Checks a request against the measurement that it names.
-async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec, ApiError> {
+async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec> {
     let measurement = app.store.measurement(lab, request.measurement).await;
     let measurement =
         measurement.map_err(|error| ApiError::reference("/measurement", error))?.facts;
@@ -168,7 +151,7 @@ fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding>
 }
 
 /// Refuses a job that no worker could do.
-fn check_memory(app: &App, spec: &JobSpec) -> Result<(), ApiError> {
+fn check_memory(app: &App, spec: &JobSpec) -> Result<()> {
     let (needed, allowed) = (spec.worker_bytes() >> 20, app.settings.worker_memory_bytes >> 20);
     if needed <= allowed {
         return Ok(());
@@ -181,7 +164,7 @@ fn check_memory(app: &App, spec: &JobSpec) -> Result<(), ApiError> {
     Err(ApiError::field("/tile/size", detail))
 }
 
-async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody, ApiError> {
+async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody> {
     let job = app.store.job(lab, id).await?;
     let progress = app.store.progress(&job).await?;
     Ok(JobBody::new(job, progress))
@@ -189,11 +172,10 @@ async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody, ApiError> {
 
 /// `GET /v1/jobs`, with an ETag, so that watching costs little.
 pub(super) async fn list(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let filter = JobFilter {
         state: query.state,
         calibration: query.calibration,
@@ -214,56 +196,44 @@ pub(super) async fn list(
 
 /// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<JobId>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }
 
-/// `POST /v1/jobs/{job}/cancel`
 pub(super) async fn cancel(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<JobId>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     app.store.cancel_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
 
-/// `POST /v1/jobs/{job}/retry`
 pub(super) async fn retry(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<JobId>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     app.store.retry_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
 
-async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response, ApiError> {
+async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response> {
     let retry_after: (HeaderName, &str) = (header::RETRY_AFTER, "1");
     Ok((StatusCode::ACCEPTED, [retry_after], Json(body(app, lab, id).await?)).into_response())
 }
 
-/// `DELETE /v1/jobs/{job}`
 pub(super) async fn delete(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<JobId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<StatusCode> {
     app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
 /// The job, if it has this snapshot; else there is no such thing.
-pub(super) async fn with_snapshot(
-    app: &App,
-    lab: &Lab,
-    id: JobId,
-    snapshot: u32,
-) -> Result<Job, ApiError> {
+pub(super) async fn with_snapshot(app: &App, lab: &Lab, id: JobId, snapshot: u32) -> Result<Job> {
     let job = app.store.job(lab, id).await?;
     if job.spec.snapshots.contains(snapshot) {
         return Ok(job);

@@ -4,7 +4,7 @@ use std::any::Any;
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request};
-use axum::http::{HeaderName, HeaderValue, Method, header};
+use axum::http::{HeaderName, HeaderValue, Method, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use tracing::Instrument;
@@ -67,6 +67,17 @@ fn is_plain(id: &HeaderValue) -> bool {
 fn new_id() -> HeaderValue {
     let text = Uuid::now_v7().to_string();
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static("unknown"))
+}
+
+/// Refuses a request that names two hosts, or none: a proxy before us and we may take it for different ones
+/// (RFC 9112, 3.2).
+pub(super) async fn one_host(request: Request, next: Next) -> Response {
+    let hosts = request.headers().get_all(header::HOST).iter().count();
+    if hosts > 1 || (hosts == 0 && request.version() == Version::HTTP_11) {
+        let detail = format!("{hosts} Host headers; a request has one");
+        return ApiError::new(Code::MalformedRequest, detail).into_response();
+    }
+    next.run(request).await
 }
 
 /// The answer to a request that takes too long.

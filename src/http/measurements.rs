@@ -1,30 +1,24 @@
 //! `/v1/measurements`: coded snapshots.
 
 use axum::Json;
-use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use super::access::Access;
-use super::app::App;
-use super::error::{ApiError, Code};
-use super::extract::{Body, Params, QueryOf};
+use super::error::{ApiError, Code, Result};
+use super::extract::{Body, Caller, Params, QueryOf};
 use super::intake::{self, Prepared};
-use super::page::{Limit, PageBody};
+use super::page::{ListQuery, PageBody};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
 use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
-use crate::store::{Measurement, MeasurementFilter, NewMeasurement};
+use crate::store::{Filter, Measurement, NewMeasurement};
 
-/// The body of `POST /v1/measurements`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct MeasurementRequest {
     name: Option<Label>,
-    /// The calibration that it was taken with.
     calibration: CalibrationId,
-    /// The upload with the snapshots.
     data: Sha256,
     /// Captures of the dark, the LCoS all black, at the measurement's exposure: their average is
     /// subtracted.
@@ -32,7 +26,6 @@ pub(super) struct MeasurementRequest {
     dark: Vec<Sha256>,
     /// The stored number from which on a pixel is full.
     saturation: Option<u32>,
-    /// The stored number that means 1.
     full_scale: Option<f32>,
     /// Snapshots in a second.
     camera_fps: Option<f64>,
@@ -40,21 +33,10 @@ pub(super) struct MeasurementRequest {
     exposure_s: Option<f64>,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<MeasurementId>,
-    calibration: Option<CalibrationId>,
-}
-
-/// `POST /v1/measurements`
 pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Body(request): Body<MeasurementRequest>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     check_times(&request)?;
     let (data, full_scale) = (request.data, request.full_scale);
     let calibration = app.store.calibration(&access.lab, request.calibration).await;
@@ -82,7 +64,7 @@ pub(super) async fn create(
 }
 
 /// Refuses times that can't be: they become the times of frames.
-fn check_times(request: &MeasurementRequest) -> Result<(), ApiError> {
+fn check_times(request: &MeasurementRequest) -> Result<()> {
     let checks = [
         ("/camera_fps", request.camera_fps, 1e9, "snapshots in a second"),
         ("/exposure_s", request.exposure_s, 1e5, "seconds"),
@@ -123,32 +105,26 @@ fn facts(
     }
 }
 
-/// `GET /v1/measurements`
 pub(super) async fn list(
-    State(app): State<App>,
-    access: Access,
-    QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<Measurement>>, ApiError> {
-    let filter = MeasurementFilter { calibration: query.calibration, after: query.cursor };
+    Caller(app, access): Caller,
+    QueryOf(query): QueryOf<ListQuery<MeasurementId>>,
+) -> Result<Json<PageBody<Measurement>>> {
+    let filter = Filter { calibration: query.calibration, after: query.cursor };
     let page = app.store.measurements(&access.lab, filter, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
-/// `GET /v1/measurements/{measurement}`
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
-) -> Result<Json<Measurement>, ApiError> {
+) -> Result<Json<Measurement>> {
     Ok(Json(app.store.measurement(&access.lab, id).await?))
 }
 
-/// `DELETE /v1/measurements/{measurement}`
 pub(super) async fn delete(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<StatusCode> {
     app.store.delete_measurement(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -32,7 +32,6 @@ impl Metrics {
         self.0.run_upkeep();
     }
 
-    /// What Prometheus reads.
     pub(super) fn render(&self) -> String {
         self.0.render()
     }

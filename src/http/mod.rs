@@ -17,6 +17,7 @@ mod extract;
 mod intake;
 mod jobs;
 mod layers;
+mod listen;
 mod measurements;
 mod metrics;
 mod model_check;
@@ -33,5 +34,6 @@ pub mod tus;
 mod upload;
 
 pub use app::App;
+pub use listen::listen;
 pub use metrics::Metrics;
 pub use router::{Route, router, routes};

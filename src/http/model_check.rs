@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::process::Command;
 use tokio::sync::Semaphore;
 
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use crate::config::{EngineArguments, ServeArguments};
 use crate::job::{ModelFacts, ModelVerdict, without_paths};
 use crate::store::NewCalibration;
@@ -59,11 +59,7 @@ impl Checker {
 
     /// Checks whether an upload is a network for these masks, and runs it once; one check at a time.
     /// Errors: 422 with what it has and what is needed; 503 if no network can be run here.
-    pub(super) async fn check(
-        &self,
-        file: &Path,
-        masks: &NewCalibration,
-    ) -> Result<ModelFacts, ApiError> {
+    pub(super) async fn check(&self, file: &Path, masks: &NewCalibration) -> Result<ModelFacts> {
         let unavailable = |why: &str| ApiError::new(Code::Unavailable, why);
         let stopped = |_| unavailable("the service is shutting down");
         let _permit = self.turn.acquire().await.map_err(stopped)?;

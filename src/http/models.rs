@@ -1,45 +1,28 @@
 //! `/v1/models`: end-to-end networks, each for one calibration.
 
 use axum::Json;
-use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use super::access::Access;
-use super::app::App;
-use super::error::ApiError;
-use super::extract::{Body, Params, QueryOf};
-use super::page::{Limit, PageBody};
+use super::error::{ApiError, Result};
+use super::extract::{Body, Caller, Params, QueryOf};
+use super::page::{ListQuery, PageBody};
 use crate::job::{CalibrationId, Label, ModelId, Sha256};
-use crate::store::{Model, ModelFilter, NewModel};
+use crate::store::{Filter, Model, NewModel};
 
-/// The body of `POST /v1/models`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ModelRequest {
     name: Option<Label>,
-    /// The calibration that it was trained for.
     calibration: CalibrationId,
-    /// The upload with the ONNX file.
     file: Sha256,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<ModelId>,
-    calibration: Option<CalibrationId>,
-}
-
-/// `POST /v1/models`
 pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Body(request): Body<ModelRequest>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let ModelRequest { name, calibration, file } = request;
     let found = app.store.calibration(&access.lab, calibration).await;
     let masks = found.map_err(|error| ApiError::reference("/calibration", error))?.facts;
@@ -54,32 +37,26 @@ pub(super) async fn create(
     Ok((StatusCode::CREATED, location, Json(model)).into_response())
 }
 
-/// `GET /v1/models`
 pub(super) async fn list(
-    State(app): State<App>,
-    access: Access,
-    QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<Model>>, ApiError> {
-    let filter = ModelFilter { calibration: query.calibration, after: query.cursor };
+    Caller(app, access): Caller,
+    QueryOf(query): QueryOf<ListQuery<ModelId>>,
+) -> Result<Json<PageBody<Model>>> {
+    let filter = Filter { calibration: query.calibration, after: query.cursor };
     let page = app.store.models(&access.lab, filter, query.limit.get()).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
-/// `GET /v1/models/{model}`
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<ModelId>,
-) -> Result<Json<Model>, ApiError> {
+) -> Result<Json<Model>> {
     Ok(Json(app.store.model(&access.lab, id).await?))
 }
 
-/// `DELETE /v1/models/{model}`
 pub(super) async fn delete(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<ModelId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<StatusCode> {
     app.store.delete_model(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

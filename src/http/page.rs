@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::job::CalibrationId;
 use crate::store::Page;
 
 /// How many items a page has where nobody says.
@@ -35,6 +36,16 @@ impl Limit {
     pub(super) fn get(self) -> u32 {
         self.0
     }
+}
+
+/// The query of a list of things that belong to calibrations.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery<Id> {
+    #[serde(default)]
+    pub(super) limit: Limit,
+    pub(super) cursor: Option<Id>,
+    pub(super) calibration: Option<CalibrationId>,
 }
 
 #[derive(Debug, Serialize)]

@@ -2,17 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use ndarray::{Array2, Axis};
 use serde::{Deserialize, Serialize};
 
-use super::access::Access;
 use super::app::App;
 use super::conditional;
-use super::error::{ApiError, Code};
-use super::extract::{Params, QueryOf};
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
 use crate::formats::mat::SceneArray;
@@ -25,9 +23,7 @@ use crate::store::{Job, StoreError};
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct QualityQuery {
-    /// The upload with the true frames.
     truth: Sha256,
-    /// The stored number that means 1.
     full_scale: Option<f32>,
 }
 
@@ -38,14 +34,12 @@ struct QualityBody {
     quality: Quality,
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/quality`
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((id, snapshot)): Params<(JobId, u32)>,
     QueryOf(query): QueryOf<QualityQuery>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
     app.store.upload(&access.lab, query.truth).await?;
     let path = frames(&app, &job, snapshot).await?;
@@ -59,7 +53,7 @@ pub(super) async fn show(
 }
 
 /// Where the frames of a snapshot are.
-async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf, ApiError> {
+async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf> {
     match app.store.result_file(job, Some(snapshot), "frames.npy").await {
         Ok((_, path)) => Ok(path),
         Err(StoreError::NotFound { .. }) => {
@@ -76,7 +70,7 @@ fn compare(
     mut truth: Opened,
     snapshot: usize,
     shape: SceneShape,
-) -> Result<Vec<FrameQuality>, ApiError> {
+) -> Result<Vec<FrameQuality>> {
     let SceneShape { frames, height, width, snapshots } = shape;
     let found = truth.info;
     let all = frames * snapshots as usize;
@@ -93,7 +87,7 @@ fn compare(
         next(&mut truth)?;
     }
     let result = npy::open_windows(path, &Limits::default())?;
-    let figures = |k: usize| -> Result<FrameQuality, ApiError> {
+    let figures = |k: usize| -> Result<FrameQuality> {
         let truth = next(&mut truth)?;
         let frame = result.read_window(k..k + 1, 0..height, 0..width)?;
         let quality = FrameQuality::of(k, frame.index_axis(Axis(0), 0), truth.view());
@@ -102,7 +96,7 @@ fn compare(
     (0..frames).map(figures).collect()
 }
 
-fn next(truth: &mut Opened) -> Result<Array2<f32>, ApiError> {
+fn next(truth: &mut Opened) -> Result<Array2<f32>> {
     let missing = || FormatError::Internal("a stack has fewer frames than it says".into());
     Ok(truth.next_frame()?.ok_or_else(missing)?)
 }

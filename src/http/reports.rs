@@ -1,14 +1,12 @@
 //! `/v1/calibrations/{calibration}/report.json`, `report.html` and `maps/{name}.png`.
 
-use axum::extract::State;
 use axum::http::{HeaderMap, header};
 use axum::response::Response;
 
-use super::access::Access;
 use super::app::App;
 use super::conditional;
-use super::error::{ApiError, Code};
-use super::extract::Params;
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params};
 use crate::intake::report_page;
 use crate::job::{CalibrationId, CalibrationReport, Lab};
 
@@ -16,24 +14,20 @@ use crate::job::{CalibrationId, CalibrationReport, Lab};
 const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
 
-/// `GET /v1/calibrations/{calibration}/report.json`
 pub(super) async fn json(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let report = report(&app, &access.lab, id).await?;
     conditional::json(&report, &headers)
 }
 
-/// `GET /v1/calibrations/{calibration}/report.html`
 pub(super) async fn html(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let report = report(&app, &access.lab, id).await?;
     let name = app.store.calibration(&access.lab, id).await?.facts.name;
     let title = name.map_or_else(|| id.to_string(), |name| name.as_str().to_owned());
@@ -44,13 +38,11 @@ pub(super) async fn html(
     Ok(response)
 }
 
-/// `GET /v1/calibrations/{calibration}/maps/{name}`
 pub(super) async fn map(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((id, name)): Params<(CalibrationId, String)>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let report = report(&app, &access.lab, id).await?;
     let plain = name.strip_suffix(".png");
     let plain = plain.filter(|name| report.maps.iter().any(|map| map == name));
@@ -62,8 +54,7 @@ pub(super) async fn map(
     Ok(conditional::content(&headers, "image/png", png.ok_or_else(missing)?))
 }
 
-/// The report, if it is made.
-async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport, ApiError> {
+async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport> {
     // Whose it is, before what it holds.
     app.store.calibration(lab, id).await?;
     let not_yet =

@@ -4,7 +4,6 @@ use std::path::Path;
 
 use axum::Json;
 use axum::body::Body;
-use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
@@ -12,11 +11,10 @@ use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
 use tokio_util::io::ReaderStream;
 
-use super::access::Access;
 use super::app::App;
 use super::conditional::{self, Wanted};
-use super::error::{ApiError, Code};
-use super::extract::Params;
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
 use crate::job::{JobId, ResultFile};
 use crate::store::{Job, StoreError};
@@ -37,12 +35,10 @@ struct FileBody {
     href: Option<String>,
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}`
 pub(super) async fn snapshot(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
-) -> Result<Json<SnapshotBody>, ApiError> {
+) -> Result<Json<SnapshotBody>> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
     let files = app.store.result_files(&job, Some(snapshot)).await?;
     let show = |file: ResultFile| FileBody { href: href(job.id, snapshot, &file.name), file };
@@ -61,13 +57,11 @@ fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
     Some(format!("{base}/frames/{number}.{kind}"))
 }
 
-/// `GET /v1/jobs/{job}/manifest.json`
 pub(super) async fn job_manifest(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(job): Params<JobId>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let job = app.store.job(&access.lab, job).await?;
     send(&app, &job, None, "manifest.json", &headers).await
 }
@@ -75,12 +69,11 @@ pub(super) async fn job_manifest(
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr` or
 /// `frames.npy`, as the routes have them.
 pub(super) async fn file(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
     uri: Uri,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
     let name = uri.path().rsplit('/').next().unwrap_or_default();
     send(&app, &job, Some(snapshot), name, &headers).await
@@ -88,11 +81,10 @@ pub(super) async fn file(
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}`, where the frame is `1.exr` or `1.png`.
 pub(super) async fn frame(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((job, snapshot, frame)): Params<(JobId, u32, String)>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
     let frames = job.spec.shape.frames;
     let name = frame_file(&frame, frames).ok_or_else(|| {
@@ -121,7 +113,7 @@ async fn send(
     snapshot: Option<u32>,
     name: &str,
     headers: &HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let (file, path) = match app.store.result_file(job, snapshot, name).await {
         Err(StoreError::NotFound { .. }) => {
             let detail = format!("{name} is not there yet; the job's state says how far it is");
@@ -155,7 +147,7 @@ fn portion(
     file: &ResultFile,
     etag: &str,
     headers: &HeaderMap,
-) -> Result<(StatusCode, u64, u64), ApiError> {
+) -> Result<(StatusCode, u64, u64)> {
     let whole = (StatusCode::OK, 0, file.size);
     if !comes_in_parts(name) {
         return Ok(whole);
@@ -178,7 +170,7 @@ fn outside(size: u64) -> ApiError {
         .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
 }
 
-async fn part(path: &Path, start: u64, length: u64) -> Result<Body, ApiError> {
+async fn part(path: &Path, start: u64, length: u64) -> Result<Body> {
     let mut file = File::open(path).await.map_err(|error| ApiError::internal(&error))?;
     if start > 0 {
         file.seek(SeekFrom::Start(start)).await.map_err(|error| ApiError::internal(&error))?;
@@ -206,7 +198,6 @@ fn disposition(job: JobId, snapshot: Option<u32>, name: &str) -> String {
     }
 }
 
-/// A header value made of characters that we chose.
 fn value(text: String) -> HeaderValue {
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }

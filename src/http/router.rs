@@ -20,8 +20,6 @@ use super::{
 /// The largest JSON body.
 const JSON_BYTES: usize = 256 * 1024;
 
-/// All routes.
-#[must_use]
 #[rustfmt::skip]
 pub fn routes() -> Vec<Route> {
     use Route as R;
@@ -81,7 +79,7 @@ pub fn router(app: App) -> Router {
     let close = map_response(layers::close_after_refusal);
     let mut router = Router::new();
     for route in routes() {
-        let guard = from_fn_with_state((app.store.clone(), route.rule), access::guard);
+        let guard = from_fn_with_state((app.clone(), route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let handlers = handlers.route_layer(guard);
@@ -93,6 +91,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(layers::method_not_allowed)
         .layer(DefaultBodyLimit::max(JSON_BYTES))
         .layer(CatchPanicLayer::custom(layers::panicked))
+        .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::observe))
         .with_state(app)
 }

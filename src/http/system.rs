@@ -12,7 +12,7 @@ use metrics::{counter, gauge};
 use serde::Serialize;
 
 use super::app::App;
-use super::error::ApiError;
+use super::error::Result;
 use crate::job::{JobState, TaskState, Timestamp};
 use crate::store::WorkerRow;
 use strum::VariantArray;
@@ -33,7 +33,6 @@ pub(super) struct SystemBody {
     onnxruntime: Option<String>,
     workers_wanted: usize,
     workers: Vec<WorkerRow>,
-    /// Jobs by state.
     jobs: BTreeMap<&'static str, u64>,
     /// Tasks that can be taken up, wait for others, and are in work.
     queue: QueueBody,
@@ -64,8 +63,7 @@ struct LimitsBody {
     worker_memory_bytes: u64,
 }
 
-/// `GET /v1/system`
-pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>, ApiError> {
+pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>> {
     let settings = &app.settings;
     Ok(Json(SystemBody {
         version: env!("CARGO_PKG_VERSION"),
@@ -87,13 +85,13 @@ pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>, Api
     }))
 }
 
-async fn jobs(app: &App) -> Result<BTreeMap<&'static str, u64>, ApiError> {
+async fn jobs(app: &App) -> Result<BTreeMap<&'static str, u64>> {
     let counted = app.store.job_counts().await?;
     let count = |state| counted.iter().find(|(found, _)| *found == state).map_or(0, |(_, n)| *n);
     Ok(JobState::VARIANTS.iter().map(|&state| (state.into_str(), count(state))).collect())
 }
 
-async fn queue(app: &App) -> Result<QueueBody, ApiError> {
+async fn queue(app: &App) -> Result<QueueBody> {
     let tasks = app.store.task_counts().await?;
     let count = |state: TaskState| {
         tasks.iter().filter(|((_, found), _)| *found == state).map(|(_, count)| count).sum()
@@ -105,7 +103,7 @@ async fn queue(app: &App) -> Result<QueueBody, ApiError> {
     })
 }
 
-async fn disk(app: &App) -> Result<DiskBody, ApiError> {
+async fn disk(app: &App) -> Result<DiskBody> {
     let (free_bytes, size_bytes) = app.store.dir().disk()?;
     let (files, file_bytes) = app.store.blob_totals().await?;
     let reserved_bytes = app.settings.min_free_bytes;
@@ -154,9 +152,8 @@ async fn workers_live(app: &App) -> Result<(), String> {
     if live == 0 { Err("no worker lives".to_owned()) } else { Ok(()) }
 }
 
-/// `GET /metrics`
 #[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
-pub(super) async fn metrics(State(app): State<App>) -> Result<Response, ApiError> {
+pub(super) async fn metrics(State(app): State<App>) -> Result<Response> {
     for (state, count) in jobs(&app).await? {
         gauge!("sci_recon_jobs", "state" => state).set(count as f64);
     }
@@ -186,7 +183,6 @@ pub(super) async fn metrics(State(app): State<App>) -> Result<Response, ApiError
     Ok((kind, app.metrics.render()).into_response())
 }
 
-/// `GET /openapi.yaml`
 pub(super) async fn contract() -> Response {
     let kind = [(header::CONTENT_TYPE, "application/yaml")];
     (kind, include_str!("../../openapi.yaml")).into_response()

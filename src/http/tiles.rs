@@ -1,15 +1,12 @@
 //! Tiles of a job as they are worked on, and how the solver converges on each.
 
-use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use serde::Serialize;
 
-use super::access::Access;
-use super::app::App;
 use super::conditional;
-use super::error::{ApiError, Code};
-use super::extract::Params;
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
 use crate::job::JobId;
 use crate::store::{TileHistory, TileState};
@@ -30,13 +27,11 @@ struct TileBody {
     state: TileState,
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles`
 pub(super) async fn list(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((id, snapshot)): Params<(JobId, u32)>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
     let plan = job.spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
     let states = app.store.tile_states(id, snapshot).await?;
@@ -49,13 +44,11 @@ pub(super) async fn list(
     conditional::json(&body, &headers)
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history`
 pub(super) async fn history(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params((id, snapshot, tile)): Params<(JobId, u32, u32)>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     with_snapshot(&app, &access.lab, id, snapshot).await?;
     let history: Option<TileHistory> = app.store.tile_history(id, snapshot, tile).await?;
     let none = || ApiError::new(Code::NotFound, format!("the job has no tile {tile}"));

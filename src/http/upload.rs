@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 
 use super::admission::Reservation;
 use super::app::App;
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use crate::store::{StagedBlob, Store, StoreError};
 
 /// Chunks between the network and the disk.
@@ -24,7 +24,7 @@ pub(super) async fn receive<S, E>(
     app: &App,
     mut room: Reservation,
     mut stream: S,
-) -> Result<StagedBlob, ApiError>
+) -> Result<StagedBlob>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
@@ -72,7 +72,7 @@ async fn pump<S, E>(
     room: &mut Reservation,
     stream: &mut S,
     sender: mpsc::Sender<Bytes>,
-) -> Result<(), ApiError>
+) -> Result<()>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
@@ -90,8 +90,7 @@ where
     Ok(())
 }
 
-/// The next chunk, if there is one and it comes in time.
-pub(super) async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>, ApiError>
+pub(super) async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,

@@ -16,6 +16,7 @@ use crate::formats::{
     self, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo, StackWriter, png,
     read_stack,
 };
+use crate::intake::error::Result;
 use crate::job::{CalibrationReport, Captures, Finding};
 use crate::optics::{
     Average, Calibrator, CaptureFigures, MaskFigures, MaskStudy, PatternFigures, References,
@@ -29,7 +30,6 @@ const PICTURE: usize = 640;
 /// The share of the work that averaging is; writing the masks and looking at them are a tenth each.
 const AVERAGING: f64 = 0.8;
 
-/// The files of captures.
 pub type CaptureFiles = Captures<PathBuf>;
 
 /// Hears how much of the work is done, on \[0,1\]; false asks to stop.
@@ -38,7 +38,6 @@ pub type Progress<'a> = dyn FnMut(f64) -> bool + 'a;
 /// What is known of masks that were made of captures.
 #[derive(Debug)]
 pub struct Calibrated {
-    /// The report on them.
     pub report: Report,
     /// How the captures are stored.
     pub sample: SampleType,
@@ -46,7 +45,6 @@ pub struct Calibrated {
     pub clipped_negatives: u64,
 }
 
-/// A report with its pictures.
 #[derive(Debug)]
 pub struct Report {
     /// What is known of the masks.
@@ -67,7 +65,7 @@ pub fn calibrate<W: Write>(
     scratch: &Path,
     open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, FormatError>,
     progress: &mut Progress<'_>,
-) -> Result<(Calibrated, W), IntakeError> {
+) -> Result<(Calibrated, W)> {
     // Checked before hours of averaging.
     let patterns = read_patterns(files, limits)?;
     let captured = average_masks(files, limits, scratch, progress)?;
@@ -81,13 +79,13 @@ pub fn calibrate<W: Write>(
 
 /// The report on masks \[B,H,W\] on \[0,1\] that were sent as such.
 /// Errors: masks that can't be read; a stop.
-pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report, IntakeError> {
+pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
     tell(&study(masks, 1.0, progress)?, None, None)
 }
 
 /// Looks at the headers of captures: they must be stacks of one size, before hours of averaging.
 /// Errors: files that can't be read, or differ in size, by their place in a request.
-pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<(), IntakeError> {
+pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<()> {
     let mut first = None;
     for (place, paths) in files.lists() {
         for (index, path) in paths.iter().enumerate() {
@@ -125,7 +123,7 @@ fn average_masks(
     limits: &Limits,
     raw: &Path,
     progress: &mut Progress<'_>,
-) -> Result<Captured, IntakeError> {
+) -> Result<Captured> {
     let total = files.masks.len() + 3;
     let mut done = 0;
     let mut average = |name: &str, paths: &[PathBuf]| {
@@ -175,7 +173,7 @@ pub(super) fn average(
     limits: &Limits,
     place: impl Fn(usize) -> String,
     progress: &mut Progress<'_>,
-) -> Result<(Average, SampleType), IntakeError> {
+) -> Result<(Average, SampleType)> {
     let (mut repeats, mut sample) = (None, SampleType::F32);
     for (index, path) in paths.iter().enumerate() {
         let failed = |source| IntakeError::format(place(index))(source);
@@ -206,7 +204,7 @@ pub(super) fn full_number(sample: SampleType, stated: Option<u32>) -> Option<f32
     stated.map(|value| value as f32).or(largest)
 }
 
-fn go_on(progress: &mut Progress<'_>, share: f64) -> Result<(), IntakeError> {
+fn go_on(progress: &mut Progress<'_>, share: f64) -> Result<()> {
     if progress(share) { Ok(()) } else { Err(IntakeError::Stopped) }
 }
 
@@ -220,7 +218,7 @@ fn write_scaled<W: Write>(
     scale: f32,
     mut to: StackWriter<W>,
     progress: &mut Progress<'_>,
-) -> Result<W, IntakeError> {
+) -> Result<W> {
     let StackInfo { frames, height, width, .. } = *raw.info();
     for frame in 0..frames {
         let mut mask = raw.read_window(frame..frame + 1, 0..height, 0..width)?;
@@ -237,7 +235,7 @@ fn tell(
     figures: &MaskFigures,
     captured: Option<&Captured>,
     patterns: Option<&Array3<f32>>,
-) -> Result<Report, IntakeError> {
+) -> Result<Report> {
     let mut findings = judge_masks(figures, patterns.map(|patterns| patterns.view()));
     let mut maps = vec![
         ("mean".to_owned(), picture(&figures.mean)?),
@@ -255,11 +253,7 @@ fn tell(
 }
 
 /// Looks at masks, once they are divided by `scale`, band by band.
-fn study(
-    masks: &Reader,
-    scale: f32,
-    progress: &mut Progress<'_>,
-) -> Result<MaskFigures, IntakeError> {
+fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<MaskFigures> {
     let StackInfo { frames, height, width, .. } = *masks.info();
     let refused = |error| IntakeError::content("masks", &error);
     let rows = (BAND_BYTES / (frames * width * size_of::<f32>())).clamp(1, height);
@@ -276,10 +270,7 @@ fn study(
 }
 
 /// The patterns that were shown \[B,h,w\], on \[0,1\], if there is a file of them.
-fn read_patterns(
-    files: &CaptureFiles,
-    limits: &Limits,
-) -> Result<Option<Array3<f32>>, IntakeError> {
+fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<f32>>> {
     let Some(path) = &files.patterns else { return Ok(None) };
     let (info, patterns) = read_stack(path, limits).map_err(IntakeError::format("patterns"))?;
     let patterns = patterns / info.default_full_scale.value();

@@ -11,6 +11,7 @@ use super::open::Opened;
 use crate::formats::planar::Reader;
 use crate::formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use crate::formats::{self, FormatError, FrameReader, Limits, StackInfo};
+use crate::intake::error::Result;
 use crate::job::{Finding, MOST_MASKS};
 use crate::optics::{MeasurementStudy, REACH, judge_measurement};
 
@@ -36,7 +37,7 @@ pub struct Exposure {
 pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
-) -> Result<MaskStatistics, IntakeError> {
+) -> Result<MaskStatistics> {
     check_axes(&opened)?;
     check_masks(&mut *opened.reader, opened.full_scale, sink)
         .map_err(IntakeError::format(opened.name))
@@ -44,7 +45,7 @@ pub fn masks(
 
 /// Refuses what has more frames than one exposure can tell apart, and what looks like masks whose last axis
 /// is the frame.
-fn check_axes(opened: &Opened) -> Result<(), IntakeError> {
+fn check_axes(opened: &Opened) -> Result<()> {
     let StackInfo { frames, height, width, .. } = opened.info;
     if frames <= MOST_MASKS && (width >= frames || height < 4 * width) {
         return Ok(());
@@ -72,7 +73,7 @@ pub fn measurement(
     exposure: &Exposure,
     limits: &Limits,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
-) -> Result<Option<Vec<f64>>, IntakeError> {
+) -> Result<Option<Vec<f64>>> {
     let Opened { info, full_scale, reader, name } = opened;
     let dark = average_dark(&exposure.dark, (info.height, info.width), limits)?;
     let saturation = full_number(info.sample, exposure.saturation);
@@ -86,7 +87,7 @@ fn average_dark(
     dark: &[PathBuf],
     (height, width): (usize, usize),
     limits: &Limits,
-) -> Result<Option<Array2<f32>>, IntakeError> {
+) -> Result<Option<Array2<f32>>> {
     if dark.is_empty() {
         return Ok(None);
     }

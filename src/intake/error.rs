@@ -2,31 +2,18 @@
 
 use crate::formats::FormatError;
 
+pub type Result<T, E = IntakeError> = std::result::Result<T, E>;
+
 /// Why a file, or what is in it, is refused. Each names the file by its `place`: a JSON pointer into
 /// the request, or a name and path, as the caller has called it; empty where there is but one.
 #[derive(Debug, thiserror::Error)]
 pub enum IntakeError {
     #[error("{}{source}", prefix(.place))]
-    Format {
-        /// Which file.
-        place: String,
-        /// What is wrong with it.
-        source: FormatError,
-    },
+    Format { place: String, source: FormatError },
     #[error("{}{detail}", prefix(.place))]
-    Size {
-        /// Which file.
-        place: String,
-        /// Both sizes.
-        detail: String,
-    },
+    Size { place: String, detail: String },
     #[error("{}{detail}", prefix(.place))]
-    Content {
-        /// Which file.
-        place: String,
-        /// What is wrong with it.
-        detail: String,
-    },
+    Content { place: String, detail: String },
     #[error("stopped")]
     Stopped,
 }
@@ -37,7 +24,6 @@ fn prefix(place: &str) -> String {
 
 impl IntakeError {
     /// Whether another attempt may succeed: the machine failed, not the data.
-    #[must_use]
     pub fn is_retryable(&self) -> bool {
         match self {
             Self::Format { source, .. } => !source.is_callers_fault(),

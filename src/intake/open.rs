@@ -7,17 +7,15 @@ use ndarray::Array2;
 use super::IntakeError;
 use crate::formats::mat::{self, SceneArray};
 use crate::formats::{self, FrameReader, FullScale, Limits, StackInfo};
+use crate::intake::error::Result;
 
 /// A file, and which array of it is meant if it is a .mat scene.
 #[derive(Debug, Clone)]
 pub struct Source<'a> {
-    /// Where it is.
     pub path: &'a Path,
-    /// What it holds.
     pub array: SceneArray,
     /// The stored number that means 1; none for the file's own.
     pub full_scale: Option<f32>,
-    /// How large it may be.
     pub limits: Limits,
     /// What errors call it; empty for an upload, of which there is one, and whose path is ours.
     pub name: String,
@@ -25,9 +23,7 @@ pub struct Source<'a> {
 
 /// A stack whose frames are read one at a time.
 pub struct Opened {
-    /// The file's shape and type.
     pub info: StackInfo,
-    /// The stored number that means 1.
     pub full_scale: FullScale,
     pub(super) reader: Box<dyn FrameReader + Send>,
     pub(super) name: String,
@@ -35,7 +31,6 @@ pub struct Opened {
 
 impl<'a> Source<'a> {
     /// A file that the user has named.
-    #[must_use]
     pub fn file(path: &'a Path, array: SceneArray, full_scale: Option<f32>) -> Self {
         let what = match array {
             SceneArray::Masks => "masks",
@@ -47,7 +42,6 @@ impl<'a> Source<'a> {
     }
 
     /// A file of the service.
-    #[must_use]
     pub fn upload(
         path: &'a Path,
         array: SceneArray,
@@ -60,7 +54,7 @@ impl<'a> Source<'a> {
     /// Opens it.
     /// Errors: no file, or none of a format that is read; larger than the limits; no such array; no
     /// full scale.
-    pub fn open(&self) -> Result<Opened, IntakeError> {
+    pub fn open(&self) -> Result<Opened> {
         let opened = match mat::is_mat(self.path) {
             Ok(true) => mat::open_array(self.path, self.array, &self.limits),
             Ok(false) => formats::open_stack(self.path, &self.limits),
@@ -78,7 +72,7 @@ impl<'a> Source<'a> {
 
 impl Opened {
     /// The next frame \[H,W\] divided by the full scale; none after the last.
-    pub fn next_frame(&mut self) -> Result<Option<Array2<f32>>, IntakeError> {
+    pub fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         let frame = self.reader.next_frame().map_err(IntakeError::format(&self.name))?;
         Ok(frame.map(|frame| frame / self.full_scale.value()))
     }

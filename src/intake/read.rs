@@ -14,18 +14,17 @@ use super::check::{Exposure, masks, measurement};
 use super::open::Source;
 use crate::formats::mat::SceneArray;
 use crate::formats::{FormatError, Limits};
+use crate::intake::error::Result;
 
 /// An array on its own scale, and the full scale that brought it there.
 #[derive(Debug)]
 pub struct Scaled<T> {
-    /// The values.
     pub array: T,
-    /// The stored number that means 1.
     pub full_scale: f32,
 }
 
 /// Masks \[B,H,W\] on \[0,1\], checked.
-pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>, IntakeError> {
+pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     let opened = source.open()?;
     let full_scale = opened.full_scale.value();
     let mut stack = Stack::default();
@@ -34,10 +33,7 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>, IntakeErro
 }
 
 /// Snapshot `index` \[H,W\] of a measurement, checked, and how many there are.
-pub fn read_snapshot(
-    source: &Source<'_>,
-    index: usize,
-) -> Result<(Scaled<Array2<f32>>, usize), IntakeError> {
+pub fn read_snapshot(source: &Source<'_>, index: usize) -> Result<(Scaled<Array2<f32>>, usize)> {
     let opened = source.open()?;
     let (full_scale, snapshots) = (opened.full_scale.value(), opened.info.frames);
     let (mut next, mut found) = (0, None);
@@ -60,13 +56,13 @@ pub fn read_snapshot(
 
 /// The true frames \[B,H,W\] of one snapshot, of a file that has those of this snapshot or of all. A .mat
 /// scene may go without; another file may not.
-/// Errors: A file that can't be read; other sizes.
+/// Errors: a file that can't be read; other sizes.
 pub fn read_truth(
     source: &Source<'_>,
     (frames, height, width): (usize, usize, usize),
     snapshot: usize,
     snapshots: usize,
-) -> Result<Option<Array3<f32>>, IntakeError> {
+) -> Result<Option<Array3<f32>>> {
     let truth = match read_frames(source) {
         Err(IntakeError::Format { source: FormatError::MissingArray { .. }, .. }) => {
             return Ok(None);
@@ -95,7 +91,7 @@ pub fn read_truth(
 /// Frames \[T,H,W\] of a file, of an npz archive, or of a folder of pictures in the order of their
 /// names, divided by the full scale; all finite.
 /// Errors: files that can't be read; pictures of different sizes.
-pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>, IntakeError> {
+pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
     let source = |path| Source::file(path, SceneArray::Truth, full_scale);
     if path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("npz")) {
         return read_frames(&source(extract(path)?.path()));
@@ -133,7 +129,7 @@ pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>, In
 }
 
 /// Frames \[T,H,W\] divided by the full scale, all finite.
-fn read_frames(source: &Source<'_>) -> Result<Array3<f32>, IntakeError> {
+fn read_frames(source: &Source<'_>) -> Result<Array3<f32>> {
     let mut opened = source.open()?;
     let mut stack = Stack::default();
     while let Some(frame) = opened.next_frame()? {
@@ -151,7 +147,7 @@ fn read_frames(source: &Source<'_>) -> Result<Array3<f32>, IntakeError> {
 }
 
 /// The only array of an npz archive, or the one called `frames`, as an npy file of its own.
-fn extract(path: &Path) -> Result<NamedTempFile, IntakeError> {
+fn extract(path: &Path) -> Result<NamedTempFile> {
     let refused =
         |problem: &dyn Display| IntakeError::content(format!("frames {}", path.display()), problem);
     let file = File::open(path).map_err(|error| refused(&error))?;
@@ -192,7 +188,7 @@ impl Stack {
         Ok(())
     }
 
-    fn into_array(self) -> Result<Array3<f32>, IntakeError> {
+    fn into_array(self) -> Result<Array3<f32>> {
         let shape = (self.frames, self.size.0, self.size.1);
         Array3::from_shape_vec(shape, self.values)
             .map_err(|error| FormatError::Internal(error.to_string()).into())

@@ -9,7 +9,6 @@ const CELL: usize = 16;
 
 /// The page of a report; `title` names the calibration. Pictures are looked for in `maps/` beside it,
 /// and the style where the service has it: without one it is plain.
-#[must_use]
 pub fn report_page(title: &str, report: &CalibrationReport) -> String {
     let page = html! {
         (DOCTYPE)

@@ -15,13 +15,10 @@ pub struct Lab(String);
 
 impl Lab {
     /// The lab of all who use a service without tokens.
-    #[must_use]
     pub fn local() -> Self {
         Self("local".into())
     }
 
-    /// Its name.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -82,26 +79,22 @@ const PREFIX: &str = "sci_";
 
 impl Secret {
     /// The token of 256 random bits.
-    #[must_use]
     pub fn from_bytes(bytes: [u8; 32]) -> Self {
         Self(format!("{PREFIX}{}", Sha256::new(bytes)))
     }
 
     /// The text, if it has the form of a token.
-    #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         text.strip_prefix(PREFIX)?.parse::<Sha256>().ok()?;
         Some(Self(text.into()))
     }
 
     /// What is stored instead of the token. Its bits are random, so a plain hash keeps it.
-    #[must_use]
     pub fn hash(&self) -> Sha256 {
         Sha256::of(self.0.as_bytes())
     }
 
     /// The token itself, to be shown once to the one it is made for.
-    #[must_use]
     pub fn reveal(&self) -> &str {
         &self.0
     }

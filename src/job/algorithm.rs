@@ -32,7 +32,6 @@ pub enum Algorithm {
 
 impl Algorithm {
     /// What it does, in a sentence.
-    #[must_use]
     pub fn summary(self) -> &'static str {
         match self {
             Self::GapTv => {
@@ -65,7 +64,6 @@ impl Algorithm {
     }
 
     /// The schedule of a job that names none; without stages for [`Self::Learned`], which has none.
-    #[must_use]
     pub fn default_schedule(self) -> Schedule {
         match self {
             Self::GapTv => Schedule::gap_tv(),
@@ -81,7 +79,6 @@ impl Algorithm {
 
     /// The tiles of a job that names none. Larger ones share less with their neighbours and are as fast
     /// (measured up to 512), but take more memory and let fewer workers help.
-    #[must_use]
     pub fn default_tile(self) -> TileSpec {
         match self {
             Self::GapTv | Self::GapTv3d | Self::AdmmTv => TileSpec { size: 384, overlap: 16 },
@@ -91,7 +88,6 @@ impl Algorithm {
     }
 
     /// The priors that a schedule of this algorithm may name.
-    #[must_use]
     pub fn priors(self) -> &'static [&'static dyn Prior] {
         match self {
             Self::GapTv | Self::GapTv3d | Self::AdmmTv => &[&TV],
@@ -107,7 +103,6 @@ impl Algorithm {
 
     /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
     /// what the stages don't do.
-    #[must_use]
     pub fn misfit(self, schedule: &Schedule) -> Option<String> {
         let own = self.priors();
         let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;

@@ -14,8 +14,8 @@ pub struct InvalidId {
     pub text: String,
 }
 
-macro_rules! identifier {
-    ($(#[$doc:meta])* $name:ident) => {
+macro_rules! identifiers {
+    ($($(#[$doc:meta])* $name:ident,)*) => {$(
         $(#[$doc])*
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[derive(Display, SerializeDisplay, DeserializeFromStr)]
@@ -23,7 +23,6 @@ macro_rules! identifier {
 
         impl $name {
             /// A new identifier, greater than all those made before it in this process.
-            #[must_use]
             #[allow(clippy::new_without_default)] // two calls differ: a default should not
             pub fn new() -> Self {
                 Self(Uuid::now_v7())
@@ -42,41 +41,27 @@ macro_rules! identifier {
                     .ok_or_else(|| InvalidId { text: text.chars().take(60).collect() })
             }
         }
-    };
+    )*};
 }
 
-identifier!(
+identifiers! {
     /// A calibration: the masks of one optical setting.
-    CalibrationId
-);
-identifier!(
+    CalibrationId,
     /// A measurement: one or more snapshots taken with one calibration.
-    MeasurementId
-);
-identifier!(
+    MeasurementId,
     /// A model: an end-to-end network that is registered for a calibration.
-    ModelId
-);
-identifier!(
+    ModelId,
     /// A job: the reconstruction of some snapshots of one measurement.
-    JobId
-);
-identifier!(
+    JobId,
     /// A task: the piece of a job that one worker does in one go.
-    TaskId
-);
-identifier!(
+    TaskId,
     /// An upload that comes in pieces.
-    PartialId
-);
-identifier!(
+    PartialId,
     /// A token; not its secret.
-    TokenId
-);
-identifier!(
+    TokenId,
     /// A worker process, from its start to its end.
-    WorkerId
-);
+    WorkerId,
+}
 
 #[cfg(test)]
 mod tests {

@@ -17,7 +17,6 @@ const NETWORK_PIXELS: u64 = 1 << 17;
 impl JobSpec {
     /// The planned cost of a tile in CPU-nanoseconds per voxel: of the schedule, or of a network as
     /// its trial took it.
-    #[must_use]
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn planned_ns_per_voxel(&self) -> f64 {
         match &self.model {
@@ -30,7 +29,6 @@ impl JobSpec {
     }
 
     /// An upper bound of the resident memory, in bytes, of a worker that does any task of this job.
-    #[must_use]
     pub fn worker_bytes(&self) -> u64 {
         // A preview by blocks takes far less than a tile.
         let voxels = self.shape.height * self.shape.width * self.shape.frames;

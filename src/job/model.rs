@@ -59,8 +59,6 @@ pub struct JobModel {
 }
 
 impl ModelTrial {
-    /// Pixels of the picture.
-    #[must_use]
     pub fn pixels(&self) -> usize {
         self.height * self.width
     }

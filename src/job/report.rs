@@ -45,7 +45,6 @@ pub enum Grade {
 
 impl Grade {
     /// The grade that findings give.
-    #[must_use]
     pub fn of(findings: &[Finding]) -> Self {
         match findings.iter().map(|finding| finding.severity).max() {
             None => Self::Good,
@@ -144,7 +143,6 @@ const SCHEMA: &str = "sci-recon/calibration-report/1";
 
 impl CalibrationReport {
     /// Of figures and what was found in them. `captures` come with the scale of the masks.
-    #[must_use]
     pub fn new(
         figures: &MaskFigures,
         captures: Option<(&CaptureFigures, f32)>,

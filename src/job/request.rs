@@ -223,7 +223,6 @@ impl JobSpec {
 
     /// An upper bound of the bytes that the job writes to the disk. Tiles are kept until it has
     /// succeeded, so both count.
-    #[must_use]
     pub fn disk_bytes(&self) -> u64 {
         let frames = self.shape.frames as u64;
         let voxels = (self.shape.height * self.shape.width) as u64 * frames;

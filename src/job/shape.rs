@@ -12,13 +12,11 @@ pub struct SnapshotRange {
 }
 
 impl SnapshotRange {
-    /// The indices.
     pub fn indices(self) -> impl Iterator<Item = u32> {
         self.first..self.first + self.count
     }
 
     /// True if the snapshot with this index is among them.
-    #[must_use]
     pub fn contains(self, index: u32) -> bool {
         index >= self.first && index - self.first < self.count
     }
@@ -35,7 +33,6 @@ pub struct TileSpec {
 
 impl TileSpec {
     /// One tile for the whole of a picture.
-    #[must_use]
     pub fn whole(height: usize, width: usize) -> Self {
         Self { size: height.max(width).max(16), overlap: 0 }
     }

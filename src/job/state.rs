@@ -45,7 +45,6 @@ pub struct IllegalTransition {
 
 impl JobState {
     /// True if nothing happens to the job any more unless a user asks for it.
-    #[must_use]
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
     }

@@ -32,7 +32,6 @@ pub enum TaskKind {
     Pilot,
     Tile {
         snapshot: u32,
-        /// The tile's index in the plan.
         tile: u32,
     },
     /// Blend the tiles of one snapshot and write its frames.
@@ -46,7 +45,6 @@ pub enum TaskKind {
 
 impl TaskKind {
     /// The snapshot that the task belongs to, if it belongs to one.
-    #[must_use]
     pub fn snapshot(self) -> Option<u32> {
         match self {
             Self::Preview { snapshot }
@@ -57,7 +55,6 @@ impl TaskKind {
     }
 
     /// The tile's index, for a tile.
-    #[must_use]
     pub fn tile(self) -> Option<u32> {
         match self {
             Self::Tile { tile, .. } => Some(tile),
@@ -66,7 +63,6 @@ impl TaskKind {
     }
 
     /// The kind with this name and these indices: the inverse of the functions above and `into_str`.
-    #[must_use]
     pub fn from_parts(name: &str, snapshot: Option<u32>, tile: Option<u32>) -> Option<Self> {
         match (name, snapshot, tile) {
             ("prepare", None, None) => Some(Self::Prepare),

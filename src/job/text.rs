@@ -43,7 +43,6 @@ impl InvalidField {
     }
 
     /// The same error seen from one level further up.
-    #[must_use]
     pub fn under(mut self, parent: &str) -> Self {
         self.pointer.insert_str(0, parent);
         self
@@ -58,8 +57,6 @@ impl Label {
     /// The most characters that a label has.
     pub const MAX_CHARS: usize = 200;
 
-    /// The text of the label.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -96,7 +93,6 @@ pub struct Sha256([u8; 32]);
 
 impl Sha256 {
     /// The hash with these 32 bytes.
-    #[must_use]
     pub fn new(bytes: [u8; 32]) -> Self {
         Self(bytes)
     }
@@ -110,7 +106,6 @@ impl Sha256 {
     }
 
     /// The hash of `bytes`.
-    #[must_use]
     pub fn of(bytes: &[u8]) -> Self {
         use sha2::Digest;
         Self(sha2::Sha256::digest(bytes).into())
@@ -145,7 +140,6 @@ pub struct Timestamp(pub i64);
 
 impl Timestamp {
     /// The wall clock's time.
-    #[must_use]
     pub fn now() -> Self {
         Self(jiff::Timestamp::now().as_millisecond())
     }
@@ -155,7 +149,6 @@ impl Timestamp {
     }
 
     /// As in the headers of HTTP (RFC 9110).
-    #[must_use]
     pub fn http_date(self) -> String {
         let printer = jiff::fmt::rfc2822::DateTimePrinter::new();
         // Fails only before the year 0.
@@ -163,7 +156,6 @@ impl Timestamp {
     }
 
     /// Seconds from `earlier` to this moment, not below zero.
-    #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn seconds_since(self, earlier: Self) -> f64 {
         (self.0 - earlier.0).max(0) as f64 / 1000.0
@@ -178,7 +170,6 @@ impl fmt::Display for Timestamp {
 
 /// The text with each absolute path in it cut down to its last part: how the folders of the service
 /// are named is nobody's business, and what failed can still be told.
-#[must_use]
 pub fn without_paths(text: &str) -> String {
     let mut clean = String::with_capacity(text.len());
     let mut rest = text;

@@ -3,7 +3,7 @@
 
 use ndarray::{Array2, ArrayView2, Zip};
 
-use super::OpticsError;
+use super::{OpticsError, Result};
 
 /// Denominators below this share of their median are too dark to divide by.
 const DARKEST: f32 = 0.01;
@@ -50,10 +50,8 @@ impl Repeats {
     }
 
     /// Adds a capture.
-    ///
-    /// # Errors
-    /// Another size; numbers that are not finite.
-    pub fn add(&mut self, capture: ArrayView2<'_, f32>) -> Result<(), OpticsError> {
+    /// Errors: another size; numbers that are not finite.
+    pub fn add(&mut self, capture: ArrayView2<'_, f32>) -> Result<()> {
         if capture.dim() != self.sum.dim() {
             let ((a, b), (c, d)) = (capture.dim(), self.sum.dim());
             return Err(OpticsError::Captures(format!(
@@ -81,11 +79,9 @@ impl Repeats {
     }
 
     /// The average.
-    ///
-    /// # Errors
-    /// No captures.
+    /// Errors: no captures.
     #[allow(clippy::cast_possible_truncation)] // to the precision of masks
-    pub fn average(mut self) -> Result<Average, OpticsError> {
+    pub fn average(mut self) -> Result<Average> {
         let repeats = self.means.len();
         if repeats == 0 {
             return Err(OpticsError::Captures("there is no capture to average".into()));
@@ -149,7 +145,7 @@ pub struct RawMask {
 impl Calibrator {
     /// # Errors
     /// References of different sizes, or a white that is nowhere brighter than the black.
-    pub fn new(references: References) -> Result<Self, OpticsError> {
+    pub fn new(references: References) -> Result<Self> {
         let size = references.white.mean.dim();
         let dark = [Some(&references.black), references.black_with_mask.as_ref()];
         if dark.into_iter().flatten().any(|image| image.mean.dim() != size) {
@@ -196,10 +192,8 @@ impl Calibrator {
     }
 
     /// The mask of an averaged pattern.
-    ///
-    /// # Errors
-    /// A capture of another size.
-    pub fn mask(&self, capture: &Average) -> Result<RawMask, OpticsError> {
+    /// Errors: a capture of another size.
+    pub fn mask(&self, capture: &Average) -> Result<RawMask> {
         if capture.mean.dim() != self.denominator.dim() {
             let ((a, b), (c, d)) = (capture.mean.dim(), self.denominator.dim());
             return Err(OpticsError::Captures(format!(

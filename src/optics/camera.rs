@@ -5,7 +5,7 @@ use rand::Rng;
 use rand_distr::{Distribution, Normal, Poisson};
 use serde::{Deserialize, Serialize};
 
-use super::OpticsError;
+use super::{OpticsError, Result};
 
 /// A camera and the light that it works in. Signals are shares of the full well.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -45,10 +45,8 @@ impl Default for Camera {
 
 impl Camera {
     /// Refuses numbers that can't be.
-    ///
-    /// # Errors
-    /// [`OpticsError::Parameter`] with the name of the first one that is wrong.
-    pub fn check(&self) -> Result<(), OpticsError> {
+    /// Errors: [`OpticsError::Parameter`] with the name of the first one that is wrong.
+    pub fn check(&self) -> Result<()> {
         let refused = |name, value: f64, range| {
             Err(OpticsError::Parameter { name, value: value.to_string(), range })
         };
@@ -88,15 +86,13 @@ impl Camera {
     /// A capture \[H,W\] of `light`, in shares of the full well on top of the background's share
     /// `background`: photons arrive by chance, reading adds noise, numbers are whole and end at
     /// [`Camera::saturation`].
-    ///
-    /// # Errors
-    /// Light that is no number.
+    /// Errors: light that is no number.
     pub fn capture(
         &self,
         light: ArrayView2<'_, f32>,
         background: f64,
         rng: &mut impl Rng,
-    ) -> Result<Array2<u16>, OpticsError> {
+    ) -> Result<Array2<u16>> {
         self.check()?;
         let read = Normal::new(0.0, self.read_noise_e).map_err(|error| impossible(&error))?;
         let unit = f64::from(self.saturation()) / self.full_well_e;
@@ -127,13 +123,8 @@ fn impossible(error: &dyn std::fmt::Display) -> OpticsError {
 
 /// Relative illumination \[H,W\] of a sensor that loses the share `vignetting` of the light at its
 /// corners, by the square of the distance from the centre.
-///
-/// # Errors
-/// A share outside \[0,1).
-pub fn illumination(
-    (height, width): (usize, usize),
-    vignetting: f64,
-) -> Result<Array2<f32>, OpticsError> {
+/// Errors: a share outside \[0,1).
+pub fn illumination((height, width): (usize, usize), vignetting: f64) -> Result<Array2<f32>> {
     if !(0.0..1.0).contains(&vignetting) {
         return Err(OpticsError::Parameter {
             name: "light vignetting",

@@ -1,6 +1,6 @@
 //! The camera's lengths, and what they mean for the masks.
 
-use super::OpticsError;
+use super::{OpticsError, Result};
 
 /// The hybrid coded aperture: an LCoS in the aperture of a 4f system, a lithography mask shortly
 /// before its image plane, and a relay from there to the sensor. Defaults are the paper's
@@ -57,10 +57,8 @@ const FAR: f64 = 1000.0;
 
 impl Geometry {
     /// Refuses lengths that can't be.
-    ///
-    /// # Errors
-    /// [`OpticsError::Parameter`] with the name of the first one that is wrong.
-    pub fn check(&self) -> Result<(), OpticsError> {
+    /// Errors: [`OpticsError::Parameter`] with the name of the first one that is wrong.
+    pub fn check(&self) -> Result<()> {
         let lengths = [
             ("lcos pitch_um", self.lcos_pitch_um),
             ("relay focal_length_mm", self.focal_length_mm),

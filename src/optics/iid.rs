@@ -3,19 +3,12 @@
 use ndarray::Array3;
 use rand::Rng;
 
-use super::{OpticsError, check_size, generator};
+use super::{Result, check_size, generator};
 
 /// `frames` binary masks of `height` x `width`, each pixel open with probability one half and
 /// independent of all others.
-///
-/// # Errors
-/// A size of 0.
-pub fn iid_masks(
-    frames: usize,
-    height: usize,
-    width: usize,
-    seed: u64,
-) -> Result<Array3<f32>, OpticsError> {
+/// Errors: a size of 0.
+pub fn iid_masks(frames: usize, height: usize, width: usize, seed: u64) -> Result<Array3<f32>> {
     check_size(frames, height, width)?;
     let mut rng = generator(seed);
     Ok(Array3::from_shape_simple_fn((frames, height, width), || {

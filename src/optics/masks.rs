@@ -4,7 +4,7 @@ use ndarray::{Array2, Array3, ArrayView3, Axis};
 use rand::Rng;
 
 use super::projection::centre;
-use super::{Geometry, Method, OpticsError, Placement, Projector, check_patterns};
+use super::{Geometry, Method, OpticsError, Placement, Projector, Result, check_patterns};
 
 /// What a mask value of 1 means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,16 +58,14 @@ pub struct ProjectedMasks {
 
 impl HybridAperture {
     /// The masks of `patterns` \[B, rows, columns\] on a sensor of `size` (rows, columns).
-    ///
-    /// # Errors
-    /// A geometry, patterns or sizes that can't be; a lithography mask that is too small or has
-    /// values outside \[0,1\]; masks without light.
+    /// Errors: a geometry, patterns or sizes that can't be; a lithography mask that is too small or
+    /// has values outside \[0,1\]; masks without light.
     pub fn masks(
         &self,
         patterns: ArrayView3<'_, f32>,
         size: (usize, usize),
         rng: &mut impl Rng,
-    ) -> Result<ProjectedMasks, OpticsError> {
+    ) -> Result<ProjectedMasks> {
         let (frames, rows, columns) = patterns.dim();
         check_patterns(patterns, frames)?;
         let projector =
@@ -98,7 +96,7 @@ impl HybridAperture {
         &self,
         (rows, columns): (usize, usize),
         rng: &mut impl Rng,
-    ) -> Result<Array2<f32>, OpticsError> {
+    ) -> Result<Array2<f32>> {
         let Some(given) = &self.lithography else {
             return Ok(Array2::from_shape_simple_fn((rows, columns), || {
                 f32::from(u8::from(rng.random::<bool>()))

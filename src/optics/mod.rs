@@ -40,6 +40,9 @@ pub use study::{MaskFigures, MaskStudy, flatness};
 
 use thiserror::Error;
 
+/// What the functions of this folder give.
+pub type Result<T, E = OpticsError> = std::result::Result<T, E>;
+
 /// What can't be built or simulated.
 #[derive(Debug, Error, PartialEq)]
 #[allow(missing_docs)] // the messages say what the fields are
@@ -78,7 +81,7 @@ pub fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
 }
 
 /// Refuses an empty stack.
-fn check_size(frames: usize, height: usize, width: usize) -> Result<(), OpticsError> {
+fn check_size(frames: usize, height: usize, width: usize) -> Result<()> {
     for (name, value) in [("compression ratio", frames), ("height", height), ("width", width)] {
         if value == 0 {
             let range = "at least 1";

@@ -3,7 +3,7 @@
 use rand::Rng;
 use rand::seq::index;
 
-use super::OpticsError;
+use super::{OpticsError, Result};
 
 /// How random patterns are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,7 +24,7 @@ impl Draw {
     }
 
     /// The rank that is asked for, if it is one that `frames` patterns of `apertures` can have.
-    fn wanted(self, frames: usize, apertures: usize) -> Result<usize, OpticsError> {
+    fn wanted(self, frames: usize, apertures: usize) -> Result<usize> {
         if self.open == 0 || self.open > apertures {
             return Err(OpticsError::Parameter {
                 name: "open sub-apertures",
@@ -55,15 +55,8 @@ pub struct Multiplexing {
 impl Multiplexing {
     /// Draws `frames` patterns of `apertures` sub-apertures until their matrix has the rank that is
     /// wanted.
-    ///
-    /// # Errors
-    /// Openings or a rank that can't be; no such matrix within the tries.
-    pub fn random(
-        frames: usize,
-        apertures: usize,
-        draw: Draw,
-        rng: &mut impl Rng,
-    ) -> Result<Self, OpticsError> {
+    /// Errors: openings or a rank that can't be; no such matrix within the tries.
+    pub fn random(frames: usize, apertures: usize, draw: Draw, rng: &mut impl Rng) -> Result<Self> {
         let wanted = draw.wanted(frames, apertures)?;
         let Draw { open, tries, .. } = draw;
         let mut reached = 0;

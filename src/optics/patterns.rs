@@ -7,7 +7,7 @@ use rand::seq::index;
 use serde::{Deserialize, Serialize};
 
 use super::multiplex::rank;
-use super::{Geometry, Multiplexing, OpticsError, check_size};
+use super::{Geometry, Multiplexing, OpticsError, Result, check_size};
 
 /// LCoS pixels along the side of a cell in which a circle is drawn: far below a mask pixel.
 const CIRCLE_CELL: usize = 8;
@@ -55,14 +55,12 @@ impl Multiplexing {
 }
 
 /// `frames` patterns with one open sub-aperture each, all different: no multiplexing.
-///
-/// # Errors
-/// More frames than sub-apertures.
+/// Errors: more frames than sub-apertures.
 pub fn single_apertures(
     frames: usize,
     grid: ApertureGrid,
     rng: &mut impl Rng,
-) -> Result<Array3<f32>, OpticsError> {
+) -> Result<Array3<f32>> {
     check_size(frames, grid.rows, grid.columns)?;
     if frames > grid.count() {
         return Err(OpticsError::Pattern(format!(
@@ -98,10 +96,8 @@ impl Default for Circle {
 
 impl Circle {
     /// `frames` patterns, each turned by 360/`frames` degrees against the one before.
-    ///
-    /// # Errors
-    /// No circle, or one that leaves the LCoS.
-    pub fn patterns(self, frames: usize, geometry: &Geometry) -> Result<Array3<f32>, OpticsError> {
+    /// Errors: no circle, or one that leaves the LCoS.
+    pub fn patterns(self, frames: usize, geometry: &Geometry) -> Result<Array3<f32>> {
         geometry.check()?;
         check_size(frames, geometry.lcos_rows, geometry.lcos_columns)?;
         self.check(geometry)?;
@@ -123,7 +119,7 @@ impl Circle {
         }))
     }
 
-    fn check(self, geometry: &Geometry) -> Result<(), OpticsError> {
+    fn check(self, geometry: &Geometry) -> Result<()> {
         let refused = |name, value: f64, range| OpticsError::Parameter {
             name,
             value: value.to_string(),
@@ -168,10 +164,8 @@ impl Circle {
 }
 
 /// Refuses patterns that are not `frames` transmissions on \[0,1\] with some light each.
-///
-/// # Errors
-/// Another number of patterns, values outside, a pattern that is closed everywhere.
-pub fn check_patterns(patterns: ArrayView3<'_, f32>, frames: usize) -> Result<(), OpticsError> {
+/// Errors: another number of patterns, values outside, a pattern that is closed everywhere.
+pub fn check_patterns(patterns: ArrayView3<'_, f32>, frames: usize) -> Result<()> {
     let (count, rows, columns) = patterns.dim();
     check_size(frames, rows, columns)?;
     if count != frames {

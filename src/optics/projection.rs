@@ -6,7 +6,7 @@ use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
 use super::axis::{Axis, Cell};
-use super::{Geometry, OpticsError, check_size};
+use super::{Geometry, OpticsError, Result, check_size};
 
 /// Where the cells of a pattern shift the mask to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,16 +42,14 @@ pub struct Projector {
 impl Projector {
     /// A projector of patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of
     /// `sensor` (rows, columns).
-    ///
-    /// # Errors
-    /// A geometry or size that can't be; cells too close for whole pixels.
+    /// Errors: a geometry or size that can't be; cells too close for whole pixels.
     pub fn new(
         geometry: &Geometry,
         cells: (usize, usize),
         placement: Placement,
         method: Method,
         sensor: (usize, usize),
-    ) -> Result<Self, OpticsError> {
+    ) -> Result<Self> {
         geometry.check()?;
         check_size(1, sensor.0, sensor.1)?;
         let shift = geometry.shift_per_lcos_pixel();
@@ -85,14 +83,12 @@ impl Projector {
     /// The mask \[H,W\] on the sensor: the sum, over the cells of `pattern`, of the cell's
     /// transmission times the lithography mask as seen through it. All open and no mask gives the
     /// number of cells.
-    ///
-    /// # Errors
-    /// Arrays that have not the sizes of [`Projector::new`] and [`Projector::mask_size`].
+    /// Errors: arrays that have not the sizes of [`Projector::new`] and [`Projector::mask_size`].
     pub fn project(
         &self,
         lithography: ArrayView2<'_, f32>,
         pattern: ArrayView2<'_, f32>,
-    ) -> Result<Array2<f32>, OpticsError> {
+    ) -> Result<Array2<f32>> {
         if pattern.dim() != self.cells || lithography.dim() != self.mask_size() {
             let text = |(rows, columns): (usize, usize)| format!("{rows}x{columns}");
             let (mask_rows, mask_columns) = self.mask_size();
@@ -147,12 +143,7 @@ fn taps(kernel: &Array2<f64>) -> Vec<Tap> {
 }
 
 /// The cells of an axis, as shifts in mask pixels; `pitch` of them from one cell to the next.
-fn place(
-    pitch: f64,
-    count: usize,
-    placement: Placement,
-    method: Method,
-) -> Result<Vec<Cell>, OpticsError> {
+fn place(pitch: f64, count: usize, placement: Placement, method: Method) -> Result<Vec<Cell>> {
     let half = match method {
         Method::Shifts => 0.0,
         Method::Convolution => pitch / 2.0,

@@ -3,16 +3,11 @@
 use ndarray::{Array2, ArrayView3};
 use rand_distr::{Distribution, Normal};
 
-use super::{OpticsError, generator};
+use super::{OpticsError, Result, generator};
 
 /// `y = sum_k C_k x_k` \[H,W\] of masks and frames \[B,H,W\], both on \[0,1\].
-///
-/// # Errors
-/// Sizes that differ.
-pub fn measure(
-    masks: ArrayView3<'_, f32>,
-    frames: ArrayView3<'_, f32>,
-) -> Result<Array2<f32>, OpticsError> {
+/// Errors: sizes that differ.
+pub fn measure(masks: ArrayView3<'_, f32>, frames: ArrayView3<'_, f32>) -> Result<Array2<f32>> {
     if masks.dim() != frames.dim() {
         let text = |(b, h, w): (usize, usize, usize)| format!("{b}x{h}x{w}");
         return Err(OpticsError::Sizes { frames: text(frames.dim()), masks: text(masks.dim()) });
@@ -26,10 +21,8 @@ pub fn measure(
 
 /// `y` with white noise of standard deviation `sigma` added, on the scale of `y` itself (the
 /// literature's level S on \[0,255\] is `S / 255`).
-///
-/// # Errors
-/// A `sigma` that is no number of at least 0.
-pub fn noisy(y: Array2<f32>, sigma: f32, seed: u64) -> Result<Array2<f32>, OpticsError> {
+/// Errors: a `sigma` that is no number of at least 0.
+pub fn noisy(y: Array2<f32>, sigma: f32, seed: u64) -> Result<Array2<f32>> {
     let refused = || OpticsError::Parameter {
         name: "noise sigma",
         value: sigma.to_string(),

@@ -2,7 +2,7 @@
 
 use ndarray::Array3;
 
-use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, OpticsError, check_size, generator};
+use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, Result, check_size, generator};
 
 /// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them: the paper's
 /// simulation.
@@ -11,15 +11,13 @@ use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, OpticsError, check
 /// [`ApertureGrid::for_frames`], half of them open in each frame: the mask of a frame is the sum
 /// of the shifted lithography masks of its open sub-apertures (Eq. 1 of the paper), divided by
 /// the largest value of all frames.
-///
-/// # Errors
-/// A size of 0, or no multiplexing matrix of full rank within bounded tries.
+/// Errors: a size of 0, or no multiplexing matrix of full rank within bounded tries.
 pub fn random_squares(
     frames: usize,
     height: usize,
     width: usize,
     seed: u64,
-) -> Result<(Array3<f32>, Multiplexing), OpticsError> {
+) -> Result<(Array3<f32>, Multiplexing)> {
     check_size(frames, height, width)?;
     let grid = ApertureGrid::for_frames(frames);
     let mut rng = generator(seed);

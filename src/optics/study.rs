@@ -2,7 +2,7 @@
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 
-use super::OpticsError;
+use super::{OpticsError, Result};
 
 /// Bins of the histogram on \[0,1\].
 const BINS: usize = 4096;
@@ -85,10 +85,8 @@ impl MaskStudy {
     }
 
     /// Looks at the next rows \[B,rows,W\] of all masks, on \[0,1\].
-    ///
-    /// # Errors
-    /// A band that is not the next one of such masks.
-    pub fn add(&mut self, band: ArrayView3<'_, f32>) -> Result<(), OpticsError> {
+    /// Errors: a band that is not the next one of such masks.
+    pub fn add(&mut self, band: ArrayView3<'_, f32>) -> Result<()> {
         let (frames, rows, width) = band.dim();
         let (height, expected) = self.mean.dim();
         if frames != self.sums.len() || width != expected || self.next_row + rows > height {
@@ -130,10 +128,8 @@ impl MaskStudy {
     }
 
     /// The figures.
-    ///
-    /// # Errors
-    /// Rows that are missing.
-    pub fn finish(self) -> Result<MaskFigures, OpticsError> {
+    /// Errors: rows that are missing.
+    pub fn finish(self) -> Result<MaskFigures> {
         let (height, width) = self.mean.dim();
         if self.next_row != height {
             return Err(OpticsError::Pattern(format!(

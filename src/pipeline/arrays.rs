@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Axis};
 
-use super::error::PipelineError;
+use super::error::{PipelineError, Result};
 use super::tile::TileInput;
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
@@ -24,7 +24,7 @@ pub struct Arrays {
 
 impl Arrays {
     /// Refuses files whose bytes are not those that were stored.
-    pub fn verify(&self) -> Result<(), PipelineError> {
+    pub fn verify(&self) -> Result<()> {
         for (what, (path, sha256)) in [("masks", &self.masks), ("snapshots", &self.snapshots)] {
             if !is_intact(path, *sha256)? {
                 return Err(PipelineError::Corrupt { what, sha256: *sha256 });

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use ndarray::{Array2, ArrayView2, Axis, CowArray, Ix2};
 
 use super::arrays::is_intact;
-use super::error::PipelineError;
+use super::error::{PipelineError, Result};
 use super::progress::Monitor;
 use super::records::TileTaskRecord;
 use crate::formats::planar::Reader;
@@ -17,23 +17,15 @@ use crate::recon::tile::{Tile, TilePlan};
 /// The stored frames \[B,h,w\] of a tile.
 #[derive(Debug, Clone)]
 pub struct StoredTile {
-    /// The tile's index in the plan.
     pub tile: u32,
-    /// The prepared array.
     pub path: PathBuf,
-    /// The hash that it should have.
     pub sha256: Sha256,
-    /// What came of it.
     pub record: TileTaskRecord,
 }
 
 /// Refuses tiles of which one is missing, or whose bytes are not those that were stored.
 /// Errors: [`PipelineError::Damaged`] with the tiles that should be done again.
-pub fn verify(
-    plan: &TilePlan,
-    tiles: &[StoredTile],
-    monitor: &Monitor,
-) -> Result<(), PipelineError> {
+pub fn verify(plan: &TilePlan, tiles: &[StoredTile], monitor: &Monitor) -> Result<()> {
     let expected = (0..plan.len() as u64).eq(tiles.iter().map(|tile| u64::from(tile.tile)));
     if !expected {
         let problem = format!("{} tiles are stored of {}", tiles.len(), plan.len());

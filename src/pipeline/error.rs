@@ -7,6 +7,8 @@ use crate::formats::FormatError;
 use crate::job::Sha256;
 use crate::recon::ReconError;
 
+pub type Result<T, E = PipelineError> = std::result::Result<T, E>;
+
 /// Why a step did not come to its end.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // the messages say it

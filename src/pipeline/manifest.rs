@@ -118,7 +118,6 @@ impl Recipe {
 pub struct JobTasks {
     /// The assembled snapshots by their index in the measurement.
     pub snapshots: Vec<(u32, SnapshotRecord)>,
-    /// Seconds that each task took.
     pub seconds: Vec<(TaskKind, f64)>,
     /// How often workers took one up, that of the manifest among them.
     pub attempts: u64,

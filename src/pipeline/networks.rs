@@ -20,7 +20,6 @@ use crate::recon::prior::{Denoiser, Network, Networks};
 /// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
 #[derive(Debug, Clone, Copy)]
 pub struct Model {
-    /// Name, for records.
     pub name: &'static str,
     /// The files, in the order in which a frame goes through them: name and content.
     pub files: &'static [(&'static str, &'static [u8])],
@@ -143,19 +142,9 @@ pub enum NetworkError {
     )]
     Missing(String),
     #[error("model {}: {reason}", path.display())]
-    Model {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: io::Error,
-    },
+    Model { path: PathBuf, reason: io::Error },
     #[error("the network's file is damaged: its hash should be {expected}, but is {found}")]
-    Damaged {
-        /// The hash that it should have.
-        expected: Sha256,
-        /// The hash that it has.
-        found: Sha256,
-    },
+    Damaged { expected: Sha256, found: Sha256 },
     /// It was found, but the network does not run on it.
     #[error(transparent)]
     Runtime(#[from] ReconError),
@@ -178,7 +167,6 @@ impl NetworkSource {
 
     /// The same with the networks in `folder`, one folder of ONNX files each as in `models/`,
     /// instead of those that the program carries.
-    #[must_use]
     pub fn with_models(self, folder: Option<PathBuf>) -> Self {
         Self { models: folder, ..self }
     }
@@ -281,7 +269,6 @@ impl WarmNetworks {
         Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
 
-    /// Where they come from.
     pub fn source(&self) -> &NetworkSource {
         &self.source
     }

@@ -3,7 +3,7 @@
 use ndarray::{Array3, Axis};
 
 use super::arrays::Arrays;
-use super::error::PipelineError;
+use super::error::Result;
 use super::progress::Monitor;
 use crate::job::{SceneShape, TaskStage};
 use crate::recon::preview::{self, Blocks};
@@ -16,7 +16,7 @@ pub fn frames(
     snapshot: u32,
     white: f32,
     monitor: &Monitor,
-) -> Result<Array3<f32>, PipelineError> {
+) -> Result<Array3<f32>> {
     let SceneShape { frames, height, width, .. } = shape;
     let side = preview::block(frames, height, width);
     if side == 1 {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use super::error::PipelineError;
+use super::error::{PipelineError, Result};
 use crate::job::{TaskProgress, TaskStage};
 use crate::recon::schedule::Schedule;
 use crate::recon::solver::{Control, Observer, Progress};
@@ -34,7 +34,6 @@ impl Monitor {
         self.progress.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Where the task stands.
     pub fn progress(&self) -> TaskProgress {
         self.lock().0
     }
@@ -71,7 +70,7 @@ impl Monitor {
     }
 
     /// A sign of life; [`PipelineError::Stopped`] once [`Monitor::stop`] was called.
-    pub fn check(&self) -> Result<(), PipelineError> {
+    pub fn check(&self) -> Result<()> {
         self.lock().1 = Instant::now();
         if self.stopped() { Err(PipelineError::Stopped) } else { Ok(()) }
     }

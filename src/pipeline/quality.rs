@@ -9,7 +9,6 @@ use crate::recon::solver::Outcome;
 use crate::recon::tile::TilePlan;
 use crate::recon::{ReconError, metrics};
 
-/// How good one frame is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FrameQuality {
     /// The frame, from 1.
@@ -41,7 +40,6 @@ pub struct Quality {
     pub psnr: f64,
     /// Mean over the frames; none if one of them has none.
     pub ssim: Option<f64>,
-    /// Each of them.
     pub frames: Vec<FrameQuality>,
 }
 

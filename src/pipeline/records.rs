@@ -14,14 +14,10 @@ pub struct PreparedRecord {
     pub white: f32,
 }
 
-/// What the pilot found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PilotRecord {
-    /// The snapshot, from 0.
     pub snapshot: usize,
-    /// First row of the piece.
     pub row: usize,
-    /// First column.
     pub column: usize,
     pub height: usize,
     pub width: usize,
@@ -40,7 +36,6 @@ impl PilotRecord {
 /// What the pilot found out about a stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageRecord {
-    /// Its prior.
     pub prior: &'static dyn Prior,
     /// The most iterations that might have been.
     pub planned: usize,
@@ -68,12 +63,10 @@ impl StageRecord {
     }
 }
 
-/// What came of a tile.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TileRecord {
     /// Iterations whose prior had a total-variation part.
     pub tv_iterations: usize,
-    /// Passes of the learned denoiser.
     pub denoiser_passes: usize,
     /// `||y - H v|| / ||y||` of the tile's frames.
     pub residual: f32,
@@ -92,10 +85,8 @@ impl From<&Outcome> for TileRecord {
     }
 }
 
-/// The record of a tile's task.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTaskRecord {
-    /// What came of the tile.
     #[serde(flatten)]
     pub tile: TileRecord,
     /// From reading its window to its frames.
@@ -110,7 +101,6 @@ pub struct CostRecord {
     pub provider: Option<String>,
     /// Build of ONNX Runtime; none without a network.
     pub onnxruntime: Option<String>,
-    /// Processor seconds.
     pub cpu_seconds: f64,
     /// Largest resident memory of a process that computed.
     pub peak_rss_bytes: u64,
@@ -128,7 +118,6 @@ impl CostRecord {
     }
 }
 
-/// What belongs to one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
     /// The job; none on the command line.
@@ -178,9 +167,7 @@ impl Summary {
 /// The record of a snapshot's assembly.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SnapshotRecord {
-    /// The tiles taken together.
     pub summary: Summary,
-    /// What belongs to the run.
     pub run: RunRecord,
     /// All files, the manifest last.
     pub files: Vec<ResultFile>,

@@ -3,7 +3,7 @@
 use ndarray::{ArrayView2, ArrayView3};
 
 use super::arrays::{Arrays, plane};
-use super::error::PipelineError;
+use super::error::{PipelineError, Result};
 use super::progress::Monitor;
 use crate::job::SnapshotRange;
 use crate::recon::ReconError;
@@ -19,11 +19,7 @@ pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Result<f32, 
 
 /// The typical white level of the snapshots of a job; memory holds a few planes, whatever the number
 /// of frames.
-pub fn white_of_job(
-    arrays: &Arrays,
-    snapshots: SnapshotRange,
-    monitor: &Monitor,
-) -> Result<f32, PipelineError> {
+pub fn white_of_job(arrays: &Arrays, snapshots: SnapshotRange, monitor: &Monitor) -> Result<f32> {
     let masks = arrays.masks()?;
     let mut estimator = ScaleEstimator::new(masks.info().height, masks.info().width);
     for frame in 0..masks.info().frames {

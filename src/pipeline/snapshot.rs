@@ -6,7 +6,7 @@ use std::thread;
 
 use ndarray::{ArrayView2, ArrayView3, Axis, s};
 
-use super::error::PipelineError;
+use super::error::{PipelineError, Result};
 use super::networks::{ModelFile, NetworkSource, WarmNetworks};
 use super::pilot;
 use super::progress::ShareDone;
@@ -17,27 +17,21 @@ use crate::recon::schedule::Schedule;
 use crate::recon::solver::{Control, Observer, Outcome, Progress};
 use crate::recon::tile::TilePlan;
 
-/// What is to be solved.
 #[derive(Debug, Clone, Copy)]
 pub struct SnapshotInput<'a> {
-    /// Its index in the measurement, for the record.
     pub snapshot: usize,
     /// Masks \[B,H,W\] on \[0,1\].
     pub masks: ArrayView3<'a, f32>,
     /// Measurement \[H,W\].
     pub measurement: ArrayView2<'a, f32>,
-    /// White level of the scene.
     pub white: f32,
-    /// How.
     pub solver: Solver<'a>,
     /// The cut; it has the size of the masks.
     pub plan: &'a TilePlan,
 }
 
-/// How tiles are solved.
 #[derive(Debug, Clone, Copy)]
 pub enum Solver<'a> {
-    /// By iterations.
     Schedule(&'a Schedule),
     /// By one run of an end-to-end network.
     Network(&'a ModelFile),
@@ -59,7 +53,6 @@ impl SnapshotInput<'_> {
 /// A snapshot whose tiles are solved.
 #[derive(Debug)]
 pub struct Solved {
-    /// The tiles in the plan's order.
     pub tiles: Vec<Outcome>,
     /// What the pilot of an adaptive schedule found.
     pub pilot: Option<PilotRecord>,
@@ -77,7 +70,7 @@ pub fn solve(
     network: &NetworkSource,
     threads: usize,
     progress: TileProgress<'_>,
-) -> Result<Solved, PipelineError> {
+) -> Result<Solved> {
     let mut pilot = None;
     if let Solver::Schedule(schedule) = input.solver {
         let (rows, columns) = recon::pilot::piece(input.measurement);
@@ -100,9 +93,9 @@ fn run_tiles(
     network: &NetworkSource,
     threads: usize,
     progress: TileProgress<'_>,
-) -> Result<Vec<Outcome>, PipelineError> {
+) -> Result<Vec<Outcome>> {
     let (next, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
-    let tiles = || -> Result<Vec<(usize, Outcome)>, PipelineError> {
+    let tiles = || -> Result<Vec<(usize, Outcome)>> {
         let mut networks = WarmNetworks::new(network.clone());
         let mut done = Vec::new();
         while let Some(tile) = input.plan.tile(next.fetch_add(1, Ordering::Relaxed)) {

@@ -8,7 +8,7 @@ use ndarray::Array2;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::error::PipelineError;
+use super::error::{PipelineError, Result};
 use super::manifest::{Manifest, SCHEMA_FAMILY, frame_attributes};
 use crate::formats::{exr, npy, png};
 use crate::job::{ResultFile, Sha256};
@@ -33,8 +33,8 @@ const NAMES: [&str; 5] = [FRAMES, PNGS, STACK, ARRAY, MANIFEST];
 pub fn write_result(
     folder: &Path,
     mut manifest: Manifest,
-    mut frame: impl FnMut(usize) -> Result<Array2<f32>, PipelineError>,
-) -> Result<Vec<ResultFile>, PipelineError> {
+    mut frame: impl FnMut(usize) -> Result<Array2<f32>>,
+) -> Result<Vec<ResultFile>> {
     for name in [FRAMES, PNGS] {
         fs::create_dir_all(folder.join(name)).map_err(failed(name))?;
     }
@@ -65,10 +65,7 @@ pub fn write_result(
 }
 
 /// Writes a `manifest.json`; it and its folder are on the disk (fsync) when this returns.
-pub fn write_manifest(
-    folder: &Path,
-    manifest: &impl Serialize,
-) -> Result<ResultFile, PipelineError> {
+pub fn write_manifest(folder: &Path, manifest: &impl Serialize) -> Result<ResultFile> {
     let text =
         serde_json::to_string_pretty(manifest).map_err(|error| failed(MANIFEST)(error.into()))?;
     fs::write(folder.join(MANIFEST), text + "\n").map_err(failed(MANIFEST))?;
@@ -78,7 +75,7 @@ pub fn write_manifest(
 }
 
 /// Refuses a folder that holds files with the names of a result, but no manifest of ours.
-pub fn check_output(folder: &Path) -> Result<(), PipelineError> {
+pub fn check_output(folder: &Path) -> Result<()> {
     // Of any version of this program: the form of manifests changes.
     let manifest = fs::read(folder.join(MANIFEST)).ok();
     let manifest = manifest.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
@@ -95,7 +92,7 @@ pub fn check_output(folder: &Path) -> Result<(), PipelineError> {
 /// Moves the result in `made` to `folder`, in place of an earlier result; other files there
 /// stay. Both must be on one file system.
 /// Errors: as [`check_output`], or a file can't be moved.
-pub fn replace_result(made: &Path, folder: &Path) -> Result<(), PipelineError> {
+pub fn replace_result(made: &Path, folder: &Path) -> Result<()> {
     check_output(folder)?;
     // The old manifest goes last and the new one comes last: what lies beside a manifest
     // is what it describes.
@@ -127,7 +124,7 @@ fn failed(name: &str) -> impl FnOnce(io::Error) -> PipelineError {
 }
 
 /// Brings a file to the disk and takes its size and hash.
-fn settle(folder: &Path, name: String) -> Result<ResultFile, PipelineError> {
+fn settle(folder: &Path, name: String) -> Result<ResultFile> {
     let measured = || -> io::Result<(Sha256, u64)> {
         let mut file = File::open(folder.join(&name))?;
         file.sync_all()?;
@@ -137,7 +134,7 @@ fn settle(folder: &Path, name: String) -> Result<ResultFile, PipelineError> {
     Ok(ResultFile { name, size, sha256 })
 }
 
-fn sync_dir(folder: &Path, name: &str) -> Result<(), PipelineError> {
+fn sync_dir(folder: &Path, name: &str) -> Result<()> {
     File::open(folder.join(name)).and_then(|dir| dir.sync_all()).map_err(failed(name))
 }
 

@@ -2,6 +2,9 @@
 
 use thiserror::Error;
 
+/// What the functions of this folder give.
+pub type Result<T, E = ReconError> = std::result::Result<T, E>;
+
 /// An error of the reconstruction core. Each message says what is wrong, where, and what
 /// would be right.
 #[derive(Debug, Error)]

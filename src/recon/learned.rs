@@ -7,7 +7,7 @@ use std::fmt;
 
 use ndarray::{Array3, ArrayView2, ArrayView3};
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 
 /// A tensor that a network takes or gives.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,14 +42,9 @@ pub enum PictureSize {
 pub trait SnapshotNetwork {
     /// The frames \[B,H,W\] behind measurement `y` \[H,W\] through `masks` \[B,H,W\], where
     /// `y = sum_k C_k x_k` with frames `x_k` on \[0,1\]. All in standard layout.
-    ///
-    /// # Errors
-    /// The network fails, or gives something else than B finite frames.
-    fn frames(
-        &mut self,
-        y: ArrayView2<'_, f32>,
-        masks: ArrayView3<'_, f32>,
-    ) -> Result<Array3<f32>, ReconError>;
+    /// Errors: the network fails, or gives something else than B finite frames.
+    fn frames(&mut self, y: ArrayView2<'_, f32>, masks: ArrayView3<'_, f32>)
+    -> Result<Array3<f32>>;
 }
 
 /// Name of the input that takes the measurement \[1,1,H,W\].
@@ -62,15 +57,8 @@ pub const FRAMES: &str = "frames";
 impl Interface {
     /// Checks that the network takes a measurement through `frames` masks of `height` x `width`
     /// pixels and gives as many frames, all float32, and says whether it takes other sizes, too.
-    ///
-    /// # Errors
-    /// [`ReconError::Shape`] with what it has and what is needed.
-    pub fn check(
-        &self,
-        frames: usize,
-        height: usize,
-        width: usize,
-    ) -> Result<PictureSize, ReconError> {
+    /// Errors: [`ReconError::Shape`] with what it has and what is needed.
+    pub fn check(&self, frames: usize, height: usize, width: usize) -> Result<PictureSize> {
         let names = |tensors: &[TensorInfo]| {
             let mut names: Vec<&str> = tensors.iter().map(|tensor| tensor.name.as_str()).collect();
             names.sort_unstable();
@@ -101,7 +89,7 @@ impl Interface {
 }
 
 impl TensorInfo {
-    fn check(&self, what: &'static str, needed: [usize; 4]) -> Result<(), ReconError> {
+    fn check(&self, what: &'static str, needed: [usize; 4]) -> Result<()> {
         let fits = self.sides.len() == needed.len()
             && self.sides.iter().zip(needed).all(|(side, needed)| side.is_none_or(|s| s == needed));
         if fits && self.element == "float32" {

@@ -3,14 +3,14 @@
 
 use ndarray::{ArrayView2, ArrayView3};
 
-use super::error::{ReconError, shape_text};
+use super::error::{ReconError, Result, shape_text};
 
 /// Side of SSIM's uniform window: smaller frames have no SSIM.
 pub const WINDOW: usize = 7;
 
 /// Mean over the frames of `10 log10(1 / MSE)` in dB, of frames \[B,H,W\] on \[0,1\].
 /// Infinite if a frame equals its truth.
-pub fn psnr(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f64, ReconError> {
+pub fn psnr(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f64> {
     mean_over_frames(frames, truth, |frame, truth| {
         let squares: f64 = frame.iter().zip(truth).map(|(&a, &b)| square(a, b)).sum();
         -10.0 * (squares / frame.len() as f64).log10()
@@ -20,7 +20,7 @@ pub fn psnr(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f
 /// Mean over the frames of the structural similarity (Wang et al. 2004) of frames \[B,H,W\] on
 /// \[0,1\], with the defaults of scikit-image: 7x7 uniform window, sample covariance, the
 /// border of 3 pixels left out. Frames must be at least 7x7.
-pub fn ssim(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f64, ReconError> {
+pub fn ssim(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f64> {
     let (_, height, width) = frames.dim();
     if height < WINDOW || width < WINDOW {
         return Err(ReconError::Shape {
@@ -41,7 +41,7 @@ fn mean_over_frames(
     frames: ArrayView3<'_, f32>,
     truth: ArrayView3<'_, f32>,
     metric: impl Fn(ArrayView2<'_, f32>, ArrayView2<'_, f32>) -> f64,
-) -> Result<f64, ReconError> {
+) -> Result<f64> {
     if frames.shape() != truth.shape() || frames.is_empty() {
         return Err(ReconError::Shape {
             what: "the frame stack",

@@ -11,7 +11,7 @@ use std::ops::Range;
 use ndarray::{ArrayView2, ArrayView3, s};
 use rand::{Rng, SeedableRng};
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 use super::prior::Networks;
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
@@ -83,16 +83,14 @@ pub enum StageEnd {
 /// and tells for every stage how many of its iterations pay. Stages of total variation alone, which
 /// cost next to nothing, are taken as they are, but for their part along time: it is left out if the
 /// stage's error is less without.
-///
-/// # Errors
-/// As [`super::solver::reconstruct`].
+/// Errors: as [`super::solver::reconstruct`].
 pub fn run(
     op: SensingOperator,
     y: ArrayView2<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-) -> Result<Vec<StageFinding>, ReconError> {
+) -> Result<Vec<StageFinding>> {
     schedule.validate()?;
     let held_out = HeldOut::of(&op, y);
     let op = op.without(&held_out.pixels);
@@ -152,12 +150,7 @@ impl Watch<'_, '_> {
         self.held_out.error(self.op, self.y, run.frames())
     }
 
-    fn stage(
-        &mut self,
-        stage: &Stage,
-        run: &mut Run<'_>,
-        before: f64,
-    ) -> Result<StageFinding, ReconError> {
+    fn stage(&mut self, stage: &Stage, run: &mut Run<'_>, before: f64) -> Result<StageFinding> {
         let fixed = stage.sigma.is_none();
         let temporal_weight = stage.temporal_weight.unwrap_or(0.0);
         let mut end = if fixed { StageEnd::Fixed } else { StageEnd::Planned };

@@ -7,7 +7,7 @@
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 
-use super::error::{ReconError, shape_text};
+use super::error::{ReconError, Result, shape_text};
 use super::prior::tv::TotalVariation;
 use super::schedule::Schedule;
 use super::sensing::SensingOperator;
@@ -38,10 +38,8 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
 
 /// Frames \[B,H,W\] of a small picture, by a few iterations of GAP-TV. `y` is on the scale on which
 /// the scene is on \[0,1\].
-///
-/// # Errors
-/// As [`solver::reconstruct`].
-pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>, ReconError> {
+/// Errors: as [`solver::reconstruct`].
+pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
     Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
 }
@@ -76,14 +74,12 @@ impl Blocks {
 
     /// One row of blocks: masks \[B,h,W\] and measurement \[h,W\] of at most `side` rows give frames
     /// \[B, W / side rounded up\]. The last block may be narrower.
-    ///
-    /// # Errors
-    /// Sizes that disagree.
+    /// Errors: sizes that disagree.
     pub fn row(
         &mut self,
         masks: ArrayView3<'_, f32>,
         y: ArrayView2<'_, f32>,
-    ) -> Result<Array2<f32>, ReconError> {
+    ) -> Result<Array2<f32>> {
         let (frames, height, width) = masks.dim();
         if y.dim() != (height, width) || frames != self.frames || height > self.side {
             return Err(ReconError::Shape {

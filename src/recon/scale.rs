@@ -2,7 +2,7 @@
 
 use ndarray::{Array2, ArrayView2};
 
-use super::error::{ReconError, shape_text};
+use super::error::{ReconError, Result, shape_text};
 
 /// Share of the pixels that lie at or below the scene's white.
 const WHITE_QUANTILE: f64 = 0.995;
@@ -25,7 +25,7 @@ impl ScaleEstimator {
     }
 
     /// Adds one mask \[H,W\].
-    pub fn add_mask(&mut self, mask: ArrayView2<'_, f32>) -> Result<(), ReconError> {
+    pub fn add_mask(&mut self, mask: ArrayView2<'_, f32>) -> Result<()> {
         self.check("a mask", mask.shape())?;
         self.light += &mask;
         Ok(())
@@ -33,10 +33,8 @@ impl ScaleEstimator {
 
     /// The white level of the scene behind measurement `y` \[H,W\]: divide measurement (and
     /// so frames) by it before reconstruction, multiply frames by it after.
-    ///
-    /// # Errors
-    /// Sizes that differ, or a measurement without light.
-    pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32, ReconError> {
+    /// Errors: sizes that differ, or a measurement without light.
+    pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
         self.check("the measurement", y.shape())?;
         // Pixels with little light have a ratio of noise by almost nothing.
         let floor = 0.25 * self.light.mean().unwrap_or(0.0);
@@ -57,7 +55,7 @@ impl ScaleEstimator {
         })
     }
 
-    fn check(&self, what: &'static str, found: &[usize]) -> Result<(), ReconError> {
+    fn check(&self, what: &'static str, found: &[usize]) -> Result<()> {
         let expected = self.light.shape();
         if found == expected {
             return Ok(());

@@ -8,7 +8,7 @@ use std::ops::Bound;
 use schemars::{JsonSchema, Schema, json_schema};
 use serde::{Deserialize, Serialize};
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 use super::prior::registry::PRIORS;
 use super::prior::{
     Network, Parameter, Prior, SIGMA, Settings, TEMPORAL_WEIGHT, TV_UPDATES, TV_WEIGHT,
@@ -158,7 +158,7 @@ impl Stage {
         ]
     }
 
-    fn check(&self) -> Result<(), ReconError> {
+    fn check(&self) -> Result<()> {
         ITERATIONS.check(self.iterations as f32)?;
         for (parameter, given) in self.given() {
             match (self.prior.takes(parameter), given) {
@@ -288,7 +288,7 @@ impl Schedule {
     }
 
     /// Refuses a schedule with a fault: the first is told.
-    pub fn validate(&self) -> Result<(), ReconError> {
+    pub fn validate(&self) -> Result<()> {
         self.faults().into_iter().next().map_or(Ok(()), |(_, error)| Err(error))
     }
 

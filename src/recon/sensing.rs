@@ -5,7 +5,7 @@ use std::ops::Range;
 use multiversion::multiversion;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
-use super::error::{ReconError, shape_text};
+use super::error::{ReconError, Result, shape_text};
 
 /// `H` of `y = Hx = sum_k C_k x_k`, for one set of masks `C` \[B,H,W\] on \[0,1\].
 ///
@@ -22,7 +22,7 @@ pub struct SensingOperator {
 
 impl SensingOperator {
     /// Takes masks \[B,H,W\], all finite and not all 0.
-    pub fn new(masks: Array3<f32>) -> Result<Self, ReconError> {
+    pub fn new(masks: Array3<f32>) -> Result<Self> {
         let (frames, height, width) = masks.dim();
         if frames == 0 || height == 0 || width == 0 {
             return Err(ReconError::Shape {
@@ -52,7 +52,7 @@ impl SensingOperator {
 
     /// Replaces `(H H^T)^-1` by `(H H^T + gamma)^-1`, for measurements with noise: plain GAP
     /// then no longer forces `y = Hx`. `gamma` is in units of the gram diagonal, >= 0.
-    pub fn with_gamma(mut self, gamma: f32) -> Result<Self, ReconError> {
+    pub fn with_gamma(mut self, gamma: f32) -> Result<Self> {
         if !gamma.is_finite() || gamma < 0.0 {
             return Err(ReconError::Parameter {
                 name: "gamma",
@@ -100,7 +100,7 @@ impl SensingOperator {
     }
 
     /// `Hx` \[H,W\] of frames `x` \[B,H,W\].
-    pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array2<f32>, ReconError> {
+    pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array2<f32>> {
         self.check("the frame stack", frames.shape(), self.masks.shape())?;
         let mut y = Array2::zeros(self.gram.raw_dim());
         for (mask, frame) in self.masks.outer_iter().zip(frames.outer_iter()) {
@@ -110,7 +110,7 @@ impl SensingOperator {
     }
 
     /// `H^T y` \[B,H,W\] of a measurement `y` \[H,W\].
-    pub fn adjoint(&self, y: ArrayView2<'_, f32>) -> Result<Array3<f32>, ReconError> {
+    pub fn adjoint(&self, y: ArrayView2<'_, f32>) -> Result<Array3<f32>> {
         self.check("the measurement", y.shape(), self.gram.shape())?;
         let mut frames = self.masks.clone();
         for mut frame in frames.outer_iter_mut() {
@@ -159,12 +159,7 @@ impl SensingOperator {
         squares
     }
 
-    fn check(
-        &self,
-        what: &'static str,
-        found: &[usize],
-        expected: &[usize],
-    ) -> Result<(), ReconError> {
+    fn check(&self, what: &'static str, found: &[usize], expected: &[usize]) -> Result<()> {
         if found == expected {
             return Ok(());
         }

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 
 /// One tile: the pixels `row..row+height` x `column..column+width`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,15 +58,8 @@ struct Span {
 impl TilePlan {
     /// Cuts `height` x `width` pixels into as few tiles of at most `size` x `size` as share at least
     /// `overlap` pixels with each neighbour, and makes these tiles as small as that allows. A side that fits into one tile is not cut.
-    ///
-    /// # Errors
-    /// `size` below 16 or above 8192, or `overlap` of more than half of `size`.
-    pub fn new(
-        height: usize,
-        width: usize,
-        size: usize,
-        overlap: usize,
-    ) -> Result<Self, ReconError> {
+    /// Errors: `size` below 16 or above 8192, or `overlap` of more than half of `size`.
+    pub fn new(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
         if height == 0 || width == 0 {
             return Err(ReconError::Shape {
                 what: "a picture to be tiled",

@@ -11,12 +11,11 @@ use std::path::{Path, PathBuf};
 
 use sha2::Digest;
 
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use super::rows::sql;
 use super::{Store, dir, identity, on_files};
 use crate::job::Sha256;
 
-/// What a backup holds.
 #[derive(Debug, Default)]
 pub struct Backup {
     /// Files that were copied, the database among them.
@@ -28,7 +27,7 @@ pub struct Backup {
 
 impl Store {
     /// Copies everything into the new folder `to`. A damaged file is copied and named.
-    pub async fn backup(&self, to: &Path) -> Result<Backup, StoreError> {
+    pub async fn backup(&self, to: &Path) -> Result<Backup> {
         let to = to.to_owned();
         fs::create_dir(&to).map_err(StoreError::io("make the folder", &to))?;
         let staged = self.staged_dir()?;
@@ -62,7 +61,7 @@ impl Store {
     }
 
     /// The hashes on record of result files, by their place in the data folder.
-    async fn expected_hashes(&self) -> Result<HashMap<PathBuf, Sha256>, StoreError> {
+    async fn expected_hashes(&self) -> Result<HashMap<PathBuf, Sha256>> {
         let rows: Vec<(String, i64, String, Sha256)> =
             sqlx::query_as("SELECT job, snapshot, name, sha256 FROM result_files")
                 .fetch_all(&self.readers)
@@ -78,7 +77,7 @@ impl Store {
 }
 
 /// Gives every file below a folder a second name below another one.
-fn link_all(from: &Path, to: &Path) -> Result<(), StoreError> {
+fn link_all(from: &Path, to: &Path) -> Result<()> {
     fs::create_dir(to).map_err(StoreError::io("make the folder", to))?;
     for entry in fs::read_dir(from).map_err(StoreError::io("read the folder", from))? {
         let entry = entry.map_err(StoreError::io("read the folder", from))?;
@@ -99,7 +98,7 @@ fn copy_all(
     to: &Path,
     expected: &HashMap<PathBuf, Sha256>,
     backup: &mut Backup,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let folder = from.join(place);
     for entry in fs::read_dir(&folder).map_err(StoreError::io("read the folder", &folder))? {
         let entry = entry.map_err(StoreError::io("read the folder", &folder))?;
@@ -120,7 +119,7 @@ fn copy_all(
     dir::sync_dir(&to.join(place))
 }
 
-fn copy_file(from: &Path, to: &Path) -> Result<(Sha256, u64), StoreError> {
+fn copy_file(from: &Path, to: &Path) -> Result<(Sha256, u64)> {
     let mut source = File::open(from).map_err(StoreError::io("open", from))?;
     let mut copy = File::create_new(to).map_err(StoreError::io("make", to))?;
     let (mut hasher, mut bytes, mut buffer) = (sha2::Sha256::new(), 0, vec![0; 256 * 1024]);

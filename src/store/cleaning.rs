@@ -10,7 +10,7 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::TryStreamExt;
 
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use super::rows::{sql, sql_scalar};
 use super::{DataDir, Store, dir, on_files};
 use crate::job::{JobId, PartialId, Sha256, Timestamp};
@@ -35,7 +35,7 @@ impl Store {
     /// Moves blobs, results and partial uploads that no row knows of to `quarantine/TIME`. Says how many.
     /// Errors: [`StoreError::Refused`] if they are too many, unless `all` is set: nothing is moved
     /// then.
-    pub async fn quarantine_orphans(&self, all: bool) -> Result<usize, StoreError> {
+    pub async fn quarantine_orphans(&self, all: bool) -> Result<usize> {
         // 1. Without the lock: nearly all are known.
         let known = self.known_things().await?;
         let root = self.dir().clone();
@@ -74,7 +74,7 @@ impl Store {
     }
 
     /// Removes what came into the quarantine before `before`.
-    pub async fn empty_quarantine(&self, before: Timestamp) -> Result<(), StoreError> {
+    pub async fn empty_quarantine(&self, before: Timestamp) -> Result<()> {
         let (quarantine, before) = (self.dir().quarantine(), folder_name(before));
         on_files(move || {
             let old = dir::children(&quarantine)?.into_iter().filter(|path| name(path) < before);
@@ -83,7 +83,7 @@ impl Store {
         .await
     }
 
-    async fn known_things(&self) -> Result<HashSet<Thing>, StoreError> {
+    async fn known_things(&self) -> Result<HashSet<Thing>> {
         let mut known = HashSet::new();
         let mut rows = sqlx::query_scalar("SELECT sha256 FROM blobs").fetch(&self.readers);
         while let Some(sha256) = rows.try_next().await? {
@@ -103,11 +103,7 @@ impl Store {
 
     /// Deletes jobs that ended before `before`, oldest first, until so many bytes of the disk are
     /// free. Says how many.
-    pub async fn remove_jobs(
-        &self,
-        before: Timestamp,
-        until_free: u64,
-    ) -> Result<usize, StoreError> {
+    pub async fn remove_jobs(&self, before: Timestamp, until_free: u64) -> Result<usize> {
         let ended = sql_scalar!(
             // A job that has not ended has no time at which it did.
             "SELECT id FROM jobs WHERE finished_at < ? ORDER BY finished_at, id",
@@ -131,10 +127,7 @@ impl Store {
     }
 }
 
-async fn is_known(
-    connection: &mut sqlx::SqliteConnection,
-    thing: &Thing,
-) -> Result<bool, StoreError> {
+async fn is_known(connection: &mut sqlx::SqliteConnection, thing: &Thing) -> Result<bool> {
     let query = match thing {
         Thing::Blob(sha256) => {
             sql!("SELECT 1 FROM blobs WHERE sha256 = ?", [sha256])
@@ -149,7 +142,7 @@ async fn is_known(
 }
 
 /// All that lies in the folder.
-fn things(root: &DataDir) -> Result<Vec<(Thing, PathBuf)>, StoreError> {
+fn things(root: &DataDir) -> Result<Vec<(Thing, PathBuf)>> {
     let mut found = Vec::new();
     for folder in dir::children(&root.blobs())? {
         for path in dir::children(&folder)? {
@@ -170,7 +163,7 @@ fn paths(things: &[(Thing, PathBuf)]) -> Vec<PathBuf> {
     things.iter().map(|(_, path)| path.clone()).collect()
 }
 
-fn refuse_too_many(root: &DataDir, orphans: &[PathBuf]) -> Result<(), StoreError> {
+fn refuse_too_many(root: &DataDir, orphans: &[PathBuf]) -> Result<()> {
     let (files, bytes) = measure(orphans)?;
     let (all, all_bytes) = measure(&[root.blobs(), root.all_results(), root.partials()])?;
     #[allow(clippy::cast_precision_loss)] // a share
@@ -187,7 +180,7 @@ fn refuse_too_many(root: &DataDir, orphans: &[PathBuf]) -> Result<(), StoreError
 }
 
 /// Number and bytes of the files at and below these paths.
-fn measure(paths: &[PathBuf]) -> Result<(u64, u64), StoreError> {
+fn measure(paths: &[PathBuf]) -> Result<(u64, u64)> {
     let (mut files, mut bytes) = (0, 0);
     for path in paths {
         let (more, more_bytes) = if path.is_dir() {
@@ -202,7 +195,7 @@ fn measure(paths: &[PathBuf]) -> Result<(u64, u64), StoreError> {
     Ok((files, bytes))
 }
 
-fn quarantine(root: &Path, path: &Path, place: &Path) -> Result<(), StoreError> {
+fn quarantine(root: &Path, path: &Path, place: &Path) -> Result<()> {
     let to = place.join(path.strip_prefix(root).unwrap_or(path));
     if let Some(folder) = to.parent() {
         fs::create_dir_all(folder).map_err(StoreError::io("make the folder", folder))?;

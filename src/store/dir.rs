@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use crate::job::{JobId, PartialId, Sha256};
 
 /// The folder with all that the service keeps.
@@ -27,13 +27,13 @@ pub struct DataDir {
 
 impl DataDir {
     /// Makes the folder where it is missing.
-    pub(crate) fn create(root: &Path) -> Result<Self, StoreError> {
+    pub(crate) fn create(root: &Path) -> Result<Self> {
         fs::create_dir_all(root).map_err(StoreError::io("make the folder", root))?;
         Self::find(root)
     }
 
     /// The folder, which must be there.
-    pub(crate) fn find(root: &Path) -> Result<Self, StoreError> {
+    pub(crate) fn find(root: &Path) -> Result<Self> {
         match root.canonicalize() {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 Err(StoreError::NoFolder(root.to_owned()))
@@ -43,15 +43,13 @@ impl DataDir {
     }
 
     /// Makes the folders in it, where they are missing.
-    pub(crate) fn fill(&self) -> Result<(), StoreError> {
+    pub(crate) fn fill(&self) -> Result<()> {
         for path in [self.blobs(), self.all_results(), self.partials(), self.tmp()] {
             fs::create_dir_all(&path).map_err(StoreError::io("make the folder", &path))?;
         }
         sync_dir(&self.root)
     }
 
-    /// The folder itself.
-    #[must_use]
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -61,7 +59,6 @@ impl DataDir {
     }
 
     /// Where the file with this hash lies, if it is in the store.
-    #[must_use]
     pub fn blob(&self, sha256: &Sha256) -> PathBuf {
         let hex = sha256.to_string();
         self.blobs().join(&hex[..2]).join(&hex[2..])
@@ -76,13 +73,11 @@ impl DataDir {
     }
 
     /// The folder with the results of a job.
-    #[must_use]
     pub fn results(&self, job: JobId) -> PathBuf {
         self.all_results().join(job.to_string())
     }
 
     /// The folder with the results of one snapshot of a job.
-    #[must_use]
     pub fn snapshot_results(&self, job: JobId, snapshot: u32) -> PathBuf {
         self.results(job).join(format!("snapshot_{snapshot:04}"))
     }
@@ -105,7 +100,7 @@ impl DataDir {
     }
 
     /// Takes the lock of the server, of which there is one for each folder.
-    pub(crate) fn lock_server(&self) -> Result<File, StoreError> {
+    pub(crate) fn lock_server(&self) -> Result<File> {
         let path = self.root.join("server.lock");
         let file = File::create(&path).map_err(StoreError::io("make", &path))?;
         match file.try_lock() {
@@ -116,7 +111,7 @@ impl DataDir {
     }
 
     /// Removes what dead processes left in `tmp`: whatever nobody holds the lock of. Says how much.
-    pub fn sweep_tmp(&self) -> Result<usize, StoreError> {
+    pub fn sweep_tmp(&self) -> Result<usize> {
         let tmp = self.tmp();
         let mut removed = 0;
         for entry in fs::read_dir(&tmp).map_err(StoreError::io("read the folder", &tmp))? {
@@ -134,7 +129,7 @@ impl DataDir {
     }
 
     /// Bytes that are free on the disk of this folder, and its size.
-    pub fn disk(&self) -> Result<(u64, u64), StoreError> {
+    pub fn disk(&self) -> Result<(u64, u64)> {
         let stat = rustix::fs::statvfs(&*self.root).map_err(|error| {
             StoreError::io("ask for the free space of", &self.root)(error.into())
         })?;
@@ -148,16 +143,16 @@ fn is_young(file: &File, age: Duration) -> bool {
 }
 
 /// Runs work on files, which blocks, where it may block.
-pub(crate) async fn on_files<T, F>(work: F) -> Result<T, StoreError>
+pub(crate) async fn on_files<T, F>(work: F) -> Result<T>
 where
     T: Send + 'static,
-    F: FnOnce() -> Result<T, StoreError> + Send + 'static,
+    F: FnOnce() -> Result<T> + Send + 'static,
 {
     tokio::task::spawn_blocking(work).await.map_err(|_| StoreError::Interrupted)?
 }
 
 /// The paths in a folder; none if it is no folder, or gone.
-pub(crate) fn children(folder: &Path) -> Result<Vec<PathBuf>, StoreError> {
+pub(crate) fn children(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = match fs::read_dir(folder) {
         Err(_) if !folder.is_dir() => return Ok(Vec::new()),
         entries => entries.map_err(StoreError::io("read the folder", folder))?,
@@ -167,20 +162,20 @@ pub(crate) fn children(folder: &Path) -> Result<Vec<PathBuf>, StoreError> {
 }
 
 /// Writes a folder's entries to the disk: without it a rename may be forgotten in a power cut.
-pub(crate) fn sync_dir(path: &Path) -> Result<(), StoreError> {
+pub(crate) fn sync_dir(path: &Path) -> Result<()> {
     File::open(path)
         .and_then(|dir| dir.sync_all())
         .map_err(StoreError::io("write to the disk the folder", path))
 }
 
 /// Renames a file or folder that is on the disk already, for good.
-pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<(), StoreError> {
+pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<()> {
     fs::rename(from, to).map_err(StoreError::io("move a file to", to))?;
     to.parent().map_or(Ok(()), sync_dir)
 }
 
 /// Makes one folder, for good. It may be there already.
-pub(crate) fn make_dir_durably(path: &Path) -> Result<(), StoreError> {
+pub(crate) fn make_dir_durably(path: &Path) -> Result<()> {
     match fs::create_dir(path) {
         Ok(()) => path.parent().map_or(Ok(()), sync_dir),
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
@@ -189,7 +184,7 @@ pub(crate) fn make_dir_durably(path: &Path) -> Result<(), StoreError> {
 }
 
 /// Removes a file or a folder with all in it. It may be gone already.
-pub(crate) fn remove(path: &Path) -> Result<(), StoreError> {
+pub(crate) fn remove(path: &Path) -> Result<()> {
     let result = match fs::symlink_metadata(path) {
         Ok(meta) if meta.is_dir() => fs::remove_dir_all(path),
         Ok(_) => fs::remove_file(path),

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use crate::job::IllegalTransition;
 
-/// An error of the store.
+pub type Result<T, E = StoreError> = std::result::Result<T, E>;
+
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     #[error("the database failed: {0}")]
@@ -78,7 +79,6 @@ impl StoreError {
     }
 
     /// True if the disk is full or a quota is used up.
-    #[must_use]
     pub fn is_disk_full(&self) -> bool {
         use std::io::ErrorKind::{QuotaExceeded, StorageFull};
         match self {

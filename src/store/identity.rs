@@ -17,7 +17,7 @@ use sqlx::{ConnectOptions, Connection};
 use uuid::Uuid;
 
 use super::dir::{self, DataDir, on_files};
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use super::rows::sql;
 
 /// Who opens a data folder, and so what may become of it.
@@ -57,7 +57,7 @@ enum Database {
 }
 
 /// Refuses a folder whose database is not its own. Changes nothing.
-pub(super) async fn check(dir: &DataDir, purpose: Purpose, schema: i64) -> Result<(), StoreError> {
+pub(super) async fn check(dir: &DataDir, purpose: Purpose, schema: i64) -> Result<()> {
     // The marker first: it never runs ahead of its database.
     let folder = dir.clone();
     let (marker, has_files) = on_files(move || {
@@ -157,7 +157,7 @@ fn outdated() -> Result<(), Refusal> {
     Err(Some((found, "start the service once with this version, which brings it up to date")))
 }
 
-async fn look(path: &Path) -> Result<Database, StoreError> {
+async fn look(path: &Path) -> Result<Database> {
     match fs::metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Database::Missing),
         // Not opened: SQLite would remove its write-ahead log.
@@ -171,7 +171,7 @@ async fn look(path: &Path) -> Result<Database, StoreError> {
     database
 }
 
-async fn ask(connection: &mut SqliteConnection) -> Result<Database, StoreError> {
+async fn ask(connection: &mut SqliteConnection) -> Result<Database> {
     let tables = "SELECT name FROM sqlite_master WHERE name IN ('_sqlx_migrations', 'folder')";
     let tables: Vec<String> = sqlx::query_scalar(tables).fetch_all(&mut *connection).await?;
     if !tables.iter().any(|name| name == "_sqlx_migrations") {
@@ -190,7 +190,7 @@ async fn ask(connection: &mut SqliteConnection) -> Result<Database, StoreError> 
     })
 }
 
-async fn identity(connection: &mut SqliteConnection) -> Result<Option<(Uuid, i64)>, StoreError> {
+async fn identity(connection: &mut SqliteConnection) -> Result<Option<(Uuid, i64)>> {
     let row: Option<(String, i64)> =
         sqlx::query_as("SELECT id, generation FROM folder").fetch_optional(connection).await?;
     let read = |(id, generation): (String, _)| match id.parse() {
@@ -201,10 +201,7 @@ async fn identity(connection: &mut SqliteConnection) -> Result<Option<(Uuid, i64
 }
 
 /// Gives a folder without an identifier one, and takes the database for right in any case.
-pub(super) async fn settle(
-    dir: &DataDir,
-    connection: &mut SqliteConnection,
-) -> Result<(), StoreError> {
+pub(super) async fn settle(dir: &DataDir, connection: &mut SqliteConnection) -> Result<()> {
     let last = read(dir)?.and_then(Result::ok).map_or(0, |marker| marker.generation);
     sql!(
         "INSERT INTO folder (one, id, generation) VALUES (1, ?, 0) ON CONFLICT DO NOTHING",
@@ -221,10 +218,7 @@ pub(super) async fn settle(
 }
 
 /// The marker that belongs to this database.
-pub(super) async fn marker(
-    connection: &mut SqliteConnection,
-    schema: i64,
-) -> Result<Marker, StoreError> {
+pub(super) async fn marker(connection: &mut SqliteConnection, schema: i64) -> Result<Marker> {
     let (id, generation) = identity(connection)
         .await?
         .ok_or(StoreError::Corrupt { column: "folder", value: "no row".into() })?;
@@ -232,7 +226,7 @@ pub(super) async fn marker(
 }
 
 /// Puts the marker into the folder, for good; `draft` is on the same disk.
-pub(super) fn write(folder: &Path, draft: &Path, marker: &Marker) -> Result<(), StoreError> {
+pub(super) fn write(folder: &Path, draft: &Path, marker: &Marker) -> Result<()> {
     let text =
         serde_json::to_vec(marker).map_err(|error| StoreError::io("write", draft)(error.into()))?;
     File::create(draft)
@@ -241,7 +235,7 @@ pub(super) fn write(folder: &Path, draft: &Path, marker: &Marker) -> Result<(), 
     dir::rename_durably(draft, &folder.join("sci-recon.json"))
 }
 
-fn read(dir: &DataDir) -> Result<Option<Result<Marker, String>>, StoreError> {
+fn read(dir: &DataDir) -> Result<Option<Result<Marker, String>>> {
     let path = dir.root().join("sci-recon.json");
     match fs::read(&path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
@@ -253,7 +247,7 @@ fn read(dir: &DataDir) -> Result<Option<Result<Marker, String>>, StoreError> {
 }
 
 /// True if there is a file somewhere below.
-fn holds_files(folder: &Path) -> Result<bool, StoreError> {
+fn holds_files(folder: &Path) -> Result<bool> {
     for path in dir::children(folder)? {
         if !path.is_dir() || holds_files(&path)? {
             return Ok(true);

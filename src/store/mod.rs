@@ -13,6 +13,7 @@
 //! fails if the disk does ([`StoreError`]). What a lab has nothing under is `NotFound`, and what others
 //! refer to is not deleted (`InUse`). Their descriptions name only what else can go wrong.
 
+use crate::store::error::Result;
 mod backup;
 mod cleaning;
 mod dir;
@@ -45,14 +46,13 @@ pub use queue::{
     CalibrationDone, CalibrationTask, ClaimedTask, Completion, Heartbeat, JobMark, JobProgress,
     JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Work, WorkerEnd,
 };
-pub use rows::Page;
+pub use rows::{Filter, Page};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{Inserted, NewJob};
 pub use tables::{
-    Blob, Calibration, FoundPartial, Job, JobFilter, LabRow, Measurement, MeasurementFilter, Model,
-    ModelFilter, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
-    PartialFile, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
-    Unready, WorkerRow, WorkerTask,
+    Blob, Calibration, FoundPartial, Job, JobFilter, LabRow, Measurement, Model, NewCalibration,
+    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, TaskCounts, TaskRecord,
+    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerRow, WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.
@@ -83,7 +83,7 @@ impl Store {
     /// Opens the store in `root`.
     /// Errors: if the folder is none, is another server's, or does not belong to its database; if
     /// it can't be written; or if a newer version of this program has changed the database.
-    pub async fn open(root: &Path, purpose: Purpose) -> Result<Self, StoreError> {
+    pub async fn open(root: &Path, purpose: Purpose) -> Result<Self> {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
@@ -126,19 +126,17 @@ impl Store {
     }
 
     /// Lets the database and the marker be newer than all copies of them; see `identity.rs`.
-    pub async fn advance_generation(&self) -> Result<(), StoreError> {
+    pub async fn advance_generation(&self) -> Result<()> {
         sqlx::query("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
         self.write_marker().await
     }
 
-    async fn write_marker(&self) -> Result<(), StoreError> {
+    async fn write_marker(&self) -> Result<()> {
         let marker = identity::marker(&mut *self.writer.acquire().await?, schema()).await?;
         let (root, draft) = (self.dir.root().to_owned(), self.temporary_path());
         on_files(move || identity::write(&root, &draft, &marker)).await
     }
 
-    /// Where the files are.
-    #[must_use]
     pub fn dir(&self) -> &DataDir {
         &self.dir
     }
@@ -150,12 +148,12 @@ impl Store {
     }
 
     /// Asks the database for an answer.
-    pub async fn ping(&self) -> Result<(), StoreError> {
+    pub async fn ping(&self) -> Result<()> {
         sqlx::query("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
         Ok(())
     }
 
-    pub(crate) async fn write(&self) -> Result<WriteTransaction, StoreError> {
+    pub(crate) async fn write(&self) -> Result<WriteTransaction> {
         Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
     }
 }

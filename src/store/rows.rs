@@ -7,7 +7,7 @@ use sqlx::sqlite::{Sqlite, SqliteArgumentsBuffer, SqliteRow, SqliteTypeInfo, Sql
 use sqlx::types::Json;
 use sqlx::{Decode, Encode, Row, SqliteConnection, Type};
 
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use crate::job::{
     CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sha256,
     TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
@@ -29,6 +29,14 @@ impl<T> Page<T> {
         items.truncate(limit);
         Self { items, more }
     }
+}
+
+/// Which things a list holds that belong to calibrations.
+#[derive(Debug, Clone, Copy)]
+pub struct Filter<Id> {
+    pub calibration: Option<CalibrationId>,
+    /// Only those older than this one.
+    pub after: Option<Id>,
 }
 
 /// A statement with the values for its places, in order.
@@ -99,7 +107,7 @@ column!(
 );
 
 /// The column as a length.
-pub(super) fn number(row: &SqliteRow, column: &'static str) -> Result<usize, StoreError> {
+pub(super) fn number(row: &SqliteRow, column: &'static str) -> Result<usize> {
     let value: i64 = row.try_get(column)?;
     value.try_into().map_err(|_| StoreError::Corrupt { column, value: value.to_string() })
 }
@@ -133,7 +141,7 @@ pub(super) enum Reference {
 pub(super) async fn require(
     connection: &mut SqliteConnection,
     references: &[Reference],
-) -> Result<(), StoreError> {
+) -> Result<()> {
     for reference in references {
         let (what, query, id) = match reference {
             Reference::Blob(id) => ("blob", "SELECT 1 FROM blobs WHERE sha256 = ?", id.to_string()),
@@ -157,7 +165,7 @@ pub(super) async fn refuse_if_used(
     connection: &mut SqliteConnection,
     (what, id): (&'static str, String),
     (by, query): (&'static str, &'static str),
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let users = sql_scalar!(query, [id]).fetch_one(connection).await?;
     if users > 0 { Err(StoreError::InUse { what, by, users }) } else { Ok(()) }
 }

@@ -12,7 +12,7 @@ use uuid::Uuid;
 
 use super::Store;
 use super::dir;
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use crate::job::{ResultFile, Sha256};
 
 /// A temporary file or folder; its lock and its removal.
@@ -26,7 +26,7 @@ struct Temporary {
 }
 
 impl Temporary {
-    fn new(path: PathBuf, lock: File) -> Result<Self, StoreError> {
+    fn new(path: PathBuf, lock: File) -> Result<Self> {
         lock.lock().map_err(StoreError::io("lock", &path))?;
         Ok(Self { path, _lock: lock, moved: false })
     }
@@ -47,7 +47,7 @@ impl Store {
     }
 
     /// A new file that is hashed while it is written. Blocks on the disk.
-    pub fn blob_writer(&self) -> Result<BlobWriter, StoreError> {
+    pub fn blob_writer(&self) -> Result<BlobWriter> {
         let staged = self.staged_path()?;
         let path = &staged.0.path;
         let file = File::options().write(true).open(path);
@@ -57,7 +57,7 @@ impl Store {
     }
 
     /// A new empty file for a writer that wants a path. Blocks on the disk.
-    pub fn staged_path(&self) -> Result<StagedPath, StoreError> {
+    pub fn staged_path(&self) -> Result<StagedPath> {
         let path = self.temporary_path();
         let lock = File::create_new(&path).map_err(StoreError::io("make", &path))?;
         Ok(StagedPath(Temporary::new(path, lock)?))
@@ -65,18 +65,14 @@ impl Store {
 
     /// A second name for a file that is there, on its way into the store; `lock` holds the file's lock
     /// already. Blocks on the disk.
-    pub(super) fn staged_link(
-        &self,
-        original: &Path,
-        lock: File,
-    ) -> Result<StagedPath, StoreError> {
+    pub(super) fn staged_link(&self, original: &Path, lock: File) -> Result<StagedPath> {
         let path = self.temporary_path();
         fs::hard_link(original, &path).map_err(StoreError::io("link", &path))?;
         Ok(StagedPath(Temporary::new(path, lock)?))
     }
 
     /// A new empty folder for the results of a task. Blocks on the disk.
-    pub fn staged_dir(&self) -> Result<StagedDir, StoreError> {
+    pub fn staged_dir(&self) -> Result<StagedDir> {
         let path = self.temporary_path();
         fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
         let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
@@ -94,14 +90,12 @@ pub struct BlobWriter {
 }
 
 impl BlobWriter {
-    /// Bytes written so far.
-    #[must_use]
     pub fn size(&self) -> u64 {
         self.size
     }
 
     /// Brings the file to the disk.
-    pub fn finish(mut self) -> Result<StagedBlob, StoreError> {
+    pub fn finish(mut self) -> Result<StagedBlob> {
         let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
         synced.map_err(StoreError::io("write to the disk", &self.temporary.path))?;
         let sha256 = Sha256::new(self.hasher.finalize().into());
@@ -128,13 +122,12 @@ pub struct StagedPath(Temporary);
 
 impl StagedPath {
     /// The path to write to. The file is there and empty; it must not be replaced by another one.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.0.path
     }
 
     /// Reads the file back to hash it, and brings it to the disk.
-    pub fn finish(self) -> Result<StagedBlob, StoreError> {
+    pub fn finish(self) -> Result<StagedBlob> {
         let path = &self.0.path;
         let mut file = File::open(path).map_err(StoreError::io("open", path))?;
         let (sha256, size) = Sha256::of_reader(&mut file).map_err(StoreError::io("read", path))?;
@@ -152,26 +145,21 @@ pub struct StagedBlob {
 }
 
 impl StagedBlob {
-    /// The hash of its bytes.
-    #[must_use]
     pub fn sha256(&self) -> Sha256 {
         self.sha256
     }
 
-    /// Its size in bytes.
-    #[must_use]
     pub fn size(&self) -> u64 {
         self.size
     }
 
     /// Where it lies until it is stored.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.temporary.path
     }
 
     /// Moves the file to its place. The writer's lock of the database must be held.
-    pub(super) fn put(mut self, place: &Path) -> Result<(), StoreError> {
+    pub(super) fn put(mut self, place: &Path) -> Result<()> {
         if let Some(folder) = place.parent() {
             dir::make_dir_durably(folder)?;
         }
@@ -190,14 +178,12 @@ impl StagedBlob {
 pub struct StagedDir(Temporary);
 
 impl StagedDir {
-    /// The folder.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.0.path
     }
 
     /// Moves the folder to `place`; what was there goes. The writer's lock must be held.
-    pub(super) fn put(mut self, place: &Path) -> Result<(), StoreError> {
+    pub(super) fn put(mut self, place: &Path) -> Result<()> {
         if place.exists() {
             let old = self.0.path.with_extension("old");
             dir::rename_durably(place, &old)?;
@@ -211,7 +197,7 @@ impl StagedDir {
     }
 
     /// Moves the files, not the folder, into the folder `place`. The writer's lock must be held.
-    pub(super) fn put_files(self, place: &Path, files: &[ResultFile]) -> Result<(), StoreError> {
+    pub(super) fn put_files(self, place: &Path, files: &[ResultFile]) -> Result<()> {
         for file in files {
             dir::rename_durably(&self.0.path.join(&file.name), &place.join(&file.name))?;
         }

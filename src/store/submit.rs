@@ -3,7 +3,7 @@
 use sqlx::SqliteConnection;
 
 use super::Store;
-use super::error::StoreError;
+use super::error::{Result, StoreError};
 use super::queue::graph;
 use super::rows::{Reference, require, sql_as};
 use super::staging::StagedBlob;
@@ -15,7 +15,6 @@ use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp,
 };
 
-/// A job to be accepted.
 #[derive(Debug, Clone)]
 pub struct NewJob {
     /// So many jobs may wait and run, with this one.
@@ -40,7 +39,7 @@ impl Store {
     /// Accepts a job: the job and its tasks, or nothing.
     /// Errors: [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::NotFound`] if
     /// the measurement or the model is gone.
-    pub async fn add_job(&self, new: NewJob) -> Result<Inserted, StoreError> {
+    pub async fn add_job(&self, new: NewJob) -> Result<Inserted> {
         let mut transaction = self.write().await?;
         if let Some(key) = &new.idempotency_key
             && let Some(job) = with_key(&mut transaction, &new.lab, key, new.request).await?
@@ -66,7 +65,7 @@ impl Store {
         lab: &Lab,
         key: &str,
         request: Sha256,
-    ) -> Result<Option<JobId>, StoreError> {
+    ) -> Result<Option<JobId>> {
         let mut connection = self.readers.acquire().await?;
         with_key(&mut connection, lab, key, request).await
     }
@@ -77,7 +76,7 @@ impl Store {
         lab: &Lab,
         facts: NewCalibration,
         prepared: StagedBlob,
-    ) -> Result<Calibration, StoreError> {
+    ) -> Result<Calibration> {
         let calibration = Calibration {
             id: CalibrationId::new(),
             prepared: prepared.sha256(),
@@ -102,7 +101,7 @@ impl Store {
         lab: &Lab,
         name: Option<&Label>,
         captures: &Captures,
-    ) -> Result<CalibrationId, StoreError> {
+    ) -> Result<CalibrationId> {
         let id = CalibrationId::new();
         let mut transaction = self.write().await?;
         calibrations::insert_request(&mut transaction, lab, id, name, Some(captures)).await?;
@@ -117,7 +116,7 @@ impl Store {
         lab: &Lab,
         facts: NewMeasurement,
         prepared: StagedBlob,
-    ) -> Result<Measurement, StoreError> {
+    ) -> Result<Measurement> {
         let measurement = Measurement {
             id: MeasurementId::new(),
             prepared: prepared.sha256(),
@@ -136,7 +135,7 @@ impl Store {
 }
 
 /// Refuses a job if enough wait and run.
-async fn check_queue(connection: &mut SqliteConnection, most: u64) -> Result<(), StoreError> {
+async fn check_queue(connection: &mut SqliteConnection, most: u64) -> Result<()> {
     let jobs = "SELECT count(*) FROM jobs WHERE finished_at IS NULL";
     let jobs = sqlx::query_scalar(jobs).fetch_one(connection).await?;
     if jobs < most { Ok(()) } else { Err(StoreError::QueueFull { jobs, most }) }
@@ -153,7 +152,7 @@ async fn with_key(
     lab: &Lab,
     key: &str,
     request: Sha256,
-) -> Result<Option<JobId>, StoreError> {
+) -> Result<Option<JobId>> {
     let found: Option<(JobId, Sha256)> =
         sql_as!("SELECT id, request FROM jobs WHERE idempotency_key = ?", [key_of(lab, key)])
             .fetch_optional(connection)

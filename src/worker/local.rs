@@ -30,7 +30,6 @@ pub struct Local {
 }
 
 impl Local {
-    /// For a worker of this name.
     pub fn new(store: Store, worker: WorkerId) -> Self {
         Self { store, worker }
     }
@@ -238,7 +237,6 @@ fn tile_task(task: &JobTask, snapshot: u32, index: u32) -> Result<TileTask, Pipe
     })
 }
 
-/// What the manifests tell of a job.
 fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);

@@ -149,7 +149,6 @@ fn run_pilot(
     Ok(pilot::decide(input, place, schedule, networks, &mut observer)?)
 }
 
-/// Reconstructs a tile.
 fn tile(
     transport: &impl Transport,
     task: &TileTask,

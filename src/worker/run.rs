@@ -37,7 +37,6 @@ const GRACE: Duration = Duration::from_secs(5);
 /// is slow, but not for ever.
 const SLOWNESS: f64 = 4.0;
 
-/// Why a worker had to end.
 #[derive(Debug, thiserror::Error)]
 pub enum WorkerError {
     /// Not even that the worker is there can be told.
@@ -66,7 +65,6 @@ pub struct Worker<T> {
 /// What the computing thread hands back.
 type Computed = (WarmNetworks, Result<Done, TaskError>);
 
-/// Why a task was stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reason {
     Cancelled,

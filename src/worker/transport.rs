@@ -32,13 +32,11 @@ pub(super) const LEASE: Duration = Duration::from_secs(20);
 /// The way to the queue and the files.
 #[allow(async_fn_in_trait)] // a worker does not move between threads
 pub trait Transport: Clone + Send + 'static {
-    /// Tells that the worker has started.
     async fn started(&self) -> Result<(), TransportError>;
 
     /// Tells that the worker, which has nothing to do, is alive.
     async fn seen(&self) -> Result<(), TransportError>;
 
-    /// The next task, if there is one.
     async fn claim(&self) -> Result<Option<Claim>, TransportError>;
 
     /// Renews a lease, notes the progress and how the solver went (JSON), and asks whether to go on.
@@ -69,7 +67,6 @@ pub trait Transport: Clone + Send + 'static {
     fn model(&self, sha256: Sha256) -> ModelFile;
 }
 
-/// A claimed task.
 #[derive(Debug)]
 pub struct Claim {
     /// The right to it, to be shown with every message about it.
@@ -146,7 +143,6 @@ pub struct TileTask {
     pub model: Option<Sha256>,
 }
 
-/// The end of a task.
 #[derive(Debug)]
 pub struct Done {
     /// Where the task stood when it ended: `fraction` is below 1 if the solver converged early.
@@ -156,7 +152,6 @@ pub struct Done {
     pub output: Output,
 }
 
-/// What a task has made.
 #[derive(Debug)]
 pub enum Output {
     Record,
@@ -170,7 +165,6 @@ pub enum Output {
     Calibration(Box<CalibrationDone>),
 }
 
-/// Why there is no output.
 #[derive(Debug, thiserror::Error)]
 pub enum TaskError {
     #[error(transparent)]
@@ -182,7 +176,6 @@ pub enum TaskError {
 }
 
 impl TaskError {
-    /// Whether another attempt may succeed.
     pub(super) fn is_retryable(&self) -> bool {
         match self {
             Self::Pipeline(error) => error.is_retryable(),

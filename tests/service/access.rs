@@ -223,3 +223,23 @@ async fn a_token_stands_in_no_log_and_no_file() {
         assert!(!found, "{} holds the token", file.display());
     }
 }
+
+#[tokio::test]
+async fn a_page_of_another_site_gets_nothing_of_an_open_service() {
+    let app = TestApp::with(&["--workers", "0", "--host", "bench.example"]).await;
+    let ask = |method: Method, lines: &[(&str, &str)]| {
+        let mut request = app.request(method, "/v1/jobs").json(&json!({}));
+        for (name, value) in lines {
+            request = request.header(*name, *value);
+        }
+        async { request.send().await.unwrap().status().as_u16() }
+    };
+    // The name of the other site points at this machine by now.
+    assert_eq!(ask(Method::GET, &[("host", "evil.example")]).await, 403);
+    assert_eq!(ask(Method::GET, &[("host", "bench.example")]).await, 200);
+    assert_eq!(ask(Method::POST, &[("origin", "http://evil.example")]).await, 403);
+    assert_eq!(ask(Method::POST, &[("sec-fetch-site", "cross-site")]).await, 403);
+    assert_eq!(ask(Method::POST, &[]).await, 422, "it comes as far as the body");
+    app.token(&["create", "--lab", "optics"]);
+    assert_eq!(ask(Method::GET, &[("host", "evil.example")]).await, 401, "a token is needed now");
+}

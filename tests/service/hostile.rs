@@ -212,3 +212,48 @@ async fn odd_requests_are_answered() {
     let odd = app.request(Method::GET, "/livez").header("x-request-id", "a b\u{e9}");
     assert_ne!(app.send(odd).await.header("x-request-id").len(), 0);
 }
+
+#[tokio::test]
+async fn silent_connections_neither_stop_the_service_nor_stay() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpStream;
+
+    let app = TestApp::with(&["--workers", "0"]).await;
+    let address = app.url.trim_start_matches("http://").to_owned();
+    let limits = std::fs::read_to_string(format!("/proc/{}/limits", app.pid())).unwrap();
+    let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
+    let figures: Vec<&str> = files.split_whitespace().collect();
+    assert_eq!(figures[3], figures[4], "the soft limit on files is raised to the hard one");
+    let mut silent = Vec::new();
+    for _ in 0..900 {
+        silent.push(TcpStream::connect(&address).await.unwrap());
+    }
+    app.get("/v1/jobs").await.expect(200);
+    let half = silent.last_mut().unwrap();
+    half.write_all(b"GET /livez HTTP/1.1\r\nHost: x\r\nX-Slow: ").await.unwrap();
+    let limit = std::time::Duration::from_secs(60);
+    let mut answer = Vec::new();
+    let ended = tokio::time::timeout(limit, half.read_to_end(&mut answer)).await;
+    assert!(ended.is_ok(), "a head that never ends keeps its connection");
+}
+
+#[tokio::test]
+async fn a_request_names_one_host() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpStream;
+
+    let app = TestApp::start().await;
+    let address = app.url.trim_start_matches("http://").to_owned();
+    for (lines, status) in [
+        (String::new(), "400"),
+        (format!("Host: {address}\r\nHost: evil.example\r\n"), "400"),
+        (format!("Host: {address}\r\n"), "200"),
+    ] {
+        let mut socket = TcpStream::connect(&address).await.unwrap();
+        let request = format!("GET /livez HTTP/1.1\r\n{lines}Connection: close\r\n\r\n");
+        socket.write_all(request.as_bytes()).await.unwrap();
+        let mut answer = String::new();
+        socket.read_to_string(&mut answer).await.unwrap();
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{lines:?}: {answer}");
+    }
+}

@@ -4,9 +4,7 @@ use sci_recon::job::Algorithm;
 
 use super::record::Row;
 
-/// What the tables show.
 pub struct Layout {
-    /// The columns.
     pub clips: Vec<String>,
     /// The rows of each scale.
     pub algorithms: Vec<Algorithm>,

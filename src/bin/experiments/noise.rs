@@ -220,7 +220,6 @@ const HEIGHT: f64 = 400.0;
 /// Where the axes' plane lies: left, right, top, bottom.
 const PLANE: [f64; 4] = [60.0, WIDTH - 20.0, 60.0, HEIGHT - 50.0];
 
-/// The curves as an SVG file.
 fn chart(record: &Record) -> String {
     let sigmas: Vec<f64> = record.sigmas.iter().map(|&sigma| f64::from(sigma)).collect();
     let span = |values: &mut dyn Iterator<Item = f64>| {

@@ -17,11 +17,9 @@ const FILE: &str = "tables.json";
 /// What all rows of one command share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Setting {
-    /// Kind of the masks.
     pub pattern: String,
     /// Standard deviation of the noise of the measurement on the scale of 255 grey values.
     pub noise_sigma: f32,
-    /// Seed of masks and noise.
     pub seed: u64,
 }
 
@@ -31,9 +29,7 @@ pub struct Key {
     pub program_version: String,
     pub clip: String,
     pub algorithm: Algorithm,
-    /// Side of the square, in pixels.
     pub scale: usize,
-    /// Frames of the snapshot.
     pub compression_ratio: usize,
     #[serde(flatten)]
     pub setting: Setting,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use sci_recon::cli::{CliError, Learned, MaskArguments, NetworkArguments, algorithms};
+use sci_recon::cli::{CliError, MaskArguments, Model, NetworkArguments, algorithms};
 use sci_recon::job::Algorithm;
 
 use super::clips::read_clips;
@@ -82,8 +82,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         seed: arguments.seed,
     };
     let network = arguments.engine.network()?;
-    let learned =
-        arguments.learned.as_ref().map(|path| Learned::open(path, &network)).transpose()?;
+    let learned = arguments.learned.as_ref().map(|path| Model::open(path, &network)).transpose()?;
     let bench = Bench::new(network, learned, setting);
     // Patterns that can't be are told now, not hours later.
     let smallest = usize::from(scales.iter().copied().min().unwrap_or(1));

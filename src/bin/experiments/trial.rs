@@ -4,7 +4,7 @@ use std::thread;
 use std::time::Instant;
 
 use ndarray::{Array2, Array3, ArrayView, ArrayView2, Dimension, s};
-use sci_recon::cli::{CliError, Learned, MaskArguments, plan};
+use sci_recon::cli::{CliError, MaskArguments, Model, plan};
 use sci_recon::job::{Algorithm, TileSpec};
 use sci_recon::optics::{illumination, measure, noisy};
 use sci_recon::pipeline::blend;
@@ -34,7 +34,7 @@ pub fn solve_on_all_cores(
 pub struct Bench {
     network: NetworkSource,
     /// The network of `learned`.
-    learned: Option<Learned>,
+    learned: Option<Model>,
     setting: Setting,
 }
 
@@ -46,7 +46,6 @@ pub struct Masks {
     light: Array2<f32>,
 }
 
-/// A clip behind masks.
 pub struct Snapshot<'a> {
     clip: &'a str,
     masks: &'a Array3<f32>,
@@ -59,7 +58,7 @@ pub struct Snapshot<'a> {
 
 impl Bench {
     /// With networks from `network`, and one of the user's own.
-    pub fn new(network: NetworkSource, learned: Option<Learned>, setting: Setting) -> Self {
+    pub fn new(network: NetworkSource, learned: Option<Model>, setting: Setting) -> Self {
         Self { network, learned, setting }
     }
 
@@ -111,7 +110,7 @@ impl Bench {
         let plan = plan(algorithm, (None, None), learned, snapshot.masks.dim())?;
         let deep = learned.is_some() || schedule.needs_network();
         let mut models = ModelRecord::of(&schedule);
-        models.extend(learned.map(Learned::record));
+        models.extend(learned.map(Model::record));
         Ok(Key {
             program_version: env!("CARGO_PKG_VERSION").into(),
             clip: snapshot.clip.into(),

@@ -11,16 +11,15 @@ use serde_json::Value;
 use tokio_util::io::ReaderStream;
 
 use crate::cli::CliError;
+use crate::cli::error::Result;
 use crate::formats::{Limits, exr};
 use crate::job::{JobState, Sha256};
 
-/// Speaks to one service.
 pub(super) struct Client {
     url: String,
     http: reqwest::Client,
 }
 
-/// Where a job stands.
 pub(super) enum JobView {
     /// It waits or runs; the share on \[0,1\] that is done.
     Going(f64),
@@ -70,7 +69,7 @@ impl Client {
     }
 
     /// Sends a file, of which memory holds a piece at a time; gives its hash.
-    pub(super) async fn upload(&self, path: &Path) -> Result<String, CliError> {
+    pub(super) async fn upload(&self, path: &Path) -> Result<String> {
         let unreadable = |error: std::io::Error| CliError::file("read", path, &error);
         let file = tokio::fs::File::open(path).await.map_err(unreadable)?;
         let body = reqwest::Body::wrap_stream(ReaderStream::new(file));
@@ -79,13 +78,12 @@ impl Client {
     }
 
     /// Makes a calibration, a measurement or a job; gives its identifier.
-    pub(super) async fn create(&self, path: &str, body: &Value) -> Result<String, CliError> {
+    pub(super) async fn create(&self, path: &str, body: &Value) -> Result<String> {
         let request = self.http.post(format!("{}{path}", self.url)).json(body);
         Ok(json::<Created>(request).await?.id)
     }
 
-    /// Asks how a job is.
-    pub(super) async fn job(&self, job: &str) -> Result<JobView, CliError> {
+    pub(super) async fn job(&self, job: &str) -> Result<JobView> {
         let job: Job = json(self.get(&format!("/v1/jobs/{job}"))).await?;
         Ok(match (job.state, job.error) {
             (JobState::Succeeded, _) => JobView::Succeeded,
@@ -98,18 +96,14 @@ impl Client {
     }
 
     /// Processor seconds that the job's computing took, from its manifest.
-    pub(super) async fn cpu_seconds(&self, job: &str) -> Result<f64, CliError> {
+    pub(super) async fn cpu_seconds(&self, job: &str) -> Result<f64> {
         let manifest: Value = json(self.get(&format!("/v1/jobs/{job}/manifest.json"))).await?;
         let seconds = manifest["run"]["cpu_seconds"].as_f64();
         seconds.ok_or_else(|| CliError::Failure("the manifest tells no cpu_seconds".into()))
     }
 
     /// Downloads the EXR frames of snapshot 0 into `folder`, and reads them: \[B,H,W\].
-    pub(super) async fn download_frames(
-        &self,
-        job: &str,
-        folder: &Path,
-    ) -> Result<Array3<f32>, CliError> {
+    pub(super) async fn download_frames(&self, job: &str, folder: &Path) -> Result<Array3<f32>> {
         let unwritable = |error| CliError::file("write", folder, &error);
         fs::create_dir_all(folder).map_err(unwritable)?;
         let snapshot: Snapshot = json(self.get(&format!("/v1/jobs/{job}/snapshots/0"))).await?;
@@ -136,12 +130,12 @@ impl Client {
 }
 
 /// Sends a request and reads the JSON of a good answer.
-async fn json<T: DeserializeOwned>(request: RequestBuilder) -> Result<T, CliError> {
+async fn json<T: DeserializeOwned>(request: RequestBuilder) -> Result<T> {
     answered(request).await?.json().await.map_err(broken)
 }
 
 /// Sends a request; a bad answer is an error with the service's own words.
-async fn answered(request: RequestBuilder) -> Result<Response, CliError> {
+async fn answered(request: RequestBuilder) -> Result<Response> {
     let response = request.send().await.map_err(broken)?;
     let status = response.status();
     if status.is_success() {

@@ -15,6 +15,7 @@ use ndarray::Array3;
 use serde_json::json;
 
 use super::{CliError, progress};
+use crate::cli::error::Result;
 use crate::job::Algorithm;
 use client::{Client, JobView};
 use report::{Quality, Report};
@@ -40,14 +41,13 @@ pub struct Arguments {
     json: bool,
 }
 
-/// Runs the command.
-pub fn run(arguments: &Arguments) -> Result<(), CliError> {
+pub fn run(arguments: &Arguments) -> Result<()> {
     let failed = |error: std::io::Error| CliError::Failure(format!("the runtime: {error}"));
     let out = fresh_folder(&arguments.out)?;
     tokio::runtime::Runtime::new().map_err(failed)?.block_on(demo(arguments, &out))
 }
 
-async fn demo(arguments: &Arguments, out: &Path) -> Result<(), CliError> {
+async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
     let started = Instant::now();
     let say = |text: String| {
         if !arguments.json {
@@ -79,11 +79,7 @@ async fn demo(arguments: &Arguments, out: &Path) -> Result<(), CliError> {
 }
 
 /// Sends the files, asks for both algorithms, waits, and compares the frames that come back.
-async fn through_http(
-    client: &Client,
-    out: &Path,
-    truth: &Array3<f32>,
-) -> Result<[Quality; 2], CliError> {
+async fn through_http(client: &Client, out: &Path, truth: &Array3<f32>) -> Result<[Quality; 2]> {
     let input = out.join("input");
     let masks = client.upload(&input.join("masks.npy")).await?;
     let measurement = client.upload(&input.join("measurement.npy")).await?;
@@ -106,7 +102,7 @@ async fn through_http(
 }
 
 /// Shows the progress of all jobs until they have succeeded.
-async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<(), CliError> {
+async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<()> {
     let screen = MultiProgress::with_draw_target(progress::target());
     let bars: Vec<_> = jobs.iter().map(|(name, _)| screen.add(progress::bar(name))).collect();
     let mut done = vec![false; jobs.len()];
@@ -131,7 +127,7 @@ async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<(), C
 }
 
 /// The absolute path of an empty folder: new, or that of an earlier demo.
-fn fresh_folder(out: &Path) -> Result<PathBuf, CliError> {
+fn fresh_folder(out: &Path) -> Result<PathBuf> {
     let unwritable = |error: std::io::Error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(unwritable)?;
     let mut entries = fs::read_dir(out).map_err(unwritable)?;

@@ -6,9 +6,9 @@ use ndarray::Array3;
 use serde::Serialize;
 
 use crate::cli::CliError;
+use crate::cli::error::Result;
 use crate::pipeline::quality::{self, FrameQuality};
 
-/// The figures of one algorithm.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Quality {
     psnr_db: f64,
@@ -32,7 +32,7 @@ pub(super) fn compare(
     frames: &Array3<f32>,
     truth: &Array3<f32>,
     cpu_seconds: f64,
-) -> Result<Quality, CliError> {
+) -> Result<Quality> {
     let pairs = frames.outer_iter().zip(truth.outer_iter()).enumerate();
     let compared = pairs.map(|(k, (frame, truth))| FrameQuality::of(k, frame, truth));
     let quality = quality::Quality::from(compared.collect::<Result<Vec<_>, _>>()?);
@@ -41,12 +41,12 @@ pub(super) fn compare(
 }
 
 impl Report {
-    pub(super) fn to_json(&self) -> Result<String, CliError> {
+    pub(super) fn to_json(&self) -> Result<String> {
         serde_json::to_string(self)
             .map_err(|error| CliError::Failure(format!("the report: {error}")))
     }
 
-    pub(super) fn print(&self, json: bool) -> Result<(), CliError> {
+    pub(super) fn print(&self, json: bool) -> Result<()> {
         if json {
             println!("{}", self.to_json()?);
             return Ok(());

@@ -7,6 +7,7 @@ use std::path::Path;
 use ndarray::Array3;
 
 use crate::cli::CliError;
+use crate::cli::error::Result;
 use crate::formats::npy;
 use crate::intake::read_clip;
 use crate::optics::{measure, random_squares};
@@ -28,7 +29,7 @@ const SEED: u64 = 1;
 
 /// Writes `masks.npy`, `measurement.npy` and the true frames as PNG into `folder`, and gives the
 /// true frames \[B,H,W\] on \[0,1\].
-pub(super) fn make(folder: &Path) -> Result<Array3<f32>, CliError> {
+pub(super) fn make(folder: &Path) -> Result<Array3<f32>> {
     let clip = folder.join("clip");
     let unwritable = |error| CliError::file("write", &clip, &error);
     fs::create_dir_all(&clip).map_err(unwritable)?;

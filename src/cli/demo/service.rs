@@ -10,6 +10,7 @@ use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::{Child, Command};
 
 use crate::cli::CliError;
+use crate::cli::error::Result;
 
 /// How long the service may take to start, and to stop.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -29,7 +30,7 @@ struct Announcement {
 impl Service {
     /// Starts `sci-recon serve` on a free port, with its data in `out/service` and its log in
     /// `out/service.log`.
-    pub(super) async fn start(out: &Path) -> Result<Self, CliError> {
+    pub(super) async fn start(out: &Path) -> Result<Self> {
         let failed = |what: &str| {
             let log = out.join("service.log");
             CliError::Failure(format!("the service {what}; see {}", log.display()))
@@ -57,13 +58,12 @@ impl Service {
         Ok(Self { process, url: announced.url })
     }
 
-    /// Where it listens.
     pub(super) fn url(&self) -> &str {
         &self.url
     }
 
     /// Stops it and waits for its end.
-    pub(super) async fn stop(mut self) -> Result<(), CliError> {
+    pub(super) async fn stop(mut self) -> Result<()> {
         let failed =
             |text: String| CliError::Failure(format!("the service can't be stopped: {text}"));
         let id = self.process.id().and_then(|id| i32::try_from(id).ok());

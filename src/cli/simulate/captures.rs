@@ -7,6 +7,7 @@ use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use serde::Serialize;
 
 use crate::cli::CliError;
+use crate::cli::error::Result;
 use crate::formats::npy;
 use crate::optics::{Camera, generator, measure};
 
@@ -40,7 +41,6 @@ struct Measurement {
     saturation: u16,
 }
 
-/// A lab with a camera.
 pub(super) struct Lab<'a> {
     pub(super) camera: Camera,
     /// Relative light \[H,W\] of the white board.
@@ -61,7 +61,7 @@ impl Lab<'_> {
         folder: &Path,
         snapshots: usize,
         scene: ArrayView3<'_, f32>,
-    ) -> Result<f32, CliError> {
+    ) -> Result<f32> {
         fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
         let camera = self.camera;
         let dim = self.illumination.dim();
@@ -110,7 +110,7 @@ impl Lab<'_> {
         count: usize,
         scene: ArrayView3<'_, f32>,
         background: f64,
-    ) -> Result<String, CliError> {
+    ) -> Result<String> {
         let exposure = single(self.camera.measurement_exposure) * self.scale;
         let mut lights = Vec::with_capacity(count);
         for clip in scene.axis_chunks_iter(Axis(0), self.masks.dim().0) {
@@ -130,12 +130,7 @@ struct Shots<'s, 'a> {
 
 impl Shots<'_, '_> {
     /// All repeats of one capture; gives the file's name.
-    fn take(
-        &mut self,
-        name: &str,
-        light: &Array2<f32>,
-        background: f64,
-    ) -> Result<String, CliError> {
+    fn take(&mut self, name: &str, light: &Array2<f32>, background: f64) -> Result<String> {
         self.write(name, self.lab.repeats, |_| (light, background))
     }
 
@@ -144,7 +139,7 @@ impl Shots<'_, '_> {
         name: &str,
         count: usize,
         light: impl Fn(usize) -> (&'l Array2<f32>, f64),
-    ) -> Result<String, CliError> {
+    ) -> Result<String> {
         let mut rng = generator(self.lab.seed);
         rng.set_stream(self.stream);
         self.stream += 1;

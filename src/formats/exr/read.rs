@@ -13,6 +13,7 @@ use ::exr::meta::header::Header;
 use ndarray::Array3;
 
 use super::{CHANNEL, FRAME_TIME};
+use crate::formats::error::Result;
 use crate::formats::{Format, FormatError, Limits};
 
 /// What a part says about its frame.
@@ -32,7 +33,7 @@ pub struct Part {
 ///
 /// Errors: I/O; [`FormatError::Unsupported`] for parts of differing sizes or with other channels
 /// than one float32 `Y`; limits and malformed files.
-pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32>), FormatError> {
+pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32>)> {
     let file = File::open(path).map_err(FormatError::io("open the EXR file"))?;
     let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
     limits.check_file(Format::Exr, length)?;
@@ -55,7 +56,7 @@ pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32
     Ok((headers.iter().map(part).collect(), stack))
 }
 
-fn common_size(headers: &[Header]) -> Result<(usize, usize), FormatError> {
+fn common_size(headers: &[Header]) -> Result<(usize, usize)> {
     let mut sizes = headers.iter().map(|header| {
         let channel = header.channels.list.first();
         let only_y = header.channels.list.len() == 1

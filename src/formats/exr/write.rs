@@ -18,6 +18,7 @@ use ndarray::{Array2, ArrayView2};
 use super::order::sort_attributes;
 use super::{CHANNEL, FRAME_TIME};
 use crate::formats::FormatError;
+use crate::formats::error::Result;
 
 /// The low bits of such floats are noise: on a camera clip with a little noise added (a stand-in for
 /// reconstructed frames) ZIP saved 3 % and took about 0.2 s a megapixel, this 0.02 s.
@@ -40,11 +41,7 @@ pub struct Attributes {
 /// Writes (or overwrites) `path` with one frame (row, column).
 ///
 /// Errors: I/O; [`FormatError::Internal`] for an empty frame or attributes that cannot be written.
-pub fn write_frame(
-    path: &Path,
-    frame: ArrayView2<'_, f32>,
-    attributes: &Attributes,
-) -> Result<(), FormatError> {
+pub fn write_frame(path: &Path, frame: ArrayView2<'_, f32>, attributes: &Attributes) -> Result<()> {
     let (height, width) = frame.dim();
     let parts = vec![header(height, width, attributes, None)?];
     write_parts(path, parts, |writer, headers| write_part(writer, headers, 0, frame))
@@ -95,7 +92,7 @@ fn header(
     width: usize,
     attributes: &Attributes,
     name: Option<String>,
-) -> Result<Header, FormatError> {
+) -> Result<Header> {
     if height == 0 || width == 0 {
         return Err(FormatError::Internal(format!("an EXR frame of {height}x{width}")));
     }
@@ -141,7 +138,7 @@ fn write_parts(
     path: &Path,
     headers: Vec<Header>,
     write: impl FnOnce(&mut PartWriter, &[Header]) -> Result<(), ExrError>,
-) -> Result<(), FormatError> {
+) -> Result<()> {
     let file = File::create(path).map_err(FormatError::io("create the EXR file"))?;
     let strict = true;
     block::write(BufWriter::new(file), headers.into_iter().collect(), strict, |meta, writer| {

@@ -3,6 +3,7 @@
 use std::io::BufRead;
 
 use super::element::{Content, malformed};
+use crate::formats::error::Result;
 use crate::formats::samples::{ByteOrder, each};
 use crate::formats::{Format, FormatError, SampleType};
 
@@ -32,7 +33,7 @@ pub(super) struct ArrayHeader {
 
 impl ArrayHeader {
     /// Reads the header. Arrays without one (empty, or of MATLAB's opaque classes) have no name.
-    pub(super) fn read<R: BufRead>(content: &mut Content<R>) -> Result<Self, FormatError> {
+    pub(super) fn read<R: BufRead>(content: &mut Content<R>) -> Result<Self> {
         let mut header = Self { name: String::new(), dimensions: Vec::new(), class: 0, flags: 0 };
         if content.is_empty() {
             return Ok(header);
@@ -55,7 +56,7 @@ impl ArrayHeader {
     }
 
     /// How the array's numbers are meant. Errors: a class that is not accepted.
-    pub(super) fn sample_type(&self) -> Result<SampleType, FormatError> {
+    pub(super) fn sample_type(&self) -> Result<SampleType> {
         let refused = match self.class {
             _ if self.flags & COMPLEX != 0 => "complex numbers",
             6 => return Ok(SampleType::F64),
@@ -89,7 +90,7 @@ impl ArrayHeader {
 pub(super) fn read_data_tag<R: BufRead>(
     content: &mut Content<R>,
     header: &ArrayHeader,
-) -> Result<(Storage, u64), FormatError> {
+) -> Result<(Storage, u64)> {
     let (kind, bytes) = content.tag()?;
     let name = &header.name;
     if kind > 0xffff {
@@ -121,11 +122,7 @@ struct Part {
 
 impl Part {
     /// Reads a part of at most `limit` bytes, and its padding.
-    fn read<R: BufRead>(
-        content: &mut Content<R>,
-        what: &'static str,
-        limit: u32,
-    ) -> Result<Self, FormatError> {
+    fn read<R: BufRead>(content: &mut Content<R>, what: &'static str, limit: u32) -> Result<Self> {
         let (kind, size) = content.tag()?;
         if kind > 0xffff {
             // At most four bytes: they stand in the tag, where the size would be.
@@ -150,7 +147,7 @@ impl Part {
         Ok(Self { what, kind, bytes })
     }
 
-    fn expect_type(self, kind: u32) -> Result<Self, FormatError> {
+    fn expect_type(self, kind: u32) -> Result<Self> {
         if self.kind == kind {
             return Ok(self);
         }

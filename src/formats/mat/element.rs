@@ -5,6 +5,7 @@ use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Take};
 
 use flate2::bufread::ZlibDecoder;
 
+use crate::formats::error::Result;
 use crate::formats::samples::ByteOrder;
 use crate::formats::{Format, FormatError};
 
@@ -38,7 +39,7 @@ pub(super) struct Element {
 
 impl Elements {
     /// `file` stands at its start and is `length` bytes long.
-    pub(super) fn new(mut file: BufReader<File>, length: u64) -> Result<Self, FormatError> {
+    pub(super) fn new(mut file: BufReader<File>, length: u64) -> Result<Self> {
         let mut header = [0; FILE_HEADER_BYTES as usize];
         file.read_exact(&mut header).map_err(read_error)?;
         let order = if header.ends_with(b"MI") { ByteOrder::Big } else { ByteOrder::Little };
@@ -46,7 +47,7 @@ impl Elements {
     }
 
     /// The next element that is an array, `None` at the end of the file.
-    pub(super) fn next(&mut self) -> Result<Option<Element>, FormatError> {
+    pub(super) fn next(&mut self) -> Result<Option<Element>> {
         while self.at < self.length {
             self.seen += 1;
             if self.seen > MAX_ELEMENTS {
@@ -78,19 +79,13 @@ impl Elements {
     }
 
     /// The content of an element, for a look at its header.
-    pub(super) fn look_into(
-        &mut self,
-        element: Element,
-    ) -> Result<Content<&mut BufReader<File>>, FormatError> {
+    pub(super) fn look_into(&mut self, element: Element) -> Result<Content<&mut BufReader<File>>> {
         self.file.seek(SeekFrom::Start(element.start)).map_err(read_error)?;
         Content::new(&mut self.file, element, self.order)
     }
 
     /// The content of an element, to keep.
-    pub(super) fn into_content(
-        mut self,
-        element: Element,
-    ) -> Result<Content<BufReader<File>>, FormatError> {
+    pub(super) fn into_content(mut self, element: Element) -> Result<Content<BufReader<File>>> {
         self.file.seek(SeekFrom::Start(element.start)).map_err(read_error)?;
         Content::new(self.file, element, self.order)
     }
@@ -112,7 +107,7 @@ enum Source<R> {
 }
 
 impl<R: BufRead> Content<R> {
-    fn new(file: R, element: Element, order: ByteOrder) -> Result<Self, FormatError> {
+    fn new(file: R, element: Element, order: ByteOrder) -> Result<Self> {
         let stored = element.bytes;
         let bytes = file.take(stored);
         if !element.compressed {
@@ -139,7 +134,7 @@ impl<R: BufRead> Content<R> {
     }
 
     /// Checks that `bytes` more bytes can come, before memory is taken for them.
-    pub(super) fn check_can_hold(&self, name: &str, bytes: u64) -> Result<(), FormatError> {
+    pub(super) fn check_can_hold(&self, name: &str, bytes: u64) -> Result<()> {
         let expansion = match self.source {
             Source::Plain(_) => 1,
             Source::Zlib(_) => MAX_EXPANSION,
@@ -156,14 +151,14 @@ impl<R: BufRead> Content<R> {
 
     /// The type and size of the next part of the array. What a small part packs into the tag's own
     /// size field shows as a type above 65535.
-    pub(super) fn tag(&mut self) -> Result<(u32, u32), FormatError> {
+    pub(super) fn tag(&mut self) -> Result<(u32, u32)> {
         let mut tag = [0; TAG_BYTES as usize];
         self.fill(&mut tag)?;
         Ok(split(tag, self.order))
     }
 
     /// Fills `bytes`. Errors: the array declares fewer bytes, or the file delivers fewer.
-    pub(super) fn fill(&mut self, bytes: &mut [u8]) -> Result<(), FormatError> {
+    pub(super) fn fill(&mut self, bytes: &mut [u8]) -> Result<()> {
         let wanted = bytes.len() as u64;
         self.left = self.left.checked_sub(wanted).ok_or_else(|| {
             malformed(format!("an array ends {} bytes too early", wanted - self.left))
@@ -172,7 +167,7 @@ impl<R: BufRead> Content<R> {
     }
 
     /// Checks that nothing but padding follows, and the checksum of compressed data.
-    pub(super) fn finish(&mut self) -> Result<(), FormatError> {
+    pub(super) fn finish(&mut self) -> Result<()> {
         let mut rest = Vec::new();
         // One byte more than may be there: reading to the end checks the checksum.
         self.source.by_ref().take(TAG_BYTES).read_to_end(&mut rest).map_err(read_error)?;

@@ -21,6 +21,7 @@ use element::{Content, Elements};
 
 use super::open::open;
 use super::{Format, FormatError, FrameReader, FullScale, Limits, StackInfo, collect, samples};
+use crate::formats::error::Result;
 
 /// An array of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -64,7 +65,7 @@ pub struct MatScene {
 }
 
 /// True for a MATLAB level 5 file, told by its first bytes. Errors: I/O.
-pub fn is_mat(path: &Path) -> Result<bool, FormatError> {
+pub fn is_mat(path: &Path) -> Result<bool> {
     match open(path) {
         Ok((_, _, format)) => Ok(format == Format::Mat),
         Err(FormatError::UnknownFormat { .. }) => Ok(false),
@@ -82,7 +83,7 @@ pub fn open_array(
     path: &Path,
     array: SceneArray,
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>, FormatError> {
+) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
     if format != Format::Mat {
@@ -107,7 +108,7 @@ pub fn open_array(
 /// Reads a scene: `mask` and `meas`, and `orig` where it is there.
 ///
 /// For benchmark scenes, which are small; [`open_array`] reads frame by frame. Errors: as there.
-pub fn read_scene_mat(path: &Path, limits: &Limits) -> Result<MatScene, FormatError> {
+pub fn read_scene_mat(path: &Path, limits: &Limits) -> Result<MatScene> {
     let read = |array| Ok(collect(&mut *open_array(path, array, limits)?)?.1);
     Ok(MatScene {
         masks: read(SceneArray::Masks)?,
@@ -145,7 +146,7 @@ impl MatReader {
         mut content: Content<BufReader<File>>,
         array: SceneArray,
         limits: &Limits,
-    ) -> Result<Self, FormatError> {
+    ) -> Result<Self> {
         let header = ArrayHeader::read(&mut content)?;
         let sample = header.sample_type()?;
         let (height, width, frames) = match *header.dimensions {
@@ -183,7 +184,7 @@ impl FrameReader for MatReader {
         &self.info
     }
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         if self.next == self.info.frames {
             return Ok(None);
         }

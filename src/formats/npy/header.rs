@@ -4,6 +4,7 @@
 //! parses any Python literal recursively, so that a small file of nested brackets could end the
 //! process. A header that NumPy writes is one flat dictionary of three keys.
 
+use crate::formats::error::Result;
 use crate::formats::samples::ByteOrder;
 use crate::formats::{Format, FormatError, SampleType};
 
@@ -25,7 +26,7 @@ pub(super) struct Header {
 impl Header {
     /// Parses the dictionary, for example
     /// `{'descr': '<f4', 'fortran_order': False, 'shape': (8, 256, 256), }`.
-    pub(super) fn parse(text: &[u8]) -> Result<Self, FormatError> {
+    pub(super) fn parse(text: &[u8]) -> Result<Self> {
         let mut cursor = Cursor { text, at: 0 };
         let (mut descr, mut fortran_order, mut shape) = (None, None, None);
         cursor.expect(b'{')?;
@@ -72,14 +73,14 @@ impl<'a> Cursor<'a> {
         found
     }
 
-    fn expect(&mut self, token: u8) -> Result<(), FormatError> {
+    fn expect(&mut self, token: u8) -> Result<()> {
         if self.accept(token) {
             return Ok(());
         }
         Err(self.error(&format!("'{}'", char::from(token))))
     }
 
-    fn string(&mut self) -> Result<&'a [u8], FormatError> {
+    fn string(&mut self) -> Result<&'a [u8]> {
         let quote = match self.peek() {
             Some(quote @ (b'\'' | b'"')) => quote,
             _ => return Err(self.error("a quoted string")),
@@ -102,7 +103,7 @@ impl<'a> Cursor<'a> {
         &rest[..length]
     }
 
-    fn boolean(&mut self) -> Result<bool, FormatError> {
+    fn boolean(&mut self) -> Result<bool> {
         match self.word() {
             b"True" => Ok(true),
             b"False" => Ok(false),
@@ -110,7 +111,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    fn shape(&mut self) -> Result<Vec<u64>, FormatError> {
+    fn shape(&mut self) -> Result<Vec<u64>> {
         let mut shape = Vec::new();
         self.expect(b'(')?;
         while !self.accept(b')') {
@@ -131,7 +132,7 @@ impl<'a> Cursor<'a> {
         Ok(shape)
     }
 
-    fn type_descriptor(&mut self) -> Result<(SampleType, ByteOrder), FormatError> {
+    fn type_descriptor(&mut self) -> Result<(SampleType, ByteOrder)> {
         if self.peek() == Some(b'[') {
             return Err(unsupported("a structured dtype".to_owned()));
         }

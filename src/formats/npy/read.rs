@@ -7,6 +7,7 @@ use std::path::Path;
 use ndarray::Array2;
 
 use super::header::{Header, MAX_HEADER_BYTES, unsupported};
+use crate::formats::error::Result;
 use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::{self, ByteOrder};
 use crate::formats::{
@@ -15,10 +16,8 @@ use crate::formats::{
 
 /// Opens an npy stack of shape (frame, row, column), float32, little-endian and in C order, of which
 /// windows are then read: the form in which this program writes frames.
-///
-/// # Errors
-/// Those of reading a header, and [`FormatError::Unsupported`] for another form.
-pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader, FormatError> {
+/// Errors: those of reading a header, and [`FormatError::Unsupported`] for another form.
+pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {
     let mut file = File::open(path).map_err(FormatError::io("open the array"))?;
     let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
     limits.check_file(Format::Npy, length)?;
@@ -51,11 +50,7 @@ pub(in crate::formats) struct NpyReader {
 impl NpyReader {
     /// Reads the header of `file` (positioned at its start, `length` bytes long) and checks it
     /// against the limits and the length.
-    pub(in crate::formats) fn open(
-        mut file: File,
-        length: u64,
-        limits: &Limits,
-    ) -> Result<Self, FormatError> {
+    pub(in crate::formats) fn open(mut file: File, length: u64, limits: &Limits) -> Result<Self> {
         let (header, data_start) = read_header(&mut file, length)?;
         let (frames, height, width) = match *header.shape {
             [height, width] => (1, height, width),
@@ -95,7 +90,7 @@ impl FrameReader for NpyReader {
         &self.info
     }
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         if self.next == self.info.frames {
             return Ok(None);
         }
@@ -112,7 +107,7 @@ impl FrameReader for NpyReader {
 }
 
 /// The header and the offset of the first sample.
-fn read_header(file: &mut File, length: u64) -> Result<(Header, u64), FormatError> {
+fn read_header(file: &mut File, length: u64) -> Result<(Header, u64)> {
     let mut start = [0u8; 8];
     fill(file, &mut start)?;
     let [magic @ .., major, minor] = start;
@@ -159,7 +154,7 @@ fn read_header(file: &mut File, length: u64) -> Result<(Header, u64), FormatErro
     Ok((Header::parse(&text)?, data_start))
 }
 
-fn fill(file: &mut File, bytes: &mut [u8]) -> Result<(), FormatError> {
+fn fill(file: &mut File, bytes: &mut [u8]) -> Result<()> {
     file.read_exact(bytes).map_err(|source| {
         if source.kind() == io::ErrorKind::UnexpectedEof {
             FormatError::malformed(Format::Npy, "the file ends inside the header")
@@ -170,7 +165,7 @@ fn fill(file: &mut File, bytes: &mut [u8]) -> Result<(), FormatError> {
 }
 
 /// The file must hold exactly what the header promises.
-fn check_length(info: &StackInfo, present: u64) -> Result<(), FormatError> {
+fn check_length(info: &StackInfo, present: u64) -> Result<()> {
     let frame_bytes = (info.height as u64)
         .saturating_mul(info.width as u64)
         .saturating_mul(info.sample.bytes() as u64);

@@ -7,6 +7,7 @@ use std::path::Path;
 use ndarray::{Array2, ArrayView2, ArrayView3};
 
 use crate::formats::FormatError;
+use crate::formats::error::Result;
 use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::StackWriter;
 
@@ -17,14 +18,14 @@ pub fn writer<W: Write>(
     frames: usize,
     height: usize,
     width: usize,
-) -> Result<StackWriter<W>, FormatError> {
+) -> Result<StackWriter<W>> {
     to.write_all(&header(&format!("({frames}, {height}, {width})")))
         .map_err(FormatError::io("write the npy header"))?;
     Ok(StackWriter::new(to, frames, height, width))
 }
 
 /// Writes (or overwrites) the file `path` with `stack`, axes (frame, row, column).
-pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<(), FormatError> {
+pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<()> {
     let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
     let (frames, height, width) = stack.dim();
     let mut writer = writer(BufWriter::new(file), frames, height, width)?;
@@ -36,7 +37,7 @@ pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<(), FormatEr
 }
 
 /// Writes (or overwrites) the file `path` with one image, axes (row, column).
-pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<(), FormatError> {
+pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<()> {
     let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
     let (height, width) = image.dim();
     let mut writer = BufWriter::new(file);

@@ -7,6 +7,7 @@ use std::collections::HashSet;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 
+use crate::formats::error::Result;
 use crate::formats::samples::ByteOrder;
 use crate::formats::{Format, FormatError, Limits};
 
@@ -42,7 +43,7 @@ struct Entry {
 /// Errors: values that lie outside the file, pages in a circle, more pages than the limits allow,
 /// and ImageJ's stacks above 4 GB, which have one page header for all frames: to read one frame of
 /// many would be a silent loss.
-pub(super) fn count_pages(file: &File, length: u64, limits: &Limits) -> Result<usize, FormatError> {
+pub(super) fn count_pages(file: &File, length: u64, limits: &Limits) -> Result<usize> {
     let (layout, mut next) = Layout::open(file, length)?;
     let mut seen = HashSet::new();
     let mut description = None;
@@ -66,7 +67,7 @@ pub(super) fn count_pages(file: &File, length: u64, limits: &Limits) -> Result<u
 
 impl<'a> Layout<'a> {
     /// Reads the file's header; the second value is the place of the first page header.
-    fn open(file: &'a File, length: u64) -> Result<(Self, u64), FormatError> {
+    fn open(file: &'a File, length: u64) -> Result<(Self, u64)> {
         let mut layout = Self { file, length, order: ByteOrder::Little, big: false };
         let head = layout.read(0, 8)?;
         if head.starts_with(b"MM") {
@@ -79,7 +80,7 @@ impl<'a> Layout<'a> {
     }
 
     /// The entries of the page header at `at`, and the place of the next one.
-    fn page(&self, page: usize, at: u64) -> Result<(Vec<Entry>, u64), FormatError> {
+    fn page(&self, page: usize, at: u64) -> Result<(Vec<Entry>, u64)> {
         let (count_bytes, entry_bytes, pointer_bytes) =
             if self.big { (8, 20, 8) } else { (2, 12, 4) };
         let count = self.number(&self.read(at, count_bytes)?);
@@ -99,7 +100,7 @@ impl<'a> Layout<'a> {
     }
 
     /// Parses one entry and checks that its values lie in the file.
-    fn entry(&self, page: usize, bytes: &[u8]) -> Result<Entry, FormatError> {
+    fn entry(&self, page: usize, bytes: &[u8]) -> Result<Entry> {
         let inline = if self.big { 8 } else { 4 };
         let (head, offset) = bytes.split_at(bytes.len() - inline);
         let tag = self.number(&head[..2]) as u16;
@@ -135,7 +136,7 @@ impl<'a> Layout<'a> {
         Ok(entry)
     }
 
-    fn check_imagej(&self, description: &Entry) -> Result<(), FormatError> {
+    fn check_imagej(&self, description: &Entry) -> Result<()> {
         if description.bytes <= 8 {
             return Ok(());
         }
@@ -154,7 +155,7 @@ impl<'a> Layout<'a> {
         }
     }
 
-    fn read(&self, at: u64, count: u64) -> Result<Vec<u8>, FormatError> {
+    fn read(&self, at: u64, count: u64) -> Result<Vec<u8>> {
         if at.saturating_add(count) > self.length {
             return Err(FormatError::Truncated {
                 format: Format::Tiff,

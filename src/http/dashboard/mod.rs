@@ -13,7 +13,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 
 use super::conditional;
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, Result};
 use super::extract::Params;
 use crate::job::Sha256;
 
@@ -95,20 +95,15 @@ fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
     encoder.finish()
 }
 
-/// `GET /`
-pub(super) async fn page(headers: HeaderMap) -> Result<Response, ApiError> {
+pub(super) async fn page(headers: HeaderMap) -> Result<Response> {
     send(PAGE, &headers)
 }
 
-/// `GET /dashboard/{file}`
-pub(super) async fn file(
-    Params(name): Params<String>,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
+pub(super) async fn file(Params(name): Params<String>, headers: HeaderMap) -> Result<Response> {
     send(&name, &headers)
 }
 
-fn send(name: &str, headers: &HeaderMap) -> Result<Response, ApiError> {
+fn send(name: &str, headers: &HeaderMap) -> Result<Response> {
     let asset = ASSETS.iter().find(|asset| asset.name == name).ok_or_else(|| {
         ApiError::new(Code::NotFound, "the dashboard has no file of this name; it begins at /")
     })?;

@@ -10,7 +10,7 @@ use tokio::sync::Semaphore;
 
 use super::render::{Picture, Region};
 use crate::formats::FormatError;
-use crate::http::error::{ApiError, Code};
+use crate::http::error::{ApiError, Code, Result};
 
 /// Memory for reduced pictures, in bytes.
 const BUDGET: u64 = 64 << 20;
@@ -60,11 +60,7 @@ impl Pictures {
     }
 
     /// The values of a region.
-    pub(super) async fn reduced(
-        &self,
-        picture: Arc<Picture>,
-        region: Region,
-    ) -> Result<Values, ApiError> {
+    pub(super) async fn reduced(&self, picture: Arc<Picture>, region: Region) -> Result<Values> {
         let key = (picture.identity.clone(), region.clone());
         let reduce = async {
             let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");

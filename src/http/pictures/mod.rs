@@ -8,7 +8,6 @@ mod source;
 
 use std::sync::Arc;
 
-use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
@@ -18,11 +17,10 @@ use names::Named;
 pub(super) use names::{OfCalibration, OfJob, OfMeasurement};
 use render::{Picture, Region, TILE};
 
-use super::access::Access;
 use super::app::App;
 use super::conditional;
-use super::error::{ApiError, Code};
-use super::extract::{Params, QueryOf};
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params, QueryOf};
 use crate::formats::png;
 use crate::job::Sha256;
 
@@ -59,7 +57,6 @@ struct SpreadBody {
     high: f32,
 }
 
-/// Which tile of a picture.
 #[derive(Debug, Deserialize)]
 pub(super) struct TilePath {
     level: u32,
@@ -67,14 +64,12 @@ pub(super) struct TilePath {
     column: usize,
 }
 
-/// `GET .../pictures/{picture}`
 pub(super) async fn preview<N: Named>(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(name): Params<N>,
     QueryOf(query): QueryOf<PreviewQuery>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let picture = name.find(&app, &access.lab).await?;
     let size = query.size.unwrap_or(PREVIEW);
     if !PREVIEWS.contains(&size) {
@@ -94,15 +89,13 @@ pub(super) async fn preview<N: Named>(
     draw(&app, picture, region, window, &headers).await
 }
 
-/// `GET .../pictures/{picture}/tiles/{level}/{row}/{column}`
 pub(super) async fn tile<N: Named>(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(name): Params<N>,
     Params(TilePath { level, row, column }): Params<TilePath>,
     QueryOf(query): QueryOf<TileQuery>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let picture = name.find(&app, &access.lab).await?;
     let window = window(query.black, query.white)?;
     let region = picture.tile(level, row, column).ok_or_else(|| {
@@ -118,13 +111,11 @@ pub(super) async fn tile<N: Named>(
     draw(&app, picture, region, Some(window), &headers).await
 }
 
-/// `GET .../pictures/{picture}/spread`
 pub(super) async fn spread<N: Named>(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(name): Params<N>,
     headers: HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let picture = name.find(&app, &access.lab).await?;
     let (height, width) = (picture.height, picture.width);
     let levels = picture.level_within(TILE);
@@ -136,7 +127,7 @@ pub(super) async fn spread<N: Named>(
 }
 
 /// The values that become black and white.
-fn window(black: f32, white: f32) -> Result<(f32, f32), ApiError> {
+fn window(black: f32, white: f32) -> Result<(f32, f32)> {
     if black.is_finite() && white.is_finite() && black < white && (white - black).is_finite() {
         return Ok((black, white));
     }
@@ -151,7 +142,7 @@ async fn draw(
     region: Region,
     window: Option<(f32, f32)>,
     headers: &HeaderMap,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let content = format!("picture/1 {} {region:?} {window:?}", picture.identity);
     let etag = conditional::etag(&Sha256::of(content.as_bytes()));
     // What is done stays the same under this address for ever; private, as results are.

@@ -8,7 +8,7 @@ use serde::de::DeserializeOwned;
 use super::render::Picture;
 use super::source::{DoneTile, Files, Stack, Unfinished};
 use crate::http::app::App;
-use crate::http::error::{ApiError, Code};
+use crate::http::error::{ApiError, Code, Result};
 use crate::http::jobs::with_snapshot;
 use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
 use crate::store::{Calibration, Job, Measurement, StoreError, TileResult};
@@ -21,7 +21,6 @@ enum JobPicture {
     Frame(usize),
     /// `difference-2`: frame 2 without frame 1.
     Difference(usize),
-    /// `residual`
     Residual,
     /// `slice-0`: all frames at row 0.
     Slice(usize),
@@ -32,7 +31,6 @@ enum JobPicture {
 #[serde(try_from = "String")]
 struct MeasurementPicture(usize);
 
-/// A picture of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 enum CalibrationPicture {
@@ -92,7 +90,7 @@ impl TryFrom<String> for CalibrationPicture {
 
 /// The parameters of a path that name a picture.
 pub(in crate::http) trait Named: DeserializeOwned + Send {
-    fn find(self, app: &App, lab: &Lab) -> impl Future<Output = Result<Picture, ApiError>> + Send;
+    fn find(self, app: &App, lab: &Lab) -> impl Future<Output = Result<Picture>> + Send;
 }
 
 /// A picture of a job's snapshot.
@@ -116,7 +114,7 @@ pub(in crate::http) struct OfCalibration {
 }
 
 impl Named for OfJob {
-    async fn find(self, app: &App, lab: &Lab) -> Result<Picture, ApiError> {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let Self { job, snapshot, picture } = self;
         let job = with_snapshot(app, lab, job, snapshot).await?;
         let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
@@ -139,7 +137,7 @@ impl Named for OfJob {
 }
 
 impl Named for OfMeasurement {
-    async fn find(self, app: &App, lab: &Lab) -> Result<Picture, ApiError> {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let stack = snapshots_of(app, &app.store.measurement(lab, self.measurement).await?);
         let (MeasurementPicture(snapshot), count) = (self.picture, stack.shape.0);
         if snapshot < count {
@@ -150,7 +148,7 @@ impl Named for OfMeasurement {
 }
 
 impl Named for OfCalibration {
-    async fn find(self, app: &App, lab: &Lab) -> Result<Picture, ApiError> {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let stack = masks_of(app, &app.store.calibration(lab, self.calibration).await?);
         let count = stack.shape.0;
         match self.picture {
@@ -185,7 +183,7 @@ fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Stack {
 }
 
 /// The frames of a snapshot: those of the result, or the tiles that are done, on the preview.
-async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack, ApiError> {
+async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let spec = &job.spec;
     let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
     match app.store.result_file(job, Some(snapshot), "frames.npy").await {

@@ -53,7 +53,6 @@ impl Picture {
         (0..).find(|level| longest.div_ceil(1 << level) <= side).unwrap_or(0)
     }
 
-    /// All of the picture at a level.
     pub(super) fn whole(&self, level: u32) -> Region {
         let side = |length: usize| 0..length.div_ceil(1 << level);
         Region { level, rows: side(self.height), columns: side(self.width) }

@@ -13,19 +13,14 @@ use crate::formats::{FormatError, Limits, npy, planar};
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
 pub(super) struct Stack {
-    /// Frames, rows and columns.
     pub(super) shape: (usize, usize, usize),
-    /// Names the content.
     pub(super) identity: String,
     pub(super) files: Files,
 }
 
-/// The files of a stack.
 #[derive(Debug, Clone)]
 pub(super) enum Files {
-    /// A prepared array.
     Prepared(PathBuf),
-    /// The frames of a result.
     Frames(PathBuf),
     /// Tiles of an unfinished result, on the preview; NaN where there is neither.
     Tiles(Arc<Unfinished>),
@@ -93,7 +88,6 @@ impl Stack {
         }
     }
 
-    /// One frame.
     pub(super) fn frame(&self, k: usize) -> Picture {
         self.picture(&format!("frame {k}"), 1, move |stack, rows, columns| {
             Ok(first(stack.window(k..k + 1, rows, columns)?))
@@ -117,7 +111,6 @@ impl Stack {
         Picture { height: frames, ..picture }
     }
 
-    /// The mean of all frames.
     pub(super) fn mean(&self) -> Picture {
         let frames = self.shape.0;
         self.picture("mean", frames, move |stack, rows, columns| {

@@ -5,7 +5,7 @@ use tokio::sync::mpsc;
 
 use super::headers::Checksum;
 use crate::http::app::App;
-use crate::http::error::{ApiError, Code};
+use crate::http::error::{ApiError, Code, Result};
 use crate::http::upload::{CHUNKS, next};
 use crate::store::{PartialFile, StoreError};
 
@@ -16,7 +16,7 @@ pub(super) async fn append(
     file: PartialFile,
     checksum: Option<Checksum>,
     body: Body,
-) -> Result<PartialFile, ApiError> {
+) -> Result<PartialFile> {
     let whole = checksum.is_some();
     let (length, received) = (file.upload().facts.length, file.upload().received);
     let (sender, receiver) = mpsc::channel(CHUNKS);
@@ -46,7 +46,7 @@ async fn pump(
     mut left: u64,
     body: Body,
     sender: mpsc::Sender<Bytes>,
-) -> Result<(), ApiError> {
+) -> Result<()> {
     let mut stream = body.into_data_stream();
     // What an upload in pieces still wants is promised to it by the database.
     while let Some(chunk) = next(app, &mut stream).await? {

@@ -67,7 +67,6 @@ impl Checksum {
     }
 
     /// True if all bytes together have the checksum that they should have.
-    #[must_use]
     pub fn holds(self) -> bool {
         match self.hasher {
             Hasher::Sha1(hasher) => hasher.finalize()[..] == self.expected[..],

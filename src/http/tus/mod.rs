@@ -12,8 +12,8 @@ use axum::response::{IntoResponse, Response};
 
 use super::access::Access;
 use super::app::App;
-use super::error::{ApiError, Code};
-use super::extract::Params;
+use super::error::{ApiError, Code, Result};
+use super::extract::{Caller, Params};
 use crate::job::{PartialId, Sha256};
 use crate::store::{FoundPartial, NewPartial, Partial, PartialFile};
 
@@ -52,11 +52,7 @@ pub(super) async fn options(State(app): State<App>) -> Response {
 }
 
 /// `POST /v1/uploads`: begins an upload.
-pub(super) async fn create(
-    State(app): State<App>,
-    access: Access,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
+pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
     let length = number(&headers, &LENGTH)?;
     if length == 0 {
         return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
@@ -84,10 +80,9 @@ fn expected(metadata: &str) -> Result<Option<Sha256>, String> {
 
 /// `HEAD /v1/uploads/{upload}`: how far it is.
 pub(super) async fn show(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<PartialId>,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let mut upload = app.store.partial(&access.lab, id).await?;
     // All has come, but not the end of its request; or bytes on record are lost, which is told here.
     if upload.result.is_none()
@@ -113,12 +108,11 @@ pub(super) async fn show(
 
 /// `PATCH /v1/uploads/{upload}`: the next piece.
 pub(super) async fn patch(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<PartialId>,
     headers: HeaderMap,
     body: Body,
-) -> Result<Response, ApiError> {
+) -> Result<Response> {
     let permit = app.admission.slot()?;
     let upload = to_the_end(async move {
         let _permit = permit;
@@ -130,8 +124,8 @@ pub(super) async fn patch(
 /// A task of its own: what has come is recorded also when the connection, and with it the request, is
 /// gone.
 async fn to_the_end<T: Send + 'static>(
-    work: impl Future<Output = Result<T, ApiError>> + Send + 'static,
-) -> Result<T, ApiError> {
+    work: impl Future<Output = Result<T>> + Send + 'static,
+) -> Result<T> {
     tokio::spawn(work).await.map_err(|error| ApiError::internal(&error))?
 }
 
@@ -141,7 +135,7 @@ async fn piece(
     id: PartialId,
     headers: &HeaderMap,
     body: Body,
-) -> Result<Partial, ApiError> {
+) -> Result<Partial> {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok());
     if kind != Some("application/offset+octet-stream") {
         let detail = "a piece must be sent as Content-Type: application/offset+octet-stream";
@@ -165,7 +159,7 @@ async fn piece(
 }
 
 /// Stores the file if all of it is there.
-async fn finish(app: &App, file: PartialFile) -> Result<Partial, ApiError> {
+async fn finish(app: &App, file: PartialFile) -> Result<Partial> {
     if file.is_complete() {
         return Ok(app.store.finish_partial(file).await?);
     }
@@ -174,10 +168,9 @@ async fn finish(app: &App, file: PartialFile) -> Result<Partial, ApiError> {
 
 /// `DELETE /v1/uploads/{upload}`: ends it; what has come goes.
 pub(super) async fn delete(
-    State(app): State<App>,
-    access: Access,
+    Caller(app, access): Caller,
     Params(id): Params<PartialId>,
-) -> Result<StatusCode, ApiError> {
+) -> Result<StatusCode> {
     app.store.partial(&access.lab, id).await?;
     let deleted = to_the_end(async move { Ok(app.store.delete_partial(id).await?) });
     if deleted.await? { Ok(StatusCode::NO_CONTENT) } else { Err(busy()) }
@@ -198,12 +191,12 @@ fn state(upload: &Partial) -> HeaderMap {
     fields
 }
 
-fn text<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Result<Option<&'a str>, ApiError> {
+fn text<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Result<Option<&'a str>> {
     let value = headers.get(name).map(HeaderValue::to_str).transpose();
     value.map_err(|_| malformed(format!("{name} is not printable ASCII")))
 }
 
-fn number(headers: &HeaderMap, name: &HeaderName) -> Result<u64, ApiError> {
+fn number(headers: &HeaderMap, name: &HeaderName) -> Result<u64> {
     let digits = |text: &&str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     let number = text(headers, name)?.filter(digits).and_then(|text| text.parse().ok());
     // SQLite keeps signed numbers.

@@ -15,7 +15,7 @@ use std::ops::{Bound, Range, RangeBounds};
 use ndarray::Array3;
 use schemars::Schema;
 
-use super::error::ReconError;
+use super::error::{ReconError, Result};
 
 /// A denoiser that a schedule's stage may name.
 pub trait Prior: Sync {
@@ -69,7 +69,7 @@ pub trait Pass {
         settings: &Settings,
         networks: &mut dyn Networks,
         ready: &mut Ready<'_>,
-    ) -> Result<(), ReconError>;
+    ) -> Result<()>;
 }
 
 /// Is told the clip, a frame, and rows of the frame that are done.
@@ -176,7 +176,7 @@ impl Parameter {
     }
 
     /// Refuses a value outside the range.
-    pub fn check(&self, value: f32) -> Result<(), ReconError> {
+    pub fn check(&self, value: f32) -> Result<()> {
         if value.is_finite() && self.range.contains(&f64::from(value)) {
             return Ok(());
         }
@@ -205,18 +205,18 @@ pub enum Network {
 pub trait Denoiser {
     /// Removes noise of level `sigma` from frames \[B,H,W\], both on the \[0,1\] scale, in place. The array
     /// is in standard layout.
-    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<(), ReconError>;
+    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()>;
 }
 
 /// Where the solver gets its networks from.
 pub trait Networks {
     /// The network, loaded at its first use.
-    fn network(&mut self, which: Network) -> Result<&mut dyn Denoiser, ReconError>;
+    fn network(&mut self, which: Network) -> Result<&mut dyn Denoiser>;
 }
 
 /// No networks at all.
 impl Networks for () {
-    fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
+    fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser> {
         Err(ReconError::NoDenoiser)
     }
 }

@@ -7,7 +7,7 @@ use ndarray::{Array3, ArrayView2, ArrayView4, ArrayViewMut2, Axis};
 
 use super::onnx::{ClipNetwork, Runtime};
 use super::{Denoiser, Memory, Network, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
-use crate::recon::error::ReconError;
+use crate::recon::error::{ReconError, Result};
 
 /// FFDNet, frame by frame.
 pub const FFDNET: NetworkPrior = NetworkPrior {
@@ -86,7 +86,7 @@ impl Pass for Network {
         settings: &Settings,
         networks: &mut dyn Networks,
         ready: &mut Ready<'_>,
-    ) -> Result<(), ReconError> {
+    ) -> Result<()> {
         networks.network(*self)?.denoise(x, settings.sigma)?;
         (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
         Ok(())
@@ -113,11 +113,7 @@ pub struct ClipDenoiser {
 
 impl ClipDenoiser {
     /// Loads a network from its ONNX files, a block each (see [`ClipNetwork::load`] for their faces).
-    pub fn load(
-        runtime: &Runtime,
-        which: Network,
-        files: &[impl AsRef<[u8]>],
-    ) -> Result<Self, ReconError> {
+    pub fn load(runtime: &Runtime, which: Network, files: &[impl AsRef<[u8]>]) -> Result<Self> {
         let (names, reach, multiple): (&[_], _, _) = match which {
             Network::FfdNet => (&["FFDNet"], 0, 2),
             Network::FastDvdNet | Network::FastDvdNetInt8 => {
@@ -132,7 +128,7 @@ impl ClipDenoiser {
 }
 
 impl Denoiser for ClipDenoiser {
-    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<(), ReconError> {
+    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
         let Self { blocks, reach, multiple, input, output } = self;
         let (count, height, width) = frames.dim();
         let (rows, columns) =
@@ -182,7 +178,7 @@ fn run_chunked(
     output: &mut [f32],
     (rows, columns): (usize, usize),
     sigma: f32,
-) -> Result<(), ReconError> {
+) -> Result<()> {
     let plane = rows * columns;
     let beside = (input.len() - output.len()) / plane;
     let chunk = (PIXELS_AT_ONCE / plane).max(1);

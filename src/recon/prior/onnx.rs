@@ -10,7 +10,7 @@ use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
 use ort::value::{Outlet, Tensor, TensorElementType, TensorRef, ValueType};
 
-use crate::recon::error::{ReconError, shape_text};
+use crate::recon::error::{ReconError, Result, shape_text};
 use crate::recon::learned::{FRAMES, Interface, MASKS, MEASUREMENT, SnapshotNetwork, TensorInfo};
 
 /// Where a network runs.
@@ -25,7 +25,7 @@ pub enum Device {
 
 impl Device {
     /// Reads `cpu` or `cuda:N`.
-    pub fn parse(text: &str) -> Result<Self, ReconError> {
+    pub fn parse(text: &str) -> Result<Self> {
         let cuda = text.strip_prefix("cuda:").and_then(|number| number.parse().ok());
         match (text, cuda) {
             ("cpu", _) => Ok(Self::Cpu),
@@ -64,11 +64,9 @@ static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
 
 impl Runtime {
     /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`.
-    ///
-    /// # Errors
-    /// The library is missing or too old. A device that can't be had shows when a network is
-    /// loaded; there is no silent fall-back.
-    pub fn open(library: &Path, device: Device) -> Result<Self, ReconError> {
+    /// Errors: the library is missing or too old. A device that can't be had shows when a network
+    /// is loaded; there is no silent fall-back.
+    pub fn open(library: &Path, device: Device) -> Result<Self> {
         let loaded = ENVIRONMENT.get_or_init(|| {
             let builder = ort::init_from(library).map_err(|error| {
                 format!(
@@ -96,7 +94,7 @@ impl Runtime {
         ort::info()
     }
 
-    fn session(&self, name: &str, model: &[u8]) -> Result<Session, ReconError> {
+    fn session(&self, name: &str, model: &[u8]) -> Result<Session> {
         let failed = |error: String| {
             ReconError::Runtime(format!(
                 "the network {name} can't be loaded on {}: {error}",
@@ -135,7 +133,7 @@ pub struct ClipNetwork {
 impl ClipNetwork {
     /// Loads a network with inputs `frames` \[n+2,1,H,W\] and `sigma` (a number) and one
     /// output \[n,1,H,W\].
-    pub fn load(runtime: &Runtime, name: &str, model: &[u8]) -> Result<Self, ReconError> {
+    pub fn load(runtime: &Runtime, name: &str, model: &[u8]) -> Result<Self> {
         let session = runtime.session(name, model)?;
         let inputs: Vec<&str> = session.inputs().iter().map(|input| input.name()).collect();
         if inputs != ["frames", "sigma"] || session.outputs().len() != 1 {
@@ -154,7 +152,7 @@ impl ClipNetwork {
         frames: ArrayView4<'_, f32>,
         sigma: f32,
         output: &mut [f32],
-    ) -> Result<(), ReconError> {
+    ) -> Result<()> {
         let Self { name, session } = self;
         let failed = |error: ort::Error| ReconError::Runtime(format!("network {name}: {error}"));
         let frames = TensorRef::from_array_view(frames).map_err(failed)?;
@@ -179,10 +177,8 @@ pub struct EndToEndNetwork {
 
 impl EndToEndNetwork {
     /// Loads a network; [`Self::interface`] says whether it is one of this kind.
-    ///
-    /// # Errors
-    /// [`ReconError::Runtime`]: no network that ONNX Runtime takes.
-    pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self, ReconError> {
+    /// Errors: [`ReconError::Runtime`]: no network that ONNX Runtime takes.
+    pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self> {
         Ok(Self { session: runtime.session("of the file", model)? })
     }
 
@@ -201,7 +197,7 @@ impl SnapshotNetwork for EndToEndNetwork {
         &mut self,
         y: ArrayView2<'_, f32>,
         masks: ArrayView3<'_, f32>,
-    ) -> Result<Array3<f32>, ReconError> {
+    ) -> Result<Array3<f32>> {
         let failed = |error: ort::Error| ReconError::Runtime(format!("the network: {error}"));
         let measurement = y.insert_axis(Axis(0)).insert_axis(Axis(0));
         let measurement = TensorRef::from_array_view(measurement).map_err(failed)?;

@@ -14,7 +14,7 @@ use super::network::{FASTDVDNET, FASTDVDNET_INT8, FFDNET};
 use super::nonlocal::NONLOCAL;
 use super::tv::TV;
 use super::{Memory, Network, Networks, Parameter, Pass, Prior, Ready, Settings};
-use crate::recon::error::ReconError;
+use crate::recon::error::Result;
 
 /// Every prior that a schedule may name.
 pub static PRIORS: [&dyn Prior; 6] =
@@ -78,7 +78,7 @@ impl Pass for (Box<dyn Pass>, Box<dyn Pass>) {
         settings: &Settings,
         networks: &mut dyn Networks,
         ready: &mut Ready<'_>,
-    ) -> Result<(), ReconError> {
+    ) -> Result<()> {
         self.0.apply(x, rows.clone(), settings, networks, &mut |_, _, _| ())?;
         self.1.apply(x, rows, settings, networks, ready)
     }

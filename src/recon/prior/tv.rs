@@ -10,7 +10,7 @@ use super::temporal::{self, TemporalVariation};
 use super::{
     Networks, Parameter, Pass, Prior, Ready, Settings, TEMPORAL_WEIGHT, TV_UPDATES, TV_WEIGHT,
 };
-use crate::recon::error::ReconError;
+use crate::recon::error::Result;
 
 /// Total variation along time where it has a weight, then of each frame.
 pub const TV: Tv = Tv;
@@ -57,7 +57,7 @@ impl Pass for (TemporalVariation, TotalVariation) {
         settings: &Settings,
         _: &mut dyn Networks,
         ready: &mut Ready<'_>,
-    ) -> Result<(), ReconError> {
+    ) -> Result<()> {
         let Settings { tv_weight, tv_updates, temporal_weight, .. } = *settings;
         let (temporal, spatial) = self;
         if temporal_weight > 0.0 {

@@ -6,7 +6,7 @@ mod state;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
-use super::error::{ReconError, shape_text};
+use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
 use super::sensing::SensingOperator;
@@ -91,9 +91,7 @@ pub struct Outcome {
 /// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
 /// variation and the learned denoiser costs what the acceleration gained. With `gamma` > 0 the
 /// operator's regularised inverse is used. Networks are asked for when a stage needs them.
-///
-/// # Errors
-/// Sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
+/// Errors: sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
 /// [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct(
     op: &SensingOperator,
@@ -101,7 +99,7 @@ pub fn reconstruct(
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-) -> Result<Outcome, ReconError> {
+) -> Result<Outcome> {
     schedule.validate()?;
     if y.shape() != op.gram().shape() {
         return Err(ReconError::Shape {
@@ -178,7 +176,7 @@ impl<'a> Run<'a> {
         index: usize,
         stage: &Stage,
         observer: &mut dyn Observer,
-    ) -> Result<StopReason, ReconError> {
+    ) -> Result<StopReason> {
         self.enter();
         for iteration in 0..stage.iterations {
             let step = self.iterate(stage, iteration)?;
@@ -217,16 +215,14 @@ impl<'a> Run<'a> {
     }
 
     /// Tells the observer of an iteration of the stage with this index.
-    ///
-    /// # Errors
-    /// [`ReconError::Cancelled`] if it says so.
+    /// Errors: [`ReconError::Cancelled`] if it says so.
     pub(super) fn tell(
         &self,
         (index, stage): (usize, &Stage),
         iteration: usize,
         step: &Step,
         observer: &mut dyn Observer,
-    ) -> Result<(), ReconError> {
+    ) -> Result<()> {
         let progress = Progress {
             stage: index,
             done: self.done,
@@ -243,10 +239,8 @@ impl<'a> Run<'a> {
     }
 
     /// Iteration `iteration` (from 0) of a stage.
-    ///
-    /// # Errors
-    /// A network that fails, or values that are no numbers any more.
-    pub(super) fn iterate(&mut self, stage: &Stage, iteration: usize) -> Result<Step, ReconError> {
+    /// Errors: a network that fails, or values that are no numbers any more.
+    pub(super) fn iterate(&mut self, stage: &Stage, iteration: usize) -> Result<Step> {
         let (frames, height, width) = self.op.dim();
         let admm = self.state.multiplier.is_some();
         let strips = stage.prior.by_strips() && !admm;
@@ -271,12 +265,7 @@ impl<'a> Run<'a> {
     /// Projection, prior and the change, in strips of so many rows: what the memory hands over is used for all
     /// three while it is in cache. The new iterate is then in `x`. Returns `||y - H v||^2` of what the
     /// iteration started from.
-    fn sweep(
-        &mut self,
-        stage: &Stage,
-        settings: &Settings,
-        rows: usize,
-    ) -> Result<(f64, Change), ReconError> {
+    fn sweep(&mut self, stage: &Stage, settings: &Settings, rows: usize) -> Result<(f64, Change)> {
         let Self { op, y, state, x, networks, .. } = self;
         let pass = self.pass.get_or_insert_with(|| stage.prior.begin(op.dim()));
         let (mut squares, mut change) = (0.0, Change::default());

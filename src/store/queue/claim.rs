@@ -13,7 +13,7 @@ use crate::job::{
     TaskState, Timestamp, WorkerId,
 };
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_as};
 use crate::store::tables::calibrations::Calibration;
 use crate::store::tables::measurements::Measurement;
@@ -35,7 +35,6 @@ pub struct ClaimedTask {
     pub work: Work,
 }
 
-/// What is to be done.
 #[derive(Debug, Clone)]
 pub enum Work {
     Job(Box<JobTask>),
@@ -43,7 +42,6 @@ pub enum Work {
     Calibration(Box<CalibrationTask>),
 }
 
-/// A step of a job.
 #[derive(Debug, Clone)]
 pub struct JobTask {
     pub job: JobId,
@@ -60,7 +58,6 @@ pub struct JobTask {
     pub records: Vec<TaskRecord>,
 }
 
-/// What is to be done for a calibration.
 #[derive(Debug, Clone, FromRow)]
 pub struct CalibrationTask {
     pub calibration: CalibrationId,
@@ -73,12 +70,7 @@ pub struct CalibrationTask {
 }
 
 impl Store {
-    /// Hands out the next task, if there is one.
-    pub async fn claim(
-        &self,
-        worker: WorkerId,
-        length: Duration,
-    ) -> Result<Option<ClaimedTask>, StoreError> {
+    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
         let now = Timestamp::now().0;
         if !self.may_have_work(now).await? {
             return Ok(None);
@@ -120,7 +112,7 @@ impl Store {
     }
 
     /// Looks without the lock: most of the time there is nothing to do.
-    async fn may_have_work(&self, now: i64) -> Result<bool, StoreError> {
+    async fn may_have_work(&self, now: i64) -> Result<bool> {
         let found = sql!(
             "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = ?1
                                         AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4)
@@ -133,7 +125,7 @@ impl Store {
         Ok(found.is_some())
     }
 
-    async fn job_task(&self, job: JobId, kind: TaskKind) -> Result<Work, StoreError> {
+    async fn job_task(&self, job: JobId, kind: TaskKind) -> Result<Work> {
         let facts = sql_as!(
             "SELECT spec,
                  (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
@@ -165,7 +157,7 @@ impl Store {
         })))
     }
 
-    async fn calibration_task(&self, id: CalibrationId) -> Result<Work, StoreError> {
+    async fn calibration_task(&self, id: CalibrationId) -> Result<Work> {
         let task = sql_as!(
             "SELECT calibration, name, captures,
                  (SELECT prepared FROM calibrations WHERE id = calibration) AS masks
@@ -185,7 +177,7 @@ async fn take(
     worker: WorkerId,
     length: Duration,
     now: i64,
-) -> Result<Option<SqliteRow>, StoreError> {
+) -> Result<Option<SqliteRow>> {
     let row = sql!(
         "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
              stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL

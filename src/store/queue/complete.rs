@@ -9,7 +9,7 @@ use crate::job::{
     CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind, TaskProgress, TaskState,
     Timestamp,
 };
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::staging::{StagedBlob, StagedDir};
 use crate::store::tables::blobs::Origin;
@@ -19,7 +19,6 @@ use crate::store::tables::tasks::Owner;
 use crate::store::tables::{results, sums};
 use crate::store::{Store, dir, on_files};
 
-/// The end of a task.
 #[derive(Debug)]
 pub struct Completion {
     /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
@@ -29,7 +28,6 @@ pub struct Completion {
     pub product: Product,
 }
 
-/// What a task has made.
 #[derive(Debug)]
 pub enum Product {
     /// Nothing but its record (prepare).
@@ -42,7 +40,6 @@ pub enum Product {
     Calibration(Box<CalibrationDone>),
 }
 
-/// What was made for a calibration.
 #[derive(Debug)]
 pub struct CalibrationDone {
     /// The masks and what is known of them, if they were made of captures.
@@ -56,11 +53,7 @@ impl Store {
     /// Stores what a task has made and moves its job on. Says [`Heartbeat::Lost`] if the lease has
     /// run out and the task was claimed again, or it was deleted; nothing is stored then. If this
     /// fails, the task is still the worker's.
-    pub async fn complete(
-        &self,
-        lease: &Lease,
-        completion: Completion,
-    ) -> Result<Heartbeat, StoreError> {
+    pub async fn complete(&self, lease: &Lease, completion: Completion) -> Result<Heartbeat> {
         let mut transaction = self.write().await?;
         let Some((owner, kind)) = lease::held(&mut transaction, lease).await? else {
             return Ok(Heartbeat::Lost);
@@ -107,7 +100,7 @@ impl Store {
         kind: TaskKind,
         staged: StagedDir,
         files: Vec<ResultFile>,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         let folder = self.dir().results(job);
         let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));
         on_files(move || {
@@ -126,7 +119,7 @@ impl Store {
         transaction: &mut SqliteConnection,
         id: CalibrationId,
         done: CalibrationDone,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         if let Some((facts, staged)) = done.masks {
             let prepared = staged.sha256();
             self.publish(transaction, staged, Origin::Prepared).await?;
@@ -136,14 +129,13 @@ impl Store {
     }
 }
 
-/// Marks a task done.
 async fn finish(
     connection: &mut SqliteConnection,
     lease: &Lease,
     progress: &TaskProgress,
     record: &Value,
     result: Option<Sha256>,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let TaskProgress { iterations, passes, fraction, .. } = *progress;
     sql!(
         "UPDATE tasks SET state = ?9, worker = NULL, lease_until = NULL, stage = NULL,

@@ -12,7 +12,7 @@ use sqlx::Row;
 
 use crate::job::{JobId, JobState};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 
 /// Workers that were silent for longer do not count.
 const WORKER_AGE: Duration = Duration::from_secs(15);
@@ -23,7 +23,7 @@ const KEPT_AT_MOST: Duration = Duration::from_secs(1);
 
 /// What is ahead of every unfinished job.
 #[derive(Debug)]
-pub(in crate::store) struct Forecast {
+pub struct Forecast {
     workers: u32,
     /// Seconds that a planned CPU-second of a tile takes.
     rate: f64,
@@ -37,7 +37,7 @@ pub(in crate::store) struct Forecast {
 
 /// Planned CPU-seconds that are left of some tasks of a job.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::store) struct Left {
+pub struct Left {
     /// Of all of them.
     pub(in crate::store) sum: f64,
     /// Of the one that has most left.
@@ -95,7 +95,7 @@ impl Forecast {
 
 impl Store {
     /// What is ahead of every unfinished job, a moment ago or now.
-    pub(in crate::store) async fn forecast(&self) -> Result<Arc<Forecast>, StoreError> {
+    pub(in crate::store) async fn forecast(&self) -> Result<Arc<Forecast>> {
         let mut kept = self.forecast.lock().await;
         if let Some(forecast) = kept.as_ref().filter(|forecast| Instant::now() < forecast.until) {
             return Ok(forecast.clone());
@@ -103,7 +103,7 @@ impl Store {
         Ok(kept.insert(self.new_forecast().await?.into()).clone())
     }
 
-    async fn new_forecast(&self) -> Result<Forecast, StoreError> {
+    async fn new_forecast(&self) -> Result<Forecast> {
         let rows = sqlx::query(
             "SELECT id, lab, priority, state, tiles_left + others_left AS left
              FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
@@ -149,7 +149,7 @@ impl Store {
     /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: measured on
     /// the last tasks of a kind, by what they really did and not by what was planned; 1 before there are
     /// any.
-    async fn rates(&self) -> Result<(f64, f64), StoreError> {
+    async fn rates(&self) -> Result<(f64, f64)> {
         let row = sqlx::query(
             "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
                     / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,

@@ -4,20 +4,19 @@ use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 
 use crate::job::{CalibrationId, JobId, JobSpec, Lab, TaskId, TaskKind, TaskState};
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::tables::{labs, sums, tasks};
 
 /// Above that of every job: people wait for calibrations before they measure.
 const CALIBRATION_PRIORITY: i32 = 1000;
 
-/// Writes the tasks of a job.
-pub(in crate::store) async fn insert(
+pub async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
     job: JobId,
     spec: &JobSpec,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let tasks = spec
         .tasks()
         .map_err(|error| StoreError::Corrupt { column: "spec", value: error.to_string() })?;
@@ -45,11 +44,11 @@ pub(in crate::store) async fn insert(
 }
 
 /// Writes the task of a calibration. Its cost is not planned: nothing is forecast from it.
-pub(in crate::store) async fn insert_calibration(
+pub async fn insert_calibration(
     connection: &mut SqliteConnection,
     lab: &Lab,
     calibration: CalibrationId,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     sql!(
         "INSERT INTO tasks (id, calibration, lab, ordinal, kind, state, priority, cost)
          VALUES (?, ?, ?, 0, ?, ?, ?, 0)",
@@ -84,7 +83,7 @@ pub(super) async fn scale_tiles(
     connection: &mut SqliteConnection,
     job: JobId,
     share: f64,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     sql!("UPDATE tasks SET cost = cost * ? WHERE job = ? AND kind = 'tile'", [share, job])
         .execute(connection)
         .await?;
@@ -96,7 +95,7 @@ pub(super) async fn unblock(
     connection: &mut SqliteConnection,
     job: JobId,
     done: TaskKind,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     // ?1 job, ?2 snapshot, ?3 to ?5 states: blocked, ready, done.
     let query = match done {
         TaskKind::Prepare => {
@@ -131,10 +130,7 @@ pub(super) async fn unblock(
 
 /// Has the tasks of a job that were given up or cancelled wait again, as at its start. What is done
 /// stays done.
-pub(super) async fn restart(
-    connection: &mut SqliteConnection,
-    job: JobId,
-) -> Result<(), StoreError> {
+pub(super) async fn restart(connection: &mut SqliteConnection, job: JobId) -> Result<()> {
     sql!(
         "UPDATE tasks SET failures = 0, losses = 0, ready_at = 0,
              state = CASE kind WHEN 'prepare' THEN ?2 ELSE ?3 END
@@ -157,10 +153,7 @@ pub(super) async fn restart(
 }
 
 /// Cancels the tasks of a job that no worker has.
-pub(super) async fn cancel_waiting(
-    connection: &mut SqliteConnection,
-    job: JobId,
-) -> Result<(), StoreError> {
+pub(super) async fn cancel_waiting(connection: &mut SqliteConnection, job: JobId) -> Result<()> {
     sql!(
         "UPDATE tasks SET state = ? WHERE job = ? AND state IN (?, ?)",
         [TaskState::Cancelled, job, TaskState::Blocked, TaskState::Ready]

@@ -4,7 +4,7 @@ use sqlx::SqliteConnection;
 
 use super::graph;
 use crate::job::{JobId, JobState, Lab, TaskState};
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::jobs;
 use crate::store::{Store, dir, on_files};
@@ -13,7 +13,7 @@ impl Store {
     /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
     /// Cancelling twice is no error.
     /// Errors: [`StoreError::State`] if the job has succeeded or failed.
-    pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+    pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
         let mut transaction = self.write().await?;
         let before = jobs::state(&mut transaction, id).await?;
@@ -30,7 +30,7 @@ impl Store {
 
     /// Takes up a failed or cancelled job again. What is done stays done.
     /// Errors: [`StoreError::State`] if the job has not failed or been cancelled.
-    pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+    pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
         let mut transaction = self.write().await?;
         jobs::set_state(&mut transaction, id, JobState::Queued, None).await?;
@@ -41,13 +41,13 @@ impl Store {
 
     /// Deletes a job that has come to its end, with all that it has made.
     /// Errors: [`StoreError::NotFinal`] if it still runs or waits.
-    pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<(), StoreError> {
+    pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
         self.remove_job(id).await
     }
 
     /// As [`Self::delete_job`], whosever it is.
-    pub(in crate::store) async fn remove_job(&self, id: JobId) -> Result<(), StoreError> {
+    pub(in crate::store) async fn remove_job(&self, id: JobId) -> Result<()> {
         let mut transaction = self.write().await?;
         let state = jobs::state(&mut transaction, id).await?;
         if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
@@ -68,7 +68,7 @@ impl Store {
         &self,
         transaction: &mut SqliteConnection,
         id: JobId,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         if jobs::state(transaction, id).await? == JobState::Running {
             jobs::set_state(transaction, id, JobState::Succeeded, None).await?;
             self.drop_tiles(transaction, id).await?;
@@ -77,11 +77,7 @@ impl Store {
     }
 
     /// Removes the tiles and previews of a job.
-    async fn drop_tiles(
-        &self,
-        transaction: &mut SqliteConnection,
-        id: JobId,
-    ) -> Result<(), StoreError> {
+    async fn drop_tiles(&self, transaction: &mut SqliteConnection, id: JobId) -> Result<()> {
         let results = "SELECT DISTINCT result FROM tasks WHERE job = ? AND result IS NOT NULL";
         let results = sql_scalar!(results, [id]).fetch_all(&mut *transaction).await?;
         sql!("UPDATE tasks SET result = NULL WHERE job = ?", [id])
@@ -95,25 +91,17 @@ impl Store {
 }
 
 /// True if the job's tasks are still to be done.
-pub(super) async fn is_wanted(
-    connection: &mut SqliteConnection,
-    id: JobId,
-) -> Result<bool, StoreError> {
+pub(super) async fn is_wanted(connection: &mut SqliteConnection, id: JobId) -> Result<bool> {
     Ok(matches!(jobs::state(connection, id).await?, JobState::Queued | JobState::Running))
 }
 
-/// Marks a job as failed for this reason.
-pub(super) async fn fail(
-    connection: &mut SqliteConnection,
-    id: JobId,
-    reason: &str,
-) -> Result<(), StoreError> {
+pub(super) async fn fail(connection: &mut SqliteConnection, id: JobId, reason: &str) -> Result<()> {
     jobs::set_state(connection, id, JobState::Failed, Some(reason)).await?;
     graph::cancel_waiting(connection, id).await
 }
 
 /// Ends a job that was being cancelled, once no worker is at it any more.
-pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Result<(), StoreError> {
+pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
     if jobs::state(connection, id).await? != JobState::Cancelling {
         return Ok(());
     }
@@ -125,7 +113,7 @@ pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Resu
     Ok(())
 }
 
-async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64, StoreError> {
+async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64> {
     let count = "SELECT count(*) FROM tasks WHERE job = ? AND state = ?";
     Ok(sql_scalar!(count, [id, TaskState::Running]).fetch_one(connection).await?)
 }

@@ -13,7 +13,7 @@ use strum::Display;
 use super::job;
 use crate::job::{JobState, TaskId, TaskKind, TaskProgress, TaskState, Timestamp, WorkerId};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::tasks::{self, Owner};
 use crate::store::tables::{sums, workers};
@@ -43,7 +43,6 @@ impl Lease {
     }
 }
 
-/// The answer to a heartbeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heartbeat {
     /// Go on; the lease is renewed.
@@ -77,7 +76,6 @@ pub(super) enum Loss {
     Failed(String, bool),
 }
 
-/// How an attempt ended.
 #[derive(Debug, Clone, Copy, Display)]
 #[strum(serialize_all = "snake_case")]
 pub(super) enum Outcome {
@@ -98,7 +96,7 @@ impl Store {
         lease: &Lease,
         progress: TaskProgress,
         history: Option<&str>,
-    ) -> Result<Heartbeat, StoreError> {
+    ) -> Result<Heartbeat> {
         let mut transaction = self.write().await?;
         workers::seen(&mut transaction, lease.worker).await?;
         let row = sql!(
@@ -130,22 +128,17 @@ impl Store {
 
     /// Records that a task could not be done. With `retryable` it is tried again after a pause,
     /// [`MAX_FAILURES`] times in all; otherwise its job or calibration has failed, for this reason.
-    pub async fn fail(
-        &self,
-        lease: &Lease,
-        reason: &str,
-        retryable: bool,
-    ) -> Result<(), StoreError> {
+    pub async fn fail(&self, lease: &Lease, reason: &str, retryable: bool) -> Result<()> {
         self.part(lease, &Loss::Failed(reason.to_owned(), retryable)).await
     }
 
     /// Gives a task back unharmed, as at a shutdown or when its job was cancelled; the attempt does not
     /// count against it.
-    pub async fn give_back(&self, lease: &Lease) -> Result<(), StoreError> {
+    pub async fn give_back(&self, lease: &Lease) -> Result<()> {
         self.part(lease, &Loss::Released).await
     }
 
-    pub(super) async fn part(&self, lease: &Lease, loss: &Loss) -> Result<(), StoreError> {
+    pub(super) async fn part(&self, lease: &Lease, loss: &Loss) -> Result<()> {
         let mut transaction = self.write().await?;
         if held(&mut transaction, lease).await?.is_some() {
             lose(&mut transaction, lease.task, loss).await?;
@@ -156,7 +149,7 @@ impl Store {
 
     /// Has tiles done again whose stored results turned out to be damaged, and gives the assembly,
     /// which found it, back to wait for them. The damage counts as a failure of each tile.
-    pub async fn redo_tiles(&self, lease: &Lease, damaged: &[u32]) -> Result<(), StoreError> {
+    pub async fn redo_tiles(&self, lease: &Lease, damaged: &[u32]) -> Result<()> {
         let mut transaction = self.write().await?;
         let Some((Owner::Job(job), kind)) = held(&mut transaction, lease).await? else {
             return Ok(());
@@ -195,7 +188,7 @@ impl Store {
     }
 
     /// Records that a worker has ended, and frees its task at once instead of when its lease runs out.
-    pub async fn worker_ended(&self, id: WorkerId, end: &WorkerEnd) -> Result<(), StoreError> {
+    pub async fn worker_ended(&self, id: WorkerId, end: &WorkerEnd) -> Result<()> {
         let loss = match end {
             WorkerEnd::Left => Loss::Released,
             WorkerEnd::Killed => Loss::Lost("the worker process was killed".into()),
@@ -218,7 +211,7 @@ impl Store {
 pub(super) async fn held(
     connection: &mut SqliteConnection,
     lease: &Lease,
-) -> Result<Option<(Owner, TaskKind)>, StoreError> {
+) -> Result<Option<(Owner, TaskKind)>> {
     let row = sql!(
         "SELECT job, calibration, kind, snapshot, tile FROM tasks
          WHERE id = ? AND attempt = ? AND state = ?",
@@ -230,7 +223,7 @@ pub(super) async fn held(
 }
 
 /// Takes back the tasks of workers that have fallen silent.
-pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<(), StoreError> {
+pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<()> {
     let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
     let tasks = "SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?";
     let tasks = sql_scalar!(tasks, [TaskState::Running, now, now + LONGEST_LEASE]);
@@ -246,7 +239,7 @@ pub(super) async fn end_attempt(
     task: TaskId,
     outcome: Outcome,
     reason: Option<&str>,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     sql!(
         "UPDATE attempts SET ended_at = ?, outcome = ?, reason = ?
          WHERE task = ? AND attempt = (SELECT attempt FROM tasks WHERE id = task)",
@@ -259,11 +252,7 @@ pub(super) async fn end_attempt(
 
 /// Parts a running task from its worker: it becomes ready again, or is cancelled with its job, or
 /// is given up and its job or calibration with it.
-async fn lose(
-    connection: &mut SqliteConnection,
-    task: TaskId,
-    loss: &Loss,
-) -> Result<(), StoreError> {
+async fn lose(connection: &mut SqliteConnection, task: TaskId, loss: &Loss) -> Result<()> {
     let row = sql!(
         "SELECT job, calibration, kind, snapshot, tile, failures, losses FROM tasks WHERE id = ?",
         [task]

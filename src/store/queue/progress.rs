@@ -14,11 +14,10 @@ use sqlx::sqlite::SqliteRow;
 use super::forecast::{Forecast, Left};
 use crate::job::{JobId, JobState, Lab, TaskStage, TaskState};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::tables::jobs::Job;
 
-/// What a job is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ProgressStage {
@@ -38,7 +37,6 @@ pub enum ProgressStage {
     Ended,
 }
 
-/// How far a job is.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JobProgress {
     pub stage: ProgressStage,
@@ -73,15 +71,14 @@ pub struct JobMark {
 }
 
 impl Store {
-    /// How far a job is.
-    pub async fn progress(&self, job: &Job) -> Result<JobProgress, StoreError> {
+    pub async fn progress(&self, job: &Job) -> Result<JobProgress> {
         let mut all = self.progress_of(std::slice::from_ref(job)).await?;
         all.pop().ok_or(StoreError::missing("job", job.id))
     }
 
     /// How far each of these jobs is, in their order. Reads what their tasks add up to, and the tasks that
     /// run: how many tasks there are, and how many jobs wait, makes no difference.
-    pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>, StoreError> {
+    pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>> {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
         let rows = sql!(
             "WITH running AS (
@@ -107,7 +104,7 @@ impl Store {
         )
         .fetch_all(&self.readers)
         .await?;
-        let by_job: Result<HashMap<JobId, &SqliteRow>, StoreError> =
+        let by_job: Result<HashMap<JobId, &SqliteRow>> =
             rows.iter().map(|row| Ok((row.try_get("job")?, row))).collect();
         let by_job = by_job?;
         let forecast = if jobs.iter().any(|job| has_eta(job.state)) {
@@ -125,7 +122,7 @@ impl Store {
     }
 
     /// The marks of all jobs, and whose they are. Reads indexes and the tasks that run.
-    pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>, StoreError> {
+    pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>> {
         let rows = sqlx::query("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
         let mut marks = HashMap::with_capacity(rows.len());
         for row in &rows {
@@ -160,11 +157,7 @@ fn has_eta(state: JobState) -> bool {
     matches!(state, JobState::Queued | JobState::Running)
 }
 
-fn progress(
-    job: &Job,
-    row: &SqliteRow,
-    forecast: Option<&Forecast>,
-) -> Result<JobProgress, StoreError> {
+fn progress(job: &Job, row: &SqliteRow, forecast: Option<&Forecast>) -> Result<JobProgress> {
     let figure = |column| row.try_get::<f64, _>(column);
     let (cost, spent, tiles_spent) = (figure("cost")?, figure("spent")?, figure("tiles_spent")?);
     let (tiles, others) = (figure("tiles_left")?, figure("others_left")?);
@@ -199,7 +192,7 @@ fn progress(
     })
 }
 
-fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage, StoreError> {
+fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage> {
     let count = |column| row.try_get::<u64, _>(column);
     Ok(match state {
         JobState::Queued => ProgressStage::Waiting,

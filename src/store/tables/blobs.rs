@@ -5,12 +5,11 @@ use sqlx::{FromRow, SqliteConnection};
 use strum::Display;
 
 use crate::job::{Lab, Sha256, Timestamp, TokenId};
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 use crate::store::staging::StagedBlob;
 use crate::store::{Store, dir, on_files};
 
-/// A stored file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
 pub struct Blob {
     /// The hash of its bytes, which is its address.
@@ -39,7 +38,7 @@ impl Store {
         lab: &Lab,
         token: Option<TokenId>,
         staged: StagedBlob,
-    ) -> Result<(Blob, bool), StoreError> {
+    ) -> Result<(Blob, bool)> {
         let sha256 = staged.sha256();
         let mut transaction = self.write().await?;
         let before = held(&mut transaction, lab, sha256).await?;
@@ -59,8 +58,7 @@ impl Store {
         Ok((blob, before.is_none()))
     }
 
-    /// The file with this hash, if the lab has uploaded it.
-    pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob, StoreError> {
+    pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob> {
         let mut connection = self.readers.acquire().await?;
         held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))
     }
@@ -71,7 +69,7 @@ impl Store {
         transaction: &mut SqliteConnection,
         staged: StagedBlob,
         origin: Origin,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         let (sha256, size) = (staged.sha256(), staged.size());
         let place = self.dir().blob(&sha256);
         on_files(move || staged.put(&place)).await?;
@@ -94,7 +92,7 @@ impl Store {
         &self,
         transaction: &mut SqliteConnection,
         sha256: Sha256,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         let removed = sql!(
             "DELETE FROM blobs WHERE sha256 = ?1
                  AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
@@ -116,7 +114,7 @@ impl Store {
     }
 
     /// Removes the uploads that nothing refers to and nobody has sent since `before`. Says how many.
-    pub async fn collect(&self, before: Timestamp) -> Result<usize, StoreError> {
+    pub async fn collect(&self, before: Timestamp) -> Result<usize> {
         let mut transaction = self.write().await?;
         sql!(
             "DELETE FROM holdings AS h WHERE touched_at < ?
@@ -154,7 +152,7 @@ impl Store {
     }
 
     /// Number and bytes of all stored files.
-    pub async fn blob_totals(&self) -> Result<(u64, u64), StoreError> {
+    pub async fn blob_totals(&self) -> Result<(u64, u64)> {
         let totals = "SELECT count(*), coalesce(sum(size), 0) FROM blobs";
         Ok(sqlx::query_as(totals).fetch_one(&self.readers).await?)
     }
@@ -165,7 +163,7 @@ async fn held(
     connection: &mut SqliteConnection,
     lab: &Lab,
     sha256: Sha256,
-) -> Result<Option<Blob>, StoreError> {
+) -> Result<Option<Blob>> {
     let blob = sql_as!(
         "SELECT sha256, size, holdings.created_at FROM holdings JOIN blobs USING (sha256)
          WHERE lab = ? AND sha256 = ?",

@@ -10,7 +10,7 @@ use sqlx::{FromRow, Row, SqliteConnection};
 
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timestamp};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{
     Page, Reference, integer, refuse_if_used, require, sql, sql_as, sql_scalar,
 };
@@ -19,7 +19,6 @@ use crate::store::rows::{
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct NewCalibration {
     pub name: Option<Label>,
-    /// The upload with the masks.
     pub masks: Sha256,
     pub format: String,
     pub sample: String,
@@ -29,7 +28,6 @@ pub struct NewCalibration {
     pub height: usize,
     #[sqlx(try_from = "i64")]
     pub width: usize,
-    /// The stored number that means 1.
     pub full_scale: f32,
     /// Mean of all mask values on [0, 1].
     pub mask_mean: f64,
@@ -39,7 +37,6 @@ pub struct NewCalibration {
     pub clipped_negatives: u64,
 }
 
-/// A calibration on record.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Calibration {
     pub id: CalibrationId,
@@ -68,11 +65,7 @@ pub struct Unready {
 impl Store {
     /// The lab's calibration with this identifier.
     /// Errors: [`StoreError::Unready`] if its masks are not there.
-    pub async fn calibration(
-        &self,
-        lab: &Lab,
-        id: CalibrationId,
-    ) -> Result<Calibration, StoreError> {
+    pub async fn calibration(&self, lab: &Lab, id: CalibrationId) -> Result<Calibration> {
         match self.find_calibration(Some(lab), id).await {
             Err(missing @ StoreError::NotFound { .. }) => match self.unready(lab, id).await? {
                 Some(Unready { id, error, .. }) => Err(StoreError::Unready { id, error }),
@@ -87,7 +80,7 @@ impl Store {
         &self,
         lab: Option<&Lab>,
         id: CalibrationId,
-    ) -> Result<Calibration, StoreError> {
+    ) -> Result<Calibration> {
         let calibration = sql_as!(
             "SELECT * FROM calibrations WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)",
             [id, lab]
@@ -98,11 +91,7 @@ impl Store {
     }
 
     /// The lab's calibration with this identifier if its masks are not there; none otherwise.
-    pub async fn unready(
-        &self,
-        lab: &Lab,
-        id: CalibrationId,
-    ) -> Result<Option<Unready>, StoreError> {
+    pub async fn unready(&self, lab: &Lab, id: CalibrationId) -> Result<Option<Unready>> {
         Ok(self.find_unready(lab, Some(id), None, 1).await?.items.pop())
     }
 
@@ -112,7 +101,7 @@ impl Store {
         lab: &Lab,
         after: Option<CalibrationId>,
         limit: u32,
-    ) -> Result<Page<Unready>, StoreError> {
+    ) -> Result<Page<Unready>> {
         self.find_unready(lab, None, after, limit).await
     }
 
@@ -122,7 +111,7 @@ impl Store {
         only: Option<CalibrationId>,
         after: Option<CalibrationId>,
         limit: u32,
-    ) -> Result<Page<Unready>, StoreError> {
+    ) -> Result<Page<Unready>> {
         let rows = sql!(
             "SELECT calibration, name, captures, created_at, state, fraction,
                  (SELECT reason FROM attempts
@@ -144,7 +133,7 @@ impl Store {
         lab: &Lab,
         after: Option<CalibrationId>,
         limit: u32,
-    ) -> Result<Page<Calibration>, StoreError> {
+    ) -> Result<Page<Calibration>> {
         let items = sql_as!(
             "SELECT * FROM calibrations WHERE lab = ?1 AND (?2 IS NULL OR id < ?2)
              ORDER BY id DESC LIMIT ?3",
@@ -156,7 +145,7 @@ impl Store {
     }
 
     /// Deletes a calibration that no measurement and no model refers to.
-    pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<(), StoreError> {
+    pub async fn delete_calibration(&self, lab: &Lab, id: CalibrationId) -> Result<()> {
         let mut transaction = self.write().await?;
         // Its task goes with it: a worker that has it in hand finds that nobody wants it any more.
         let asked =
@@ -183,12 +172,12 @@ impl Store {
 }
 
 /// Writes the row of a calibration whose masks were made of its captures, which it needs no more.
-pub(in crate::store) async fn insert_made(
+pub async fn insert_made(
     connection: &mut SqliteConnection,
     id: CalibrationId,
     prepared: Sha256,
     facts: NewCalibration,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let request = "SELECT lab, created_at FROM calibration_requests WHERE calibration = ?";
     let (lab, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
     insert(connection, &lab, &Calibration { id, prepared, created_at, facts }).await?;
@@ -199,13 +188,13 @@ pub(in crate::store) async fn insert_made(
 }
 
 /// Writes down what is asked for: masks of captures (as JSON), or without them a report.
-pub(in crate::store) async fn insert_request(
+pub async fn insert_request(
     connection: &mut SqliteConnection,
     lab: &Lab,
     id: CalibrationId,
     name: Option<&Label>,
     captures: Option<&Captures>,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     sql!(
         "INSERT INTO calibration_requests (calibration, lab, name, captures, created_at)
          VALUES (?, ?, ?, ?, ?)",
@@ -227,11 +216,11 @@ pub(in crate::store) async fn insert_request(
 }
 
 /// Writes the row of a calibration whose masks are there.
-pub(in crate::store) async fn insert(
+pub async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
     calibration: &Calibration,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let facts = &calibration.facts;
     sql!(
         "INSERT INTO calibrations (lab, id, name, masks, prepared, format, sample, frames, height,
@@ -260,7 +249,7 @@ pub(in crate::store) async fn insert(
     Ok(())
 }
 
-fn unready(row: &SqliteRow) -> Result<Unready, StoreError> {
+fn unready(row: &SqliteRow) -> Result<Unready> {
     let Json(captures): Json<Captures> = row.try_get("captures")?;
     let failed = row.try_get::<TaskState, _>("state")? == TaskState::Failed;
     Ok(Unready {

@@ -7,10 +7,9 @@ use crate::job::{
     CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, Timestamp,
 };
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 
-/// A job on record.
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct Job {
     pub id: JobId,
@@ -25,7 +24,6 @@ pub struct Job {
     pub finished_at: Option<Timestamp>,
 }
 
-/// Which jobs a list holds.
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
     pub state: Option<JobState>,
@@ -39,19 +37,12 @@ pub struct JobFilter {
 }
 
 impl Store {
-    /// The lab's job with this identifier.
-    pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job, StoreError> {
+    pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job> {
         let job = sql_as!("SELECT * FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
-    /// A page of the lab's jobs, newest first.
-    pub async fn jobs(
-        &self,
-        lab: &Lab,
-        filter: &JobFilter,
-        limit: u32,
-    ) -> Result<Page<Job>, StoreError> {
+    pub async fn jobs(&self, lab: &Lab, filter: &JobFilter, limit: u32) -> Result<Page<Job>> {
         let items = sql_as!(
             "SELECT * FROM jobs
              WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state = ?2)
@@ -76,21 +67,20 @@ impl Store {
         Ok(Page::cut(items, limit))
     }
 
-    /// The number of jobs in each state.
-    pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>, StoreError> {
+    pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
         let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
         Ok(sqlx::query_as(counts).fetch_all(&self.readers).await?)
     }
 }
 
 /// Writes the row of a job with the hash of its request, and the user's key if there is one.
-pub(in crate::store) async fn insert(
+pub async fn insert(
     connection: &mut SqliteConnection,
     id: JobId,
     lab: &Lab,
     spec: &JobSpec,
     (request, key): (Sha256, Option<String>),
-) -> Result<(), StoreError> {
+) -> Result<()> {
     sql!(
         "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
              idempotency_key, request, created_at, lab, disk_bytes, model)
@@ -116,22 +106,18 @@ pub(in crate::store) async fn insert(
     Ok(())
 }
 
-/// The job's state.
-pub(in crate::store) async fn state(
-    connection: &mut SqliteConnection,
-    id: JobId,
-) -> Result<JobState, StoreError> {
+pub async fn state(connection: &mut SqliteConnection, id: JobId) -> Result<JobState> {
     let state = sql_scalar!("SELECT state FROM jobs WHERE id = ?", [id]);
     state.fetch_optional(connection).await?.ok_or_else(|| StoreError::missing("job", id))
 }
 
 /// Takes a legal step to another state and notes the time.
-pub(in crate::store) async fn set_state(
+pub async fn set_state(
     connection: &mut SqliteConnection,
     id: JobId,
     to: JobState,
     error: Option<&str>,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let to = state(connection, id).await?.step(to)?;
     let now = Timestamp::now();
     sql!(

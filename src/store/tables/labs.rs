@@ -4,13 +4,11 @@ use sqlx::{FromRow, SqliteConnection};
 
 use crate::job::Lab;
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 use crate::store::rows::sql;
 
-/// A lab on record.
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct LabRow {
-    /// Its name.
     pub lab: Lab,
     /// Its share of the machine, beside the shares of the others that want it.
     pub share: f64,
@@ -21,8 +19,7 @@ pub struct LabRow {
 }
 
 impl Store {
-    /// All labs, by name.
-    pub async fn labs(&self) -> Result<Vec<LabRow>, StoreError> {
+    pub async fn labs(&self) -> Result<Vec<LabRow>> {
         let rows = sqlx::query_as(
             "SELECT labs.lab, share, count(jobs.id) AS jobs,
                  coalesce(sum(tiles_left + others_left), 0.0) AS cost_left
@@ -35,7 +32,7 @@ impl Store {
     }
 
     /// Sets a lab's share of the machine, which is above 0. A lab that is not on record yet is put there.
-    pub async fn set_share(&self, lab: &Lab, share: f64) -> Result<(), StoreError> {
+    pub async fn set_share(&self, lab: &Lab, share: f64) -> Result<()> {
         sql!(
             "INSERT INTO labs (lab, share) VALUES (?, ?)
              ON CONFLICT (lab) DO UPDATE SET share = excluded.share",
@@ -48,10 +45,7 @@ impl Store {
 }
 
 /// Puts a lab on record, if it is not there.
-pub(in crate::store) async fn know(
-    connection: &mut SqliteConnection,
-    lab: &Lab,
-) -> Result<(), StoreError> {
+pub async fn know(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
     sql!("INSERT OR IGNORE INTO labs (lab) VALUES (?)", [lab]).execute(connection).await?;
     Ok(())
 }

@@ -7,16 +7,14 @@ use sqlx::{Row, SqliteConnection};
 
 use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
 use crate::store::Store;
-use crate::store::error::StoreError;
-use crate::store::rows::{Page, integer, list, number, refuse_if_used, sql, sql_scalar};
+use crate::store::error::{Result, StoreError};
+use crate::store::rows::{Filter, Page, integer, list, number, refuse_if_used, sql, sql_scalar};
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NewMeasurement {
     pub name: Option<Label>,
-    /// The calibration that it was taken with.
     pub calibration: CalibrationId,
-    /// The upload with the snapshots.
     pub data: Sha256,
     pub format: String,
     pub sample: String,
@@ -35,7 +33,6 @@ pub struct NewMeasurement {
     pub warnings: Vec<Finding>,
 }
 
-/// A measurement on record.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Measurement {
     pub id: MeasurementId,
@@ -47,21 +44,8 @@ pub struct Measurement {
     pub facts: NewMeasurement,
 }
 
-/// Which measurements a list holds.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct MeasurementFilter {
-    pub calibration: Option<CalibrationId>,
-    /// Only those older than this one.
-    pub after: Option<MeasurementId>,
-}
-
 impl Store {
-    /// The lab's measurement with this identifier.
-    pub async fn measurement(
-        &self,
-        lab: &Lab,
-        id: MeasurementId,
-    ) -> Result<Measurement, StoreError> {
+    pub async fn measurement(&self, lab: &Lab, id: MeasurementId) -> Result<Measurement> {
         self.find_measurement(Some(lab), id).await
     }
 
@@ -70,7 +54,7 @@ impl Store {
         &self,
         lab: Option<&Lab>,
         id: MeasurementId,
-    ) -> Result<Measurement, StoreError> {
+    ) -> Result<Measurement> {
         let row = sql!(
             "SELECT * FROM measurements WHERE id = ?1 AND (?2 IS NULL OR lab = ?2)",
             [id, lab]
@@ -80,13 +64,12 @@ impl Store {
         measurement(&row.ok_or_else(|| StoreError::missing("measurement", id))?)
     }
 
-    /// A page of the lab's measurements, newest first.
     pub async fn measurements(
         &self,
         lab: &Lab,
-        filter: MeasurementFilter,
+        filter: Filter<MeasurementId>,
         limit: u32,
-    ) -> Result<Page<Measurement>, StoreError> {
+    ) -> Result<Page<Measurement>> {
         let rows = sql!(
             "SELECT * FROM measurements
              WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
@@ -99,7 +82,7 @@ impl Store {
     }
 
     /// Deletes a measurement that no job refers to.
-    pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<(), StoreError> {
+    pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<()> {
         self.measurement(lab, id).await?;
         let mut transaction = self.write().await?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE measurement = ?";
@@ -114,12 +97,11 @@ impl Store {
     }
 }
 
-/// Writes the row of a measurement.
-pub(in crate::store) async fn insert(
+pub async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
     measurement: &Measurement,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let facts = &measurement.facts;
     sql!(
         "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
@@ -151,7 +133,7 @@ pub(in crate::store) async fn insert(
     Ok(())
 }
 
-fn measurement(row: &SqliteRow) -> Result<Measurement, StoreError> {
+fn measurement(row: &SqliteRow) -> Result<Measurement> {
     Ok(Measurement {
         id: row.try_get("id")?,
         prepared: row.try_get("prepared")?,

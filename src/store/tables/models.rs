@@ -6,23 +6,20 @@ use sqlx::types::Json;
 
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 use crate::store::Store;
-use crate::store::error::StoreError;
-use crate::store::rows::{Page, Reference, refuse_if_used, require, sql, sql_as};
+use crate::store::error::{Result, StoreError};
+use crate::store::rows::{Filter, Page, Reference, refuse_if_used, require, sql, sql_as};
 
 /// What is known of an end-to-end network when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct NewModel {
     pub name: Option<Label>,
-    /// The calibration that it was trained for.
     pub calibration: CalibrationId,
-    /// The upload with the ONNX file.
     pub file: Sha256,
     #[serde(flatten)]
     #[sqlx(json)]
     pub facts: ModelFacts,
 }
 
-/// An end-to-end network on record.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct Model {
     pub id: ModelId,
@@ -30,14 +27,6 @@ pub struct Model {
     #[serde(flatten)]
     #[sqlx(flatten)]
     pub content: NewModel,
-}
-
-/// Which models a list holds.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct ModelFilter {
-    pub calibration: Option<CalibrationId>,
-    /// Only those older than this one.
-    pub after: Option<ModelId>,
 }
 
 impl From<Model> for JobModel {
@@ -49,8 +38,7 @@ impl From<Model> for JobModel {
 }
 
 impl Store {
-    /// Records a network.
-    pub async fn add_model(&self, lab: &Lab, content: NewModel) -> Result<Model, StoreError> {
+    pub async fn add_model(&self, lab: &Lab, content: NewModel) -> Result<Model> {
         let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
         let NewModel { name, calibration, file, facts } = &model.content;
         let mut transaction = self.write().await?;
@@ -67,19 +55,17 @@ impl Store {
         Ok(model)
     }
 
-    /// The lab's model with this identifier.
-    pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model, StoreError> {
+    pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model> {
         let model = sql_as!("SELECT * FROM models WHERE id = ? AND lab = ?", [id, lab]);
         model.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("model", id))
     }
 
-    /// A page of the lab's models, newest first.
     pub async fn models(
         &self,
         lab: &Lab,
-        filter: ModelFilter,
+        filter: Filter<ModelId>,
         limit: u32,
-    ) -> Result<Page<Model>, StoreError> {
+    ) -> Result<Page<Model>> {
         let items = sql_as!(
             "SELECT * FROM models
              WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
@@ -92,7 +78,7 @@ impl Store {
     }
 
     /// Deletes a model that no job refers to. Its file is left to [`Self::collect`].
-    pub async fn delete_model(&self, lab: &Lab, id: ModelId) -> Result<(), StoreError> {
+    pub async fn delete_model(&self, lab: &Lab, id: ModelId) -> Result<()> {
         self.model(lab, id).await?;
         let mut transaction = self.write().await?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE model = ?";

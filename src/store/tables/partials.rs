@@ -9,11 +9,10 @@ use std::time::Duration;
 use sqlx::FromRow;
 
 use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 use crate::store::{Store, dir, on_files};
 
-/// An upload to be begun.
 #[derive(Debug, Clone, FromRow)]
 pub struct NewPartial {
     pub lab: Lab,
@@ -27,7 +26,6 @@ pub struct NewPartial {
     pub expected: Option<Sha256>,
 }
 
-/// An upload that was begun.
 #[derive(Debug, Clone, FromRow)]
 pub struct Partial {
     pub id: PartialId,
@@ -64,20 +62,18 @@ pub enum FoundPartial {
 
 impl PartialFile {
     /// The row, as it stands under the lock.
-    #[must_use]
     pub fn upload(&self) -> &Partial {
         &self.upload
     }
 
     /// True if nothing is missing but to store it.
-    #[must_use]
     pub fn is_complete(&self) -> bool {
         self.upload.received == self.upload.facts.length
     }
 
     /// Drops what was written without being recorded. A file that lacks bytes on record is refused: to
     /// extend it would make zeros of them.
-    fn ready(mut file: File, path: PathBuf, upload: Partial) -> Result<Self, StoreError> {
+    fn ready(mut file: File, path: PathBuf, upload: Partial) -> Result<Self> {
         let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
         if bytes < upload.received {
             return Err(short(&upload, bytes));
@@ -90,12 +86,12 @@ impl PartialFile {
     }
 
     /// Appends bytes. Blocks.
-    pub fn append(&mut self, bytes: &[u8]) -> Result<(), StoreError> {
+    pub fn append(&mut self, bytes: &[u8]) -> Result<()> {
         self.file.write_all(bytes).map_err(StoreError::io("write", &self.path))
     }
 
     /// Brings all to the disk. Blocks.
-    pub fn sync(&self) -> Result<(), StoreError> {
+    pub fn sync(&self) -> Result<()> {
         self.file.sync_data().map_err(StoreError::io("write to the disk", &self.path))
     }
 }
@@ -107,7 +103,7 @@ enum Lock {
     Gone,
 }
 
-fn lock(path: &Path) -> Result<Lock, StoreError> {
+fn lock(path: &Path) -> Result<Lock> {
     let file = match File::options().write(true).open(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Lock::Gone),
         file => file.map_err(StoreError::io("open", path))?,
@@ -127,11 +123,7 @@ fn lock(path: &Path) -> Result<Lock, StoreError> {
 
 impl Store {
     /// Begins an upload, which is given up when nothing more has come for `age`.
-    pub async fn begin_partial(
-        &self,
-        facts: NewPartial,
-        age: Duration,
-    ) -> Result<Partial, StoreError> {
+    pub async fn begin_partial(&self, facts: NewPartial, age: Duration) -> Result<Partial> {
         let id = PartialId::new();
         let expires_at = after(age);
         let path = self.dir().partial(id);
@@ -162,7 +154,7 @@ impl Store {
     }
 
     /// The lab's upload with this identifier, unless it has expired.
-    pub async fn partial(&self, lab: &Lab, id: PartialId) -> Result<Partial, StoreError> {
+    pub async fn partial(&self, lab: &Lab, id: PartialId) -> Result<Partial> {
         let partial = sql_as!(
             "SELECT * FROM partials WHERE id = ? AND lab = ? AND expires_at > ?",
             [id, lab, Timestamp::now()]
@@ -175,7 +167,7 @@ impl Store {
     /// Takes an upload for this request alone, unless another one has it.
     /// Errors: [`StoreError::NotFound`] if it is gone; [`StoreError::Short`] if bytes on record are
     /// lost.
-    pub async fn open_partial(&self, lab: &Lab, id: PartialId) -> Result<FoundPartial, StoreError> {
+    pub async fn open_partial(&self, lab: &Lab, id: PartialId) -> Result<FoundPartial> {
         let upload = self.partial(lab, id).await?;
         if upload.result.is_some() {
             return Ok(FoundPartial::Stored(upload));
@@ -198,7 +190,7 @@ impl Store {
     }
 
     /// Bytes of an upload's file as it lies on the disk; 0 if there is none.
-    pub async fn partial_bytes(&self, id: PartialId) -> Result<u64, StoreError> {
+    pub async fn partial_bytes(&self, id: PartialId) -> Result<u64> {
         let path = self.dir().partial(id);
         on_files(move || match std::fs::metadata(&path) {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(0),
@@ -213,7 +205,7 @@ impl Store {
         partial: &mut PartialFile,
         bytes: u64,
         age: Duration,
-    ) -> Result<(), StoreError> {
+    ) -> Result<()> {
         let upload = &mut partial.upload;
         let (received, expires_at) = (upload.received + bytes, after(age));
         let changed = sql!(
@@ -233,7 +225,7 @@ impl Store {
     /// hash is that of the file as it lies on the disk.
     /// Errors: [`StoreError::HashMismatch`] if the client named another hash; the upload is ended
     /// then. [`StoreError::Short`] if the file has not the length that was announced.
-    pub async fn finish_partial(&self, partial: PartialFile) -> Result<Partial, StoreError> {
+    pub async fn finish_partial(&self, partial: PartialFile) -> Result<Partial> {
         // The file is open, and so locked, until the upload is stored and its row says so.
         let PartialFile { mut upload, file, path } = partial;
         let lock = file.try_clone().map_err(StoreError::io("open", &path))?;
@@ -258,7 +250,7 @@ impl Store {
     }
 
     /// Ends an upload that no other request has; what has come of it goes. False if it is busy.
-    pub async fn delete_partial(&self, id: PartialId) -> Result<bool, StoreError> {
+    pub async fn delete_partial(&self, id: PartialId) -> Result<bool> {
         let path = self.dir().partial(id);
         let lock = on_files(move || lock(&path)).await?;
         if !matches!(lock, Lock::Busy) {
@@ -269,14 +261,14 @@ impl Store {
     }
 
     /// Removes the row and the file, whose lock must be held.
-    async fn end_partial(&self, id: PartialId) -> Result<(), StoreError> {
+    async fn end_partial(&self, id: PartialId) -> Result<()> {
         sql!("DELETE FROM partials WHERE id = ?", [id]).execute(&self.writer).await?;
         let path = self.dir().partial(id);
         on_files(move || dir::remove(&path)).await
     }
 
     /// Ends the uploads that have expired, but none to which a piece is being written. Says how many.
-    pub async fn expire_partials(&self) -> Result<usize, StoreError> {
+    pub async fn expire_partials(&self) -> Result<usize> {
         let due = sql_scalar!("SELECT id FROM partials WHERE expires_at <= ?", [Timestamp::now()]);
         let mut ended = 0;
         for id in due.fetch_all(&self.readers).await? {
@@ -300,7 +292,7 @@ impl Store {
 
     /// Bytes of the disk that were promised and are not written: the rest of uploads in pieces, and
     /// of jobs what is not assembled.
-    pub async fn promised_bytes(&self) -> Result<u64, StoreError> {
+    pub async fn promised_bytes(&self) -> Result<u64> {
         let bytes: f64 = sql_scalar!(
             "SELECT (SELECT coalesce(sum(length - received), 0) FROM partials WHERE result IS NULL)
                   + (SELECT coalesce(sum(disk_bytes * (

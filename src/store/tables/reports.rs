@@ -5,31 +5,31 @@ use sqlx::types::Json;
 
 use crate::job::{CalibrationId, CalibrationReport};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 use crate::store::rows::{sql, sql_scalar};
 
 impl Store {
     /// The report of a calibration; none if it is not made yet.
-    pub async fn report(&self, id: CalibrationId) -> Result<Option<CalibrationReport>, StoreError> {
+    pub async fn report(&self, id: CalibrationId) -> Result<Option<CalibrationReport>> {
         let report =
             sql_scalar!("SELECT report FROM calibration_reports WHERE calibration = ?", [id]);
         Ok(report.fetch_optional(&self.readers).await?.map(|Json(report)| report))
     }
 
     /// A picture of a report, as PNG; none if there is none of this name.
-    pub async fn map(&self, id: CalibrationId, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
+    pub async fn map(&self, id: CalibrationId, name: &str) -> Result<Option<Vec<u8>>> {
         let png = "SELECT png FROM calibration_maps WHERE calibration = ? AND name = ?";
         Ok(sql_scalar!(png, [id, name]).fetch_optional(&self.readers).await?)
     }
 }
 
 /// Writes a report with its pictures, which are PNGs by name.
-pub(in crate::store) async fn insert(
+pub async fn insert(
     connection: &mut SqliteConnection,
     id: CalibrationId,
     report: &CalibrationReport,
     maps: Vec<(String, Vec<u8>)>,
-) -> Result<(), StoreError> {
+) -> Result<()> {
     sql!(
         "INSERT OR REPLACE INTO calibration_reports (calibration, report) VALUES (?, ?)",
         [id, Json(report)]

@@ -6,7 +6,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use crate::job::{JobId, ResultFile};
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql};
 use crate::store::{Job, Store};
 
@@ -21,7 +21,7 @@ impl Store {
         job: &Job,
         snapshot: Option<u32>,
         name: &str,
-    ) -> Result<(ResultFile, PathBuf), StoreError> {
+    ) -> Result<(ResultFile, PathBuf)> {
         let row = sql!(
             "SELECT * FROM result_files WHERE job = ? AND snapshot = ? AND name = ?",
             [job.id, snapshot.map_or(WHOLE_JOB, i64::from), name]
@@ -39,11 +39,7 @@ impl Store {
     }
 
     /// The result files of a snapshot (or, with none, of the whole job), by name.
-    pub async fn result_files(
-        &self,
-        job: &Job,
-        snapshot: Option<u32>,
-    ) -> Result<Vec<ResultFile>, StoreError> {
+    pub async fn result_files(&self, job: &Job, snapshot: Option<u32>) -> Result<Vec<ResultFile>> {
         let rows = sql!(
             "SELECT * FROM result_files WHERE job = ? AND snapshot = ? ORDER BY name",
             [job.id, snapshot.map_or(WHOLE_JOB, i64::from)]
@@ -55,12 +51,12 @@ impl Store {
 }
 
 /// Replaces the list of files of a snapshot (or of the whole job).
-pub(in crate::store) async fn record(
+pub async fn record(
     connection: &mut SqliteConnection,
     job: JobId,
     snapshot: Option<u32>,
     files: &[ResultFile],
-) -> Result<(), StoreError> {
+) -> Result<()> {
     let snapshot = snapshot.map_or(WHOLE_JOB, i64::from);
     sql!("DELETE FROM result_files WHERE job = ? AND snapshot = ?", [job, snapshot])
         .execute(&mut *connection)
@@ -76,7 +72,7 @@ pub(in crate::store) async fn record(
     Ok(())
 }
 
-fn result_file(row: &SqliteRow) -> Result<ResultFile, StoreError> {
+fn result_file(row: &SqliteRow) -> Result<ResultFile> {
     Ok(ResultFile {
         name: row.try_get("name")?,
         size: row.try_get("size")?,

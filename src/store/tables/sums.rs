@@ -3,14 +3,11 @@
 use sqlx::SqliteConnection;
 
 use crate::job::{JobId, TaskState};
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 use crate::store::rows::sql;
 
 /// Counts the tasks of a job anew.
-pub(in crate::store) async fn recount(
-    connection: &mut SqliteConnection,
-    job: JobId,
-) -> Result<(), StoreError> {
+pub async fn recount(connection: &mut SqliteConnection, job: JobId) -> Result<()> {
     sql!(
         "INSERT OR REPLACE INTO job_sums (job, cost, tiles_left, tiles_longest, others_left,
              others_longest, tiles_total, tiles_done, tile_seconds, tile_cost, prepared,

@@ -12,25 +12,22 @@ use strum::{VariantArray, VariantNames};
 
 use crate::job::{CalibrationId, JobId, Sha256, TaskKind, TaskState};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_as, sql_scalar};
 
 /// What a task belongs to, and goes with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::store) enum Owner {
+pub enum Owner {
     Job(JobId),
     Calibration(CalibrationId),
 }
 
-/// The stored result of a tile.
 #[derive(Debug, Clone, FromRow)]
 pub struct TileResult {
-    /// The tile's index in the plan.
     pub tile: u32,
     /// The hash that its file should have.
     #[sqlx(rename = "result")]
     pub sha256: Sha256,
-    /// What the worker told about it.
     #[sqlx(json)]
     pub record: Value,
 }
@@ -39,7 +36,6 @@ pub struct TileResult {
 #[derive(Debug, Clone)]
 pub struct TaskRecord {
     pub kind: TaskKind,
-    /// What the worker told about it.
     pub record: Value,
     /// Seconds of the successful attempt.
     pub seconds: f64,
@@ -47,10 +43,8 @@ pub struct TaskRecord {
     pub attempt: u32,
 }
 
-/// A tile as it is worked on.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct TileState {
-    /// Its index in the plan.
     pub tile: u32,
     pub state: TaskState,
     pub stage: Option<String>,
@@ -69,7 +63,6 @@ pub struct TileState {
 /// How the solver went on a tile.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct TileHistory {
-    /// The tile's index in the plan.
     pub tile: u32,
     pub state: TaskState,
     /// \[iteration, residual, change, sigma or null\], by iteration; many iterations are thinned out.
@@ -93,11 +86,7 @@ pub type TaskCounts = BTreeMap<(String, TaskState), u64>;
 
 impl Store {
     /// The stored preview of a snapshot, while there is one: a prepared array of coarse frames.
-    pub async fn preview(
-        &self,
-        job: JobId,
-        snapshot: u32,
-    ) -> Result<Option<(Sha256, PathBuf)>, StoreError> {
+    pub async fn preview(&self, job: JobId, snapshot: u32) -> Result<Option<(Sha256, PathBuf)>> {
         let sha256: Option<Sha256> = sql_scalar!(
             "SELECT result FROM tasks
              WHERE job = ? AND kind = 'preview' AND snapshot = ? AND result IS NOT NULL",
@@ -110,11 +99,7 @@ impl Store {
 
     /// The stored tiles of a snapshot, in the order of the plan. The job's assembly has the right to
     /// count on all of them being there.
-    pub async fn tile_results(
-        &self,
-        job: JobId,
-        snapshot: u32,
-    ) -> Result<Vec<TileResult>, StoreError> {
+    pub async fn tile_results(&self, job: JobId, snapshot: u32) -> Result<Vec<TileResult>> {
         let tiles = sql_as!(
             "SELECT tile, result, record FROM tasks
              WHERE job = ? AND kind = 'tile' AND snapshot = ? AND state = ? ORDER BY tile",
@@ -126,7 +111,7 @@ impl Store {
     }
 
     /// What is known of all tasks of a job that are done, in order.
-    pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>, StoreError> {
+    pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>> {
         let rows = sql!(
             "SELECT kind, snapshot, tile, record, seconds, attempt FROM tasks
              WHERE job = ? AND state = ? ORDER BY ordinal",
@@ -146,11 +131,7 @@ impl Store {
     }
 
     /// The tiles of a snapshot, in the order of the plan.
-    pub async fn tile_states(
-        &self,
-        job: JobId,
-        snapshot: u32,
-    ) -> Result<Vec<TileState>, StoreError> {
+    pub async fn tile_states(&self, job: JobId, snapshot: u32) -> Result<Vec<TileState>> {
         let tiles = sql_as!(
             "SELECT tile, state, stage, iterations, passes, fraction, attempt,
                  CASE state WHEN ? THEN record ->> 'residual' END AS residual
@@ -168,7 +149,7 @@ impl Store {
         job: JobId,
         snapshot: u32,
         tile: u32,
-    ) -> Result<Option<TileHistory>, StoreError> {
+    ) -> Result<Option<TileHistory>> {
         let history = sql_as!(
             "SELECT tile, state, coalesce(history, '[]') AS history
              FROM tasks WHERE job = ? AND kind = 'tile' AND snapshot = ? AND tile = ?",
@@ -180,7 +161,7 @@ impl Store {
     }
 
     /// Version of ONNX Runtime that the last worker told that finished a tile with it; none before.
-    pub async fn last_onnxruntime(&self) -> Result<Option<String>, StoreError> {
+    pub async fn last_onnxruntime(&self) -> Result<Option<String>> {
         let version = sql_scalar!(
             "SELECT record ->> 'onnxruntime' FROM tasks
              WHERE state = ? AND kind = 'tile' AND record ->> 'onnxruntime' IS NOT NULL
@@ -193,12 +174,12 @@ impl Store {
     }
 
     /// What has been done in all, by kind of task.
-    pub async fn totals(&self) -> Result<Vec<TaskTotals>, StoreError> {
+    pub async fn totals(&self) -> Result<Vec<TaskTotals>> {
         Ok(sqlx::query_as("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await?)
     }
 
     /// The number of tasks by kind and state, with zeros for what there is none of.
-    pub async fn task_counts(&self) -> Result<TaskCounts, StoreError> {
+    pub async fn task_counts(&self) -> Result<TaskCounts> {
         let found: Vec<(String, TaskState, u64)> =
             sqlx::query_as("SELECT kind, state, count(*) FROM tasks GROUP BY kind, state")
                 .fetch_all(&self.readers)
@@ -213,15 +194,14 @@ impl Store {
     }
 }
 
-/// The kind of the task in this row.
-pub(in crate::store) fn kind(row: &SqliteRow) -> Result<TaskKind, StoreError> {
+pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
     let name: String = row.try_get("kind")?;
     TaskKind::from_parts(&name, row.try_get("snapshot")?, row.try_get("tile")?)
         .ok_or(StoreError::Corrupt { column: "kind", value: name })
 }
 
 /// What the task in this row belongs to.
-pub(in crate::store) fn owner(row: &SqliteRow) -> Result<Owner, StoreError> {
+pub fn owner(row: &SqliteRow) -> Result<Owner> {
     Ok(match row.try_get("job")? {
         Some(job) => Owner::Job(job),
         None => Owner::Calibration(row.try_get("calibration")?),

@@ -4,7 +4,7 @@ use sqlx::{FromRow, Row};
 
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql, sql_as, sql_scalar};
 
 /// A token on record, without the secret.
@@ -24,7 +24,7 @@ pub struct Token {
 
 impl Store {
     /// Records a token by the hash of its secret.
-    pub async fn add_token(&self, token: &Token, secret: &Secret) -> Result<(), StoreError> {
+    pub async fn add_token(&self, token: &Token, secret: &Secret) -> Result<()> {
         sql!(
             "INSERT INTO tokens (id, hash, lab, role, note, max_bytes, created_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -44,13 +44,13 @@ impl Store {
     }
 
     /// The token with this secret, unless it was revoked.
-    pub async fn token(&self, secret: &Secret) -> Result<Option<Token>, StoreError> {
+    pub async fn token(&self, secret: &Secret) -> Result<Option<Token>> {
         let token = "SELECT * FROM tokens WHERE hash = ? AND revoked_at IS NULL";
         Ok(sql_as!(token, [secret.hash()]).fetch_optional(&self.readers).await?)
     }
 
     /// All tokens, oldest first, each with the bytes that it keeps here.
-    pub async fn tokens(&self) -> Result<Vec<(Token, u64)>, StoreError> {
+    pub async fn tokens(&self) -> Result<Vec<(Token, u64)>> {
         let rows = sqlx::query(
             "SELECT *, (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
                         WHERE token = tokens.id)
@@ -64,7 +64,7 @@ impl Store {
     }
 
     /// Revokes a token, for ever. A second time changes nothing.
-    pub async fn revoke_token(&self, id: TokenId) -> Result<(), StoreError> {
+    pub async fn revoke_token(&self, id: TokenId) -> Result<()> {
         let changed = sql!(
             "UPDATE tokens SET revoked_at = coalesce(revoked_at, ?) WHERE id = ?",
             [Timestamp::now(), id]
@@ -79,13 +79,13 @@ impl Store {
 
     /// True if no token was ever made: everyone may do everything then. Revoking the last one does
     /// not open the service again.
-    pub async fn is_open(&self) -> Result<bool, StoreError> {
+    pub async fn is_open(&self) -> Result<bool> {
         let row = sqlx::query("SELECT 1 FROM tokens LIMIT 1").fetch_optional(&self.readers).await?;
         Ok(row.is_none())
     }
 
     /// Bytes of uploads that a token keeps here, or has begun.
-    pub async fn token_bytes(&self, id: TokenId) -> Result<u64, StoreError> {
+    pub async fn token_bytes(&self, id: TokenId) -> Result<u64> {
         let bytes = sql_scalar!(
             "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
                      WHERE token = ?1)

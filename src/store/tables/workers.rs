@@ -8,10 +8,9 @@ use sqlx::{FromRow, Row, SqliteConnection};
 
 use crate::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
 use crate::store::Store;
-use crate::store::error::StoreError;
+use crate::store::error::Result;
 use crate::store::rows::{sql, sql_scalar};
 
-/// A worker process on record.
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerRow {
     pub id: WorkerId,
@@ -22,7 +21,6 @@ pub struct WorkerRow {
     pub task: Option<WorkerTask>,
 }
 
-/// A task in a worker's hands.
 #[derive(Debug, Clone, Serialize, FromRow)]
 pub struct WorkerTask {
     /// The job; none for a calibration's.
@@ -36,8 +34,7 @@ pub struct WorkerTask {
 }
 
 impl Store {
-    /// Records that a worker has started.
-    pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<(), StoreError> {
+    pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<()> {
         let now = Timestamp::now();
         sql!(
             "INSERT INTO workers (id, pid, version, started_at, seen_at) VALUES (?, ?, ?, ?, ?)
@@ -50,12 +47,12 @@ impl Store {
     }
 
     /// Records that a worker lives though it has no task; a heartbeat says the same of one that has.
-    pub async fn worker_seen(&self, id: WorkerId) -> Result<(), StoreError> {
+    pub async fn worker_seen(&self, id: WorkerId) -> Result<()> {
         seen(&mut *self.writer.acquire().await?, id).await
     }
 
     /// The workers that gave a sign of life within `age`.
-    pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>, StoreError> {
+    pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>> {
         let rows = sql!(
             "SELECT workers.id, pid, version, started_at, seen_at,
                  job, calibration, kind, snapshot, tile, stage
@@ -69,32 +66,24 @@ impl Store {
     }
 
     /// The last sign of life of a worker; none if it is not on record.
-    pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>, StoreError> {
+    pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>> {
         let seen = sql_scalar!("SELECT seen_at FROM workers WHERE id = ?", [id]);
         Ok(seen.fetch_optional(&self.readers).await?)
     }
 
     /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
-    pub async fn forget_workers(&self, age: Duration) -> Result<(), StoreError> {
+    pub async fn forget_workers(&self, age: Duration) -> Result<()> {
         sql!("DELETE FROM workers WHERE seen_at < ?", [since(age)]).execute(&self.writer).await?;
         Ok(())
     }
 }
 
-/// Forgets a worker that has ended.
-pub(in crate::store) async fn remove(
-    connection: &mut SqliteConnection,
-    id: WorkerId,
-) -> Result<(), StoreError> {
+pub async fn remove(connection: &mut SqliteConnection, id: WorkerId) -> Result<()> {
     sql!("DELETE FROM workers WHERE id = ?", [id]).execute(connection).await?;
     Ok(())
 }
 
-/// Notes a sign of life.
-pub(in crate::store) async fn seen(
-    connection: &mut SqliteConnection,
-    id: WorkerId,
-) -> Result<(), StoreError> {
+pub async fn seen(connection: &mut SqliteConnection, id: WorkerId) -> Result<()> {
     sql!("UPDATE workers SET seen_at = ? WHERE id = ?", [Timestamp::now(), id])
         .execute(connection)
         .await?;
@@ -105,7 +94,7 @@ fn since(age: Duration) -> i64 {
     Timestamp::now().0 - i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2)
 }
 
-fn worker(row: &SqliteRow) -> Result<WorkerRow, StoreError> {
+fn worker(row: &SqliteRow) -> Result<WorkerRow> {
     let has_task = row.try_get::<Option<String>, _>("kind")?.is_some();
     Ok(WorkerRow {
         id: row.try_get("id")?,

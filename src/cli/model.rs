@@ -3,22 +3,22 @@
 use std::path::Path;
 
 use super::CliError;
+use crate::cli::error::Result;
 use crate::job::{Algorithm, TileSpec};
 use crate::pipeline::networks::{ModelFile, ModelRecord, NetworkSource};
 use crate::recon::learned::{Interface, PictureSize};
 use crate::recon::tile::TilePlan;
 
 /// An end-to-end network for one size of masks.
-pub struct Learned {
+pub struct Model {
     name: String,
-    /// Its ONNX file.
     pub file: ModelFile,
     interface: Interface,
 }
 
-impl Learned {
+impl Model {
     /// Loads the network once, to see what it takes.
-    pub fn open(path: &Path, network: &NetworkSource) -> Result<Self, CliError> {
+    pub fn open(path: &Path, network: &NetworkSource) -> Result<Self> {
         let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
         let interface = network.end_to_end(&file)?.interface();
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -26,10 +26,7 @@ impl Learned {
     }
 
     /// Which pictures it takes, for masks of frames x rows x columns.
-    pub fn size(
-        &self,
-        (frames, height, width): (usize, usize, usize),
-    ) -> Result<PictureSize, CliError> {
+    pub fn size(&self, (frames, height, width): (usize, usize, usize)) -> Result<PictureSize> {
         Ok(self.interface.check(frames, height, width)?)
     }
 
@@ -44,9 +41,9 @@ impl Learned {
 pub fn plan(
     algorithm: Algorithm,
     (tile, overlap): (Option<usize>, Option<usize>),
-    model: Option<&Learned>,
+    model: Option<&Model>,
     dim: (usize, usize, usize),
-) -> Result<TilePlan, CliError> {
+) -> Result<TilePlan> {
     let (_, height, width) = dim;
     let fixed = model.map(|model| model.size(dim)).transpose()? == Some(PictureSize::Fixed);
     let usual = if fixed { TileSpec::whole(height, width) } else { algorithm.default_tile() };
