@@ -12,7 +12,7 @@ use crate::formats::planar::Reader;
 use crate::formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use crate::formats::{self, FormatError, FrameReader, Limits, StackInfo};
 use crate::intake::error::Result;
-use crate::job::Finding;
+use crate::job::{Finding, MOST_MASKS};
 use crate::optics::{MeasurementStudy, REACH, judge_measurement};
 
 /// Side of a window that is looked at, without its margin.
@@ -32,14 +32,36 @@ pub struct Exposure {
 }
 
 /// Hands each mask on \[0,1\] to `sink`.
-/// Errors: whatever is wrong with the file; values outside the scale; masks without an open pixel;
-/// those of `sink`. What it received must be thrown away then.
+/// Errors: whatever is wrong with the file; a shape that masks don't have; values outside the scale; masks
+/// without an open pixel; those of `sink`. What it received must be thrown away then.
 pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
 ) -> Result<MaskStatistics> {
+    check_axes(&opened)?;
     check_masks(&mut *opened.reader, opened.full_scale, sink)
         .map_err(IntakeError::format(opened.name))
+}
+
+/// Refuses what has more frames than one exposure can tell apart, and what looks like masks whose last axis
+/// is the frame.
+fn check_axes(opened: &Opened) -> Result<()> {
+    let StackInfo { frames, height, width, .. } = opened.info;
+    if frames <= MOST_MASKS && (width >= frames || height < 4 * width) {
+        return Ok(());
+    }
+    let mut detail = format!("{frames} masks of {height}x{width} (rows x columns)");
+    if frames > MOST_MASKS {
+        detail += &format!("; a calibration has at most {MOST_MASKS}");
+    }
+    if width <= MOST_MASKS {
+        detail += &format!(
+            "; it looks like {width} masks of {frames}x{height}, saved as [row, column, frame]. \
+             [frame, row, column] is needed: python -c \"import numpy as n; n.save('masks.npy', \
+             n.moveaxis(n.load('FILE.npy'), -1, 0))\""
+        );
+    }
+    Err(IntakeError::Size { place: opened.name.clone(), detail })
 }
 
 /// Hands each snapshot, less its dark and divided by the full scale, to `sink`. Tells the share of full

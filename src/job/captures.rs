@@ -6,6 +6,8 @@ use super::{InvalidField, Sha256};
 
 /// The most patterns, and the most uploads for each.
 const MOST: usize = 4096;
+/// Masks of a calibration. Published systems have up to 50.
+pub const MOST_MASKS: usize = 64;
 
 /// Files by what they show, as uploads or as paths. Each has one frame or several: all are repeats of
 /// the same.
@@ -70,8 +72,8 @@ impl Captures {
     /// Errors: all that is wrong, each with its place.
     pub fn check(&self) -> Result<(), Vec<InvalidField>> {
         let mut errors = Vec::new();
-        if self.masks.is_empty() || self.masks.len() > MOST {
-            let detail = format!("{} patterns; it must be 1 to {MOST}", self.masks.len());
+        if self.masks.is_empty() || self.masks.len() > MOST_MASKS {
+            let detail = format!("{} patterns; it must be 1 to {MOST_MASKS}", self.masks.len());
             errors.push(InvalidField::new("/captures/masks", detail));
         }
         for (place, list) in self.lists() {

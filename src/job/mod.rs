@@ -16,7 +16,7 @@ mod text;
 pub use crate::recon::schedule::Schedule;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
-pub use captures::Captures;
+pub use captures::{Captures, MOST_MASKS};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };

@@ -83,6 +83,21 @@ fn colour_png() -> Vec<u8> {
 }
 
 #[tokio::test]
+async fn masks_with_their_axes_in_another_order_are_refused_with_how_to_turn_them() {
+    let app = TestApp::start().await;
+    // The third one would keep a worker busy for hours.
+    for shape in [[96, 128, 8], [64, 64, 8], [4096, 8, 8]] {
+        let answer = app.calibrate(constant(&shape, 0.5)).await;
+        let detail = answer.problem(422, "size_mismatch");
+        let turned = format!("8 masks of {}x{}", shape[0], shape[1]);
+        assert!(detail.contains(&turned) && detail.contains("moveaxis"), "{detail}");
+    }
+    let detail = app.calibrate(constant(&[65, 72, 72], 0.5)).await.problem(422, "size_mismatch");
+    assert!(detail.contains("at most 64") && !detail.contains("moveaxis"), "{detail}");
+    app.calibrate(constant(&[64, 8, 8], 0.5)).await.expect(201);
+}
+
+#[tokio::test]
 async fn measurements_that_do_not_fit_are_refused_with_both_sizes() {
     let app = TestApp::start().await;
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));

@@ -1,0 +1,116 @@
+"""Holds the samples under deploy/ and docker/ to the validators of those who read them.
+
+Usage: deploy.py ROOT. Says what was not checked because its program is not here; ends with 1 and the reasons
+if anything is wrong.
+"""
+
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+
+import kubernetes_validate
+import yaml
+
+VERSION = "1.31"
+
+
+def run(*command, **options):
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    return done.returncode, done.stdout + done.stderr
+
+
+def kubernetes(root, wrong):
+    folder = root / "deploy/kubernetes"
+    documents = []
+    for file in sorted(folder.glob("*.yaml")):
+        if file.name != "kustomization.yaml":
+            documents += [(file.name, each) for each in yaml.safe_load_all(file.read_text())]
+    listed = yaml.safe_load((folder / "kustomization.yaml").read_text())["resources"]
+    if sorted(listed) != sorted({name for name, _ in documents}):
+        wrong.append(f"kustomization.yaml lists {listed}")
+    for name, document in documents:
+        if document["kind"] == "ScaledJob":
+            # KEDA's own kind: what it makes jobs of is held to the schema of a job.
+            target = dict(document["spec"]["jobTargetRef"])
+            document = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "worker"}, "spec": target}
+        try:
+            kubernetes_validate.validate(document, VERSION, strict=True)
+        except kubernetes_validate.ValidationError as error:
+            wrong.append(f"{name}: {document['kind']}: {error.message}")
+
+
+def kustomize(root, wrong):
+    if not shutil.which("kubectl"):
+        return "kubectl"
+    with tempfile.TemporaryDirectory() as copy:
+        folder = pathlib.Path(copy) / "kubernetes"
+        shutil.copytree(root / "deploy/kubernetes", folder)
+        (folder / "secrets").mkdir()
+        for name in ["nats-server.conf", "hub.creds", "worker.creds"]:
+            (folder / "secrets" / name).write_text("x")
+        status, told = run("kubectl", "kustomize", str(folder))
+    if status:
+        wrong.append(f"kubectl kustomize: {told}")
+        return None
+    kinds = [each["kind"] for each in yaml.safe_load_all(told)]
+    if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
+        wrong.append(f"kubectl kustomize makes {kinds}")
+    return None
+
+
+def compose(root, wrong):
+    if not shutil.which("docker-compose"):
+        return "docker-compose"
+    files = ["-f", str(root / "docker/compose.yaml"), "-f", str(root / "docker/cluster.yaml")]
+    status, told = run("docker-compose", *files, "config")
+    if status:
+        wrong.append(f"docker-compose config: {told}")
+    return None
+
+
+def systemd(root, wrong):
+    if not shutil.which("systemd-analyze"):
+        return "systemd-analyze"
+    for unit in (root / "deploy/systemd").glob("*.service"):
+        _, told = run("systemd-analyze", "verify", str(unit))
+        # The program is not installed where this runs.
+        told = [line for line in told.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
+        if told:
+            wrong.append(f"{unit.name}: {told}")
+    return None
+
+
+def dashboard(root, wrong):
+    board = json.loads((root / "deploy/grafana/sci-recon.json").read_text())
+    names = {name for panel in board["panels"] for target in panel.get("targets", [])
+             for name in words(target["expr"])}
+    described = set()
+    for file in (root / "src").rglob("*.rs"):
+        described |= words(file.read_text())
+    missing = {name for name in names if name.removesuffix("_bucket") not in described}
+    if missing or not names:
+        wrong.append(f"sci-recon.json asks for figures that the service does not have: {sorted(missing)}")
+
+
+def words(text):
+    clean = "".join(c if c.isalnum() or c == "_" else " " for c in text)
+    return {word for word in clean.split() if word.startswith("sci_recon_")}
+
+
+def main():
+    root, wrong = pathlib.Path(sys.argv[1]), []
+    kubernetes(root, wrong)
+    dashboard(root, wrong)
+    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd)) if name]
+    if absent:
+        print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
+    for reason in wrong:
+        print(reason, file=sys.stderr)
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()
