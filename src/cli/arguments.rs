@@ -79,7 +79,6 @@ impl ScheduleArguments {
 }
 
 impl NetworkArguments {
-    /// The source of denoisers.
     pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable is one that is not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());

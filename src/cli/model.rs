@@ -30,7 +30,6 @@ impl Model {
         Ok(self.interface.check(frames, height, width)?)
     }
 
-    /// For a manifest.
     pub fn record(&self) -> ModelRecord {
         ModelRecord { name: self.name.clone(), sha256: self.file.sha256().to_string() }
     }

@@ -28,7 +28,6 @@ pub(super) fn show(bar: &ProgressBar, share: f64) {
     bar.set_position((share.clamp(0.0, 1.0) * STEPS as f64) as u64);
 }
 
-/// The tiles of one snapshot on one bar.
 pub(super) struct SnapshotBar {
     bar: ProgressBar,
     shares: Mutex<Vec<f64>>,

@@ -144,7 +144,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     report.print(arguments)
 }
 
-/// The network of `--model`.
 fn model(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Model>> {
     let Some(path) = &arguments.model else { return Ok(None) };
     match arguments.schedule.algorithm {

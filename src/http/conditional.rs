@@ -39,10 +39,11 @@ pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Respon
 /// What part of a file is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wanted {
-    /// All of it.
     Whole,
-    /// The bytes from `start`, `length` of them.
-    Part { start: u64, length: u64 },
+    Part {
+        start: u64,
+        length: u64,
+    },
     /// Bytes that are not there.
     Outside,
 }

@@ -38,7 +38,6 @@ struct Change {
     more: bool,
 }
 
-/// The version of each job, by lab and job.
 type Versions = HashMap<(Lab, JobId), JobMark>;
 
 type Changes = Arc<HashMap<Lab, String>>;

@@ -52,7 +52,6 @@ pub(super) async fn show(
     conditional::json(&QualityBody { truth, quality: frames.await?.into() }, &headers)
 }
 
-/// Where the frames of a snapshot are.
 async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf> {
     match app.store.result_file(job, Some(snapshot), "frames.npy").await {
         Ok((_, path)) => Ok(path),

@@ -11,7 +11,6 @@ use crate::recon::prior::registry::TV_FASTDVDNET;
 use crate::recon::prior::tv::TV;
 use crate::recon::schedule::Schedule;
 
-/// The algorithms.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray,
 )]

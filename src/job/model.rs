@@ -43,11 +43,9 @@ pub enum ModelVerdict {
     Refused(String),
 }
 
-/// The network of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobModel {
     pub id: ModelId,
-    /// The calibration that it was registered for.
     pub calibration: CalibrationId,
     pub name: Option<Label>,
     /// Hash of its ONNX file.

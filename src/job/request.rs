@@ -101,7 +101,6 @@ pub struct JobRequest {
 /// A job after all checks: nothing is left open, and it is stored and recorded as it stands here.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobSpec {
-    /// The calibration of the measurement.
     pub calibration: CalibrationId,
     pub measurement: MeasurementId,
     pub shape: SceneShape,

@@ -31,7 +31,6 @@ pub struct InvalidField {
 }
 
 impl InvalidField {
-    /// `detail` is wrong at `pointer`.
     pub fn new(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
         Self { pointer: pointer.into(), detail: detail.into() }
     }
@@ -105,7 +104,6 @@ impl Sha256 {
         Ok((Self(hasher.finalize().into()), size))
     }
 
-    /// The hash of `bytes`.
     pub fn of(bytes: &[u8]) -> Self {
         use sha2::Digest;
         Self(sha2::Sha256::digest(bytes).into())

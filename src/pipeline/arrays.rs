@@ -33,7 +33,6 @@ impl Arrays {
         Ok(())
     }
 
-    /// The masks, to be read one by one.
     pub(super) fn masks(&self) -> Result<Reader, FormatError> {
         Reader::open(&self.masks.0, &Limits::default())
     }

@@ -17,7 +17,6 @@ use crate::job::{
 };
 use crate::recon::tile::TilePlan;
 
-/// Version of this program.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// What the names of all our records begin with.
@@ -210,7 +209,6 @@ impl CameraRecord {
     }
 }
 
-/// `manifest.json` of a job.
 #[derive(Debug, Serialize)]
 pub struct JobManifest {
     schema: &'static str,
@@ -278,7 +276,6 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
     (0..content.frames).map(frame).collect()
 }
 
-/// A manifest for tests.
 #[cfg(test)]
 pub(super) fn sample(frames: usize) -> Manifest {
     let hash = Sha256::of(b"");

@@ -73,7 +73,6 @@ impl ModelRecord {
         schedule.networks().into_iter().map(record).collect()
     }
 
-    /// Those of a job.
     pub fn of_job(spec: &JobSpec) -> Vec<Self> {
         let model = spec.model.as_ref().map(|model| Self {
             name: model.name.as_ref().map_or("learned", Label::as_str).to_owned(),
@@ -103,7 +102,6 @@ impl ModelFile {
         Self { path, sha256 }
     }
 
-    /// A file as it is.
     pub fn open(path: &Path) -> Result<Self, NetworkError> {
         let bytes = read(path)?;
         Ok(Self { path: path.to_owned(), sha256: Sha256::of(&bytes) })
@@ -114,7 +112,6 @@ impl ModelFile {
         self.sha256
     }
 
-    /// The content.
     fn read(&self) -> Result<Vec<u8>, NetworkError> {
         let bytes = read(&self.path)?;
         let found = Sha256::of(&bytes);
@@ -135,7 +132,6 @@ const LIBRARY: &str = "libonnxruntime.so";
 /// Why there is no denoiser.
 #[derive(Debug, thiserror::Error)]
 pub enum NetworkError {
-    /// No libonnxruntime was found.
     #[error(
         "no libonnxruntime: {0}; name it with --onnxruntime or ORT_DYLIB_PATH, or fetch it with \
          scripts/fetch-onnxruntime.sh"
@@ -171,7 +167,6 @@ impl NetworkSource {
         Self { models: folder, ..self }
     }
 
-    /// The networks of a schedule, for records.
     pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;

@@ -123,7 +123,6 @@ pub(super) struct ShareDone {
 }
 
 impl ShareDone {
-    /// For one run of `schedule`.
     pub(super) fn new(schedule: Schedule) -> Self {
         Self { schedule, stage: 0, iterations: 0 }
     }

@@ -26,7 +26,6 @@ pub struct PilotRecord {
 }
 
 impl PilotRecord {
-    /// The schedule for the tiles.
     pub fn decide(&self, schedule: &Schedule) -> Schedule {
         let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
         schedule.decided(&found.collect::<Vec<_>>())
@@ -152,7 +151,6 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Of these tiles.
     pub fn of(tiles: &[TileRecord]) -> Self {
         let converged = tiles.iter().all(|tile| tile.stop_reason == "converged");
         Self {

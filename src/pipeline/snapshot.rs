@@ -38,7 +38,6 @@ pub enum Solver<'a> {
 }
 
 impl SnapshotInput<'_> {
-    /// What one tile is made of.
     fn window(&self, rows: Range<usize>, columns: Range<usize>) -> TileInput {
         let y = self.measurement.slice(s![rows.clone(), columns.clone()]);
         TileInput {

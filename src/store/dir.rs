@@ -72,12 +72,10 @@ impl DataDir {
         self.root.join("results")
     }
 
-    /// The folder with the results of a job.
     pub fn results(&self, job: JobId) -> PathBuf {
         self.all_results().join(job.to_string())
     }
 
-    /// The folder with the results of one snapshot of a job.
     pub fn snapshot_results(&self, job: JobId, snapshot: u32) -> PathBuf {
         self.results(job).join(format!("snapshot_{snapshot:04}"))
     }

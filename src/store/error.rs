@@ -18,7 +18,6 @@ pub enum StoreError {
     Corrupt { column: &'static str, value: String },
     #[error("{path} is no data folder of a service", path = .0.display())]
     NoFolder(PathBuf),
-    /// Another server has the folder.
     #[error(
         "another server uses {path}; stop it first, or give this one its own --data",
         path = .0.display()

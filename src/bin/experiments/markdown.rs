@@ -20,7 +20,6 @@ struct Group<'a> {
     rows: Vec<Option<&'a Row>>,
 }
 
-/// A table; rows that are short of cells end in dashes.
 pub fn table(head: Vec<String>, rows: impl Iterator<Item = Vec<String>>) -> String {
     let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
     let mut text = line(&head) + &line(&vec!["---".to_owned(); head.len()]);

@@ -73,7 +73,6 @@ struct Record {
     crossing_sigma: Option<f64>,
 }
 
-/// One kind of masks.
 #[derive(Debug, Serialize)]
 struct Curve {
     masks: &'static str,
@@ -270,7 +269,6 @@ fn chart(record: &Record) -> String {
     chart.into_string() + "\n"
 }
 
-/// A curve and its line of the legend.
 fn polyline(points: Vec<(f64, f64)>, name: &str, index: usize) -> Markup {
     let colour = ["#0b57a8", "#b3541e"][index % 2];
     let (left, label) = (PLANE[0], 22.0 + 18.0 * index as f64);

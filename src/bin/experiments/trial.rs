@@ -33,7 +33,6 @@ pub fn solve_on_all_cores(
 /// Makes rows.
 pub struct Bench {
     network: NetworkSource,
-    /// The network of `learned`.
     learned: Option<Model>,
     setting: Setting,
 }

@@ -25,7 +25,6 @@ use service::Service;
 const REPORT: &str = "demo.json";
 /// What the demo makes in its folder.
 const PARTS: [&str; 4] = ["input", "service", "frames", "service.log"];
-/// What the demo compares.
 const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastdvdnet];
 /// Time between looks at the jobs.
 const POLL: Duration = Duration::from_millis(250);

@@ -24,7 +24,6 @@ const FRAMES: [&[u8]; 8] = [
     include_bytes!("../../../demo/clip/frame_0008.png"),
 ];
 
-/// Seed of the masks.
 const SEED: u64 = 1;
 
 /// Writes `masks.npy`, `measurement.npy` and the true frames as PNG into `folder`, and gives the

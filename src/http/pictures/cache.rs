@@ -59,7 +59,6 @@ impl Pictures {
         Self { reduced, turns: Semaphore::new(AT_ONCE) }
     }
 
-    /// The values of a region.
     pub(super) async fn reduced(&self, picture: Arc<Picture>, region: Region) -> Result<Values> {
         let key = (picture.identity.clone(), region.clone());
         let reduce = async {

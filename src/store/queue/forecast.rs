@@ -5,17 +5,10 @@
 //! lab has been served `w` times the ratio of their shares, or all that it wanted.
 
 use std::collections::{BTreeMap, HashMap};
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sqlx::Row;
+use crate::job::JobId;
 
-use crate::job::{JobId, JobState};
-use crate::store::Store;
-use crate::store::error::Result;
-
-/// Workers that were silent for longer do not count.
-const WORKER_AGE: Duration = Duration::from_secs(15);
 /// A forecast is good for so long for each job in it, about twenty times as long as it takes to make: it
 /// costs a twentieth of a core, however many ask.
 const KEPT_PER_JOB: Duration = Duration::from_micros(50);
@@ -55,13 +48,13 @@ struct Ahead {
 
 /// A job that has not ended.
 #[derive(Debug)]
-struct Unfinished {
-    id: JobId,
-    lab: usize,
-    priority: i64,
-    waits: bool,
+pub(super) struct Unfinished {
+    pub(super) id: JobId,
+    pub(super) lab: usize,
+    pub(super) priority: i64,
+    pub(super) waits: bool,
     /// Planned CPU-seconds that are left of it.
-    left: f64,
+    pub(super) left: f64,
 }
 
 impl Forecast {
@@ -88,79 +81,34 @@ impl Forecast {
         self.ahead(job).position
     }
 
-    fn ahead(&self, job: JobId) -> Ahead {
-        self.jobs.get(&job).copied().unwrap_or(self.of_a_new_one)
-    }
-}
-
-impl Store {
-    /// What is ahead of every unfinished job, a moment ago or now.
-    pub(in crate::store) async fn forecast(&self) -> Result<Arc<Forecast>> {
-        let mut kept = self.forecast.lock().await;
-        if let Some(forecast) = kept.as_ref().filter(|forecast| Instant::now() < forecast.until) {
-            return Ok(forecast.clone());
-        }
-        Ok(kept.insert(self.new_forecast().await?.into()).clone())
-    }
-
-    async fn new_forecast(&self) -> Result<Forecast> {
-        let rows = sqlx::query(
-            "SELECT id, lab, priority, state, tiles_left + others_left AS left
-             FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
-             WHERE finished_at IS NULL ORDER BY id",
-        )
-        .fetch_all(&self.readers)
-        .await?;
-        let (mut names, mut unfinished) = (HashMap::new(), Vec::with_capacity(rows.len()));
-        for row in &rows {
-            let lab: String = row.try_get("lab")?;
-            let next = names.len();
-            unfinished.push(Unfinished {
-                id: row.try_get("id")?,
-                lab: *names.entry(lab).or_insert(next),
-                priority: row.try_get("priority")?,
-                waits: row.try_get::<JobState, _>("state")? == JobState::Queued,
-                left: row.try_get("left")?,
-            });
-        }
-        let mut shares = vec![1.0; names.len()];
-        for row in sqlx::query("SELECT lab, share FROM labs").fetch_all(&self.readers).await? {
-            if let Some(lab) = names.get(&row.try_get::<String, _>("lab")?) {
-                shares[*lab] = row.try_get("share")?;
-            }
-        }
-        let jobs = ahead(&unfinished, &shares);
-        let workers = self.live_workers(WORKER_AGE).await?.len();
+    /// For as many workers, which take these seconds for a planned CPU-second of tiles and of other tasks.
+    pub(super) fn new(
+        unfinished: &[Unfinished],
+        shares: &[f64],
+        workers: usize,
+        (rate, others_rate): (f64, f64),
+    ) -> Self {
         let of_a_new_one = Ahead {
             cost: unfinished.iter().map(|job| job.left).sum(),
             position: 1 + unfinished.iter().filter(|job| job.waits).count(),
         };
-        let (rate, others_rate) = self.rates().await?;
-        Ok(Forecast {
+        Self {
             workers: count(workers),
             rate,
             others_rate,
-            jobs,
+            jobs: ahead(unfinished, shares),
             of_a_new_one,
             until: Instant::now() + (KEPT_PER_JOB * count(unfinished.len())).min(KEPT_AT_MOST),
-        })
+        }
     }
 
-    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: measured on
-    /// the last tasks of a kind, by what they really did and not by what was planned; 1 before there are
-    /// any.
-    async fn rates(&self) -> Result<(f64, f64)> {
-        let row = sqlx::query(
-            "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
-                    / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
-                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
-                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
-             FROM totals",
-        )
-        .fetch_one(&self.readers)
-        .await?;
-        let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
-        Ok((rate(row.try_get("tiles")?), rate(row.try_get("others")?)))
+    /// False once it should be made anew.
+    pub(super) fn is_good(&self) -> bool {
+        Instant::now() < self.until
+    }
+
+    fn ahead(&self, job: JobId) -> Ahead {
+        self.jobs.get(&job).copied().unwrap_or(self.of_a_new_one)
     }
 }
 

@@ -5,18 +5,23 @@
 //! longest task` (Graham); tiles are taken to cost what those of the same job that are done did.
 
 use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
 
 use serde::Serialize;
 use serde_json::Value;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
-use super::forecast::{Forecast, Left};
+use super::forecast::{Forecast, Left, Unfinished};
 use crate::job::{JobId, JobState, Lab, TaskStage, TaskState};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::tables::jobs::Job;
+
+/// Workers that were silent for longer do not count.
+const WORKER_AGE: Duration = Duration::from_secs(15);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -150,6 +155,62 @@ impl Store {
             }
         }
         Ok(marks)
+    }
+
+    /// What is ahead of every unfinished job, a moment ago or now.
+    async fn forecast(&self) -> Result<Arc<Forecast>> {
+        let mut kept = self.forecast.lock().await;
+        if let Some(forecast) = kept.as_ref().filter(|forecast| forecast.is_good()) {
+            return Ok(forecast.clone());
+        }
+        Ok(kept.insert(self.new_forecast().await?.into()).clone())
+    }
+
+    async fn new_forecast(&self) -> Result<Forecast> {
+        let rows = sqlx::query(
+            "SELECT id, lab, priority, state, tiles_left + others_left AS left
+             FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
+             WHERE finished_at IS NULL ORDER BY id",
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        let (mut names, mut unfinished) = (HashMap::new(), Vec::with_capacity(rows.len()));
+        for row in &rows {
+            let lab: String = row.try_get("lab")?;
+            let next = names.len();
+            unfinished.push(Unfinished {
+                id: row.try_get("id")?,
+                lab: *names.entry(lab).or_insert(next),
+                priority: row.try_get("priority")?,
+                waits: row.try_get::<JobState, _>("state")? == JobState::Queued,
+                left: row.try_get("left")?,
+            });
+        }
+        let mut shares = vec![1.0; names.len()];
+        for row in sqlx::query("SELECT lab, share FROM labs").fetch_all(&self.readers).await? {
+            if let Some(lab) = names.get(&row.try_get::<String, _>("lab")?) {
+                shares[*lab] = row.try_get("share")?;
+            }
+        }
+        let workers = self.live_workers(WORKER_AGE).await?.len();
+        Ok(Forecast::new(&unfinished, &shares, workers, self.rates().await?))
+    }
+
+    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: measured on
+    /// the last tasks of a kind, by what they really did and not by what was planned; 1 before there are
+    /// any.
+    async fn rates(&self) -> Result<(f64, f64)> {
+        let row = sqlx::query(
+            "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
+                    / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
+                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
+                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
+             FROM totals",
+        )
+        .fetch_one(&self.readers)
+        .await?;
+        let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
+        Ok((rate(row.try_get("tiles")?), rate(row.try_get("others")?)))
     }
 }
 

@@ -49,7 +49,6 @@ pub struct Calibration {
     pub facts: NewCalibration,
 }
 
-/// A calibration whose masks are not there.
 #[derive(Debug, Clone)]
 pub struct Unready {
     pub id: CalibrationId,

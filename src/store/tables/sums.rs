@@ -6,7 +6,6 @@ use crate::job::{JobId, TaskState};
 use crate::store::error::Result;
 use crate::store::rows::sql;
 
-/// Counts the tasks of a job anew.
 pub async fn recount(connection: &mut SqliteConnection, job: JobId) -> Result<()> {
     sql!(
         "INSERT OR REPLACE INTO job_sums (job, cost, tiles_left, tiles_longest, others_left,
