@@ -8,6 +8,7 @@ use sqlx::types::Json;
 use sqlx::{FromRow, Row, SqliteConnection};
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
+use super::remote;
 use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, JobState, Label, Sha256, TaskKind, TaskStage,
     TaskState, Timestamp, WorkerId,
@@ -72,20 +73,49 @@ pub struct CalibrationTask {
     pub masks: Option<Sha256>,
 }
 
+/// Who asks for a task, and so which tasks may be handed out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Claimant<'a> {
+    /// A worker of this machine that does all there is.
+    Local,
+    /// One that leaves the tiles to other machines.
+    WithoutTiles,
+    /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
+    /// run out.
+    Pool(&'a str),
+}
+
+impl Claimant<'_> {
+    /// Whether it takes tiles, and whether it takes others.
+    fn takes(self) -> (bool, bool) {
+        (self != Self::WithoutTiles, !matches!(self, Self::Pool(_)))
+    }
+}
+
 impl Store {
-    /// Hands out the next task, if there is one.
+    /// Hands out the next task of any kind, if there is one.
     pub async fn claim(
         &self,
         worker: WorkerId,
         length: Duration,
     ) -> Result<Option<ClaimedTask>, StoreError> {
+        self.claim_as(Claimant::Local, worker, length).await
+    }
+
+    /// Hands out the next task that this claimant may have, if there is one.
+    pub async fn claim_as(
+        &self,
+        claimant: Claimant<'_>,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>, StoreError> {
         let now = Timestamp::now().0;
-        if !self.may_have_work(now).await? {
+        if !self.may_have_work(claimant, now).await? {
             return Ok(None);
         }
         let mut transaction = self.write().await?;
         lease::reap(&mut transaction, now).await?;
-        let claimed = take(&mut transaction, worker, length, now).await?;
+        let claimed = take(&mut transaction, claimant, worker, length, now).await?;
         let Some(row) = claimed else {
             transaction.commit().await?;
             return Ok(None);
@@ -104,13 +134,12 @@ impl Store {
         {
             jobs::set_state(&mut transaction, job, JobState::Running, None).await?;
         }
+        if let Claimant::Pool(pool) = claimant {
+            remote::hand_over(&mut transaction, &lease, pool).await?;
+        }
         workers::seen(&mut transaction, worker).await?;
         transaction.commit().await?;
-        let work = match owner {
-            Owner::Job(job) => self.job_task(job, kind).await,
-            Owner::Calibration(id) => self.calibration_task(id).await,
-        };
-        match work {
+        match self.work(owner, kind).await {
             Ok(work) => Ok(Some(ClaimedTask { lease, kind, cost: row.try_get("cost")?, work })),
             Err(error) => {
                 self.part(&lease, &Loss::Lost(error.to_string())).await?;
@@ -119,14 +148,32 @@ impl Store {
         }
     }
 
+    /// All that a task needs.
+    pub(super) async fn work(&self, owner: Owner, kind: TaskKind) -> Result<Work, StoreError> {
+        match owner {
+            Owner::Job(job) => self.job_task(job, kind).await,
+            Owner::Calibration(id) => self.calibration_task(id).await,
+        }
+    }
+
     /// Looks without the lock: most of the time there is nothing to do.
-    async fn may_have_work(&self, now: i64) -> Result<bool, StoreError> {
+    async fn may_have_work(&self, claimant: Claimant<'_>, now: i64) -> Result<bool, StoreError> {
+        let (tiles, others) = claimant.takes();
         let found = sql!(
             "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = ?1
-                                        AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4)
+                                        AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4
+                                        AND CASE kind WHEN 'tile' THEN ?6 ELSE ?7 END)
                  OR EXISTS (SELECT 1 FROM tasks WHERE state = ?2
                                 AND lease_until NOT BETWEEN ?3 AND ?3 + ?5)",
-            [TaskState::Ready, TaskState::Running, now, LONGEST_PAUSE, LONGEST_LEASE]
+            [
+                TaskState::Ready,
+                TaskState::Running,
+                now,
+                LONGEST_PAUSE,
+                LONGEST_LEASE,
+                tiles,
+                others
+            ]
         )
         .fetch_optional(&self.readers)
         .await?;
@@ -181,15 +228,18 @@ impl Store {
 /// One statement finds the next task, marks it and counts the attempt.
 async fn take(
     connection: &mut SqliteConnection,
+    claimant: Claimant<'_>,
     worker: WorkerId,
     length: Duration,
     now: i64,
 ) -> Result<Option<SqliteRow>, StoreError> {
+    let (tiles, others) = claimant.takes();
     let row = sql!(
         "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
              stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
          WHERE id = (SELECT id FROM tasks
                      WHERE state = ?5 AND ready_at NOT BETWEEN ?6 + 1 AND ?6 + ?7
+                       AND CASE kind WHEN 'tile' THEN ?8 ELSE ?9 END
                      ORDER BY priority DESC, job, ordinal, id LIMIT 1)
          RETURNING id, job, calibration, kind, snapshot, tile, attempt, cost",
         [
@@ -199,7 +249,9 @@ async fn take(
             TaskStage::Reading,
             TaskState::Ready,
             now,
-            LONGEST_PAUSE
+            LONGEST_PAUSE,
+            tiles,
+            others
         ]
     )
     .fetch_optional(connection)

@@ -258,7 +258,7 @@ pub(super) async fn end_attempt(
 
 /// Parts a running task from its worker: it becomes ready again, or is cancelled with its job, or
 /// is given up and its job or calibration with it.
-async fn lose(
+pub(super) async fn lose(
     connection: &mut SqliteConnection,
     task: TaskId,
     loss: &Loss,

@@ -20,4 +20,4 @@ pub use models::{Model, ModelFilter, NewModel};
 pub use partials::{FoundPartial, NewPartial, Partial, PartialFile};
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
-pub use workers::{WorkerRow, WorkerTask};
+pub use workers::{WorkerPlace, WorkerRow, WorkerTask};
