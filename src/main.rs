@@ -27,6 +27,8 @@ enum Command {
     Token(cli::token::Arguments),
     Backup(cli::backup::Arguments),
     CheckModel(cli::check_model::Arguments),
+    #[cfg(feature = "nats")]
+    Cluster(cli::cluster::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -42,6 +44,8 @@ fn main() -> ExitCode {
         Command::Token(arguments) => cli::token::run(&arguments),
         Command::Backup(arguments) => cli::backup::run(&arguments),
         Command::CheckModel(arguments) => cli::check_model::run(&arguments),
+        #[cfg(feature = "nats")]
+        Command::Cluster(arguments) => cli::cluster::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

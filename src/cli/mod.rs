@@ -12,6 +12,8 @@ mod supervisor;
 pub mod backup;
 pub mod calibrate;
 pub mod check_model;
+#[cfg(feature = "nats")]
+pub mod cluster;
 pub mod demo;
 pub mod optics;
 pub mod reconstruct;

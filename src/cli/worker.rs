@@ -37,6 +37,8 @@ pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
                 tracing::info!("{error}");
                 Ok(())
             }
+            #[cfg(feature = "nats")]
+            Err(WorkEnd::Cluster(error)) => Err(error.into()),
             ended => ended.map_err(|error| failed(&error)),
         }
     });

@@ -34,6 +34,8 @@ pub enum ClusterError {
     Nats { action: &'static str, reason: String },
     #[error("the server refuses this worker: {0}")]
     Refused(String),
+    #[error("{path}: {reason}")]
+    Authority { path: String, reason: String },
     #[error("the cache {path}: {reason}")]
     Cache { path: String, reason: String },
 }

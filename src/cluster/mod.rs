@@ -13,8 +13,11 @@
 //! one report of each attempt.
 
 mod arrays;
+mod authority;
 mod blobs;
 mod cache;
+mod check;
+pub mod configuration;
 mod connection;
 mod hub;
 mod message;
@@ -22,6 +25,9 @@ mod names;
 mod remote;
 mod setup;
 
+pub use authority::{Authority, HUB as HUB_CREDENTIAL, Issued};
+pub use check::Check;
+pub use configuration::Node;
 pub use connection::{ClusterError, Connection, Credential};
 pub use hub::{Hub, describe_metrics};
 pub use remote::{Remote, RemoteSettings};

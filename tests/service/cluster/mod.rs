@@ -1,6 +1,9 @@
 //! Workers on other machines, over real message servers on ports of this one.
 
+mod hostile;
 mod nodes;
+mod proxy;
+mod rounds;
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -215,7 +218,7 @@ async fn a_worker_of_another_version_is_refused_with_both() {
     let asked = futures_util::StreamExt::next(&mut hellos).await.unwrap();
     client.publish(asked.reply.unwrap(), refused.into()).await.unwrap();
     client.flush().await.unwrap();
-    assert_eq!(unwelcome.process.ended(Duration::from_secs(10)), Some(1));
+    assert_eq!(unwelcome.process.ended(Duration::from_secs(10)), Some(2));
     assert!(unwelcome.said().contains("0.0.7"), "{}", unwelcome.said());
 }
 

@@ -77,6 +77,11 @@ impl Drop for Process {
 pub struct Nats {
     program: PathBuf,
     folder: TempDir,
+    /// Where nodes keep their messages.
+    stores: PathBuf,
+    configurations: Vec<PathBuf>,
+    /// True if it asks for credentials.
+    secured: bool,
     pub ports: Vec<u16>,
     pub nodes: Vec<Option<Process>>,
 }
@@ -106,12 +111,143 @@ impl Nats {
             }
             std::fs::write(folder.path().join(format!("n{n}.conf")), text).unwrap();
         }
-        let nodes = (0..count).map(|_| None).collect();
-        let mut nats = Self { program, folder, ports: ports.to_vec(), nodes };
-        for n in 0..count {
+        let configurations = (0..count).map(|n| folder.path().join(format!("n{n}.conf"))).collect();
+        let stores = folder.path().to_owned();
+        Some(Self::run(program, folder, stores, configurations, ports.to_vec(), false))
+    }
+
+    /// With the configuration that `sci-recon cluster init` writes; none if there is no nats-server.
+    pub fn secured(count: usize, more: &[&str]) -> Option<Self> {
+        let program = server()?;
+        let folder = tempfile::tempdir().unwrap();
+        let (keys, stores) = (folder.path().join("keys"), folder.path().join("stores"));
+        let mut line: Vec<String> = ["cluster", "init", "--keys"].map(str::to_owned).to_vec();
+        line.extend([keys.to_str().unwrap().into(), "--store".into()]);
+        line.extend([
+            stores.to_str().unwrap().into(),
+            "--store-bytes".into(),
+            "20000000000".into(),
+        ]);
+        let mut ports = Vec::new();
+        while ports.len() < count {
+            let port = self::ports(1)[0];
+            // Nodes meet each other 2000 above.
+            if port < 60_000 && TcpListener::bind(("127.0.0.1", port + 2000)).is_ok() {
+                line.extend(["--node".into(), format!("127.0.0.1:{port}")]);
+                ports.push(port);
+            }
+        }
+        line.extend(more.iter().map(|&word| word.to_owned()));
+        let made = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+            .args(line)
+            .env("NATS_SERVER", &program)
+            .output()
+            .unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        let said = String::from_utf8(made.stdout).unwrap();
+        let lines = said.lines().filter_map(|line| line.strip_prefix("nats-server -c "));
+        let configurations: Vec<PathBuf> = lines.map(PathBuf::from).collect();
+        assert_eq!(configurations.len(), count, "{said}");
+        Some(Self::run(program, folder, stores, configurations, ports, true))
+    }
+
+    fn run(
+        program: PathBuf,
+        folder: TempDir,
+        stores: PathBuf,
+        configurations: Vec<PathBuf>,
+        ports: Vec<u16>,
+        secured: bool,
+    ) -> Self {
+        let nodes = configurations.iter().map(|_| None).collect();
+        let mut nats = Self { program, folder, stores, configurations, secured, ports, nodes };
+        for n in 0..nats.nodes.len() {
             nats.begin(n);
         }
-        Some(nats)
+        nats
+    }
+
+    /// The folder with the keys.
+    pub fn keys(&self) -> PathBuf {
+        self.folder.path().join("keys")
+    }
+
+    /// The credential of the server.
+    pub fn hub(&self) -> PathBuf {
+        self.keys().join("hub.creds")
+    }
+
+    /// What `sci-recon cluster` prints for these arguments.
+    pub fn cluster(&self, arguments: &[&str]) -> Result<String, String> {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        let ran = command.arg("cluster").args(arguments).arg("--keys").arg(self.keys()).output();
+        let ran = ran.unwrap();
+        let text = |bytes| String::from_utf8(bytes).unwrap();
+        if ran.status.success() { Ok(text(ran.stdout)) } else { Err(text(ran.stderr)) }
+    }
+
+    /// A credential for workers of a pool, in a file that everybody may read.
+    pub fn credential(&self, pool: &str) -> PathBuf {
+        let path = self.folder.path().join(format!("{pool}.creds"));
+        self.cluster(&["worker", "create", "--pool", pool, "--out", path.to_str().unwrap()])
+            .unwrap();
+        path
+    }
+
+    /// SIGKILL.
+    pub fn end(&mut self, n: usize) {
+        if let Some(mut node) = self.nodes[n].take() {
+            node.kill();
+        }
+    }
+
+    pub fn signal(&self, n: usize, signal: Signal) {
+        if let Some(node) = &self.nodes[n] {
+            node.signal(signal);
+        }
+    }
+
+    /// Removes all messages of a node that does not run.
+    pub fn wipe(&self, n: usize) {
+        let several = self.nodes.len() > 1;
+        let store = match (self.secured, several) {
+            (true, true) => self.stores.join(format!("n{}", n + 1)),
+            (true, false) => self.stores.clone(),
+            (false, _) => self.stores.join(format!("store{n}")),
+        };
+        std::fs::remove_dir_all(store.join("jetstream")).unwrap();
+    }
+
+    /// The node that leads the stream of tiles.
+    pub async fn leader(&self) -> usize {
+        let context = async_nats::jetstream::new(self.client().await);
+        let Ok(stream) = context.get_stream("SCI_TASKS").await else { return 0 };
+        let leader = stream.cached_info().cluster.as_ref().and_then(|all| all.leader.clone());
+        let digits: String =
+            leader.unwrap_or_default().chars().filter(char::is_ascii_digit).collect();
+        digits.parse::<usize>().map_or(0, |n| (n - 1) % self.nodes.len())
+    }
+
+    /// Writes something else over a chunk that is stored.
+    pub async fn corrupt(&self, stream: &str) {
+        use futures_util::TryStreamExt;
+        let client = self.client().await;
+        let context = async_nats::jetstream::new(client);
+        for _ in 0..100 {
+            if let Ok(found) = context.get_stream(stream).await
+                && let Ok(subjects) = found.info_with_subjects(">").await
+                && let Ok(all) = subjects.try_collect::<Vec<_>>().await
+                && let Some((subject, _)) = all.first()
+            {
+                let garbage = vec![0x5a; 1000];
+                if let Ok(sent) = context.publish(subject.clone(), garbage.into()).await {
+                    let _ = sent.await;
+                    return;
+                }
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        eprintln!("nothing was in {stream} to be corrupted");
     }
 
     /// Starts a node, on the disk that it had.
@@ -119,7 +255,7 @@ impl Nats {
         let log = std::fs::File::create(self.folder.path().join(format!("n{n}.log"))).unwrap();
         let child = Command::new(&self.program)
             .arg("-c")
-            .arg(self.folder.path().join(format!("n{n}.conf")))
+            .arg(&self.configurations[n])
             .env("GOMEMLIMIT", "400MiB")
             .stderr(log)
             .stdin(Stdio::null())
@@ -142,7 +278,30 @@ impl Nats {
     pub async fn client(&self) -> async_nats::Client {
         let urls: Vec<async_nats::ServerAddr> =
             self.url().split(',').map(|url| url.parse().unwrap()).collect();
-        async_nats::connect(urls).await.unwrap()
+        let mut options = match self.secured {
+            true => async_nats::ConnectOptions::with_credentials_file(self.hub()).await.unwrap(),
+            false => async_nats::ConnectOptions::new(),
+        };
+        let authority = self.keys().join("ca.pem");
+        if authority.exists() {
+            options = options.add_root_certificates(authority).require_tls(true);
+        }
+        options.connect(urls).await.unwrap()
+    }
+
+    /// The subject of a message in a stream, once there is one.
+    pub async fn subject_in(&self, stream: &str) -> String {
+        use futures_util::TryStreamExt;
+        let context = async_nats::jetstream::new(self.client().await);
+        loop {
+            let found = context.get_stream(stream).await.unwrap();
+            let subjects = found.info_with_subjects(">").await.unwrap();
+            let subjects: Vec<(String, usize)> = subjects.try_collect().await.unwrap();
+            if let Some((subject, _)) = subjects.into_iter().next() {
+                return subject;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
     }
 
     /// Messages in each stream.
@@ -150,8 +309,10 @@ impl Nats {
         let context = async_nats::jetstream::new(self.client().await);
         let mut found = Vec::new();
         for name in ["SCI_TASKS", "SCI_EVENTS", "SCI_IN", "SCI_OUT"] {
-            let stream = context.get_stream(name).await.unwrap();
-            found.push((name.to_owned(), stream.cached_info().state.messages));
+            // A cluster may be about to choose a leader.
+            let stream = context.get_stream(name).await;
+            let count = stream.map_or(1, |stream| stream.cached_info().state.messages);
+            found.push((name.to_owned(), count));
         }
         found
     }
@@ -192,11 +353,25 @@ pub struct RemoteWorker {
     pub process: Process,
     pub folder: TempDir,
     pub log: PathBuf,
+    credential: Option<tempfile::NamedTempFile>,
 }
 
 impl RemoteWorker {
     pub fn start(arguments: &[&str]) -> Self {
         Self::within(&[], arguments)
+    }
+
+    /// With a credential, of which it gets a copy of its own.
+    pub fn with_credential(credential: &Path, arguments: &[&str]) -> Self {
+        let own = tempfile::NamedTempFile::new().unwrap();
+        std::fs::copy(credential, own.path()).unwrap();
+        if rustix::process::getuid().is_root() {
+            std::os::unix::fs::chown(own.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+        }
+        let path = own.path().to_str().unwrap().to_owned();
+        let mut worker = Self::within(&[], &[&["--nats-creds", path.as_str()], arguments].concat());
+        worker.credential = Some(own);
+        worker
     }
 
     /// Under the command in front of it, such as one that sets limits.
@@ -225,7 +400,31 @@ impl RemoteWorker {
             command.uid(NOBODY).gid(NOBODY);
         }
         let process = Process(command.spawn().unwrap());
-        Self { process, folder, log }
+        Self { process, folder, log, credential: None }
+    }
+
+    /// SIGKILL.
+    pub fn kill(&mut self) {
+        self.process.kill();
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        self.process.signal(signal);
+    }
+
+    /// Bytes in its cache.
+    pub fn cached(&self) -> u64 {
+        let Ok(entries) = std::fs::read_dir(self.folder.path().join("cache")) else { return 0 };
+        entries.flatten().filter_map(|entry| entry.metadata().ok()).map(|facts| facts.len()).sum()
+    }
+
+    /// The most bytes that it has had resident.
+    pub fn peak_memory(&self) -> u64 {
+        let path = format!("/proc/{}/status", self.process.pid().as_raw_nonzero());
+        let text = std::fs::read_to_string(path).unwrap_or_default();
+        let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
+        kib.unwrap_or(0) * 1024
     }
 
     pub fn said(&self) -> String {
