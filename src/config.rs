@@ -168,6 +168,23 @@ pub struct RemoteArguments {
     /// The pool that it works for [default: that of the credential].
     #[arg(long, env = "SCI_RECON_POOL", value_name = "NAME")]
     pub pool: Option<Pool>,
+
+    /// File in which it notes what it has in hand.
+    #[arg(long, value_name = "FILE", hide = true)]
+    pub hand: Option<PathBuf>,
+
+    /// How the process before it died, whose file that is.
+    #[arg(long, value_name = "TEXT", hide = true)]
+    pub died: Option<String>,
+}
+
+#[cfg(feature = "nats")]
+impl RemoteArguments {
+    /// The folder of the cache.
+    #[must_use]
+    pub fn cache_folder(&self) -> PathBuf {
+        self.cache.clone().unwrap_or_else(|| std::env::temp_dir().join("sci-recon-cache"))
+    }
 }
 
 /// Takes tasks and does them, until it is told to stop: those of a data folder on this machine, or,

@@ -2,6 +2,8 @@
 
 mod arguments;
 mod error;
+#[cfg(feature = "nats")]
+mod guard;
 mod learned;
 mod logging;
 mod maintenance;

@@ -7,6 +7,8 @@ use tokio::io::AsyncReadExt;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
+#[cfg(feature = "nats")]
+use super::guard::guard;
 use super::{CliError, logging};
 #[cfg(feature = "nats")]
 use crate::cluster::{ClusterError, Remote, RemoteSettings};
@@ -29,6 +31,10 @@ pub fn run(settings: &WorkerArguments) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(|error| failed(&error))?;
+    #[cfg(feature = "nats")]
+    if settings.remote.nats.is_wanted() && !settings.supervised {
+        return runtime.block_on(guard(&settings.remote.cache_folder(), terminated()));
+    }
     let ended = runtime.block_on(async {
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
@@ -85,13 +91,13 @@ async fn work(
 #[cfg(feature = "nats")]
 fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
     let remote = &settings.remote;
-    // Without a place of its own, one that goes when the machine does.
-    let cache = || std::env::temp_dir().join("sci-recon-cache");
     RemoteSettings {
         urls: remote.nats.nats.clone(),
         credential: remote.nats.nats_creds.clone(),
         pool: remote.pool.clone(),
-        cache: (remote.cache.clone().unwrap_or_else(cache), remote.cache_bytes),
+        cache: (remote.cache_folder(), remote.cache_bytes),
+        hand: remote.hand.clone(),
+        died: remote.died.clone(),
         device: settings.engine.device.clone(),
         patience: Duration::from_secs(settings.engine.stall_seconds) / 2,
         idle: remote.exit_when_idle.map(Duration::from_secs),

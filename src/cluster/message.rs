@@ -70,6 +70,11 @@ pub enum End {
     },
     /// The worker was to end, or the job was cancelled.
     GivenBack,
+    /// Its process died, of itself (a fault, which the tile may have caused) or from outside.
+    Died {
+        how: String,
+        fault: bool,
+    },
 }
 
 /// A worker that has a message asks whether to begin.

@@ -12,6 +12,7 @@ use async_nats::jetstream::message::PublishMessage;
 use async_nats::jetstream::{AckKind, Message};
 use futures_util::StreamExt;
 use ndarray::Array3;
+use serde::{Deserialize, Serialize};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -34,6 +35,8 @@ use crate::pipeline::tile::TileInput;
 use crate::store::{Heartbeat, Lease};
 use crate::worker::{Claim, Done, Output, TaskInput, TileTask, Transport, TransportError};
 
+/// How the process died that was killed from outside.
+const KILLED: &str = "killed";
 /// How long a request for a tile waits at the message server.
 const PULL: Duration = Duration::from_secs(5);
 /// How long the hub may take to say whether to begin; a server that is down does not stop its workers.
@@ -62,6 +65,18 @@ pub struct RemoteSettings {
     pub patience: Duration,
     /// How long to go on without a tile; none for ever.
     pub idle: Option<Duration>,
+    /// The file for what is in hand, for the process after this one.
+    pub hand: Option<PathBuf>,
+    /// How the process before this one died.
+    pub died: Option<String>,
+}
+
+/// What is in hand, for the process after this one.
+#[derive(Debug, Serialize, Deserialize)]
+struct Hand {
+    event: Event,
+    /// Where the message is let go.
+    acknowledge: String,
 }
 
 /// A worker's connection to the hub and its cache.
@@ -78,6 +93,7 @@ struct Inner {
     cache: Mutex<Cache>,
     patience: Duration,
     idle: Option<Duration>,
+    hand: Option<PathBuf>,
     stop: CancellationToken,
     runtime: Handle,
     /// The tile in hand, and since when there is one or none.
@@ -172,11 +188,15 @@ impl Remote {
             cache: Mutex::new(cache),
             patience: settings.patience,
             idle: settings.idle,
+            hand: settings.hand,
             stop,
             runtime: Handle::current(),
             held: Mutex::new((None, Instant::now())),
         };
         let remote = Self(Arc::new(inner));
+        if let Some(how) = settings.died {
+            remote.tell_of_death(how).await;
+        }
         tokio::spawn(remote.clone().listen(told));
         tokio::spawn(remote.clone().give_signs());
         Ok(Some(remote))
@@ -238,7 +258,49 @@ impl Remote {
         lock(&self.0.held).0.clone()
     }
 
+    /// Tells how the process before this one died, with what it had in hand.
+    async fn tell_of_death(&self, how: String) {
+        let Some(path) = &self.0.hand else { return };
+        let found = std::fs::read(path).ok();
+        let hand: Option<Hand> = found.and_then(|text| serde_json::from_slice(&text).ok());
+        let Some(Hand { mut event, acknowledge }) = hand else { return };
+        if let End::Died { how: told, fault } = &mut event.end {
+            *fault = how != KILLED;
+            *told = how;
+        }
+        let told = self.publish(&event).await;
+        let acked = self.0.connection.client.publish(acknowledge, "+ACK".into()).await;
+        if told.is_err() || acked.is_err() {
+            tracing::warn!("it could not be told: the tile is delivered again after a while");
+        }
+        self.note_hand(None);
+    }
+
+    /// Notes what is in hand, for the process after this one.
+    fn note_hand(&self, held: Option<&Held>) {
+        let Some(path) = &self.0.hand else { return };
+        let noted = match held {
+            None => match std::fs::remove_file(path) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+                _ => Ok(()),
+            },
+            Some(held) => {
+                let end = End::Died { how: String::new(), fault: false };
+                let (task, worker) = (held.task.task, self.0.hello.worker);
+                let event = Event { task, attempt: held.attempt, worker, end };
+                let acknowledge =
+                    held.message.reply.as_ref().map_or("", |to| to.as_str()).to_owned();
+                let text = serde_json::to_vec(&Hand { event, acknowledge });
+                text.map_err(io::Error::other).and_then(|text| std::fs::write(path, text))
+            }
+        };
+        if let Err(error) = noted {
+            tracing::warn!(%error, "what is in hand can't be noted");
+        }
+    }
+
     fn hold(&self, held: Option<Arc<Held>>) {
+        self.note_hand(held.as_deref());
         let mut place = lock(&self.0.held);
         if place.0.is_some() || held.is_some() {
             *place = (held, Instant::now());
@@ -359,7 +421,24 @@ impl Remote {
             return Ok(Heartbeat::Lost);
         }
         let event = Event { task: lease.task, attempt: lease.attempt, worker: lease.worker, end };
-        let text = serde_json::to_vec(&event)?;
+        self.publish(&event).await?;
+        if standing == Standing::Mine {
+            let let_go = self.persist(|| async {
+                let acked = held.message.double_ack().await;
+                acked.map_err(ClusterError::nats("let the message go"))
+            });
+            if let Err(error) = let_go.await {
+                // It is delivered again, and the hub says that the tile is done.
+                tracing::warn!(%error, "the tile's message stays");
+            }
+        }
+        self.hold(None);
+        Ok(Heartbeat::Continue)
+    }
+
+    /// Publishes how a tile ended, and waits until that is stored.
+    async fn publish(&self, event: &Event) -> Result<(), TransportError> {
+        let text = serde_json::to_vec(event)?;
         let id = format!("{}.{}.{}", event.task, event.attempt, event.worker);
         self.persist(|| async {
             let message = PublishMessage::build().message_id(&id).payload(text.clone().into());
@@ -373,18 +452,7 @@ impl Remote {
                 .map_err(ClusterError::nats("tell the end"))
         })
         .await?;
-        if standing == Standing::Mine {
-            let let_go = self.persist(|| async {
-                let acked = held.message.double_ack().await;
-                acked.map_err(ClusterError::nats("let the message go"))
-            });
-            if let Err(error) = let_go.await {
-                // It is delivered again, and the hub says that the tile is done.
-                tracing::warn!(%error, "the tile's message stays");
-            }
-        }
-        self.hold(None);
-        Ok(Heartbeat::Continue)
+        Ok(())
     }
 
     /// Does something again and again until it succeeds or the time is over.

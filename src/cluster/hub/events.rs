@@ -138,6 +138,10 @@ impl Core {
                 tracing::warn!(%task, attempt, %worker, reason, "a tile has failed");
                 self.store.fail(&lease, &reason, retry).await?;
             }
+            End::Died { how, fault } => {
+                tracing::warn!(%task, attempt, %worker, how, "a worker has died in a tile");
+                self.store.remote_died(&remote, &how, fault).await?;
+            }
             End::GivenBack => self.store.give_back(&lease).await?,
         }
         self.clear(pool, task).await;

@@ -278,6 +278,18 @@ impl Store {
         self.part(&remote.lease(), &Loss::Lost(reason.to_owned())).await
     }
 
+    /// Records that the process of a tile's worker died: of a fault, or killed from outside.
+    pub async fn remote_died(
+        &self,
+        remote: &RemoteTask,
+        how: &str,
+        fault: bool,
+    ) -> Result<(), StoreError> {
+        let reason = format!("the worker process died: {how}");
+        let loss = if fault { Loss::Crashed(reason) } else { Loss::Lost(reason) };
+        self.part(&remote.lease(), &loss).await
+    }
+
     /// For a server without a hub: what an earlier one has handed out can't come back.
     pub async fn disown_remote(&self) -> Result<(), StoreError> {
         for remote in self.remote_tasks().await? {

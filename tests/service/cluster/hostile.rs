@@ -52,7 +52,6 @@ async fn a_credential_opens_the_subjects_of_its_pool_alone() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&with_iterations(&measurement, 4000)).await;
     busy(&app).await;
-    let before = nats.messages().await;
     let found = nats.subject_in("SCI_IN").await;
     let worker = workers(&app).await[0]["id"].as_str().unwrap().to_owned();
     let (client, refused) = intruder(&nats, "b").await;
@@ -147,8 +146,6 @@ async fn a_credential_opens_the_subjects_of_its_pool_alone() {
     client.flush().await.unwrap();
     tokio::time::sleep(Duration::from_millis(300)).await;
     assert_eq!(workers(&app).await.len(), 1, "it is still there: {task:#}");
-    let after = nats.messages().await;
-    assert!(before.len() == after.len());
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 }
 

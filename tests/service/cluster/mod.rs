@@ -117,7 +117,7 @@ async fn a_worker_that_is_killed_in_a_tile_costs_one_attempt() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let id = app.submit(&job(&measurement)).await;
     busy(&app).await;
-    first.process.kill();
+    first.kill();
     let _second = worker(&nats, &[]);
     let done = app.ended(&id).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
@@ -242,6 +242,36 @@ async fn a_tile_that_fails_on_every_worker_fails_its_job_with_the_reason() {
     let next = app.submit(&with_iterations(&measurement, 50)).await;
     assert_eq!(app.ended(&next).await["state"], "succeeded");
     nats.emptied().await;
+}
+
+#[tokio::test]
+async fn a_tile_that_kills_its_workers_is_given_up_with_the_reason() {
+    let Some(nats) = Nats::start(1) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let library = crate::hangs::library(folder.path(), "abort();");
+    // The worker runs as somebody else.
+    use std::os::unix::fs::PermissionsExt;
+    std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    // Far longer than the test: nobody waits for a silent worker.
+    let app = served(&nats, "600").await;
+    let mut worker = worker(&nats, &["--onnxruntime", library.to_str().unwrap()]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({
+        "measurement": measurement,
+        "algorithm": "pnp-tv-fastdvdnet",
+        "snapshots": 0,
+        "schedule": {"stages": [{"prior": "fastdvdnet", "iterations": 1, "sigma": [0.2, 0.1]}]},
+    });
+    let done = app.ended(&app.submit(&body).await).await;
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("SIGABRT") && error.contains("(3 attempts)"), "{error}");
+    // A process that is killed from outside is replaced, too, and its tile taken up again at once.
+    let job = app.submit(&job(&measurement)).await;
+    busy(&app).await;
+    rustix::process::kill_process(worker.inner().unwrap(), Signal::KILL).unwrap();
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert!(worker.process.lives());
 }
 
 #[tokio::test]

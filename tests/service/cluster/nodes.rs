@@ -403,13 +403,34 @@ impl RemoteWorker {
         Self { process, folder, log, credential: None }
     }
 
-    /// SIGKILL.
+    /// The process that computes, under the one that watches over it.
+    pub fn inner(&self) -> Option<Pid> {
+        let path = format!("/proc/{}/task", self.process.pid().as_raw_nonzero());
+        let threads: Vec<_> = std::fs::read_dir(path).ok()?.flatten().collect();
+        let children = threads
+            .iter()
+            .filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
+        let all = children.collect::<Vec<String>>().join(" ");
+        Pid::from_raw(all.split_whitespace().next()?.parse().ok()?)
+    }
+
+    /// SIGKILL for all of it, as when its machine is gone.
     pub fn kill(&mut self) {
+        let inner = self.inner();
+        // Nobody is to hear of the other's death.
+        self.process.signal(Signal::STOP);
+        if let Some(inner) = inner {
+            let _ = kill_process(inner, Signal::KILL);
+        }
         self.process.kill();
     }
 
+    /// A signal for both processes.
     pub fn signal(&self, signal: Signal) {
         self.process.signal(signal);
+        if let Some(inner) = self.inner() {
+            let _ = kill_process(inner, signal);
+        }
     }
 
     /// Bytes in its cache.
@@ -420,7 +441,8 @@ impl RemoteWorker {
 
     /// The most bytes that it has had resident.
     pub fn peak_memory(&self) -> u64 {
-        let path = format!("/proc/{}/status", self.process.pid().as_raw_nonzero());
+        let Some(inner) = self.inner() else { return 0 };
+        let path = format!("/proc/{}/status", inner.as_raw_nonzero());
         let text = std::fs::read_to_string(path).unwrap_or_default();
         let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
