@@ -7,6 +7,8 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 
+#[cfg(feature = "nats")]
+use crate::job::Pool;
 use crate::job::WorkerId;
 use crate::recon::prior::onnx::Device;
 
@@ -36,10 +38,15 @@ pub struct ServeArguments {
     #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
     pub hosts: Vec<String>,
 
-    /// Worker processes to run; 0 runs none, for workers that are started by hand [default: one
-    /// for each core].
+    /// Worker processes to run; 0 runs none, for workers that are started by hand, or, with --nats, one
+    /// that leaves the tiles to other machines [default: one for each core].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
+
+    /// Workers on other machines.
+    #[cfg(feature = "nats")]
+    #[command(flatten)]
+    pub cluster: ClusterArguments,
 
     /// Settings that the workers get.
     #[command(flatten)]
@@ -105,12 +112,104 @@ pub struct ServeArguments {
     pub log_format: LogFormat,
 }
 
-/// Takes tasks from a data folder and does them, until it is told to stop.
+/// Where a NATS server is, and who asks.
+#[cfg(feature = "nats")]
+#[derive(Debug, Clone, Default, Args)]
+pub struct NatsArguments {
+    /// Address of a NATS server with JetStream, such as nats://host:4222 or tls://host:4222; several are
+    /// separated by commas [default: that of the credential].
+    #[arg(long, env = "SCI_RECON_NATS", value_name = "URL")]
+    pub nats: Option<String>,
+
+    /// File with the credential for it.
+    #[arg(long, env = "SCI_RECON_NATS_CREDS", value_name = "FILE")]
+    pub nats_creds: Option<PathBuf>,
+}
+
+#[cfg(feature = "nats")]
+impl NatsArguments {
+    /// Whether there is to be a connection at all.
+    #[must_use]
+    pub fn is_wanted(&self) -> bool {
+        self.nats.is_some() || self.nats_creds.is_some()
+    }
+}
+
+/// How tiles get to workers on other machines.
+#[cfg(feature = "nats")]
+#[derive(Debug, Clone, Args)]
+pub struct ClusterArguments {
+    /// The NATS server.
+    #[command(flatten)]
+    pub nats: NatsArguments,
+
+    /// Seconds of silence after which another worker gets the tile of one on another machine.
+    #[arg(long, env = "SCI_RECON_ACK_WAIT", value_name = "SECONDS", default_value_t = 30,
+          value_parser = clap::value_parser!(u64).range(2..=3600))]
+    pub ack_wait: u64,
+}
+
+/// How a worker on another machine gets its tiles.
+#[cfg(feature = "nats")]
+#[derive(Debug, Clone, Default, Args)]
+pub struct RemoteArguments {
+    /// The NATS server.
+    #[command(flatten)]
+    pub nats: NatsArguments,
+
+    /// Folder for what later tiles need again; it may be empty, and may be removed afterwards [default:
+    /// one in the folder for temporary files].
+    #[arg(long, env = "SCI_RECON_CACHE", value_name = "DIR")]
+    pub cache: Option<PathBuf>,
+
+    /// Bytes that the cache may hold.
+    #[arg(long, env = "SCI_RECON_CACHE_BYTES", value_name = "N", default_value_t = 4 << 30)]
+    pub cache_bytes: u64,
+
+    /// Seconds without a tile after which the worker ends [default: it waits for ever].
+    #[arg(long, env = "SCI_RECON_EXIT_WHEN_IDLE", value_name = "SECONDS")]
+    pub exit_when_idle: Option<u64>,
+
+    /// The pool that it works for [default: that of the credential].
+    #[arg(long, env = "SCI_RECON_POOL", value_name = "NAME")]
+    pub pool: Option<Pool>,
+
+    /// File in which it notes what it has in hand.
+    #[arg(long, value_name = "FILE", hide = true)]
+    pub hand: Option<PathBuf>,
+
+    /// How the process before it died, whose file that is.
+    #[arg(long, value_name = "TEXT", hide = true)]
+    pub died: Option<String>,
+}
+
+#[cfg(feature = "nats")]
+impl RemoteArguments {
+    /// The folder of the cache.
+    #[must_use]
+    pub fn cache_folder(&self) -> PathBuf {
+        self.cache.clone().unwrap_or_else(|| std::env::temp_dir().join("sci-recon-cache"))
+    }
+}
+
+/// Takes tasks and does them, until it is told to stop: those of a data folder on this machine, or,
+/// with --nats or --nats-creds, tiles of a server elsewhere.
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArguments {
     /// Folder with the database, uploads and results.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
-    pub data: PathBuf,
+    #[cfg_attr(feature = "nats", arg(required_unless_present_any = ["nats", "nats_creds"]))]
+    #[cfg_attr(not(feature = "nats"), arg(required = true))]
+    pub data: Option<PathBuf>,
+
+    /// For a server elsewhere.
+    #[cfg(feature = "nats")]
+    #[command(flatten)]
+    pub remote: RemoteArguments,
+
+    /// Leaves the tiles to workers on other machines.
+    #[arg(long, hide = true)]
+    pub without_tiles: bool,
 
     /// Where and how it computes.
     #[command(flatten)]
@@ -184,7 +283,19 @@ impl ServeArguments {
     #[must_use]
     pub fn worker_count(&self) -> usize {
         let cores = || std::thread::available_parallelism().map_or(1, usize::from);
-        self.workers.unwrap_or_else(cores)
+        // With none there would be nobody for what does not leave this machine.
+        let least = usize::from(self.without_tiles());
+        self.workers.unwrap_or_else(cores).max(least)
+    }
+
+    /// Whether the workers of this machine leave the tiles to others.
+    #[must_use]
+    pub fn without_tiles(&self) -> bool {
+        #[cfg(feature = "nats")]
+        let elsewhere = self.cluster.nats.is_wanted();
+        #[cfg(not(feature = "nats"))]
+        let elsewhere = false;
+        elsewhere && self.workers == Some(0)
     }
 
     #[must_use]
@@ -214,12 +325,12 @@ impl EngineArguments {
 }
 
 impl WorkerArguments {
-    /// The command line that makes these arguments again, for a worker process.
+    /// The command line that makes these arguments again, for a worker process of this machine.
     #[must_use]
     pub fn command_line(&self) -> Vec<std::ffi::OsString> {
         let mut line: Vec<std::ffi::OsString> = vec!["worker".into()];
         let mut option = |name: &str, value: std::ffi::OsString| line.extend([name.into(), value]);
-        option("--data", self.data.clone().into());
+        option("--data", self.data.clone().unwrap_or_default().into());
         option("--device", self.engine.device.clone().into());
         option("--nice", self.engine.nice.to_string().into());
         option("--stall-seconds", self.engine.stall_seconds.to_string().into());
@@ -230,6 +341,9 @@ impl WorkerArguments {
         }
         if let Some(id) = self.id {
             option("--id", id.to_string().into());
+        }
+        if self.without_tiles {
+            line.push("--without-tiles".into());
         }
         if self.supervised {
             line.push("--supervised".into());
@@ -278,6 +392,7 @@ mod tests {
             "--onnxruntime",
             "lib.so",
             "--supervised",
+            "--without-tiles",
             "--log-format",
             "json",
         ];

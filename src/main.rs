@@ -28,6 +28,8 @@ enum Command {
     Lab(cli::lab::Arguments),
     Backup(cli::backup::Arguments),
     CheckModel(cli::check_model::Arguments),
+    #[cfg(feature = "nats")]
+    Cluster(cli::cluster::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -44,6 +46,8 @@ fn main() -> ExitCode {
         Command::Lab(arguments) => cli::lab::run(&arguments),
         Command::Backup(arguments) => cli::backup::run(&arguments),
         Command::CheckModel(arguments) => cli::check_model::run(&arguments),
+        #[cfg(feature = "nats")]
+        Command::Cluster(arguments) => cli::cluster::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

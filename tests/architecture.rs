@@ -22,6 +22,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("pipeline", &["recon", "optics", "formats", "job"]),
     ("store", &["job", "formats"]),
     ("worker", &["store", "pipeline", "intake", "job", "formats", "recon", "optics"]),
+    ("cluster", &["worker", "store", "pipeline", "job", "formats", "recon"]),
     ("http", &["store", "pipeline", "intake", "job", "formats", "config"]),
 ];
 
@@ -30,7 +31,9 @@ const OWNERS: &[(&str, &[&str])] = &[
     ("ort", &["src/recon/prior/onnx.rs"]),
     ("sqlx", &["src/store/"]),
     ("axum", &["src/http/", "src/cli/serve.rs"]),
-    ("tokio", &["src/http/", "src/store/", "src/worker/", "src/cli/"]),
+    ("tokio", &["src/http/", "src/store/", "src/worker/", "src/cluster/", "src/cli/"]),
+    ("async_nats", &["src/cluster/"]),
+    ("crate::cluster", &["src/cluster/", "src/cli/"]),
     ("crate::http", &["src/http/", "src/cli/serve.rs"]),
 ];
 

@@ -2,6 +2,8 @@
 
 mod arguments;
 mod error;
+#[cfg(feature = "nats")]
+mod guard;
 mod logging;
 mod maintenance;
 mod masks;
@@ -12,6 +14,8 @@ mod supervisor;
 pub mod backup;
 pub mod calibrate;
 pub mod check_model;
+#[cfg(feature = "nats")]
+pub mod cluster;
 pub mod demo;
 pub mod lab;
 pub mod optics;

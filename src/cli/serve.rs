@@ -13,6 +13,10 @@ use tokio_util::sync::CancellationToken;
 use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
+#[cfg(feature = "nats")]
+use crate::cluster::{ClusterError, Connection, Credential, Hub, describe_metrics};
+#[cfg(feature = "nats")]
+use crate::config::{ClusterArguments, RemoteArguments};
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, listen, router};
 use crate::store::{Purpose, Store, StoreError};
@@ -34,6 +38,9 @@ pub enum ServeError {
     Listen { address: SocketAddr, source: std::io::Error },
     #[error("can't {action}: {source}")]
     Io { action: &'static str, source: std::io::Error },
+    #[cfg(feature = "nats")]
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
     #[error("can't count figures: {0}")]
     Metrics(#[from] metrics_exporter_prometheus::BuildError),
 }
@@ -70,6 +77,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let metrics = Metrics::install()?;
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
+    let hub = cluster(settings, &store).await?;
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
     let closing = CancellationToken::new();
     let figures = metrics.clone();
@@ -88,7 +96,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         () = listen(listener, service, stopped(stop.clone())) => {}
         () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
     }
-    // 6. The end: workers give their tasks back.
+    // 6. The end: workers of this machine give their tasks back; those of others go on.
+    drop(hub);
     supervisor.ended().await;
     store.advance_generation().await?;
     // It only tells where the service was.
@@ -115,12 +124,36 @@ fn announce(root: &Path, address: SocketAddr) -> Result<(), ServeError> {
 
 fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
     WorkerArguments {
-        data: root.to_owned(),
+        data: Some(root.to_owned()),
+        #[cfg(feature = "nats")]
+        remote: RemoteArguments::default(),
+        without_tiles: settings.without_tiles(),
         engine: settings.engine.clone(),
         log_format: settings.log_format,
         id: None,
         supervised: true,
     }
+}
+
+/// Begins to hand tiles out to other machines, if that is wanted.
+#[cfg(feature = "nats")]
+async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>, ServeError> {
+    let ClusterArguments { nats, ack_wait } = &settings.cluster;
+    if !nats.is_wanted() {
+        store.disown_remote().await?;
+        return Ok(None);
+    }
+    describe_metrics();
+    let credential = nats.nats_creds.as_deref().map(Credential::read).transpose()?;
+    let connection =
+        Connection::open(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")
+            .await?;
+    Ok(Some(Hub::start(store.clone(), connection, Duration::from_secs(*ack_wait))))
+}
+
+#[cfg(not(feature = "nats"))]
+async fn cluster(_: &ServeArguments, store: &Store) -> Result<(), ServeError> {
+    Ok(store.disown_remote().await?)
 }
 
 /// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.

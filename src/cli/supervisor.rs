@@ -18,15 +18,16 @@ use crate::job::WorkerId;
 use crate::store::{Store, WorkerEnd};
 
 /// How long a worker may take to give its task back.
-const GRACE: Duration = Duration::from_secs(8);
+pub(super) const GRACE: Duration = Duration::from_secs(8);
 /// The shortest and the longest pause before a worker is started again.
-const PAUSES: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(15));
+pub(super) const PAUSES: (Duration, Duration) =
+    (Duration::from_millis(100), Duration::from_secs(15));
 /// Time between looks at a worker's signs of life.
 const LOOK: Duration = Duration::from_secs(5);
 /// A worker that gives no sign of life for so long hangs as a whole; its lease has run out.
 const SILENCE: Duration = Duration::from_secs(30);
 /// A worker that lived for so long did not die of its start.
-const HEALTHY: Duration = Duration::from_secs(20);
+pub(super) const HEALTHY: Duration = Duration::from_secs(20);
 
 pub(super) struct Supervisor {
     slots: JoinSet<()>,
@@ -171,7 +172,7 @@ async fn end(id: WorkerId, mut child: Child) {
 }
 
 /// Why a worker ended: by itself, from outside, or of a fault that its task may have caused.
-fn judge(status: ExitStatus) -> WorkerEnd {
+pub(super) fn judge(status: ExitStatus) -> WorkerEnd {
     const SIGINT: i32 = 2;
     const SIGKILL: i32 = 9;
     const SIGTERM: i32 = 15;

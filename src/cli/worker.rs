@@ -1,18 +1,23 @@
-//! `sci-recon worker`: does the tasks of a data folder.
+//! `sci-recon worker`: does the tasks of a data folder, or tiles of a server elsewhere.
 
+use std::path::Path;
 use std::time::Duration;
 
 use tokio::io::AsyncReadExt;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
+#[cfg(feature = "nats")]
+use super::guard::guard;
 use super::{CliError, logging};
 use crate::cli::error::Result;
+#[cfg(feature = "nats")]
+use crate::cluster::{ClusterError, Remote, RemoteSettings};
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
-use crate::store::{Purpose, Store};
+use crate::store::{Purpose, Store, StoreError};
 use crate::worker::{Local, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
@@ -27,26 +32,77 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
         .enable_all()
         .build()
         .map_err(|error| failed(&error))?;
+    #[cfg(feature = "nats")]
+    if settings.remote.nats.is_wanted() && !settings.supervised {
+        return runtime.block_on(guard(&settings.remote.cache_folder(), terminated()));
+    }
     let ended = runtime.block_on(async {
-        let store = Store::open(&settings.data, Purpose::Use).await?;
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
-        let id = settings.id.unwrap_or_else(WorkerId::new);
-        let stall = Duration::from_secs(settings.engine.stall_seconds);
-        let worker = Worker::new(Local::new(store.clone(), id), network, stall, stop);
-        let ended = worker.run().await;
-        store.close().await;
-        match ended {
-            Err(error @ WorkerError::Unfinished) => {
+        match work(settings, network, stop).await {
+            Err(WorkEnd::Worker(error @ WorkerError::Unfinished)) => {
                 tracing::info!("{error}");
                 Ok(())
             }
+            #[cfg(feature = "nats")]
+            Err(WorkEnd::Cluster(error)) => Err(error.into()),
             ended => ended.map_err(|error| failed(&error)),
         }
     });
     // The computing thread may still be at it, or hang: not waited for.
     runtime.shutdown_background();
     ended
+}
+
+/// Why the work came to an end.
+#[derive(Debug, thiserror::Error)]
+enum WorkEnd {
+    #[error(transparent)]
+    Worker(#[from] WorkerError),
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[cfg(feature = "nats")]
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
+}
+
+async fn work(
+    settings: &WorkerArguments,
+    network: NetworkSource,
+    stop: CancellationToken,
+) -> Result<(), WorkEnd> {
+    let id = settings.id.unwrap_or_else(WorkerId::new);
+    let stall = Duration::from_secs(settings.engine.stall_seconds);
+    #[cfg(feature = "nats")]
+    if settings.remote.nats.is_wanted() {
+        let remote = remote_settings(settings);
+        let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
+        let ended = Worker::new(remote.clone(), network, stall, stop).run().await;
+        remote.leave().await;
+        return Ok(ended?);
+    }
+    let store =
+        Store::open(settings.data.as_deref().unwrap_or(Path::new("")), Purpose::Use).await?;
+    let local = Local::new(store.clone(), id, !settings.without_tiles);
+    let ended = Worker::new(local, network, stall, stop).run().await;
+    store.close().await;
+    Ok(ended?)
+}
+
+#[cfg(feature = "nats")]
+fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
+    let remote = &settings.remote;
+    RemoteSettings {
+        urls: remote.nats.nats.clone(),
+        credential: remote.nats.nats_creds.clone(),
+        pool: remote.pool.clone(),
+        cache: (remote.cache_folder(), remote.cache_bytes),
+        hand: remote.hand.clone(),
+        died: remote.died.clone(),
+        device: settings.engine.device.clone(),
+        patience: Duration::from_secs(settings.engine.stall_seconds) / 2,
+        idle: remote.exit_when_idle.map(Duration::from_secs),
+    }
 }
 
 /// Lowers the priority of this process, and so of all its threads.

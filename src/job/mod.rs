@@ -6,6 +6,7 @@ mod captures;
 mod ids;
 mod memory;
 mod model;
+mod pool;
 mod report;
 mod request;
 mod shape;
@@ -21,6 +22,7 @@ pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
+pub use pool::{InvalidPool, Pool};
 pub use report::{
     CalibrationReport, CaptureReport, Finding, Grade, MaskReport, PatternReport, Severity,
 };

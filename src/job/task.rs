@@ -165,7 +165,7 @@ pub enum TaskStage {
 }
 
 /// How far a running task is.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TaskProgress {
     pub stage: TaskStage,
     /// Solver iterations done so far.

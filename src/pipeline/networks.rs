@@ -64,13 +64,15 @@ pub struct ModelRecord {
 }
 
 impl ModelRecord {
+    /// That of a network that the program carries.
+    pub fn carried(network: Network) -> Self {
+        let model = carried(network);
+        Self::new(&model, model.files.iter().map(|(_, content)| *content))
+    }
+
     /// Those of a schedule that the program carries, in a fixed order.
     pub fn of(schedule: &Schedule) -> Vec<Self> {
-        let record = |network| {
-            let model = carried(network);
-            Self::new(&model, model.files.iter().map(|(_, content)| *content))
-        };
-        schedule.networks().into_iter().map(record).collect()
+        schedule.networks().into_iter().map(Self::carried).collect()
     }
 
     pub fn of_job(spec: &JobSpec) -> Vec<Self> {

@@ -3,11 +3,12 @@
 use std::ops::Range;
 
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
+use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result};
 
 /// One tile: the pixels `row..row+height` x `column..column+width`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Tile {
     /// Position in the plan.
     pub index: usize,

@@ -43,8 +43,9 @@ pub(crate) use dir::on_files;
 pub use error::StoreError;
 pub use identity::Purpose;
 pub use queue::{
-    CalibrationDone, CalibrationTask, ClaimedTask, Completion, Heartbeat, JobMark, JobProgress,
-    JobTask, Lease, MAX_FAILURES, MAX_LOSSES, Product, ProgressStage, Work, WorkerEnd,
+    Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Heartbeat, JobMark,
+    JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MessagePlace, Product, ProgressStage,
+    RemoteBeat, RemoteTask, Work, WorkerEnd,
 };
 pub use rows::{Filter, Page};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
@@ -52,7 +53,8 @@ pub use submit::{Inserted, NewJob};
 pub use tables::{
     Blob, Calibration, FoundPartial, Job, JobFilter, LabRow, Measurement, Model, NewCalibration,
     NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, TaskCounts, TaskRecord,
-    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerRow, WorkerTask,
+    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow,
+    WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.

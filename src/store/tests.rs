@@ -14,7 +14,7 @@ use tempfile::TempDir;
 
 use super::{
     ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
-    Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd,
+    Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd, WorkerPlace,
 };
 use crate::job::{
     Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sha256, SnapshotSelection,
@@ -91,7 +91,7 @@ impl Lab {
         let measurement =
             store.add_measurement(&local, facts, upload(b"prepared data")).await.unwrap();
         let worker = WorkerId::new();
-        store.worker_started(worker, 1).await.unwrap();
+        store.worker_started(worker, 1, &WorkerPlace::default()).await.unwrap();
         let lab = Self { store, measurement: measurement.id, worker, _folder: folder };
         assert_eq!(lab.work_off().await, [TaskKind::Calibration], "its report");
         lab

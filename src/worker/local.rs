@@ -18,8 +18,8 @@ use crate::pipeline::pilot::full_schedule;
 use crate::pipeline::records::{PilotRecord, PreparedRecord};
 use crate::pipeline::tile::TileInput;
 use crate::store::{
-    ClaimedTask, Completion, Heartbeat, JobTask, Lease, Product, StagedBlob, Store, StoreError,
-    TaskRecord, TileResult, Work,
+    Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, Product, StagedBlob, Store,
+    StoreError, TaskRecord, TileResult, Work, WorkerPlace,
 };
 
 /// The store, and who works for it.
@@ -27,11 +27,14 @@ use crate::store::{
 pub struct Local {
     store: Store,
     worker: WorkerId,
+    claimant: Claimant<'static>,
 }
 
 impl Local {
-    pub fn new(store: Store, worker: WorkerId) -> Self {
-        Self { store, worker }
+    /// For a worker of this name, which does all there is, or leaves the tiles to other machines.
+    pub fn new(store: Store, worker: WorkerId, tiles: bool) -> Self {
+        let claimant = if tiles { Claimant::Local } else { Claimant::WithoutTiles };
+        Self { store, worker, claimant }
     }
 
     fn arrays(&self, masks: Sha256, snapshots: Sha256) -> Arrays {
@@ -129,7 +132,10 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        Ok(self.store.worker_started(self.worker, std::process::id()).await?)
+        Ok(self
+            .store
+            .worker_started(self.worker, std::process::id(), &WorkerPlace::default())
+            .await?)
     }
 
     async fn seen(&self) -> Result<(), TransportError> {
@@ -137,7 +143,8 @@ impl Transport for Local {
     }
 
     async fn claim(&self) -> Result<Option<Claim>, TransportError> {
-        let Some(task) = self.store.claim(self.worker, LEASE).await? else { return Ok(None) };
+        let task = self.store.claim_as(self.claimant, self.worker, LEASE).await?;
+        let Some(task) = task else { return Ok(None) };
         let ClaimedTask { lease, kind, cost, work } = task;
         let (id, name) = (lease.task, kind.into_str());
         let span = match &work {
@@ -219,7 +226,8 @@ fn pilot(task: &JobTask) -> Result<Option<PilotRecord>, PipelineError> {
     parsed("pilot", task.pilot.as_ref().unwrap_or(&Value::Null))
 }
 
-fn tile_task(task: &JobTask, snapshot: u32, index: u32) -> Result<TileTask, PipelineError> {
+/// A tile of a job, from the plan and the records of the tasks before it.
+pub fn tile_task(task: &JobTask, snapshot: u32, index: u32) -> Result<TileTask, PipelineError> {
     let plan = task.spec.tile_plan()?;
     let tile = plan.tile(index as usize).ok_or_else(|| PipelineError::Record {
         what: "task",

@@ -6,4 +6,8 @@ mod run;
 mod transport;
 
 pub use local::Local;
+#[cfg(feature = "nats")]
+pub(crate) use local::tile_task;
 pub use run::{Worker, WorkerError};
+#[cfg(feature = "nats")]
+pub(crate) use transport::{Claim, Done, Output, TaskInput, TileTask, Transport, TransportError};

@@ -227,7 +227,8 @@ impl<T: Transport> Worker<T> {
             self.stop.cancelled().await;
             tokio::time::sleep(GRACE).await;
         };
-        tokio::pin!(too_late);
+        let called_off = self.transport.called_off(lease);
+        tokio::pin!(too_late, called_off);
         loop {
             let silence = monitor.silence();
             if silence > patience {
@@ -239,10 +240,9 @@ impl<T: Transport> Worker<T> {
                 }
                 () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
                 () = &mut too_late => return Err(WorkerError::Unfinished),
+                answer = &mut called_off, if reason.is_none() => reason = stop_for(answer),
                 _ = tick.tick() => match self.beat(lease, monitor).await {
-                    Ok(Heartbeat::Continue) => {}
-                    Ok(Heartbeat::Cancelled) => reason = Some(Reason::Cancelled),
-                    Ok(Heartbeat::Lost) => reason = Some(Reason::Lost),
+                    Ok(answer) => reason = reason.or(stop_for(answer)),
                     // If this goes on, the lease runs out, and the store will say so.
                     Err(error) => tracing::error!(%error, "a heartbeat is not recorded"),
                 },
@@ -289,6 +289,15 @@ impl<T: Transport> Worker<T> {
         // The user reads the reason, and has no business with the folders of this machine.
         let reason = without_paths(&error.to_string());
         said(self.transport.fail(lease, &reason, error.is_retryable()).await);
+    }
+}
+
+/// Why an answer ends a task, if it does.
+fn stop_for(answer: Heartbeat) -> Option<Reason> {
+    match answer {
+        Heartbeat::Continue => None,
+        Heartbeat::Cancelled => Some(Reason::Cancelled),
+        Heartbeat::Lost => Some(Reason::Lost),
     }
 }
 

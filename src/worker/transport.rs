@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ndarray::Array3;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::intake::{CaptureFiles, IntakeError};
@@ -46,6 +47,12 @@ pub trait Transport: Clone + Send + 'static {
         progress: TaskProgress,
         history: Option<&str>,
     ) -> Result<Heartbeat, TransportError>;
+
+    /// Waits until a task is known to be wanted no more, or to be someone else's, between heartbeats.
+    /// Where nobody tells, for ever.
+    async fn called_off(&self, _lease: &Lease) -> Heartbeat {
+        std::future::pending().await
+    }
 
     /// Hands over what was made. [`Heartbeat::Lost`] says that the task is someone else's by now; an
     /// error that it is still the worker's.
@@ -128,7 +135,7 @@ pub enum TaskInput {
 
 /// A tile to be reconstructed. Arrays and models are named by their hashes, so that this can go to
 /// another machine as it is.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTask {
     pub masks: Sha256,
     pub measurement: Sha256,

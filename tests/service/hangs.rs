@@ -11,7 +11,7 @@ use crate::app::TestApp;
 use crate::samples::Scene;
 
 /// Builds a library whose entry point does this instead of what it should do.
-fn library(folder: &Path, body: &str) -> PathBuf {
+pub fn library(folder: &Path, body: &str) -> PathBuf {
     let (source, library) = (folder.join("fake.c"), folder.join("libfake.so"));
     let code = format!(
         "#include <stdlib.h>\n#include <unistd.h>\nconst void *OrtGetApiBase(void) {{ {body} }}\n"

@@ -7,6 +7,8 @@ mod adaptive;
 mod app;
 mod calibration;
 mod cli;
+#[cfg(feature = "nats")]
+mod cluster;
 mod contract;
 mod crashes;
 mod damage;

@@ -201,6 +201,11 @@ pub enum Network {
     FastDvdNetInt8,
 }
 
+impl Network {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::FfdNet, Self::FastDvdNet, Self::FastDvdNetInt8];
+}
+
 /// A loaded network.
 pub trait Denoiser {
     /// Removes noise of level `sigma` from frames \[B,H,W\], both on the \[0,1\] scale, in place. The array

@@ -8,6 +8,7 @@ use sqlx::types::Json;
 use sqlx::{FromRow, Row, SqliteConnection};
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
+use super::remote;
 use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, JobState, Label, Sha256, TaskKind, TaskStage,
     TaskState, Timestamp, WorkerId,
@@ -69,15 +70,49 @@ pub struct CalibrationTask {
     pub masks: Option<Sha256>,
 }
 
+/// Who asks for a task, and so which tasks may be handed out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Claimant<'a> {
+    /// A worker of this machine that does all there is.
+    Local,
+    /// One that leaves the tiles to other machines.
+    WithoutTiles,
+    /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
+    /// run out.
+    Pool(&'a str),
+}
+
+impl Claimant<'_> {
+    /// Whether it takes tiles, and whether it takes others.
+    fn takes(self) -> (bool, bool) {
+        (self != Self::WithoutTiles, !matches!(self, Self::Pool(_)))
+    }
+}
+
 impl Store {
-    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
+    /// Hands out the next task of any kind, if there is one.
+    pub async fn claim(
+        &self,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>> {
+        self.claim_as(Claimant::Local, worker, length).await
+    }
+
+    /// Hands out the next task that this claimant may have, if there is one.
+    pub async fn claim_as(
+        &self,
+        claimant: Claimant<'_>,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>> {
         let now = Timestamp::now().0;
-        if !self.may_have_work(now).await? {
+        if !self.may_have_work(claimant, now).await? {
             return Ok(None);
         }
         let mut transaction = self.write().await?;
         lease::reap(&mut transaction, now).await?;
-        let claimed = take(&mut transaction, worker, length, now).await?;
+        let claimed = take(&mut transaction, claimant, worker, length, now).await?;
         let Some(row) = claimed else {
             transaction.commit().await?;
             return Ok(None);
@@ -96,13 +131,12 @@ impl Store {
         {
             jobs::set_state(&mut transaction, job, JobState::Running, None).await?;
         }
+        if let Claimant::Pool(pool) = claimant {
+            remote::hand_over(&mut transaction, &lease, pool).await?;
+        }
         workers::seen(&mut transaction, worker).await?;
         transaction.commit().await?;
-        let work = match owner {
-            Owner::Job(job) => self.job_task(job, kind).await,
-            Owner::Calibration(id) => self.calibration_task(id).await,
-        };
-        match work {
+        match self.work(owner, kind).await {
             Ok(work) => Ok(Some(ClaimedTask { lease, kind, cost: row.try_get("cost")?, work })),
             Err(error) => {
                 self.part(&lease, &Loss::Lost(error.to_string())).await?;
@@ -111,14 +145,32 @@ impl Store {
         }
     }
 
+    /// All that a task needs.
+    pub(super) async fn work(&self, owner: Owner, kind: TaskKind) -> Result<Work, StoreError> {
+        match owner {
+            Owner::Job(job) => self.job_task(job, kind).await,
+            Owner::Calibration(id) => self.calibration_task(id).await,
+        }
+    }
+
     /// Looks without the lock: most of the time there is nothing to do.
-    async fn may_have_work(&self, now: i64) -> Result<bool> {
+    async fn may_have_work(&self, claimant: Claimant<'_>, now: i64) -> Result<bool> {
+        let (tiles, others) = claimant.takes();
         let found = sql!(
             "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = ?1
-                                        AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4)
+                                        AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4
+                                        AND CASE kind WHEN 'tile' THEN ?6 ELSE ?7 END)
                  OR EXISTS (SELECT 1 FROM tasks WHERE state = ?2
                                 AND lease_until NOT BETWEEN ?3 AND ?3 + ?5)",
-            [TaskState::Ready, TaskState::Running, now, LONGEST_PAUSE, LONGEST_LEASE]
+            [
+                TaskState::Ready,
+                TaskState::Running,
+                now,
+                LONGEST_PAUSE,
+                LONGEST_LEASE,
+                tiles,
+                others
+            ]
         )
         .fetch_optional(&self.readers)
         .await?;
@@ -174,10 +226,12 @@ impl Store {
 /// whose turn it is, of the jobs that have begun before others, of the oldest one.
 async fn take(
     connection: &mut SqliteConnection,
+    claimant: Claimant<'_>,
     worker: WorkerId,
     length: Duration,
     now: i64,
 ) -> Result<Option<SqliteRow>> {
+    let (tiles, others) = claimant.takes();
     let row = sql!(
         "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
              stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
@@ -187,16 +241,19 @@ async fn take(
                  SELECT finish, (SELECT id FROM tasks
                                  WHERE state = 'ready' AND tasks.lab = labs.lab
                                    AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
+                                   AND CASE kind WHEN 'tile' THEN ?7 ELSE ?8 END
                                  ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
                  FROM labs
                  UNION ALL
                  SELECT finish, (SELECT id FROM tasks
                                  WHERE state = 'ready' AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
+                                   AND CASE kind WHEN 'tile' THEN ?7 ELSE ?8 END
                                    AND job = (SELECT id FROM jobs
                                               WHERE jobs.state = 'running' AND jobs.lab = labs.lab
                                                 AND EXISTS (SELECT 1 FROM tasks WHERE job = jobs.id
                                                     AND state = 'ready'
-                                                    AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6)
+                                                    AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
+                                                    AND CASE kind WHEN 'tile' THEN ?7 ELSE ?8 END)
                                               ORDER BY priority DESC, id LIMIT 1)
                                  ORDER BY ordinal LIMIT 1)
                  FROM labs)
@@ -212,7 +269,9 @@ async fn take(
             Lease::until(length, now),
             TaskStage::Reading,
             now,
-            LONGEST_PAUSE
+            LONGEST_PAUSE,
+            tiles,
+            others
         ]
     )
     .fetch_optional(&mut *connection)

@@ -252,7 +252,11 @@ pub(super) async fn end_attempt(
 
 /// Parts a running task from its worker: it becomes ready again, or is cancelled with its job, or
 /// is given up and its job or calibration with it.
-async fn lose(connection: &mut SqliteConnection, task: TaskId, loss: &Loss) -> Result<()> {
+pub(super) async fn lose(
+    connection: &mut SqliteConnection,
+    task: TaskId,
+    loss: &Loss,
+) -> Result<()> {
     let row = sql!(
         "SELECT job, calibration, kind, snapshot, tile, failures, losses FROM tasks WHERE id = ?",
         [task]

@@ -12,9 +12,11 @@ pub(super) mod graph;
 mod job;
 mod lease;
 mod progress;
+mod remote;
 
-pub use claim::{CalibrationTask, ClaimedTask, JobTask, Work};
+pub use claim::{CalibrationTask, Claimant, ClaimedTask, JobTask, Work};
 pub use complete::{CalibrationDone, Completion, Product};
 pub(super) use forecast::Forecast;
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, WorkerEnd};
 pub use progress::{JobMark, JobProgress, ProgressStage};
+pub use remote::{Begun, MessagePlace, RemoteBeat, RemoteTask};

@@ -23,4 +23,4 @@ pub use models::{Model, NewModel};
 pub use partials::{FoundPartial, NewPartial, Partial, PartialFile};
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
-pub use workers::{WorkerRow, WorkerTask};
+pub use workers::{WorkerPlace, WorkerRow, WorkerTask};

@@ -16,9 +16,20 @@ pub struct WorkerRow {
     pub id: WorkerId,
     pub pid: u32,
     pub version: String,
+    #[serde(flatten)]
+    pub place: WorkerPlace,
     pub started_at: Timestamp,
     pub seen_at: Timestamp,
     pub task: Option<WorkerTask>,
+}
+
+/// Where a worker is that came over the network; empty for one of this machine.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, FromRow)]
+pub struct WorkerPlace {
+    pub host: Option<String>,
+    pub pool: Option<String>,
+    /// Where it computes: cpu, or cuda:0.
+    pub device: Option<String>,
 }
 
 #[derive(Debug, Clone, Serialize, FromRow)]
@@ -34,12 +45,19 @@ pub struct WorkerTask {
 }
 
 impl Store {
-    pub async fn worker_started(&self, id: WorkerId, pid: u32) -> Result<()> {
+    /// Records that a worker has started; it has the version of this program.
+    pub async fn worker_started(
+        &self,
+        id: WorkerId,
+        pid: u32,
+        WorkerPlace { host, pool, device }: &WorkerPlace,
+    ) -> Result<()> {
         let now = Timestamp::now();
         sql!(
-            "INSERT INTO workers (id, pid, version, started_at, seen_at) VALUES (?, ?, ?, ?, ?)
+            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?)
              ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
-            [id, pid, env!("CARGO_PKG_VERSION"), now, now]
+            [id, pid, env!("CARGO_PKG_VERSION"), host, pool, device, now, now]
         )
         .execute(&self.writer)
         .await?;
@@ -54,7 +72,7 @@ impl Store {
     /// The workers that gave a sign of life within `age`.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>> {
         let rows = sql!(
-            "SELECT workers.id, pid, version, started_at, seen_at,
+            "SELECT workers.id, pid, version, host, pool, device, started_at, seen_at,
                  job, calibration, kind, snapshot, tile, stage
              FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
              WHERE seen_at >= ? ORDER BY workers.id",
@@ -100,6 +118,7 @@ fn worker(row: &SqliteRow) -> Result<WorkerRow> {
         id: row.try_get("id")?,
         pid: row.try_get("pid")?,
         version: row.try_get("version")?,
+        place: WorkerPlace::from_row(row)?,
         started_at: row.try_get("started_at")?,
         seen_at: row.try_get("seen_at")?,
         task: has_task.then(|| WorkerTask::from_row(row)).transpose()?,

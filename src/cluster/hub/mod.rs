@@ -1,0 +1,13 @@
+//! The part of the server that hands tiles out to other machines and takes their frames in.
+
+mod core;
+mod dispatch;
+mod events;
+mod figures;
+mod presence;
+mod requests;
+mod run;
+mod sweep;
+
+pub use figures::describe as describe_metrics;
+pub use run::Hub;

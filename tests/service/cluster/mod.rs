@@ -1,0 +1,288 @@
+//! Workers on other machines, over real message servers on ports of this one.
+
+mod hostile;
+mod nodes;
+mod proxy;
+mod rounds;
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use serde_json::{Value, json};
+
+use self::nodes::{Nats, RemoteWorker};
+use crate::app::TestApp;
+use crate::faults::results;
+use crate::samples::Scene;
+
+/// Sixteen tiles of a part of a second each.
+fn job(measurement: &str) -> Value {
+    with_iterations(measurement, 1500)
+}
+
+fn with_iterations(measurement: &str, iterations: u32) -> Value {
+    json!({
+        "measurement": measurement,
+        "algorithm": "gap-tv",
+        "tile": {"size": 24, "overlap": 8},
+        "schedule": {"stages": [
+            {"prior": "tv", "iterations": iterations, "tv_weight": 0.05, "tv_updates": 20},
+        ]},
+    })
+}
+
+/// What a job gives on this machine alone.
+async fn local(body: fn(&str) -> Value) -> BTreeMap<String, String> {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&body(&measurement)).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    results(&app, &job).await
+}
+
+/// A server whose tiles leave the machine.
+async fn served(nats: &Nats, ack_wait: &str) -> TestApp {
+    TestApp::with(&["--workers", "0", "--nats", &nats.url(), "--ack-wait", ack_wait]).await
+}
+
+fn worker(nats: &Nats, more: &[&str]) -> RemoteWorker {
+    let url = nats.url();
+    RemoteWorker::start(&[&["--nats", url.as_str(), "--pool", "test"], more].concat())
+}
+
+/// A figure of the server.
+async fn figure(app: &TestApp, name: &str) -> f64 {
+    let text = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
+    let line = text.lines().find_map(|line| line.strip_prefix(name));
+    line.unwrap_or_else(|| panic!("no figure {name}")).trim().parse().unwrap()
+}
+
+/// The workers on other machines that the server knows.
+async fn workers(app: &TestApp) -> Vec<Value> {
+    let system = app.get("/v1/system").await.expect(200).json();
+    let all = system["workers"].as_array().unwrap().clone();
+    all.into_iter().filter(|worker| !worker["pool"].is_null()).collect()
+}
+
+/// Waits until something holds.
+async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> F) {
+    let start = Instant::now();
+    while !holds().await {
+        assert!(start.elapsed() < Duration::from_secs(60), "{what}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+async fn busy(app: &TestApp) {
+    until("a worker has a tile", || async {
+        workers(app).await.iter().any(|worker| !worker["task"].is_null())
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_job_over_the_network_gives_the_same_bytes() {
+    let Some(nats) = Nats::start(1) else { return };
+    let expected = local(job).await;
+    let app = served(&nats, "5").await;
+    let _workers = [worker(&nats, &[]), worker(&nats, &[])];
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&job(&measurement)).await;
+    busy(&app).await;
+    let found = workers(&app).await;
+    assert_eq!(found.len(), 2, "{found:#?}");
+    let one = found.iter().find(|worker| !worker["task"].is_null()).unwrap();
+    assert_eq!((&one["pool"], &one["device"]), (&json!("test"), &json!("cpu")), "{one:#}");
+    assert!(!one["host"].as_str().unwrap().is_empty(), "{one:#}");
+    assert_eq!(one["task"]["kind"], "tile");
+    assert_eq!(one["task"]["job"], id);
+    let done = app.ended(&id).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    assert_eq!(results(&app, &id).await, expected);
+    let history = app.get(&format!("/v1/jobs/{id}/snapshots/0/tiles/0/history")).await;
+    assert!(!history.expect(200).json()["points"].as_array().unwrap().is_empty());
+    assert_eq!(figure(&app, "sci_recon_cluster_refused_total").await, 0.0);
+    assert_eq!(figure(&app, "sci_recon_cluster_redelivered_total").await, 0.0);
+    assert!(figure(&app, "sci_recon_cluster_blob_bytes_total{direction=\"in\"}").await > 0.0);
+    nats.emptied().await;
+}
+
+#[tokio::test]
+async fn a_worker_that_is_killed_in_a_tile_costs_one_attempt() {
+    let Some(nats) = Nats::start(1) else { return };
+    let expected = local(job).await;
+    let app = served(&nats, "2").await;
+    let mut first = worker(&nats, &[]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&job(&measurement)).await;
+    busy(&app).await;
+    first.kill();
+    let _second = worker(&nats, &[]);
+    let done = app.ended(&id).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    assert_eq!(results(&app, &id).await, expected);
+    assert!(figure(&app, "sci_recon_cluster_redelivered_total").await >= 1.0);
+    assert_eq!(figure(&app, "sci_recon_cluster_refused_total").await, 0.0);
+}
+
+#[tokio::test]
+async fn a_worker_that_is_told_to_end_gives_its_tile_back() {
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "60").await;
+    let mut first = worker(&nats, &[]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    app.submit(&with_iterations(&measurement, 9000)).await;
+    busy(&app).await;
+    let start = Instant::now();
+    first.process.signal(Signal::TERM);
+    assert_eq!(first.process.ended(Duration::from_secs(5)), Some(0));
+    eprintln!("the worker ended after {:?}", start.elapsed());
+    until("the worker is gone from the list", || async { workers(&app).await.is_empty() }).await;
+    // Well before its message would be delivered again.
+    let _second = worker(&nats, &[]);
+    busy(&app).await;
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    assert_eq!(figure(&app, "sci_recon_cluster_redelivered_total").await, 0.0);
+}
+
+#[tokio::test]
+async fn a_server_that_is_killed_finds_its_tiles_again() {
+    let Some(nats) = Nats::start(1) else { return };
+    let expected = local(job).await;
+    let mut app = served(&nats, "5").await;
+    let _workers = [worker(&nats, &[]), worker(&nats, &[])];
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&job(&measurement)).await;
+    for _ in 0..3 {
+        busy(&app).await;
+        tokio::time::sleep(Duration::from_millis(rand::random_range(0..400))).await;
+        app.restart();
+    }
+    let done = app.ended(&id).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    assert_eq!(results(&app, &id).await, expected);
+    nats.emptied().await;
+}
+
+#[tokio::test]
+async fn a_cancel_is_pushed_to_the_worker() {
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "5").await;
+    let _worker = worker(&nats, &[]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&with_iterations(&measurement, 9000)).await;
+    busy(&app).await;
+    let start = Instant::now();
+    app.post(&format!("/v1/jobs/{id}/cancel"), &json!({})).await.expect(202);
+    assert_eq!(app.ended(&id).await["state"], "cancelled");
+    let took = start.elapsed();
+    eprintln!("cancelled after {took:?}");
+    assert!(took < Duration::from_secs(5), "{took:?}");
+    // The worker is free for the next one.
+    let next = app.submit(&with_iterations(&measurement, 50)).await;
+    assert_eq!(app.ended(&next).await["state"], "succeeded");
+    nats.emptied().await;
+}
+
+#[tokio::test]
+async fn a_worker_of_another_version_is_refused_with_both() {
+    let Some(nats) = Nats::start(1) else { return };
+    let client = nats.client().await;
+    // What a worker of this version says.
+    let mut hellos = client.subscribe("sci.v1.hello.test").await.unwrap();
+    let mut waiting = worker(&nats, &[]);
+    let hello = futures_util::StreamExt::next(&mut hellos).await.unwrap();
+    drop(hellos);
+    let app = served(&nats, "5").await;
+    let mut body: Value = serde_json::from_slice(&hello.payload).unwrap();
+    body["program"]["version"] = json!("0.0.7");
+    let refused = {
+        let text = body.to_string();
+        let mut answer = None;
+        let start = Instant::now();
+        while answer.is_none() && start.elapsed() < Duration::from_secs(20) {
+            answer = client.request("sci.v1.hello.test", text.clone().into()).await.ok();
+        }
+        String::from_utf8(answer.unwrap().payload.to_vec()).unwrap()
+    };
+    assert!(refused.contains("0.0.7") && refused.contains(env!("CARGO_PKG_VERSION")), "{refused}");
+    // The worker that waited comes in, ...
+    until("the worker comes in", || async { workers(&app).await.len() == 1 }).await;
+    assert!(waiting.process.lives());
+    drop(app);
+    // ... and one that is refused ends with the reason.
+    let mut hellos = client.subscribe("sci.v1.hello.other").await.unwrap();
+    let url = nats.url();
+    let mut unwelcome = RemoteWorker::start(&["--nats", &url, "--pool", "other"]);
+    let asked = futures_util::StreamExt::next(&mut hellos).await.unwrap();
+    client.publish(asked.reply.unwrap(), refused.into()).await.unwrap();
+    client.flush().await.unwrap();
+    assert_eq!(unwelcome.process.ended(Duration::from_secs(10)), Some(2));
+    assert!(unwelcome.said().contains("0.0.7"), "{}", unwelcome.said());
+}
+
+#[tokio::test]
+async fn a_tile_that_fails_on_every_worker_fails_its_job_with_the_reason() {
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "5").await;
+    let _worker = worker(&nats, &["--onnxruntime", "/nowhere/lib.so"]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({
+        "measurement": measurement,
+        "algorithm": "pnp-tv-fastdvdnet",
+        "snapshots": 0,
+        "schedule": {"stages": [{"prior": "fastdvdnet", "iterations": 1, "sigma": [0.2, 0.1]}]},
+    });
+    let done = app.ended(&app.submit(&body).await).await;
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("lib.so") && !error.contains("/nowhere"), "{error}");
+    // The worker lives and does what it can.
+    let next = app.submit(&with_iterations(&measurement, 50)).await;
+    assert_eq!(app.ended(&next).await["state"], "succeeded");
+    nats.emptied().await;
+}
+
+#[tokio::test]
+async fn a_tile_that_kills_its_workers_is_given_up_with_the_reason() {
+    let Some(nats) = Nats::start(1) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let library = crate::hangs::library(folder.path(), "abort();");
+    // The worker runs as somebody else.
+    use std::os::unix::fs::PermissionsExt;
+    std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    // Far longer than the test: nobody waits for a silent worker.
+    let app = served(&nats, "600").await;
+    let mut worker = worker(&nats, &["--onnxruntime", library.to_str().unwrap()]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({
+        "measurement": measurement,
+        "algorithm": "pnp-tv-fastdvdnet",
+        "snapshots": 0,
+        "schedule": {"stages": [{"prior": "fastdvdnet", "iterations": 1, "sigma": [0.2, 0.1]}]},
+    });
+    let done = app.ended(&app.submit(&body).await).await;
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("SIGABRT") && error.contains("(3 attempts)"), "{error}");
+    // A process that is killed from outside is replaced, too, and its tile taken up again at once.
+    let job = app.submit(&job(&measurement)).await;
+    busy(&app).await;
+    rustix::process::kill_process(worker.inner().unwrap(), Signal::KILL).unwrap();
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert!(worker.process.lives());
+}
+
+#[tokio::test]
+async fn a_worker_without_work_ends_and_one_cache_serves_the_next() {
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "5").await;
+    let mut first = worker(&nats, &["--exit-when-idle", "2"]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&with_iterations(&measurement, 50)).await;
+    assert_eq!(app.ended(&id).await["state"], "succeeded");
+    assert_eq!(first.process.ended(Duration::from_secs(20)), Some(0));
+    let cached = std::fs::read_dir(first.folder.path().join("cache")).unwrap().count();
+    assert!(cached >= 8, "windows of masks: {cached}");
+}
