@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load fuzz schemathesis deny \
+.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -39,6 +39,11 @@ faults: runtime ## 200 random kills, pieces sent twice, faults at file operation
 load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once (12 GB of disk)
 	$(PYTHON) scripts/figures.py load \
 		$(CARGO) test --release --test service -- --nocapture --ignored --test-threads 1 load::
+
+cluster: runtime ## workers on other machines, with faults at random moments; needs nats-server; ROUNDS=20
+	SCI_RECON_CLUSTER_ROUNDS=$(ROUNDS) $(PYTHON) scripts/figures.py cluster \
+		$(CARGO) test --release --test service -- --nocapture --include-ignored --test-threads 1 cluster::rounds::
+ROUNDS ?= 20
 
 fuzz: ## every decoder for SECONDS seconds of CPU; needs cargo install cargo-fuzz
 	$(PYTHON) scripts/fuzz.py $(SECONDS)

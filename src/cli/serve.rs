@@ -77,7 +77,10 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let metrics = Metrics::install()?;
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
+    #[cfg(feature = "nats")]
     let hub = cluster(settings, &store).await?;
+    #[cfg(not(feature = "nats"))]
+    store.disown_remote().await?;
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
     let closing = CancellationToken::new();
     let figures = metrics.clone();
@@ -97,6 +100,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
     }
     // 6. The end: workers of this machine give their tasks back; those of others go on.
+    #[cfg(feature = "nats")]
     drop(hub);
     supervisor.ended().await;
     store.advance_generation().await?;
@@ -149,11 +153,6 @@ async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>
         Connection::open(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")
             .await?;
     Ok(Some(Hub::start(store.clone(), connection, Duration::from_secs(*ack_wait))))
-}
-
-#[cfg(not(feature = "nats"))]
-async fn cluster(_: &ServeArguments, store: &Store) -> Result<(), ServeError> {
-    Ok(store.disown_remote().await?)
 }
 
 /// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.

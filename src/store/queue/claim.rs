@@ -8,7 +8,6 @@ use sqlx::types::Json;
 use sqlx::{FromRow, Row, SqliteConnection};
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
-use super::remote;
 use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, JobState, Label, Sha256, TaskKind, TaskStage,
     TaskState, Timestamp, WorkerId,
@@ -91,11 +90,7 @@ impl Claimant<'_> {
 
 impl Store {
     /// Hands out the next task of any kind, if there is one.
-    pub async fn claim(
-        &self,
-        worker: WorkerId,
-        length: Duration,
-    ) -> Result<Option<ClaimedTask>> {
+    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
         self.claim_as(Claimant::Local, worker, length).await
     }
 
@@ -132,7 +127,7 @@ impl Store {
             jobs::set_state(&mut transaction, job, JobState::Running, None).await?;
         }
         if let Claimant::Pool(pool) = claimant {
-            remote::hand_over(&mut transaction, &lease, pool).await?;
+            hand_over(&mut transaction, &lease, pool).await?;
         }
         workers::seen(&mut transaction, worker).await?;
         transaction.commit().await?;
@@ -286,4 +281,22 @@ async fn take(
     .execute(connection)
     .await?;
     Ok(Some(row))
+}
+
+/// Notes that a tile that was claimed a moment ago is out with a pool.
+async fn hand_over(
+    connection: &mut SqliteConnection,
+    lease: &Lease,
+    pool: &str,
+) -> Result<(), StoreError> {
+    sql!(
+        "INSERT INTO remote_tasks (task, pool, attempt) VALUES (?, ?, ?)",
+        [lease.task, pool, lease.attempt]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!("UPDATE tasks SET lease_until = NULL WHERE id = ?", [lease.task])
+        .execute(connection)
+        .await?;
+    Ok(())
 }

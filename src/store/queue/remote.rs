@@ -304,24 +304,6 @@ impl Store {
     }
 }
 
-/// Notes that a tile that was claimed a moment ago is out with a pool.
-pub(super) async fn hand_over(
-    connection: &mut SqliteConnection,
-    lease: &Lease,
-    pool: &str,
-) -> Result<(), StoreError> {
-    sql!(
-        "INSERT INTO remote_tasks (task, pool, attempt) VALUES (?, ?, ?)",
-        [lease.task, pool, lease.attempt]
-    )
-    .execute(&mut *connection)
-    .await?;
-    sql!("UPDATE tasks SET lease_until = NULL WHERE id = ?", [lease.task])
-        .execute(connection)
-        .await?;
-    Ok(())
-}
-
 /// Gives a tile that was lost a moment ago to the worker that has its message now. Gives the number of
 /// the attempt; none if the tile is not to be tried again.
 async fn take_again(
