@@ -1,5 +1,7 @@
 //! The filter of groups of patches.
 
+#![allow(clippy::needless_range_loop)] // the indices of the algebra
+
 use pulp::Simd;
 
 use super::{BATCH, PATCHES, PIXELS};
@@ -9,16 +11,16 @@ const ROWS: usize = 4;
 const _: () = assert!(PIXELS.is_multiple_of(ROWS) && PATCHES.is_multiple_of(4));
 
 /// The patches of a batch of groups and what their filter needs: matrices, row by row, of vectors that hold a
-/// number of each of so many groups as they have lanes.
+/// number of each of so many groups as they have lanes; so many matrices one after the other as make a batch.
 #[derive(Debug)]
 pub(super) struct Filter {
-    /// `Y` of the whole batch: [BATCH / lanes, PIXELS, PATCHES] vectors.
+    /// `Y`: \[PIXELS, PATCHES\].
     pub(super) patches: Vec<f32>,
-    /// [PIXELS, PIXELS].
+    /// `G`: \[PIXELS, PIXELS\].
     gram: Vec<f32>,
-    /// Lower triangle of the Cholesky factor, with the reciprocals of its diagonal: [PIXELS, PIXELS].
+    /// Lower triangle of the Cholesky factor, with the reciprocals of its diagonal: \[PIXELS, PIXELS\].
     factor: Vec<f32>,
-    /// [PIXELS, PATCHES].
+    /// `Y - mean` and what is made of it: \[PIXELS, PATCHES\].
     solved: Vec<f32>,
 }
 
@@ -30,23 +32,57 @@ impl Default for Filter {
     }
 }
 
-/// `Y <- mean + G^2 (G^2 + tau^2)^-1 (Y - mean)` with `G` of the patches less their mean, in every
-/// group: the same as `Y - tau^2 (G^2 + tau^2)^-1 (Y - mean)`.
+// The filter is `Y <- mean + G^2 (G^2 + tau^2)^-1 (Y - mean)` with `G` of the patches less their mean, in every
+// group: the same as `Y - tau^2 (G^2 + tau^2)^-1 (Y - mean)`.
+
+/// `G = (Y - mean) (Y - mean)^T`.
 #[inline(always)]
-pub(super) fn low_rank<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
-    let Filter { patches, gram, factor, solved } = filter;
-    let [gram, factor] = [gram, factor].map(|matrix| S::as_mut_simd_f32s(matrix).0);
-    let solved = S::as_mut_simd_f32s(solved).0;
-    for patches in S::as_mut_simd_f32s(patches).0.chunks_exact_mut(PIXELS * PATCHES) {
-        match S::F32_LANES {
-            16 => Group::<S, 4> { simd, patches, gram, factor, solved }.filter(tau),
-            _ => Group::<S, 2> { simd, patches, gram, factor, solved }.filter(tau),
-        }
+pub(super) fn multiply<S: Simd>(simd: S, filter: &mut Filter) {
+    match S::F32_LANES {
+        16 => parts::<S, 4>(simd, filter).for_each(|mut part| part.multiply()),
+        _ => parts::<S, 2>(simd, filter).for_each(|mut part| part.multiply()),
     }
 }
 
+/// The Cholesky factor of `G^2 + tau^2`.
+#[inline(always)]
+pub(super) fn factorize<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
+    match S::F32_LANES {
+        16 => parts::<S, 4>(simd, filter).for_each(|mut part| part.factorize(tau)),
+        _ => parts::<S, 2>(simd, filter).for_each(|mut part| part.factorize(tau)),
+    }
+}
+
+/// The filtered patches in place of `Y`.
+#[inline(always)]
+pub(super) fn solve<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
+    match S::F32_LANES {
+        16 => parts::<S, 4>(simd, filter).for_each(|mut part| part.solve(tau)),
+        _ => parts::<S, 2>(simd, filter).for_each(|mut part| part.solve(tau)),
+    }
+}
+
+#[inline(always)]
+fn parts<S: Simd, const C: usize>(
+    simd: S,
+    filter: &mut Filter,
+) -> impl Iterator<Item = Part<'_, S, C>> {
+    let Filter { patches, gram, factor, solved } = filter;
+    let patches = S::as_mut_simd_f32s(patches).0.chunks_exact_mut(PIXELS * PATCHES);
+    let gram = S::as_mut_simd_f32s(gram).0.chunks_exact_mut(PIXELS * PIXELS);
+    let factor = S::as_mut_simd_f32s(factor).0.chunks_exact_mut(PIXELS * PIXELS);
+    let solved = S::as_mut_simd_f32s(solved).0.chunks_exact_mut(PIXELS * PATCHES);
+    patches.zip(gram).zip(factor.zip(solved)).map(move |((patches, gram), (factor, solved))| Part {
+        simd,
+        patches,
+        gram,
+        factor,
+        solved,
+    })
+}
+
 /// As many groups as a vector has lanes, in tiles of `ROWS` x `C`.
-struct Group<'a, S: Simd, const C: usize> {
+struct Part<'a, S: Simd, const C: usize> {
     simd: S,
     patches: &'a mut [S::f32s],
     gram: &'a mut [S::f32s],
@@ -56,22 +92,15 @@ struct Group<'a, S: Simd, const C: usize> {
 
 type Tile<S, const C: usize> = [[<S as Simd>::f32s; C]; ROWS];
 
-impl<S: Simd, const C: usize> Group<'_, S, C> {
+impl<S: Simd, const C: usize> Part<'_, S, C> {
+    /// `tau^2`. Far below the largest eigenvalue the square is lost in rounding: the filter passes nothing there.
     #[inline(always)]
-    fn filter(mut self, tau: f32) {
+    fn square(&self, tau: f32) -> S::f32s {
         let simd = self.simd;
-        self.centre();
-        self.multiply();
         let mut trace = simd.splat_f32s(0.0);
         (0..PIXELS).for_each(|i| trace = simd.add_f32s(trace, self.gram[i * PIXELS + i]));
-        // Far below the largest eigenvalue the square is lost in rounding: the filter passes nothing there.
         let least = simd.mul_f32s(simd.splat_f32s(4e-6), simd.mul_f32s(trace, trace));
-        let square = simd.max_f32s(simd.splat_f32s(tau * tau), least);
-        self.factorize(square);
-        for column in (0..PATCHES).step_by(C) {
-            (0..PIXELS).step_by(ROWS).for_each(|row| self.forward(row, column));
-            (0..PIXELS).step_by(ROWS).rev().for_each(|row| self.backward(row, column, square));
-        }
+        simd.max_f32s(simd.splat_f32s(tau * tau), least)
     }
 
     /// `solved = Y - mean`.
@@ -92,6 +121,7 @@ impl<S: Simd, const C: usize> Group<'_, S, C> {
     /// `G = solved solved^T`, both triangles.
     #[inline(always)]
     fn multiply(&mut self) {
+        self.centre();
         for i in (0..PIXELS).step_by(ROWS) {
             for j in (0..i + ROWS).step_by(C) {
                 let mut tile = self.zeros();
@@ -109,8 +139,8 @@ impl<S: Simd, const C: usize> Group<'_, S, C> {
 
     /// `G^2 + square = L L^T`, tile by tile.
     #[inline(always)]
-    fn factorize(&mut self, square: S::f32s) {
-        let simd = self.simd;
+    fn factorize(&mut self, tau: f32) {
+        let (simd, square) = (self.simd, self.square(tau));
         for j in (0..PIXELS).step_by(ROWS) {
             for i in (j..PIXELS).step_by(ROWS) {
                 for column in (j..j + ROWS).step_by(C) {
@@ -149,6 +179,15 @@ impl<S: Simd, const C: usize> Group<'_, S, C> {
         };
     }
 
+    #[inline(always)]
+    fn solve(&mut self, tau: f32) {
+        let square = self.square(tau);
+        for column in (0..PATCHES).step_by(C) {
+            (0..PIXELS).step_by(ROWS).for_each(|row| self.forward(row, column));
+            (0..PIXELS).step_by(ROWS).rev().for_each(|row| self.backward(row, column, square));
+        }
+    }
+
     /// A tile of `L^-1 solved`, in place of `solved`; those above it are done.
     #[inline(always)]
     fn forward(&mut self, i: usize, column: usize) {
@@ -164,8 +203,8 @@ impl<S: Simd, const C: usize> Group<'_, S, C> {
                 }
             }
         }
-        for r in 0..ROWS {
-            for c in 0..C {
+        for c in 0..C {
+            for r in 0..ROWS {
                 for k in 0..r {
                     let done = tile[k][c];
                     tile[r][c] = simd.negate_mul_add_e_f32s(factor[r][i + k], done, tile[r][c]);
@@ -191,8 +230,8 @@ impl<S: Simd, const C: usize> Group<'_, S, C> {
                 }
             }
         }
-        for r in (0..ROWS).rev() {
-            for c in 0..C {
+        for c in 0..C {
+            for r in (0..ROWS).rev() {
                 for k in r + 1..ROWS {
                     let factor = self.factor[(i + k) * PIXELS + i + r];
                     tile[r][c] = simd.negate_mul_add_e_f32s(factor, tile[k][c], tile[r][c]);
@@ -267,7 +306,7 @@ fn store<V: Copy, const C: usize>(
 #[cfg(test)]
 mod tests {
     use super::super::place_of;
-    use super::{BATCH, Filter, PATCHES, PIXELS, low_rank};
+    use super::{BATCH, Filter, PATCHES, PIXELS, factorize, multiply, solve};
     use pulp::{Arch, Simd, WithSimd};
     use rand::{Rng, SeedableRng};
 
@@ -294,7 +333,9 @@ mod tests {
                     }
                 }
             }
-            low_rank(simd, &mut filter, self.tau);
+            multiply(simd, &mut filter);
+            factorize(simd, &mut filter, self.tau);
+            solve(simd, &mut filter, self.tau);
             let row =
                 |group, i| std::array::from_fn(|patch| filter.patches[place(group, i, patch)]);
             let group = |group| (0..PIXELS).map(|i| row(group, i)).collect();

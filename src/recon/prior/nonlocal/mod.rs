@@ -105,6 +105,8 @@ pub struct Nonlocal {
     /// Top left pixels of all patches, `PATCHES` for a group.
     groups: Vec<u32>,
     filter: Filter,
+    /// The vector instructions of this machine.
+    arch: Arch,
 }
 
 impl Nonlocal {
@@ -122,6 +124,7 @@ impl Nonlocal {
             cover: vec![0.0; size],
             groups: Vec::new(),
             filter: Filter::default(),
+            arch: Arch::new(),
         }
     }
 
@@ -131,17 +134,6 @@ impl Nonlocal {
     /// Passes of one object belong to one clip: patches are compared in the result of the pass
     /// before, and the groups are kept for a few passes.
     pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) {
-        let arch = Arch::new();
-        self.denoise_with(frames, sigma, |part| arch.dispatch(part));
-    }
-
-    /// The same, with the vector instructions that `run` chooses.
-    fn denoise_with(
-        &mut self,
-        frames: &mut Array3<f32>,
-        sigma: f32,
-        run: impl FnOnce(VectorPart<'_>),
-    ) {
         debug_assert_eq!(frames.dim(), (self.frames, self.height, self.width));
         if self.height < SIDE || self.width < SIDE {
             return;
@@ -154,7 +146,8 @@ impl Nonlocal {
         if self.passes == 0 {
             self.guide.copy_from_slice(&self.noisy);
         }
-        run(VectorPart { prior: self, sigma });
+        let refresh = self.passes.is_multiple_of(REFRESH);
+        self.work(if refresh { &Part::ALL } else { &Part::ALL[1..] }, sigma);
         self.passes += 1;
         let filtered = self.guide.chunks_exact_mut(row_length);
         let sums = self.sum.chunks_exact(row_length).zip(self.cover.chunks_exact(row_length));
@@ -168,35 +161,66 @@ impl Nonlocal {
         }
     }
 
-    #[inline(always)]
-    fn filter_groups<S: Simd>(&mut self, simd: S, sigma: f32) {
-        let Self { noisy, sum, groups, filter, width, .. } = self;
-        let row_length = row_length(*width);
-        let tau = STRENGTH * PATCHES as f32 * sigma * sigma;
-        sum.fill(0.0);
-        for batch in groups.chunks(BATCH * PATCHES) {
-            gather::<S>(noisy, row_length, batch, &mut filter.patches);
-            low_rank::low_rank(simd, filter, tau);
-            scatter::<S>(&filter.patches, row_length, batch, sum);
-        }
+    /// Does these parts of a pass on the clip as it stands.
+    pub fn work(&mut self, parts: &[Part], sigma: f32) {
+        self.arch.dispatch(Work { prior: self, parts, sigma });
     }
 }
 
-/// What takes the time of a pass.
-struct VectorPart<'a> {
+/// A part of a pass, in their order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Finds the patches of each group.
+    Search,
+    /// Copies them from the clip.
+    Gather,
+    /// `G = Y Y^T` of the patches less their mean.
+    Gram,
+    /// Cholesky factor of `G^2 + tau^2`.
+    Factor,
+    /// The filtered patches.
+    Solve,
+    /// Adds them up.
+    Scatter,
+}
+
+impl Part {
+    /// A whole pass.
+    pub const ALL: [Self; 6] =
+        [Self::Search, Self::Gather, Self::Gram, Self::Factor, Self::Solve, Self::Scatter];
+}
+
+struct Work<'a> {
     prior: &'a mut Nonlocal,
+    parts: &'a [Part],
     sigma: f32,
 }
 
-impl WithSimd for VectorPart<'_> {
+impl WithSimd for Work<'_> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        if self.prior.passes.is_multiple_of(REFRESH) {
+        let (parts, sigma) = (self.parts, self.sigma);
+        if parts.contains(&Part::Search) {
             search::search(simd, self.prior);
         }
-        self.prior.filter_groups(simd, self.sigma);
+        let Nonlocal { noisy, sum, groups, filter, width, .. } = self.prior;
+        let row_length = row_length(*width);
+        let tau = STRENGTH * PATCHES as f32 * sigma * sigma;
+        sum.fill(0.0);
+        for batch in groups.chunks(BATCH * PATCHES) {
+            for part in parts {
+                match part {
+                    Part::Search => {}
+                    Part::Gather => gather::<S>(noisy, row_length, batch, &mut filter.patches),
+                    Part::Gram => low_rank::multiply(simd, filter),
+                    Part::Factor => low_rank::factorize(simd, filter, tau),
+                    Part::Solve => low_rank::solve(simd, filter, tau),
+                    Part::Scatter => scatter::<S>(&filter.patches, row_length, batch, sum),
+                }
+            }
+        }
     }
 }
 
@@ -213,11 +237,14 @@ fn place_of<S: Simd>(group: usize, patch: usize) -> usize {
 fn gather<S: Simd>(clip: &[f32], row_length: usize, batch: &[u32], patches: &mut [f32]) {
     for patch in 0..PATCHES {
         for (index, group) in batch.chunks_exact(PATCHES).enumerate() {
-            let values = patches[place_of::<S>(index, patch)..].iter_mut();
-            let values = values.step_by(PATCHES * S::F32_LANES);
-            let rows = (group[patch] as usize..).step_by(row_length).take(SIDE);
-            let pixels = rows.flat_map(|start| &clip[start..start + SIDE]);
-            values.zip(pixels).for_each(|(value, &pixel)| *value = pixel);
+            let values = &mut patches[place_of::<S>(index, patch)..][..span::<S>()];
+            let start = group[patch] as usize;
+            for i in 0..SIDE {
+                let row = &clip[start + i * row_length..][..SIDE];
+                for (j, &pixel) in row.iter().enumerate() {
+                    values[(i * SIDE + j) * PATCHES * S::F32_LANES] = pixel;
+                }
+            }
         }
     }
 }
@@ -226,14 +253,22 @@ fn gather<S: Simd>(clip: &[f32], row_length: usize, batch: &[u32], patches: &mut
 fn scatter<S: Simd>(patches: &[f32], row_length: usize, batch: &[u32], sum: &mut [f32]) {
     for patch in 0..PATCHES {
         for (index, group) in batch.chunks_exact(PATCHES).enumerate() {
-            let values = patches[place_of::<S>(index, patch)..].iter();
-            let mut values = values.step_by(PATCHES * S::F32_LANES);
-            for start in (group[patch] as usize..).step_by(row_length).take(SIDE) {
-                let row = sum[start..start + SIDE].iter_mut();
-                row.zip(&mut values).for_each(|(sum, value)| *sum += value);
+            let values = &patches[place_of::<S>(index, patch)..][..span::<S>()];
+            let start = group[patch] as usize;
+            for i in 0..SIDE {
+                let row = &mut sum[start + i * row_length..][..SIDE];
+                for (j, pixel) in row.iter_mut().enumerate() {
+                    *pixel += values[(i * SIDE + j) * PATCHES * S::F32_LANES];
+                }
             }
         }
     }
+}
+
+/// From the first number of a patch to the end of its last one.
+#[inline(always)]
+fn span<S: Simd>() -> usize {
+    (PIXELS - 1) * PATCHES * S::F32_LANES + 1
 }
 
 /// Length of a row with its margin.
@@ -251,12 +286,10 @@ fn positions(length: usize) -> Vec<usize> {
 
 #[cfg(test)]
 mod tests {
-    use super::{
-        Nonlocal, PATCHES, PIXELS, REACH, REFRESH, SIDE, STRENGTH, VectorPart, positions,
-        search::window,
-    };
+    use super::search::window;
+    use super::{Nonlocal, PATCHES, PIXELS, REACH, REFRESH, SIDE, STRENGTH, positions};
     use ndarray::Array3;
-    use pulp::{Scalar, Simd};
+    use pulp::Arch;
     use rand::{Rng, SeedableRng};
 
     fn noisy(size: (usize, usize, usize), sigma: f32) -> (Array3<f32>, Array3<f32>) {
@@ -422,23 +455,19 @@ mod tests {
     #[test]
     fn vector_instructions_do_not_matter() {
         let size = (4, 27, 38);
-        let passes = |run: fn(VectorPart<'_>)| {
+        let passes = |arch: Arch| {
             let mut clip = noisy(size, 0.1).1;
-            let mut prior = Nonlocal::new(size);
-            (0..REFRESH + 2).for_each(|_| prior.denoise_with(&mut clip, 0.05, run));
+            let mut prior = Nonlocal { arch, ..Nonlocal::new(size) };
+            (0..REFRESH + 2).for_each(|_| prior.denoise(&mut clip, 0.05));
             clip
         };
-        let own = passes(|part| pulp::Arch::new().dispatch(part));
-        let scalar = passes(|part| Scalar.vectorize(part));
+        let own = passes(Arch::new());
+        let scalar = passes(Arch::Scalar);
         let worst = (&own - &scalar).mapv(f32::abs).fold(0.0, |a: f32, &b| a.max(b));
         assert!(worst < 1e-4, "{worst}");
         #[cfg(target_arch = "x86_64")]
-        if pulp::x86::V3::try_new().is_some() {
-            let run = |part: VectorPart<'_>| {
-                let v3 = pulp::x86::V3::try_new().unwrap();
-                Simd::vectorize(v3, part);
-            };
-            assert_eq!(passes(run), own);
+        if let Some(avx2) = pulp::x86::V3::try_new() {
+            assert_eq!(passes(Arch::V3(avx2)), own);
         }
     }
 
