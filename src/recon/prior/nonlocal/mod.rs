@@ -39,7 +39,7 @@ impl Prior for NonlocalPrior {
     }
 
     fn cost(&self, _: &Settings) -> f64 {
-        1_700.0
+        400.0
     }
 
     /// Four clips with margins, and 40 indices for each 16 pixels.
