@@ -219,7 +219,7 @@ async fn silent_connections_neither_stop_the_service_nor_stay() {
     use tokio::net::TcpStream;
 
     let app = TestApp::with(&["--workers", "0"]).await;
-    let address = app.url.trim_start_matches("http://").to_owned();
+    let address = app.address();
     let limits = std::fs::read_to_string(format!("/proc/{}/limits", app.pid())).unwrap();
     let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
     let figures: Vec<&str> = files.split_whitespace().collect();
@@ -243,7 +243,7 @@ async fn a_request_names_one_host() {
     use tokio::net::TcpStream;
 
     let app = TestApp::start().await;
-    let address = app.url.trim_start_matches("http://").to_owned();
+    let address = app.address();
     for (lines, status) in [
         (String::new(), "400"),
         (format!("Host: {address}\r\nHost: evil.example\r\n"), "400"),

@@ -91,11 +91,7 @@ impl Claimant<'_> {
 
 impl Store {
     /// Hands out the next task of any kind, if there is one.
-    pub async fn claim(
-        &self,
-        worker: WorkerId,
-        length: Duration,
-    ) -> Result<Option<ClaimedTask>> {
+    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
         self.claim_as(Claimant::Local, worker, length).await
     }
 
