@@ -8,6 +8,7 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
 use rand::{Rng, SeedableRng};
+use sci_recon::recon::prior::nonlocal::{Nonlocal, Part};
 use sci_recon::recon::prior::temporal::TemporalVariation;
 use sci_recon::recon::prior::tv::TotalVariation;
 use sci_recon::recon::schedule::Schedule;
@@ -63,6 +64,51 @@ fn kernels(criterion: &mut Criterion) {
     group.bench_function("roofline, memory of a gap-tv iteration", |bencher| {
         bencher
             .iter(|| ndarray::azip!((out in &mut out, &a in &frames, &b in &masks) *out = a + b));
+    });
+    group.finish();
+    nonlocal(criterion);
+}
+
+/// The nonlocal prior part by part. A part of all groups beside its operations on registers alone; the parts that
+/// only move numbers, beside the same traffic with the memory, a load and a store for each number.
+fn nonlocal(criterion: &mut Criterion) {
+    const PIXELS: usize = 36;
+    const PATCHES: usize = 40;
+    let mut group = criterion.benchmark_group("nonlocal 8x256x256");
+    group.sample_size(10);
+    group.throughput(Throughput::Elements((DIM.0 * DIM.1 * DIM.2) as u64));
+    let mut prior = Nonlocal::new(DIM);
+    let mut frames = random(7);
+    group.bench_function("four passes", |bencher| {
+        bencher.iter(|| (0..4).for_each(|_| prior.denoise(black_box(&mut frames), 0.05)));
+    });
+    for part in Part::ALL {
+        let name = format!("{part:?}").to_lowercase();
+        group
+            .bench_function(&name, |bencher| bencher.iter(|| prior.work(black_box(&[part]), 0.05)));
+    }
+    let groups = DIM.0 * 64 * 64;
+    // 44 pairs of frames that are at most 3 apart, of 8 x 8; a difference and a square for each pixel.
+    let candidates = 44 * 64 * 64 * 16 * 16;
+    let triangle = |size: usize| size * (size + 1) / 2;
+    let square = PIXELS * PIXELS;
+    for (part, count) in [
+        ("search", candidates * PIXELS * 2),
+        ("gram", groups * triangle(PIXELS) * PATCHES),
+        ("factor", groups * (triangle(PIXELS) * PIXELS + square * PIXELS / 6)),
+        ("solve", groups * square * PATCHES),
+    ] {
+        group.bench_function(format!("roofline, arithmetic of {part}"), |bencher| {
+            bencher.iter(|| operations(black_box(count)));
+        });
+    }
+    let (from, mut to) = (vec![1.0f32; PIXELS * PATCHES], vec![0.0f32; PIXELS * PATCHES]);
+    group.bench_function("roofline, memory of gather or scatter", |bencher| {
+        bencher.iter(|| {
+            for _ in 0..groups {
+                black_box(&from).iter().zip(black_box(&mut to)).for_each(|(from, to)| *to = *from);
+            }
+        });
     });
     group.finish();
 }
