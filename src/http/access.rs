@@ -3,6 +3,7 @@
 //! A service for which no token was ever made is open; all data are the lab `local`'s then.
 
 use std::net::IpAddr;
+use std::sync::Arc;
 
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::request::Parts;
@@ -14,9 +15,9 @@ use headers::authorization::{Authorization, Bearer};
 use headers::{Cookie, HeaderMapExt};
 use rustix::system::uname;
 
-use super::app::App;
 use super::error::{ApiError, Code, Result};
 use crate::job::{Lab, Role, Secret, TokenId};
+use crate::store::Store;
 
 /// A page that can't set headers of its requests (for pictures and events, say) keeps the token in
 /// this cookie. It opens only what changes nothing, so that no foreign page can use it to do harm.
@@ -65,13 +66,13 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
 
 /// Lets a request pass if its token may do what it wants.
 pub(super) async fn guard(
-    State((app, rule)): State<(App, Rule)>,
+    State((store, hosts, rule)): State<(Store, Arc<[String]>, Rule)>,
     mut request: Request,
     next: Next,
 ) -> Response {
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
     let secret = secret(request.method(), request.headers());
-    match admit(&app, secret, role, (request.method(), request.headers())).await {
+    match admit((&store, &hosts), secret, role, (request.method(), request.headers())).await {
         Ok(access) => {
             tracing::Span::current().record("lab", access.lab.as_str());
             request.extensions_mut().insert(access);
@@ -82,19 +83,18 @@ pub(super) async fn guard(
 }
 
 async fn admit(
-    app: &App,
+    (store, hosts): (&Store, &[String]),
     secret: Option<Secret>,
     role: Role,
     (method, headers): (&Method, &HeaderMap),
 ) -> Result<Access> {
-    let store = &app.store;
     let token = match &secret {
         Some(secret) => store.token(secret).await?,
         None => None,
     };
     let Some(token) = token else {
         if store.is_open().await? {
-            check_site(method, headers, &app.settings.hosts)?;
+            check_site(method, headers, hosts)?;
             return Ok(Access { lab: Lab::local(), token: None, max_bytes: None });
         }
         return Err(missing());

@@ -1,5 +1,7 @@
 //! The routes: the table of contents of the API. `openapi.yaml` has the same ones; a test sees to it.
 
+use std::sync::Arc;
+
 use axum::error_handling::HandleErrorLayer;
 use axum::extract::DefaultBodyLimit;
 use axum::handler::Handler;
@@ -77,9 +79,11 @@ pub fn router(app: App) -> Router {
     let late = HandleErrorLayer::new(move |_: BoxError| async move { layers::timed_out(seconds) });
     let timeout = ServiceBuilder::new().layer(late).timeout(app.settings.request_time());
     let close = map_response(layers::close_after_refusal);
+    let hosts: Arc<[String]> = app.settings.hosts.clone().into();
     let mut router = Router::new();
     for route in routes() {
-        let guard = from_fn_with_state((app.clone(), route.rule), access::guard);
+        let guard =
+            from_fn_with_state((app.store.clone(), hosts.clone(), route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let handlers = handlers.route_layer(guard);

@@ -4,7 +4,7 @@
 
 use pulp::Simd;
 
-use super::{BATCH, PATCHES, PIXELS};
+use super::layout::{BATCH, PATCHES, PIXELS};
 
 /// Rows of a tile of a product. A tile's sums stay in registers: 4x4 of the 32 that AVX-512 has, 4x2 of 16.
 const ROWS: usize = 4;
@@ -305,7 +305,7 @@ fn store<V: Copy, const C: usize>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::place_of;
+    use super::super::layout::place_of;
     use super::{BATCH, Filter, PATCHES, PIXELS, factorize, multiply, solve};
     use pulp::{Arch, Simd, WithSimd};
     use rand::{Rng, SeedableRng};

@@ -7,6 +7,7 @@
 //! `G^2 (G^2 + tau^2)^-1` with `G = Y Y^T`: nearly as sharp (of second order in the eigenvalues),
 //! and one Cholesky factorisation instead of an eigenvalue problem.
 
+mod layout;
 mod low_rank;
 mod search;
 
@@ -17,6 +18,7 @@ use pulp::{Arch, Simd, WithSimd};
 
 use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
 use crate::recon::error::ReconError;
+use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
 use low_rank::Filter;
 
 /// Groups of similar patches, filtered by their own covariance.
@@ -67,26 +69,10 @@ impl Pass for Nonlocal {
     }
 }
 
-/// Height and width of a patch, pixels.
-const SIDE: usize = 6;
-/// Pixels of a patch.
-const PIXELS: usize = SIDE * SIDE;
-/// Patches of a group.
-const PATCHES: usize = 40;
-/// Distance of neighbouring reference patches, pixels.
-const STRIDE: usize = 4;
-/// Height and width of the window that is searched in each frame, in positions of patches.
-const WINDOW: usize = 16;
-/// Frames before and after the reference that are searched.
-const REACH: usize = 3;
 /// Passes for which the groups are kept.
 const REFRESH: usize = 4;
 /// `tau` in units of `PATCHES sigma^2`, the eigenvalue that noise alone would have.
 const STRENGTH: f32 = 4.0;
-/// Groups that are filtered together, so many in each vector register as it has lanes. The number is the
-/// same for every machine: so is the order in which patches are added up.
-const BATCH: usize = 16;
-
 /// The prior with its groups and working memory, for clips of one size.
 #[derive(Debug)]
 pub struct Nonlocal {
@@ -203,7 +189,10 @@ impl WithSimd for Work<'_> {
     fn with_simd<S: Simd>(self, simd: S) {
         let (parts, sigma) = (self.parts, self.sigma);
         if parts.contains(&Part::Search) {
-            search::search(simd, self.prior);
+            {
+                let Nonlocal { guide, groups, cover, frames, height, width, .. } = &mut *self.prior;
+                search::search(simd, guide, (*frames, *height, *width), groups, cover);
+            }
         }
         let Nonlocal { noisy, sum, groups, filter, width, .. } = self.prior;
         let row_length = row_length(*width);
@@ -222,14 +211,6 @@ impl WithSimd for Work<'_> {
             }
         }
     }
-}
-
-/// Where a number of a patch lies among those of a batch: `S::F32_LANES` groups beside each other, pixel by
-/// pixel and patch by patch.
-#[inline(always)]
-fn place_of<S: Simd>(group: usize, patch: usize) -> usize {
-    let lanes = S::F32_LANES;
-    group / lanes * (PIXELS * PATCHES * lanes) + patch * lanes + group % lanes
 }
 
 // Patch by patch and not group by group: what is written then fills whole lines of the cache.
@@ -271,23 +252,11 @@ fn span<S: Simd>() -> usize {
     (PIXELS - 1) * PATCHES * S::F32_LANES + 1
 }
 
-/// Length of a row with its margin.
-fn row_length(width: usize) -> usize {
-    width + WINDOW + SIDE
-}
-
-/// Positions of the reference patches along an axis, the last one at its end.
-fn positions(length: usize) -> Vec<usize> {
-    let last = length - SIDE;
-    let mut all: Vec<usize> = (0..last).step_by(STRIDE).collect();
-    all.push(last);
-    all
-}
-
 #[cfg(test)]
 mod tests {
+    use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions};
     use super::search::window;
-    use super::{Nonlocal, PATCHES, PIXELS, REACH, REFRESH, SIDE, STRENGTH, positions};
+    use super::{Nonlocal, REFRESH, STRENGTH};
     use ndarray::Array3;
     use pulp::Arch;
     use rand::{Rng, SeedableRng};

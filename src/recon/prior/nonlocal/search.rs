@@ -4,7 +4,10 @@ use std::ops::Range;
 
 use pulp::{Simd, bytemuck};
 
-use super::{Nonlocal, PATCHES, REACH, SIDE, WINDOW, positions, row_length};
+use super::layout::{PATCHES, REACH, SIDE, WINDOW, positions, row_length};
+
+/// Frames, height and width of a clip.
+type Size = (usize, usize, usize);
 
 /// Rows of a window that are compared at once: their sums stay in registers.
 pub(super) const ROWS: usize = 8;
@@ -15,31 +18,41 @@ const KEPT: usize = 128;
 /// cover a pixel. Of patches equally similar those that come first in the clip are taken; of a group they are
 /// in the clip's order, which does not depend on how they were found.
 #[inline(always)]
-pub(super) fn search<S: Simd>(simd: S, prior: &mut Nonlocal) {
+pub(super) fn search<S: Simd>(
+    simd: S,
+    guide: &[f32],
+    size: Size,
+    groups: &mut Vec<u32>,
+    cover: &mut [f32],
+) {
     match S::F32_LANES {
-        16 => search_with::<S, { WINDOW / 16 }>(simd, prior),
-        8 => search_with::<S, { WINDOW / 8 }>(simd, prior),
-        4 => search_with::<S, { WINDOW / 4 }>(simd, prior),
-        _ => search_with::<S, WINDOW>(simd, prior),
+        16 => search_with::<S, { WINDOW / 16 }>(simd, guide, size, groups),
+        8 => search_with::<S, { WINDOW / 8 }>(simd, guide, size, groups),
+        4 => search_with::<S, { WINDOW / 4 }>(simd, guide, size, groups),
+        _ => search_with::<S, WINDOW>(simd, guide, size, groups),
     }
-    count_cover(prior);
+    count_cover(groups, cover, row_length(size.2));
 }
 
 /// The same with `V` vectors for a row of a window.
 #[inline(always)]
-fn search_with<S: Simd, const V: usize>(simd: S, prior: &mut Nonlocal) {
-    let Nonlocal { guide, groups, frames, height, width, .. } = prior;
-    let row_length = row_length(*width);
-    let plane = *height * row_length;
-    let (rows, columns) = (positions(*height), positions(*width));
+fn search_with<S: Simd, const V: usize>(
+    simd: S,
+    guide: &[f32],
+    (frames, height, width): Size,
+    groups: &mut Vec<u32>,
+) {
+    let row_length = row_length(width);
+    let plane = height * row_length;
+    let (rows, columns) = (positions(height), positions(width));
     let mut best = Best::default();
     groups.clear();
-    for frame in 0..*frames {
-        let near = frame.saturating_sub(REACH)..(frame + REACH + 1).min(*frames);
+    for frame in 0..frames {
+        let near = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
         // The own frame first: there the most similar ones are likely, and the bound falls at once.
         let order = || [frame].into_iter().chain(near.clone().filter(|&other| other != frame));
         for (&row, &column) in rows.iter().flat_map(|row| columns.iter().map(move |c| (row, c))) {
-            let (top, left) = (window(row, *height), window(column, *width));
+            let (top, left) = (window(row, height), window(column, width));
             let reference = frame * plane + row * row_length + column;
             best.clear();
             for (other, first) in
@@ -173,13 +186,12 @@ fn distances<S: Simd, const V: usize>(
 }
 
 /// How many patches cover a pixel: the sums of the patches that begin here over squares of `SIDE`.
-fn count_cover(prior: &mut Nonlocal) {
-    let Nonlocal { cover, groups, width, .. } = prior;
+fn count_cover(groups: &[u32], cover: &mut [f32], row_length: usize) {
     cover.fill(0.0);
     for &place in groups.iter() {
         cover[place as usize] += 1.0;
     }
-    for step in [1, row_length(*width)] {
+    for step in [1, row_length] {
         for at in (0..cover.len()).rev() {
             let before = (0..SIDE).map_while(|back| at.checked_sub(back * step));
             cover[at] = before.map(|place| cover[place]).sum();
