@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: demo test e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: demo test deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -16,6 +16,9 @@ demo: runtime ## reconstruct a real clip through the real HTTP service
 test: runtime judges $(TRAINING)/.stamp ## all tests
 	SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test
 	$(TRAINING)/bin/python training/test_pipeline.py
+
+deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
+	$(JUDGES)/bin/python tests/judges/deploy.py .
 
 e2e: runtime ## the dashboard in a real browser; ends with one line of JSON; SHORT=1
 	@SHORT=$(SHORT) tests/e2e/run.sh

@@ -48,9 +48,9 @@ def kustomize(root, wrong):
     with tempfile.TemporaryDirectory() as copy:
         folder = pathlib.Path(copy) / "kubernetes"
         shutil.copytree(root / "deploy/kubernetes", folder)
-        (folder / "secrets").mkdir()
-        for name in ["nats-server.conf", "hub.creds", "worker.creds"]:
-            (folder / "secrets" / name).write_text("x")
+        (folder / "cluster").mkdir(exist_ok=True)
+        for name in [*(f"nats-server-{n}.conf" for n in (1, 2, 3)), "hub.creds", "default.creds"]:
+            (folder / "cluster" / name).write_text("x")
         status, told = run("kubectl", "kustomize", str(folder))
     if status:
         wrong.append(f"kubectl kustomize: {told}")
