@@ -46,6 +46,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
             }
             #[cfg(feature = "nats")]
             Err(WorkEnd::Cluster(error)) => Err(error.into()),
+            Err(WorkEnd::Store(error)) => Err(error.into()),
             ended => ended.map_err(|error| failed(&error)),
         }
     });
