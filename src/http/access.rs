@@ -17,7 +17,7 @@ use rustix::system::uname;
 
 use super::error::{ApiError, Code, Result};
 use crate::job::{Lab, Role, Secret, TokenId};
-use crate::store::Store;
+use crate::store::{Store, Token};
 
 /// A page that can't set headers of its requests (for pictures and events, say) keeps the token in
 /// this cookie. It opens only what changes nothing, so that no foreign page can use it to do harm.
@@ -50,6 +50,7 @@ impl Rule {
 pub(super) struct Access {
     /// Whose data are seen.
     pub(super) lab: Lab,
+    pub(super) role: Role,
     pub(super) token: Option<TokenId>,
     /// Bytes of uploads that the token may keep here.
     pub(super) max_bytes: Option<u64>,
@@ -95,7 +96,8 @@ async fn admit(
     let Some(token) = token else {
         if store.is_open().await? {
             check_site(method, headers, hosts)?;
-            return Ok(Access { lab: Lab::local(), token: None, max_bytes: None });
+            let (lab, role) = (Lab::local(), Role::Admin);
+            return Ok(Access { lab, role, token: None, max_bytes: None });
         }
         return Err(missing());
     };
@@ -103,7 +105,8 @@ async fn admit(
         let detail = format!("this needs the role {role}; the token has {}", token.role);
         return Err(ApiError::new(Code::Forbidden, detail));
     }
-    Ok(Access { lab: token.lab, token: Some(token.id), max_bytes: token.max_bytes })
+    let Token { id, lab, role, max_bytes, .. } = token;
+    Ok(Access { lab, role, token: Some(id), max_bytes })
 }
 
 /// Refuses what a page of another site may have had a browser send: without tokens nothing else tells

@@ -1,21 +1,27 @@
 //! `/v1/blobs`: files by the SHA-256 of their bytes.
 
+use std::str::FromStr;
+
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{FromRequest, Multipart, Request};
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ContentLength, HeaderMapExt};
+use serde::Deserialize;
+use serde_with::DeserializeFromStr;
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::access::Access;
 use super::admission::Reservation;
 use super::app::App;
+use super::download::Download;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Caller, Params};
+use super::extract::{Caller, Params, QueryOf};
+use super::page::{Limit, PageBody};
 use super::upload;
-use crate::job::Sha256;
-use crate::store::{Blob, StagedBlob};
+use crate::job::{Sha256, Timestamp};
+use crate::store::{Blob, BlobRow, StagedBlob};
 
 /// `POST /v1/blobs`: the file as the raw body, or as the field `file` of a form.
 pub(super) async fn create(
@@ -60,6 +66,71 @@ pub(super) async fn show(
     Params(sha256): Params<Sha256>,
 ) -> Result<Json<Blob>> {
     Ok(Json(app.store.upload(&access.lab, sha256).await?))
+}
+
+/// Where a list goes on: behind an upload of this time and hash. Opaque for clients.
+#[derive(Debug, DeserializeFromStr)]
+pub(super) struct BlobCursor(Timestamp, Sha256);
+
+impl FromStr for BlobCursor {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let parts = text.split_once('-');
+        let parts = parts.and_then(|(time, hash)| Some((time.parse().ok()?, hash.parse().ok()?)));
+        let (time, hash) = parts.ok_or("the cursor is none of this list")?;
+        Ok(Self(Timestamp(time), hash))
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    #[serde(default)]
+    limit: Limit,
+    cursor: Option<BlobCursor>,
+}
+
+/// `GET /v1/blobs`: the lab's files, newest first.
+pub(super) async fn list(
+    Caller(app, access): Caller,
+    QueryOf(query): QueryOf<ListQuery>,
+) -> Result<Json<PageBody<BlobRow>>> {
+    let after = query.cursor.map(|BlobCursor(time, sha256)| (time, sha256));
+    let page = app.store.uploads(&access.lab, after, query.limit.get()).await?;
+    let cursor = |row: &BlobRow| format!("{}-{}", row.blob.created_at.0, row.blob.sha256);
+    Ok(Json(PageBody::new(page, cursor, |row| row)))
+}
+
+/// `GET /v1/blobs/{sha256}/content`: the bytes as they were sent, for the lab that sent them. No browser
+/// shows them, whatever they are.
+pub(super) async fn content(
+    Caller(app, access): Caller,
+    Params(sha256): Params<Sha256>,
+    headers: HeaderMap,
+) -> Result<Response> {
+    let blob = app.store.upload(&access.lab, sha256).await?;
+    let download = Download {
+        sha256,
+        size: blob.size,
+        kind: "application/octet-stream",
+        disposition: format!("attachment; filename=\"{sha256}.bin\""),
+        in_parts: true,
+    };
+    let mut response = download.send(&app.store.dir().blob(&sha256), &headers).await?;
+    let fields = response.headers_mut();
+    fields.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    fields.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static("sandbox"));
+    Ok(response)
+}
+
+/// `DELETE /v1/blobs/{sha256}`.
+pub(super) async fn delete(
+    Caller(app, access): Caller,
+    Params(sha256): Params<Sha256>,
+) -> Result<StatusCode> {
+    app.store.delete_upload(&access.lab, sha256).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 /// Takes one of the slots for uploads and reserves room on the disk; refuses an upload that says by

@@ -1,22 +1,25 @@
 //! `/v1/calibrations`: masks of optical settings.
 
 use axum::Json;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::app::App;
+use super::conditional;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf};
+use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::intake::{self, Prepared};
-use super::page::{Limit, PageBody};
+use super::page::{Limit, PageBody, Renaming};
 use crate::formats::validate::MaskStatistics;
 use crate::intake::check_sizes;
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
-use crate::store::{Calibration, NewCalibration, Page, Unready};
+use crate::store::{
+    Calibration, Filter, Inserted, NewCalibration, Page, RequestKey, Span, Unready,
+};
 
 /// The body of `POST /v1/calibrations`: masks, or the captures to make them of.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CalibrationRequest {
     name: Option<Label>,
@@ -25,12 +28,20 @@ pub(super) struct CalibrationRequest {
     captures: Option<Captures>,
 }
 
+impl CalibrationRequest {
+    pub(super) fn of_masks(name: Option<Label>, masks: Sha256) -> Self {
+        Self { name, masks: Some(masks), full_scale: None, captures: None }
+    }
+}
+
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
     cursor: Option<CalibrationId>,
+    created_after: Option<Timestamp>,
+    created_before: Option<Timestamp>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -116,48 +127,73 @@ impl From<Unready> for CalibrationBody {
 
 pub(super) async fn create(
     Caller(app, access): Caller,
+    headers: HeaderMap,
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response> {
+    let key = request_key(&headers, &request)?;
+    let (status, id) = created(make(&app, &access.lab, request, key.as_ref()).await?);
+    let body = body(&app, &access.lab, id).await?;
+    let made = body.state == CalibrationState::Ready;
+    let status = if made { status } else { StatusCode::ACCEPTED };
+    let location = [(header::LOCATION, format!("/v1/calibrations/{id}"))];
+    Ok((status, location, Json(body)).into_response())
+}
+
+/// Makes one, or finds the one that was made with the same key.
+pub(super) async fn make(
+    app: &App,
+    lab: &Lab,
+    request: CalibrationRequest,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<CalibrationId>> {
+    match app.store.made_with(lab, "calibration", key).await? {
+        Some(id) => Ok(Inserted::Before(id)),
+        None => insert(app, lab, request, key).await,
+    }
+}
+
+/// Makes a calibration of masks, or has one made of captures.
+async fn insert(
+    app: &App,
+    lab: &Lab,
+    request: CalibrationRequest,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<CalibrationId>> {
     let CalibrationRequest { name, masks, full_scale, captures } = request;
-    let (status, body) = match (masks, captures) {
-        (Some(masks), None) => {
-            (StatusCode::CREATED, of_masks(&app, &access.lab, name, masks, full_scale).await?)
-        }
+    match (masks, captures) {
+        (Some(masks), None) => of_masks(app, lab, (name, masks, full_scale), key).await,
         (None, Some(captures)) if full_scale.is_none() => {
-            (StatusCode::ACCEPTED, of_captures(&app, &access.lab, name, captures).await?)
+            of_captures(app, lab, (name, captures), key).await
         }
         (None, Some(_)) => {
             let detail = "captures have no full scale: white and black give their masks' scale";
-            return Err(ApiError::field("/full_scale", detail));
+            Err(ApiError::field("/full_scale", detail))
         }
-        _ => return Err(ApiError::field("", "name either masks or captures, not both or none")),
-    };
-    let location = [(header::LOCATION, format!("/v1/calibrations/{}", body.id))];
-    Ok((status, location, Json(body)).into_response())
+        _ => Err(ApiError::field("", "name either masks or captures, not both or none")),
+    }
 }
 
 async fn of_masks(
     app: &App,
     lab: &Lab,
-    name: Option<Label>,
-    masks: Sha256,
-    full_scale: Option<f32>,
-) -> Result<CalibrationBody> {
+    (name, masks, full_scale): (Option<Label>, Sha256, Option<f32>),
+    key: Option<&RequestKey>,
+) -> Result<Inserted<CalibrationId>> {
     app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
     let prepared =
         intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
     let prepared = prepared.await?;
     let facts = facts(name, masks, &prepared);
-    Ok(app.store.add_calibration(lab, facts, prepared.file).await?.into())
+    Ok(app.store.add_calibration(lab, facts, prepared.file, key).await?)
 }
 
 /// Puts captures in the queue, once they look as if they could be calibrated with.
 async fn of_captures(
     app: &App,
     lab: &Lab,
-    name: Option<Label>,
-    captures: Captures,
-) -> Result<CalibrationBody> {
+    (name, captures): (Option<Label>, Captures),
+    key: Option<&RequestKey>,
+) -> Result<Inserted<CalibrationId>> {
     captures.check().map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     for (place, upload) in captures.uploads() {
         app.store.upload(lab, upload).await.map_err(|error| ApiError::reference(&place, error))?;
@@ -167,8 +203,7 @@ async fn of_captures(
         Ok(captures)
     })
     .await?;
-    let id = app.store.add_captures(lab, name.as_ref(), &captures).await?;
-    body(app, lab, id).await
+    Ok(app.store.add_captures(lab, name.as_ref(), &captures, key).await?)
 }
 
 async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody> {
@@ -202,23 +237,37 @@ fn facts(
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<CalibrationBody>>> {
+    headers: HeaderMap,
+) -> Result<Response> {
     let limit = query.limit.get();
-    let ready = app.store.calibrations(&access.lab, query.cursor, limit).await?;
-    let unready = app.store.all_unready(&access.lab, query.cursor, limit).await?;
+    let created = Span { from: query.created_after, before: query.created_before };
+    let filter = Filter { calibration: None, created, after: query.cursor };
+    let ready = app.store.calibrations(&access.lab, filter, limit).await?;
+    let unready = app.store.all_unready(&access.lab, filter, limit).await?;
     let mut items: Vec<CalibrationBody> = ready.items.into_iter().map(Into::into).collect();
     items.extend(unready.items.into_iter().map(CalibrationBody::from));
     items.sort_by_key(|item| std::cmp::Reverse(item.id));
     let most = usize::try_from(limit).unwrap_or(usize::MAX);
     let more = ready.more || unready.more || items.len() > most;
     items.truncate(most);
-    Ok(Json(PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item)))
+    let id = |item: &CalibrationBody| item.id.to_string();
+    conditional::json(&PageBody::new(Page { items, more }, id, |item| item), &headers)
 }
 
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
+    headers: HeaderMap,
+) -> Result<Response> {
+    conditional::json(&body(&app, &access.lab, id).await?, &headers)
+}
+
+pub(super) async fn rename(
+    Caller(app, access): Caller,
+    Params(id): Params<CalibrationId>,
+    Body(renaming): Body<Renaming>,
 ) -> Result<Json<CalibrationBody>> {
+    app.store.rename_calibration(&access.lab, id, renaming.name.as_ref()).await?;
     Ok(Json(body(&app, &access.lab, id).await?))
 }
 

@@ -6,7 +6,7 @@ use axum::Json;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use strum::IntoStaticStr;
+use strum::{EnumString, IntoStaticStr, VariantArray};
 
 use crate::formats::FormatError;
 use crate::intake::IntakeError;
@@ -21,14 +21,15 @@ static CHECKSUM_STATUS: LazyLock<StatusCode> =
 /// later. The name, which is the variant's in snake case, never changes, for programs to rely on.
 macro_rules! codes {
     ($($code:ident: $status:expr, $title:literal, $retryable:literal;)*) => {
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr, VariantArray)]
         #[strum(serialize_all = "snake_case", const_into_str)]
         pub enum Code {
             $($code,)*
         }
 
         impl Code {
-            fn row(self) -> (StatusCode, &'static str, bool) {
+            /// Its status, its title, and whether the same request may succeed later.
+            pub(super) fn row(self) -> (StatusCode, &'static str, bool) {
                 match self {
                     $(Self::$code => ($status, $title, $retryable),)*
                 }
@@ -66,6 +67,7 @@ codes! {
     HashMismatch: StatusCode::UNPROCESSABLE_ENTITY, "The bytes are not those named", true;
     IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "The key was used for another request", false;
     TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads at once", true;
+    TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many requests wait", true;
     QueueFull: StatusCode::TOO_MANY_REQUESTS, "Enough jobs wait", true;
     Internal: StatusCode::INTERNAL_SERVER_ERROR, "The service has failed", true;
     Unavailable: StatusCode::SERVICE_UNAVAILABLE, "The service can't serve this now", true;
@@ -76,10 +78,17 @@ codes! {
 
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
 
+tokio::task_local! {
+    /// The identifier of the request that is being answered.
+    pub(super) static REQUEST_ID: String;
+}
+
 /// An error on its way to the user.
 #[derive(Debug)]
 pub struct ApiError {
     code: Code,
+    /// False where another request of the same code may succeed later, and this one can't.
+    has_hope: bool,
     detail: String,
     errors: Vec<InvalidField>,
     reason: Option<&'static str>,
@@ -95,6 +104,8 @@ struct Problem<'a> {
     code: &'a str,
     retryable: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
+    instance: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     reason: Option<&'a str>,
     /// Where the first of `errors` stands, for programs that look at one.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -107,7 +118,7 @@ impl ApiError {
     /// An error with what is wrong, where, and what would be right.
     pub fn new(code: Code, detail: impl Into<String>) -> Self {
         let (detail, errors, headers) = (detail.into(), Vec::new(), Vec::new());
-        Self { code, detail, errors, reason: None, headers }
+        Self { code, has_hope: true, detail, errors, reason: None, headers }
     }
 
     /// A request with fields that are wrong.
@@ -151,14 +162,16 @@ impl ApiError {
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
         let (status, title, retryable) = self.code.row();
+        let retryable = retryable && self.has_hope;
         let code = self.code.into_str();
         let problem = Problem {
-            r#type: format!("urn:sci-recon:problem:{code}"),
+            r#type: format!("/problems/{code}"),
             title,
             status: status.as_u16(),
             detail: &self.detail,
             code,
             retryable,
+            instance: REQUEST_ID.try_with(|id| format!("urn:sci-recon:request:{id}")).ok(),
             reason: self.reason,
             pointer: self.errors.first().map(|error| error.pointer.as_str()),
             errors: &self.errors,
@@ -184,8 +197,10 @@ impl From<StoreError> for ApiError {
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
             StoreError::Unready { .. } => Code::CalibrationNotReady,
-            StoreError::InUse { .. } => Code::InUse,
-            StoreError::State(_) | StoreError::NotFinal(_) => Code::IllegalState,
+            StoreError::InUse { .. } | StoreError::FileInUse(_) => Code::InUse,
+            StoreError::State(_) | StoreError::NotFinal(_) | StoreError::Ended(_) => {
+                Code::IllegalState
+            }
             StoreError::KeyReused { .. } => Code::IdempotencyKeyReused,
             StoreError::HashMismatch { .. } => Code::HashMismatch,
             StoreError::QueueFull { .. } => Code::QueueFull,
@@ -203,7 +218,9 @@ impl From<StoreError> for ApiError {
             | StoreError::Refused { .. }
             | StoreError::Corrupt { .. } => return Self::internal(&error),
         };
-        Self::new(code, error.to_string())
+        // A calibration that has failed will never be ready.
+        let has_hope = !matches!(error, StoreError::Unready { error: Some(_), .. });
+        Self { has_hope, ..Self::new(code, error.to_string()) }
     }
 }
 
@@ -235,5 +252,52 @@ impl From<IntakeError> for ApiError {
             IntakeError::Stopped => return StoreError::Interrupted.into(),
         };
         if place.is_empty() { error } else { error.at(&place) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use serde_json::Value;
+    use strum::VariantArray;
+
+    use super::Code;
+
+    /// Codes that a text names in backticks.
+    fn named(text: &str) -> impl Iterator<Item = &str> {
+        text.split('`').skip(1).step_by(2).filter(|word| word.parse::<Code>().is_ok())
+    }
+
+    #[test]
+    fn the_contract_has_every_code_under_its_status_and_no_other() {
+        let contract: Value = serde_yaml_ng::from_str(include_str!("../../openapi.yaml")).unwrap();
+        let codes = Code::VARIANTS.iter().map(|code| code.into_str());
+        let listed = &contract["components"]["schemas"]["Problem"]["properties"]["code"];
+        let listed = listed["x-extensible-enum"].as_array().unwrap();
+        assert_eq!(
+            listed.iter().map(|code| code.as_str().unwrap()).collect::<BTreeSet<_>>(),
+            codes.collect()
+        );
+        // What each answer of each operation names, under its status.
+        let mut documented = BTreeSet::new();
+        for path in contract["paths"].as_object().unwrap().values() {
+            for operation in path.as_object().unwrap().values() {
+                let Some(answers) = operation["responses"].as_object() else { continue };
+                for (status, answer) in answers {
+                    let place = answer["$ref"].as_str().map(|place| place.trim_start_matches('#'));
+                    let answer = place.map_or(answer, |place| contract.pointer(place).unwrap());
+                    let text = answer["description"].as_str().unwrap();
+                    documented.extend(named(text).map(|code| (status.clone(), code)));
+                }
+            }
+        }
+        // No operation has the status for a method that a path does not take.
+        let about = contract["info"]["description"].as_str().unwrap();
+        assert!(about.contains("405 (`method_not_allowed`)"));
+        documented.insert(("405".into(), "method_not_allowed"));
+        let status = |code: &Code| code.row().0.as_u16().to_string();
+        let sent = Code::VARIANTS.iter().map(|code| (status(code), code.into_str()));
+        assert_eq!(documented, sent.collect());
     }
 }

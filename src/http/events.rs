@@ -5,7 +5,7 @@
 
 use std::collections::{HashMap, HashSet};
 use std::convert::Infallible;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::extract::State;
@@ -29,6 +29,11 @@ const LISTENERS: usize = 128;
 /// The most jobs that an event names; beyond that a list is cheaper to read again.
 const NAMED: usize = 200;
 
+/// Requests of one lab that wait for the end of a job at the same time: each holds a connection.
+const WAITERS: usize = 64;
+/// What an event says that does not name all jobs.
+const MORE: &str = "\"more\":true";
+
 /// What listeners are told.
 #[derive(Debug, Default, Serialize)]
 struct Change {
@@ -47,6 +52,7 @@ type Changes = Arc<HashMap<Lab, String>>;
 pub(super) struct Events {
     sender: broadcast::Sender<Changes>,
     slots: Arc<Semaphore>,
+    waiters: Waiters,
     closing: CancellationToken,
 }
 
@@ -55,7 +61,81 @@ impl Events {
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
         tokio::spawn(closing.clone().run_until_cancelled_owned(look(store, sender.clone())));
-        Self { sender, slots: Arc::new(Semaphore::new(LISTENERS)), closing }
+        let slots = Arc::new(Semaphore::new(LISTENERS));
+        Self { sender, slots, waiters: Waiters::default(), closing }
+    }
+}
+
+impl Events {
+    /// Waits until a job of the lab has ended, at most for `time` and until the service stops. No connection
+    /// to the database is held meanwhile: the looks that listeners need serve all who wait.
+    pub(super) async fn ended(
+        &self,
+        store: &Store,
+        lab: &Lab,
+        job: JobId,
+        time: Duration,
+    ) -> Result<()> {
+        let _place = self.waiters.take(lab)?;
+        // Before the first look at the job, so that no change falls between them.
+        let mut receiver = self.sender.subscribe();
+        let name = job.to_string();
+        let ended = async {
+            while !store.job_state(lab, job).await?.is_final() {
+                loop {
+                    match receiver.recv().await {
+                        Ok(changes) => {
+                            let text = changes.get(lab);
+                            if text.is_some_and(|text| text.contains(&name) || text.contains(MORE))
+                            {
+                                break;
+                            }
+                        }
+                        Err(broadcast::error::RecvError::Lagged(_)) => break,
+                        Err(broadcast::error::RecvError::Closed) => return Ok(()),
+                    }
+                }
+            }
+            Ok(())
+        };
+        tokio::select! {
+            ended = ended => ended,
+            () = tokio::time::sleep(time) => Ok(()),
+            () = self.closing.cancelled() => Ok(()),
+        }
+    }
+}
+
+/// How many requests of each lab wait for the end of a job.
+#[derive(Debug, Clone, Default)]
+struct Waiters(Arc<Mutex<HashMap<Lab, usize>>>);
+
+/// The place of a request that waits, until it is dropped.
+#[derive(Debug)]
+struct Waiter(Waiters, Lab);
+
+impl Waiters {
+    fn take(&self, lab: &Lab) -> Result<Waiter> {
+        let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = waiting.entry(lab.clone()).or_default();
+        if *own >= WAITERS {
+            let detail = format!("{WAITERS} requests of this lab wait for jobs; ask without wait");
+            return Err(ApiError::new(Code::TooManyWaiters, detail));
+        }
+        *own += 1;
+        Ok(Waiter(self.clone(), lab.clone()))
+    }
+}
+
+impl Drop for Waiter {
+    fn drop(&mut self) {
+        let mut waiting = self.0.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(own) = waiting.get_mut(&self.1) {
+            *own -= 1;
+            if *own == 0 {
+                waiting.remove(&self.1);
+            }
+        }
     }
 }
 

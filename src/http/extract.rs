@@ -5,12 +5,14 @@ use axum::extract::rejection::{BytesRejection, PathRejection, QueryRejection};
 use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode, header};
+use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use crate::job::InvalidField;
+use crate::job::{InvalidField, Sha256};
+use crate::store::{Inserted, RequestKey};
 
 /// The service, and for whom a request to it is.
 pub(super) struct Caller(pub(super) App, pub(super) Access);
@@ -134,6 +136,25 @@ fn pointer(path: &serde_path_to_error::Path) -> String {
         pointer.push_str(&text);
     }
     pointer
+}
+
+/// The key against making a thing twice that came with this request. The request is hashed as it was
+/// understood, so that white space and the order of fields do not matter.
+pub(super) fn request_key<T: Serialize>(
+    headers: &HeaderMap,
+    request: &T,
+) -> Result<Option<RequestKey>> {
+    let Some(key) = idempotency_key(headers)? else { return Ok(None) };
+    let text = serde_json::to_vec(request).map_err(|error| ApiError::internal(&error))?;
+    Ok(Some(RequestKey { key, request: Sha256::of(&text) }))
+}
+
+/// The status of an answer to a request that makes a thing, and the thing.
+pub(super) fn created<Id>(inserted: Inserted<Id>) -> (StatusCode, Id) {
+    match inserted {
+        Inserted::New(id) => (StatusCode::CREATED, id),
+        Inserted::Before(id) => (StatusCode::OK, id),
+    }
 }
 
 pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {

@@ -1,20 +1,28 @@
 //! `/v1/jobs`: asking for a reconstruction and watching it.
 
+use std::str::FromStr;
+use std::time::Duration;
+
 use axum::Json;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
+use serde_with::DeserializeFromStr;
+use strum::VariantArray;
 
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf, idempotency_key};
+use super::extract::{Body, Caller, Params, QueryOf, created, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
     Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
     MeasurementId, ModelId, SceneShape, Schedule, Sha256, SnapshotRange, TileSpec, Timestamp,
+    priority_error,
 };
-use crate::store::{Inserted, Job, JobFilter, JobProgress, NewJob, Page, StoreError};
+use crate::store::{
+    Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob, Page, Span, StoreError,
+};
 
 #[derive(Debug, Serialize)]
 pub(super) struct JobBody {
@@ -40,6 +48,11 @@ pub(super) struct JobBody {
 }
 
 impl JobBody {
+    /// Its address.
+    pub(super) fn place(&self) -> String {
+        format!("/v1/jobs/{}", self.id)
+    }
+
     fn new(job: Job, progress: JobProgress) -> Self {
         let spec = job.spec;
         Self {
@@ -71,12 +84,88 @@ pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
     cursor: Option<JobId>,
-    state: Option<JobState>,
+    state: Option<States>,
     calibration: Option<CalibrationId>,
     measurement: Option<MeasurementId>,
     label: Option<Label>,
     /// A part of the label or identifier.
     search: Option<Label>,
+    created_after: Option<Timestamp>,
+    created_before: Option<Timestamp>,
+}
+
+/// One state, or several with commas between them.
+#[derive(Debug, DeserializeFromStr)]
+struct States(Vec<JobState>);
+
+impl FromStr for States {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let state = |name: &str| {
+            name.parse::<JobState>().map_err(|_| {
+                let names = JobState::VARIANTS.iter().map(|state| state.into_str());
+                let names = names.collect::<Vec<_>>().join(", ");
+                format!("{name:?} is no state; states are {names}")
+            })
+        };
+        text.split(',').map(state).collect::<Result<_, _>>().map(Self)
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ShowQuery {
+    #[serde(default)]
+    wait: Wait,
+}
+
+/// Seconds to wait for the end of a job, on 0 to 20.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(try_from = "f64")]
+struct Wait(f64);
+
+impl Wait {
+    fn time(self) -> Duration {
+        Duration::from_secs_f64(self.0)
+    }
+}
+
+impl TryFrom<f64> for Wait {
+    type Error = String;
+
+    fn try_from(seconds: f64) -> Result<Self, String> {
+        if (0.0..=20.0).contains(&seconds) {
+            return Ok(Self(seconds));
+        }
+        Err(format!("wait is {seconds}; it must be from 0 to 20 seconds"))
+    }
+}
+
+/// What a user changes of a job: what is left out stays.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Changes {
+    /// Null takes it away.
+    #[serde(default, with = "serde_with::rust::double_option")]
+    label: Option<Option<Label>>,
+    priority: Option<i32>,
+}
+
+/// What a job would take.
+#[derive(Debug, Serialize)]
+pub(super) struct EstimateBody {
+    tiles: u64,
+    tasks: usize,
+    /// Planned processor seconds.
+    cpu_seconds: f64,
+    #[serde(flatten)]
+    forecast: Estimate,
+    /// The most that it writes to the disk.
+    disk_bytes: u64,
+    /// The most memory that a worker needs.
+    worker_memory_bytes: u64,
+    warnings: Vec<Finding>,
 }
 
 pub(super) async fn create(
@@ -84,16 +173,24 @@ pub(super) async fn create(
     headers: HeaderMap,
     Body(request): Body<JobRequest>,
 ) -> Result<Response> {
-    let idempotency_key = idempotency_key(&headers)?;
+    let key = idempotency_key(&headers)?;
+    let (status, body) = make(&app, &access.lab, request, key).await?;
+    let location = [(header::LOCATION, body.place())];
+    Ok((status, location, Json(body)).into_response())
+}
+
+/// Makes a job, or finds the one that was made with the same key.
+pub(super) async fn make(
+    app: &App,
+    lab: &Lab,
+    request: JobRequest,
+    idempotency_key: Option<String>,
+) -> Result<(StatusCode, JobBody)> {
     // Hashed as it was understood, so that white space and the order of fields do not matter.
     let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
-    let inserted = insert(&app, access.lab.clone(), request, Sha256::of(&text), idempotency_key);
-    let (id, status) = match inserted.await? {
-        Inserted::New(id) => (id, StatusCode::CREATED),
-        Inserted::Before(id) => (id, StatusCode::OK),
-    };
-    let location = [(header::LOCATION, format!("/v1/jobs/{id}"))];
-    Ok((status, location, Json(body(&app, &access.lab, id).await?)).into_response())
+    let inserted = insert(app, lab.clone(), request, Sha256::of(&text), idempotency_key);
+    let (status, id) = created(inserted.await?);
+    Ok((status, body(app, lab, id).await?))
 }
 
 /// Accepts a job, unless it was accepted before, if there is room for it.
@@ -177,11 +274,12 @@ pub(super) async fn list(
     headers: HeaderMap,
 ) -> Result<Response> {
     let filter = JobFilter {
-        state: query.state,
+        states: query.state.map(|States(states)| states),
         calibration: query.calibration,
         measurement: query.measurement,
         label: query.label,
         search: query.search,
+        created: Span { from: query.created_after, before: query.created_before },
         after: query.cursor,
     };
     let page = app.store.jobs(&access.lab, &filter, query.limit.get()).await?;
@@ -198,9 +296,48 @@ pub(super) async fn list(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
+    QueryOf(query): QueryOf<ShowQuery>,
     headers: HeaderMap,
 ) -> Result<Response> {
+    if query.wait.0 > 0.0 {
+        // A proxy, or the limit on the time of answers, must not come first.
+        let longest = app.settings.request_time() / 2;
+        app.events.ended(&app.store, &access.lab, id, query.wait.time().min(longest)).await?;
+    }
     conditional::json(&body(&app, &access.lab, id).await?, &headers)
+}
+
+/// `PATCH /v1/jobs/{job}`.
+pub(super) async fn change(
+    Caller(app, access): Caller,
+    Params(id): Params<JobId>,
+    Body(changes): Body<Changes>,
+) -> Result<Json<JobBody>> {
+    let Changes { label, priority } = changes;
+    if let Some(error) = priority.and_then(priority_error) {
+        return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
+    }
+    app.store.change_job(&access.lab, id, &JobChanges { label, priority }).await?;
+    Ok(Json(body(&app, &access.lab, id).await?))
+}
+
+/// `POST /v1/jobs/estimate`: what a job would take, which is checked as one that is meant.
+pub(super) async fn estimate(
+    Caller(app, access): Caller,
+    Body(request): Body<JobRequest>,
+) -> Result<Json<EstimateBody>> {
+    let spec = resolve(&app, &access.lab, request).await?;
+    let tasks = spec.tasks().map_err(|error| ApiError::internal(&error))?;
+    let tiles = tasks.iter().filter(|(kind, _)| kind.tile().is_some()).count() as u64;
+    Ok(Json(EstimateBody {
+        tiles,
+        tasks: tasks.len(),
+        cpu_seconds: tasks.iter().map(|(_, cost)| cost).sum(),
+        forecast: app.store.estimate(&tasks).await?,
+        disk_bytes: spec.disk_bytes(),
+        worker_memory_bytes: spec.worker_bytes(),
+        warnings: spec.warnings,
+    }))
 }
 
 pub(super) async fn cancel(

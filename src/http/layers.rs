@@ -11,21 +11,22 @@ use tracing::Instrument;
 use tracing::field::Empty;
 use uuid::Uuid;
 
-use super::error::{ApiError, Code};
+use super::error::{ApiError, Code, REQUEST_ID};
 use super::metrics;
 
-const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+const HEADER: HeaderName = HeaderName::from_static("x-request-id");
 
 /// Gives the request an identifier, or keeps the client's; logs and counts it when it is answered.
 pub(super) async fn observe(mut request: Request, next: Next) -> Response {
-    let id = request.headers().get(&REQUEST_ID).filter(|id| is_plain(id)).cloned();
+    let id = request.headers().get(&HEADER).filter(|id| is_plain(id)).cloned();
     let id = id.unwrap_or_else(new_id);
-    request.headers_mut().insert(REQUEST_ID, id.clone());
+    request.headers_mut().insert(HEADER, id.clone());
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let route = request.extensions().get::<MatchedPath>().map(|route| route.as_str().to_owned());
     let span = tracing::info_span!("request", id = id.to_str().unwrap_or(""), %method, path = %path, lab = Empty);
     let start = Instant::now();
-    let mut response = next.run(request).instrument(span.clone()).await;
+    let answer = next.run(request).instrument(span.clone());
+    let mut response = REQUEST_ID.scope(id.to_str().unwrap_or("").to_owned(), answer).await;
     let (status, took) = (response.status().as_u16(), start.elapsed());
     // A status that everyone polls for is not worth a line each.
     let _entered = span.enter();
@@ -35,7 +36,7 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
         tracing::info!(status, ms = took.as_millis(), "answered");
     }
     metrics::observe(known(&method), route.as_deref().unwrap_or("none"), status, took);
-    response.headers_mut().insert(REQUEST_ID, id);
+    response.headers_mut().insert(HEADER, id);
     response
 }
 

@@ -1,20 +1,21 @@
 //! `/v1/measurements`: coded snapshots.
 
 use axum::Json;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
+use super::app::App;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf};
+use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::intake::{self, Prepared};
-use super::page::{ListQuery, PageBody};
+use super::page::{ListQuery, PageBody, Renaming};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
-use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
-use crate::store::{Filter, Measurement, NewMeasurement};
+use crate::job::{CalibrationId, Finding, InvalidField, Lab, Label, MeasurementId, Sha256};
+use crate::store::{Inserted, Measurement, NewMeasurement, RequestKey};
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct MeasurementRequest {
     name: Option<Label>,
@@ -33,34 +34,72 @@ pub(super) struct MeasurementRequest {
     exposure_s: Option<f64>,
 }
 
+impl MeasurementRequest {
+    pub(super) fn of_data(name: Option<Label>, calibration: CalibrationId, data: Sha256) -> Self {
+        Self {
+            name,
+            calibration,
+            data,
+            dark: Vec::new(),
+            saturation: None,
+            full_scale: None,
+            camera_fps: None,
+            exposure_s: None,
+        }
+    }
+}
+
 pub(super) async fn create(
     Caller(app, access): Caller,
+    headers: HeaderMap,
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response> {
+    let key = request_key(&headers, &request)?;
+    let (status, id) = created(make(&app, &access.lab, request, key.as_ref()).await?);
+    let location = [(header::LOCATION, format!("/v1/measurements/{id}"))];
+    let measurement = app.store.measurement(&access.lab, id).await?;
+    Ok((status, location, Json(measurement)).into_response())
+}
+
+/// Makes one, or finds the one that was made with the same key.
+pub(super) async fn make(
+    app: &App,
+    lab: &Lab,
+    request: MeasurementRequest,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<MeasurementId>> {
+    match app.store.made_with(lab, "measurement", key).await? {
+        Some(id) => Ok(Inserted::Before(id)),
+        None => insert(app, lab, request, key).await,
+    }
+}
+
+/// Checks a measurement and puts it on record.
+async fn insert(
+    app: &App,
+    lab: &Lab,
+    request: MeasurementRequest,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<MeasurementId>> {
     check_times(&request)?;
     let (data, full_scale) = (request.data, request.full_scale);
-    let calibration = app.store.calibration(&access.lab, request.calibration).await;
+    let calibration = app.store.calibration(lab, request.calibration).await;
     let calibration = calibration.map_err(|error| ApiError::reference("/calibration", error))?;
-    app.store
-        .upload(&access.lab, data)
-        .await
-        .map_err(|error| ApiError::reference("/data", error))?;
+    app.store.upload(lab, data).await.map_err(|error| ApiError::reference("/data", error))?;
     for (index, dark) in request.dark.iter().enumerate() {
-        let there = app.store.upload(&access.lab, *dark).await;
+        let there = app.store.upload(lab, *dark).await;
         there.map_err(|error| ApiError::reference(&format!("/dark/{index}"), error))?;
     }
     let exposure = Exposure {
         dark: request.dark.iter().map(|dark| app.store.dir().blob(dark)).collect(),
         saturation: request.saturation,
     };
-    let prepared = intake::run(&app, move |store, limits| {
+    let prepared = intake::run(app, move |store, limits| {
         intake::measurement(store, limits, &data, full_scale, &exposure, &calibration)
     });
     let Prepared { info, full_scale, found, file } = prepared.await?;
     let facts = facts(request, &info, full_scale, found);
-    let measurement = app.store.add_measurement(&access.lab, facts, file).await?;
-    let location = [(header::LOCATION, format!("/v1/measurements/{}", measurement.id))];
-    Ok((StatusCode::CREATED, location, Json(measurement)).into_response())
+    Ok(app.store.add_measurement(lab, facts, file, key).await?)
 }
 
 /// Refuses times that can't be: they become the times of frames.
@@ -109,8 +148,8 @@ pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery<MeasurementId>>,
 ) -> Result<Json<PageBody<Measurement>>> {
-    let filter = Filter { calibration: query.calibration, after: query.cursor };
-    let page = app.store.measurements(&access.lab, filter, query.limit.get()).await?;
+    let limit = query.limit.get();
+    let page = app.store.measurements(&access.lab, query.filter(), limit).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
@@ -118,6 +157,15 @@ pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
 ) -> Result<Json<Measurement>> {
+    Ok(Json(app.store.measurement(&access.lab, id).await?))
+}
+
+pub(super) async fn rename(
+    Caller(app, access): Caller,
+    Params(id): Params<MeasurementId>,
+    Body(renaming): Body<Renaming>,
+) -> Result<Json<Measurement>> {
+    app.store.rename_measurement(&access.lab, id, renaming.name.as_ref()).await?;
     Ok(Json(app.store.measurement(&access.lab, id).await?))
 }
 

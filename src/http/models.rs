@@ -1,17 +1,18 @@
 //! `/v1/models`: end-to-end networks, each for one calibration.
 
 use axum::Json;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
+use super::app::App;
 use super::error::{ApiError, Result};
-use super::extract::{Body, Caller, Params, QueryOf};
-use super::page::{ListQuery, PageBody};
-use crate::job::{CalibrationId, Label, ModelId, Sha256};
-use crate::store::{Filter, Model, NewModel};
+use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
+use super::page::{ListQuery, PageBody, Renaming};
+use crate::job::{CalibrationId, Lab, Label, ModelId, Sha256};
+use crate::store::{Inserted, Model, NewModel, RequestKey};
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ModelRequest {
     name: Option<Label>,
@@ -21,28 +22,51 @@ pub(super) struct ModelRequest {
 
 pub(super) async fn create(
     Caller(app, access): Caller,
+    headers: HeaderMap,
     Body(request): Body<ModelRequest>,
 ) -> Result<Response> {
+    let key = request_key(&headers, &request)?;
+    let (status, id) = created(make(&app, &access.lab, request, key.as_ref()).await?);
+    let location = [(header::LOCATION, format!("/v1/models/{id}"))];
+    let model = app.store.model(&access.lab, id).await?;
+    Ok((status, location, Json(model)).into_response())
+}
+
+/// Makes one, or finds the one that was made with the same key.
+async fn make(
+    app: &App,
+    lab: &Lab,
+    request: ModelRequest,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<ModelId>> {
+    match app.store.made_with(lab, "model", key).await? {
+        Some(id) => Ok(Inserted::Before(id)),
+        None => insert(app, lab, request, key).await,
+    }
+}
+
+/// Checks a network and registers it.
+async fn insert(
+    app: &App,
+    lab: &Lab,
+    request: ModelRequest,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<ModelId>> {
     let ModelRequest { name, calibration, file } = request;
-    let found = app.store.calibration(&access.lab, calibration).await;
+    let found = app.store.calibration(lab, calibration).await;
     let masks = found.map_err(|error| ApiError::reference("/calibration", error))?.facts;
-    app.store
-        .upload(&access.lab, file)
-        .await
-        .map_err(|error| ApiError::reference("/file", error))?;
+    app.store.upload(lab, file).await.map_err(|error| ApiError::reference("/file", error))?;
     let facts = app.checker.check(&app.store.dir().blob(&file), &masks).await?;
     let new = NewModel { name, calibration, file, facts };
-    let model = app.store.add_model(&access.lab, new).await?;
-    let location = [(header::LOCATION, format!("/v1/models/{}", model.id))];
-    Ok((StatusCode::CREATED, location, Json(model)).into_response())
+    Ok(app.store.add_model(lab, new, key).await?)
 }
 
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery<ModelId>>,
 ) -> Result<Json<PageBody<Model>>> {
-    let filter = Filter { calibration: query.calibration, after: query.cursor };
-    let page = app.store.models(&access.lab, filter, query.limit.get()).await?;
+    let limit = query.limit.get();
+    let page = app.store.models(&access.lab, query.filter(), limit).await?;
     Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
 }
 
@@ -50,6 +74,15 @@ pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<ModelId>,
 ) -> Result<Json<Model>> {
+    Ok(Json(app.store.model(&access.lab, id).await?))
+}
+
+pub(super) async fn rename(
+    Caller(app, access): Caller,
+    Params(id): Params<ModelId>,
+    Body(renaming): Body<Renaming>,
+) -> Result<Json<Model>> {
+    app.store.rename_model(&access.lab, id, renaming.name.as_ref()).await?;
     Ok(Json(app.store.model(&access.lab, id).await?))
 }
 

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::job::CalibrationId;
-use crate::store::Page;
+use crate::job::{CalibrationId, Label, Timestamp};
+use crate::store::{Filter, Page, Span};
 
 /// How many items a page has where nobody says.
 const DEFAULT: u32 = 50;
@@ -46,6 +46,24 @@ pub(super) struct ListQuery<Id> {
     pub(super) limit: Limit,
     pub(super) cursor: Option<Id>,
     pub(super) calibration: Option<CalibrationId>,
+    pub(super) created_after: Option<Timestamp>,
+    pub(super) created_before: Option<Timestamp>,
+}
+
+impl<Id> ListQuery<Id> {
+    pub(super) fn filter(self) -> Filter<Id> {
+        let created = Span { from: self.created_after, before: self.created_before };
+        Filter { calibration: self.calibration, created, after: self.cursor }
+    }
+}
+
+/// The body of a request that gives a thing another name, or none.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Renaming {
+    /// Needed: that it is left out is more likely to be a mistake.
+    #[serde(deserialize_with = "Option::deserialize")]
+    pub(super) name: Option<Label>,
 }
 
 #[derive(Debug, Serialize)]

@@ -1,18 +1,12 @@
 //! Results: frames, stacks and manifests of a job, with ETag and Range.
 
-use std::path::Path;
-
 use axum::Json;
-use axum::body::Body;
-use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::{HeaderMap, Uri};
+use axum::response::Response;
 use serde::Serialize;
-use tokio::fs::File;
-use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
-use tokio_util::io::ReaderStream;
 
 use super::app::App;
-use super::conditional::{self, Wanted};
+use super::download::Download;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
@@ -121,61 +115,15 @@ async fn send(
         }
         other => other?,
     };
-    let etag = conditional::etag(&file.sha256);
-    if conditional::is_known(headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
-    }
-    let (status, start, length) = portion(name, &file, &etag, headers)?;
-    let mut response = (status, part(&path, start, length).await?).into_response();
-    let fields = response.headers_mut();
-    fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(media_type(name)));
-    fields.insert(header::CONTENT_LENGTH, length.into());
-    let ranges = if comes_in_parts(name) { "bytes" } else { "none" };
-    fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static(ranges));
-    fields.insert(header::ETAG, value(etag));
-    fields.insert(header::CONTENT_DISPOSITION, value(disposition(job.id, snapshot, name)));
-    if status == StatusCode::PARTIAL_CONTENT {
-        let range = format!("bytes {start}-{}/{}", start + length - 1, file.size);
-        fields.insert(header::CONTENT_RANGE, value(range));
-    }
-    Ok(response)
-}
-
-/// Status, first byte and length of what is asked for.
-fn portion(
-    name: &str,
-    file: &ResultFile,
-    etag: &str,
-    headers: &HeaderMap,
-) -> Result<(StatusCode, u64, u64)> {
-    let whole = (StatusCode::OK, 0, file.size);
-    if !comes_in_parts(name) {
-        return Ok(whole);
-    }
-    match conditional::wanted(headers, etag, file.size) {
-        Wanted::Whole => Ok(whole),
-        Wanted::Part { start, length } => Ok((StatusCode::PARTIAL_CONTENT, start, length)),
-        Wanted::Outside => Err(outside(file.size)),
-    }
-}
-
-/// Part of a JSON document would not be one.
-fn comes_in_parts(name: &str) -> bool {
-    media_type(name) != "application/json"
-}
-
-fn outside(size: u64) -> ApiError {
-    let detail = format!("the file has {size} bytes, counted from 0");
-    ApiError::new(Code::RangeNotSatisfiable, detail)
-        .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
-}
-
-async fn part(path: &Path, start: u64, length: u64) -> Result<Body> {
-    let mut file = File::open(path).await.map_err(|error| ApiError::internal(&error))?;
-    if start > 0 {
-        file.seek(SeekFrom::Start(start)).await.map_err(|error| ApiError::internal(&error))?;
-    }
-    Ok(Body::from_stream(ReaderStream::with_capacity(file.take(length), 64 * 1024)))
+    let download = Download {
+        sha256: file.sha256,
+        size: file.size,
+        kind: media_type(name),
+        disposition: disposition(job.id, snapshot, name),
+        // Part of a JSON document would not be one.
+        in_parts: media_type(name) != "application/json",
+    };
+    download.send(&path, headers).await
 }
 
 fn media_type(name: &str) -> &'static str {
@@ -196,10 +144,6 @@ fn disposition(job: JobId, snapshot: Option<u32>, name: &str) -> String {
         Some(snapshot) => format!("inline; filename=\"{short}_{snapshot:04}_{file}\""),
         None => format!("inline; filename=\"{short}_{file}\""),
     }
-}
-
-fn value(text: String) -> HeaderValue {
-    HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }
 
 #[cfg(test)]

@@ -15,8 +15,8 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::pictures::{OfCalibration, OfJob, OfMeasurement};
 use super::{
-    algorithms, blobs, calibrations, dashboard, events, jobs, layers, measurements, models,
-    pictures, quality, reports, results, system, tiles, tus,
+    algorithms, blobs, calibrations, dashboard, events, jobs, layers, me, measurements, models,
+    pictures, problems, quality, reports, results, samples, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -26,22 +26,26 @@ const JSON_BYTES: usize = 256 * 1024;
 pub fn routes() -> Vec<Route> {
     use Route as R;
     vec![
-        R::at("/v1/blobs").post(blobs::create).uploads(),
-        R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).uploads(),
-        R::at("/v1/uploads").post(tus::create).options(tus::options).tus(),
+        R::at("/v1/me").get(me::show),
+        R::at("/v1/blobs").get(blobs::list).post(blobs::create).uploads(),
+        R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).delete(blobs::delete).uploads(),
+        R::at("/v1/blobs/{sha256}/content").get(blobs::content),
+        R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
-        R::at("/v1/calibrations/{calibration}").get(calibrations::show).delete(calibrations::delete),
+        R::at("/v1/calibrations/{calibration}").get(calibrations::show).patch(calibrations::rename).delete(calibrations::delete),
         R::at("/v1/calibrations/{calibration}/report.json").get(reports::json),
         R::at("/v1/calibrations/{calibration}/report.html").get(reports::html),
         R::at("/v1/calibrations/{calibration}/maps/{map}").get(reports::map),
         R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
-        R::at("/v1/measurements/{measurement}").get(measurements::show).delete(measurements::delete),
+        R::at("/v1/measurements/{measurement}").get(measurements::show).patch(measurements::rename).delete(measurements::delete),
         R::at("/v1/models").get(models::list).post(models::create).slow(),
-        R::at("/v1/models/{model}").get(models::show).delete(models::delete),
+        R::at("/v1/models/{model}").get(models::show).patch(models::rename).delete(models::delete),
         R::at("/v1/algorithms").get(algorithms::list),
         R::at("/v1/jobs").get(jobs::list).post(jobs::create),
-        R::at("/v1/jobs/{job}").get(jobs::show).delete(jobs::delete),
+        R::at("/v1/samples").post(samples::create),
+        R::at("/v1/jobs/estimate").post(jobs::estimate),
+        R::at("/v1/jobs/{job}").get(jobs::show).patch(jobs::change).delete(jobs::delete),
         R::at("/v1/jobs/{job}/cancel").post(jobs::cancel),
         R::at("/v1/jobs/{job}/retry").post(jobs::retry),
         R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest),
@@ -69,6 +73,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/livez").get(system::live).only(Rule::Public),
         R::at("/readyz").get(system::ready).only(Rule::Public),
         R::at("/metrics").get(system::metrics).only(Rule::Admin),
+        R::at("/problems/{code}").get(problems::show).only(Rule::Public),
         R::at("/openapi.yaml").get(system::contract).only(Rule::Public),
     ]
 }

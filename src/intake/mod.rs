@@ -9,6 +9,7 @@ mod error;
 mod open;
 mod read;
 mod report_page;
+mod sample;
 
 pub use captures::{Calibrated, CaptureFiles, Progress, Report, calibrate, check_sizes, report};
 pub use check::{Exposure, judge, masks, measurement};
@@ -16,3 +17,4 @@ pub use error::IntakeError;
 pub use open::{Opened, Source};
 pub use read::{Scaled, read_clip, read_masks, read_snapshot, read_truth};
 pub use report_page::report_page;
+pub use sample::{Sample, sample};

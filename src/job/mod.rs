@@ -26,7 +26,7 @@ pub use pool::{InvalidPool, Pool};
 pub use report::{
     CalibrationReport, CaptureReport, Finding, Grade, MaskReport, PatternReport, Severity,
 };
-pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection};
+pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
 pub use shape::{SceneShape, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
 pub use task::{ResultFile, TaskKind, TaskProgress, TaskStage, TaskState};

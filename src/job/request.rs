@@ -158,10 +158,7 @@ impl JobRequest {
             Ok(plan) => errors.extend(too_many(plan.len(), snapshots)),
             Err(error) => errors.push(InvalidField::new("/tile", error.to_string())),
         }
-        if !(-100..=100).contains(&self.priority) {
-            let detail = format!("priority is {}; it must be from -100 to 100", self.priority);
-            errors.push(InvalidField::new("/priority", detail));
-        }
+        errors.extend(priority_error(self.priority));
         if !errors.is_empty() {
             return Err(errors);
         }
@@ -181,6 +178,14 @@ impl JobRequest {
             warnings: Vec::new(),
         })
     }
+}
+
+/// What is wrong with a priority.
+pub fn priority_error(priority: i32) -> Option<InvalidField> {
+    (!(-100..=100).contains(&priority)).then(|| {
+        let detail = format!("priority is {priority}; it must be from -100 to 100");
+        InvalidField::new("/priority", detail)
+    })
 }
 
 fn too_many(tiles: usize, snapshots: SnapshotRange) -> Option<InvalidField> {

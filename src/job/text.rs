@@ -133,8 +133,24 @@ impl FromStr for Sha256 {
 }
 
 /// A moment: milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text, always in UTC.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay, DeserializeFromStr,
+)]
 pub struct Timestamp(pub i64);
+
+impl FromStr for Timestamp {
+    type Err = InvalidText;
+
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
+        let moment: Result<jiff::Timestamp, _> = text.parse();
+        moment.map(|moment| Self(moment.as_millisecond())).map_err(|_| {
+            InvalidText(format!(
+                "{:?} is no moment; it should be like 2026-11-21T10:39:01Z",
+                text.chars().take(80).collect::<String>()
+            ))
+        })
+    }
+}
 
 impl Timestamp {
     /// The wall clock's time.
@@ -207,6 +223,12 @@ mod tests {
         assert_eq!(Timestamp(0).to_string(), "1970-01-01T00:00:00.000Z");
         assert_eq!(Timestamp(951_827_696_789).to_string(), "2000-02-29T12:34:56.789Z");
         assert_eq!(Timestamp(1_798_761_599_999).to_string(), "2026-12-31T23:59:59.999Z");
+        for text in ["2000-02-29T12:34:56.789Z", "2000-02-29T13:34:56.789+01:00"] {
+            assert_eq!(text.parse(), Ok(Timestamp(951_827_696_789)), "{text}");
+        }
+        for bad in ["", "2000-02-30T00:00:00Z", "yesterday", "2000-02-29", "951827696"] {
+            assert!(bad.parse::<Timestamp>().is_err(), "{bad}");
+        }
     }
 
     #[test]

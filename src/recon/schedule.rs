@@ -496,6 +496,9 @@ mod tests {
         let schema = schemars::schema_for!(Schedule).to_value();
         assert_eq!(facts(&schemas["Schedule"], &contract), facts(&schema, &schema));
         let names: Vec<_> = PRIORS.iter().map(|prior| prior.name()).collect();
-        assert_eq!(schemas["AlgorithmInfo"]["properties"]["priors"]["items"]["enum"], json!(names));
+        assert_eq!(
+            schemas["AlgorithmInfo"]["properties"]["priors"]["items"]["x-extensible-enum"],
+            json!(names)
+        );
     }
 }

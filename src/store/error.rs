@@ -35,10 +35,14 @@ pub enum StoreError {
     },
     #[error("the {what} is used by {users} {by}; delete those first")]
     InUse { what: &'static str, by: &'static str, users: u64 },
+    #[error("a calibration, a measurement or a model needs the file {0}; delete that first")]
+    FileInUse(crate::job::Sha256),
     #[error("{0}")]
     State(#[from] IllegalTransition),
     #[error("the job is {0}; cancel it before it is deleted")]
     NotFinal(crate::job::JobState),
+    #[error("the job is {0}: its priority no longer matters")]
+    Ended(crate::job::JobState),
     #[error("the hash should be {expected}, the bytes have {found}")]
     HashMismatch { expected: crate::job::Sha256, found: crate::job::Sha256 },
     /// Of an upload in pieces, bytes are lost that were on the disk.
@@ -49,8 +53,8 @@ pub enum StoreError {
     Short { id: crate::job::PartialId, found: u64, recorded: u64 },
     #[error("{jobs} jobs wait or run, and no more than {most} may")]
     QueueFull { jobs: u64, most: u64 },
-    #[error("the Idempotency-Key {key:?} was used for another request, which made job {job}")]
-    KeyReused { key: String, job: crate::job::JobId },
+    #[error("the Idempotency-Key {key:?} was used for another request, which made {what} {id}")]
+    KeyReused { key: String, what: &'static str, id: String },
     /// A task that blocks was broken off, as at shutdown.
     #[error("the work was broken off")]
     Interrupted,

@@ -43,18 +43,18 @@ pub(crate) use dir::on_files;
 pub use error::StoreError;
 pub use identity::Purpose;
 pub use queue::{
-    Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Heartbeat, JobMark,
-    JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MessagePlace, Product, ProgressStage,
-    RemoteBeat, RemoteTask, Work, WorkerEnd,
+    Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Estimate,
+    Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MessagePlace,
+    Product, ProgressStage, RemoteBeat, RemoteTask, Work, WorkerEnd,
 };
-pub use rows::{Filter, Page};
+pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
-pub use submit::{Inserted, NewJob};
+pub use submit::NewJob;
 pub use tables::{
-    Blob, Calibration, FoundPartial, Job, JobFilter, LabRow, Measurement, Model, NewCalibration,
-    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, TaskCounts, TaskRecord,
-    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow,
-    WorkerTask,
+    Blob, BlobRow, Calibration, FoundPartial, Inserted, Job, JobChanges, JobFilter, LabRow, LabUse,
+    Measurement, Model, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
+    PartialFile, RequestKey, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
+    TileState, Token, Unready, WorkerPlace, WorkerRow, WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.

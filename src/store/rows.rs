@@ -31,12 +31,28 @@ impl<T> Page<T> {
     }
 }
 
+/// When the things of a list were made.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Span {
+    /// Only those made at this moment or later.
+    pub from: Option<Timestamp>,
+    /// Only those made before this moment.
+    pub before: Option<Timestamp>,
+}
+
 /// Which things a list holds that belong to calibrations.
 #[derive(Debug, Clone, Copy)]
 pub struct Filter<Id> {
     pub calibration: Option<CalibrationId>,
+    pub created: Span,
     /// Only those older than this one.
     pub after: Option<Id>,
+}
+
+impl<Id> Default for Filter<Id> {
+    fn default() -> Self {
+        Self { calibration: None, created: Span::default(), after: None }
+    }
 }
 
 /// A statement with the values for its places, in order.

@@ -10,6 +10,7 @@ use super::staging::StagedBlob;
 use super::tables::blobs::Origin;
 use super::tables::calibrations::{self, Calibration, NewCalibration};
 use super::tables::jobs;
+use super::tables::keys::{self, CALIBRATION, Inserted, MEASUREMENT, RequestKey};
 use super::tables::measurements::{self, Measurement, NewMeasurement};
 use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp,
@@ -25,14 +26,6 @@ pub struct NewJob {
     pub request: Sha256,
     /// The user's key against double submission.
     pub idempotency_key: Option<String>,
-}
-
-/// What became of a [`NewJob`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Inserted {
-    New(JobId),
-    /// The same request with the same key was accepted before.
-    Before(JobId),
 }
 
 impl Store {
@@ -71,12 +64,14 @@ impl Store {
     }
 
     /// Records a calibration and puts its prepared masks in place. Its report is made by a worker.
+    /// Errors: [`StoreError::KeyReused`].
     pub async fn add_calibration(
         &self,
         lab: &Lab,
         facts: NewCalibration,
         prepared: StagedBlob,
-    ) -> Result<Calibration> {
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<CalibrationId>> {
         let calibration = Calibration {
             id: CalibrationId::new(),
             prepared: prepared.sha256(),
@@ -85,38 +80,50 @@ impl Store {
         };
         let (id, facts) = (calibration.id, &calibration.facts);
         let mut transaction = self.write().await?;
+        if let Some(before) = keys::found(&mut transaction, lab, CALIBRATION, key).await? {
+            return Ok(Inserted::Before(before));
+        }
         require(&mut transaction, &[Reference::Blob(facts.masks)]).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         calibrations::insert(&mut transaction, lab, &calibration).await?;
         let name = facts.name.as_ref();
         calibrations::insert_request(&mut transaction, lab, id, name, None).await?;
         graph::insert_calibration(&mut transaction, lab, id).await?;
+        keys::insert(&mut transaction, lab, CALIBRATION, key, id).await?;
         transaction.commit().await?;
-        Ok(calibration)
+        Ok(Inserted::New(id))
     }
 
     /// Records a calibration whose masks, and their report, are to be made of captures.
+    /// Errors: [`StoreError::KeyReused`].
     pub async fn add_captures(
         &self,
         lab: &Lab,
         name: Option<&Label>,
         captures: &Captures,
-    ) -> Result<CalibrationId> {
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<CalibrationId>> {
         let id = CalibrationId::new();
         let mut transaction = self.write().await?;
+        if let Some(before) = keys::found(&mut transaction, lab, CALIBRATION, key).await? {
+            return Ok(Inserted::Before(before));
+        }
         calibrations::insert_request(&mut transaction, lab, id, name, Some(captures)).await?;
         graph::insert_calibration(&mut transaction, lab, id).await?;
+        keys::insert(&mut transaction, lab, CALIBRATION, key, id).await?;
         transaction.commit().await?;
-        Ok(id)
+        Ok(Inserted::New(id))
     }
 
     /// Records a measurement and puts its prepared snapshots in place.
+    /// Errors: [`StoreError::KeyReused`].
     pub async fn add_measurement(
         &self,
         lab: &Lab,
         facts: NewMeasurement,
         prepared: StagedBlob,
-    ) -> Result<Measurement> {
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<MeasurementId>> {
         let measurement = Measurement {
             id: MeasurementId::new(),
             prepared: prepared.sha256(),
@@ -126,11 +133,15 @@ impl Store {
         let facts = &measurement.facts;
         let references = [Reference::Calibration(facts.calibration), Reference::Blob(facts.data)];
         let mut transaction = self.write().await?;
+        if let Some(before) = keys::found(&mut transaction, lab, MEASUREMENT, key).await? {
+            return Ok(Inserted::Before(before));
+        }
         require(&mut transaction, &references).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         measurements::insert(&mut transaction, lab, &measurement).await?;
+        keys::insert(&mut transaction, lab, MEASUREMENT, key, measurement.id).await?;
         transaction.commit().await?;
-        Ok(measurement)
+        Ok(Inserted::New(measurement.id))
     }
 }
 
@@ -159,7 +170,7 @@ async fn with_key(
             .await?;
     match found {
         Some((job, asked)) if asked != request => {
-            Err(StoreError::KeyReused { key: key.to_owned(), job })
+            Err(StoreError::KeyReused { key: key.to_owned(), what: "job", id: job.to_string() })
         }
         found => Ok(found.map(|(job, _)| job)),
     }

@@ -71,11 +71,11 @@ impl Lab {
             dead_pixels: 0,
             clipped_negatives: 0,
         };
-        let calibration =
-            store.add_calibration(&local, facts, upload(b"prepared masks")).await.unwrap();
+        let masks = upload(b"prepared masks");
+        let calibration = store.add_calibration(&local, facts, masks, None).await.unwrap().id();
         let facts = NewMeasurement {
             name: None,
-            calibration: calibration.id,
+            calibration,
             data: data.sha256,
             format: "npy".into(),
             sample: "float32".into(),
@@ -88,11 +88,11 @@ impl Lab {
             dark: Vec::new(),
             warnings: Vec::new(),
         };
-        let measurement =
-            store.add_measurement(&local, facts, upload(b"prepared data")).await.unwrap();
+        let data = upload(b"prepared data");
+        let measurement = store.add_measurement(&local, facts, data, None).await.unwrap().id();
         let worker = WorkerId::new();
         store.worker_started(worker, 1, &WorkerPlace::default()).await.unwrap();
-        let lab = Self { store, measurement: measurement.id, worker, _folder: folder };
+        let lab = Self { store, measurement, worker, _folder: folder };
         assert_eq!(lab.work_off().await, [TaskKind::Calibration], "its report");
         lab
     }

@@ -8,7 +8,7 @@ use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::samples;
+use crate::{contract, samples};
 
 /// A running service; it is killed when this is dropped.
 pub struct TestApp {
@@ -54,7 +54,9 @@ impl Answer {
         let problem = self.json();
         assert_eq!(problem["code"], code, "{text}");
         assert_eq!(problem["status"], status);
-        assert_eq!(problem["type"], format!("urn:sci-recon:problem:{code}"));
+        assert_eq!(problem["type"], format!("/problems/{code}"));
+        let request = self.header("x-request-id");
+        assert_eq!(problem["instance"], format!("urn:sci-recon:request:{request}"));
         assert!(problem["title"].is_string() && problem["retryable"].is_boolean());
         problem["detail"].as_str().unwrap().to_owned()
     }
@@ -193,8 +195,14 @@ impl TestApp {
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
+    /// Sends a request. Whatever the answer is, it must stand in the contract.
     pub async fn send(&self, request: RequestBuilder) -> Answer {
-        Answer::read(request.send().await.unwrap()).await
+        let (client, request) = request.build_split();
+        let request = request.unwrap();
+        let (method, path) = (request.method().clone(), request.url().path().to_owned());
+        let answer = Answer::read(client.execute(request).await.unwrap()).await;
+        contract::hold(&method, &path, &answer);
+        answer
     }
 
     pub async fn get(&self, path: &str) -> Answer {

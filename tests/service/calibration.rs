@@ -335,8 +335,10 @@ async fn captures_that_can_not_be_are_refused() {
     let error = failed["error"].as_str().unwrap();
     assert!(error.contains("nowhere brighter"), "{error}");
     let body = json!({"calibration": failed["id"], "data": small});
-    let detail = app.post("/v1/measurements", &body).await.problem(409, "calibration_not_ready");
+    let refused = app.post("/v1/measurements", &body).await;
+    let detail = refused.problem(409, "calibration_not_ready");
     assert!(detail.contains("nowhere brighter"), "{detail}");
+    assert_eq!(refused.json()["retryable"], false, "it will never be ready");
     let listed = app.get("/v1/calibrations").await.expect(200).json();
     assert_eq!(listed["items"][0]["state"], "failed");
     let path = format!("/v1/calibrations/{}", failed["id"].as_str().unwrap());
@@ -351,7 +353,9 @@ async fn a_calibration_waits_for_a_worker_and_says_so() {
     let answer = app.post("/v1/calibrations", &json!({"captures": captures})).await.expect(202);
     let calibration = id(&answer);
     let body = json!({"calibration": calibration, "data": captures["white"][0]});
-    app.post("/v1/measurements", &body).await.problem(409, "calibration_not_ready");
+    let refused = app.post("/v1/measurements", &body).await;
+    refused.problem(409, "calibration_not_ready");
+    assert_eq!(refused.json()["retryable"], true, "while it is being made");
     let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await;
     report.problem(409, "calibration_not_ready");
     app.restart_with(&["--workers", "1"]);

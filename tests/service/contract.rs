@@ -1,12 +1,76 @@
 //! The service beside its contract, and what watches it.
 
-use serde_json::Value;
+use std::sync::LazyLock;
 
-use crate::app::TestApp;
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use crate::app::{Answer, TestApp};
 use crate::samples::Scene;
 
+static CONTRACT: LazyLock<Value> = LazyLock::new(|| {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi.yaml");
+    serde_yaml_ng::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+});
+
+/// Where a reference leads; the value itself if it is none.
+fn followed(value: &Value) -> &Value {
+    match value["$ref"].as_str() {
+        Some(place) => CONTRACT.pointer(place.trim_start_matches('#')).unwrap(),
+        None => value,
+    }
+}
+
+/// Fails unless the contract has this answer: its status, the code of an error under that status, and the
+/// fields that must be there.
+#[track_caller]
+pub fn hold(method: &Method, path: &str, answer: &Answer) {
+    let Some(operation) = operation(method, path) else { return };
+    let status = answer.status.as_str();
+    let documented = followed(&operation["responses"][status]);
+    let text = String::from_utf8_lossy(&answer.bytes);
+    assert!(!documented.is_null(), "{method} {path}: no {status} in the contract; it said {text}");
+    let kind = answer.header("content-type").split(';').next().unwrap_or_default();
+    let (false, "application/json" | "application/problem+json") = (answer.bytes.is_empty(), kind)
+    else {
+        return;
+    };
+    let schema = followed(&documented["content"][kind]["schema"]);
+    assert!(!schema.is_null(), "{method} {path}: no {kind} for {status} in the contract");
+    let body = answer.json();
+    for field in schema["required"].as_array().into_iter().flatten() {
+        let there = body.get(field.as_str().unwrap()).is_some();
+        assert!(there, "{method} {path}: no field {field} in {text}");
+    }
+    for field in body.as_object().into_iter().flat_map(|body| body.keys()) {
+        let known = schema["properties"].get(field).is_some() || schema["properties"].is_null();
+        assert!(known, "{method} {path}: the contract has no field {field} of {text}");
+    }
+    if kind == "application/problem+json" {
+        let code = format!("`{}`", body["code"].as_str().unwrap());
+        let words = documented["description"].as_str().unwrap();
+        assert!(words.contains(&code), "{method} {path}: no {code} under {status} in the contract");
+    }
+}
+
+/// The operation of the contract; none for a path or a method that it does not have.
+fn operation<'a>(method: &Method, path: &str) -> Option<&'a Value> {
+    let name = method.as_str().to_ascii_lowercase();
+    let fits = |template: &str| {
+        let (ours, theirs) = (path.split('/'), template.split('/'));
+        ours.clone().count() == theirs.clone().count()
+            && ours.zip(theirs).all(|(part, pattern)| pattern.starts_with('{') || part == pattern)
+    };
+    let paths = CONTRACT["paths"].as_object().unwrap().iter();
+    let (_, item) = paths
+        .filter(|(template, _)| fits(template))
+        .min_by_key(|(template, _)| template.matches('{').count())?;
+    let get = if name == "head" { item.get("get") } else { None };
+    item.get(&name).or(get)
+}
+
 #[tokio::test]
-async fn the_contract_is_served_and_every_status_of_the_code_stands_in_it() {
+async fn the_contract_is_served_and_its_references_lead_somewhere() {
     let app = TestApp::start().await;
     let answer = app.get("/openapi.yaml").await.expect(200);
     let contract: Value = serde_yaml_ng::from_slice(&answer.bytes).unwrap();
@@ -20,13 +84,27 @@ async fn the_contract_is_served_and_every_status_of_the_code_stands_in_it() {
     }
 }
 
+#[tokio::test]
+async fn every_error_leads_to_a_page_that_explains_it() {
+    let app = TestApp::start().await;
+    let refused = app.post("/v1/jobs", &json!({})).await;
+    refused.problem(422, "invalid_request");
+    let place = refused.json()["type"].as_str().unwrap().to_owned();
+    let page = app.get(&place).await.expect(200);
+    assert!(page.header("content-type").starts_with("text/html"));
+    assert!(page.header("content-security-policy").contains("default-src 'none'"));
+    assert!(String::from_utf8_lossy(&page.bytes).contains("invalid_request"));
+    app.get("/problems/nothing").await.problem(404, "not_found");
+}
+
 #[test]
 fn the_dashboard_has_words_for_every_stage_of_the_contract() {
     let read = |path: &str| {
         std::fs::read_to_string(format!("{}/{path}", env!("CARGO_MANIFEST_DIR"))).unwrap()
     };
     let contract: Value = serde_yaml_ng::from_str(&read("openapi.yaml")).unwrap();
-    let stages = &contract["components"]["schemas"]["Progress"]["properties"]["stage"]["enum"];
+    let stages =
+        &contract["components"]["schemas"]["Progress"]["properties"]["stage"]["x-extensible-enum"];
     let script = read("src/http/dashboard/format.js");
     let (_, words) = script.split_once("const words = {").unwrap();
     let (words, _) = words.split_once('}').unwrap();

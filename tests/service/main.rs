@@ -7,6 +7,7 @@ mod adaptive;
 mod app;
 mod calibration;
 mod cli;
+mod clients;
 #[cfg(feature = "nats")]
 mod cluster;
 mod contract;

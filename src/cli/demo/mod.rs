@@ -2,7 +2,6 @@
 
 mod client;
 mod report;
-mod scene;
 mod service;
 
 use std::fs;
@@ -16,6 +15,7 @@ use serde_json::json;
 
 use super::{CliError, progress};
 use crate::cli::error::Result;
+use crate::intake::sample;
 use crate::job::Algorithm;
 use client::{Client, JobView};
 use report::{Quality, Report};
@@ -54,7 +54,7 @@ async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
         }
     };
     // 1. A lab's files: masks and one snapshot.
-    let truth = scene::make(&out.join("input"))?;
+    let truth = sample(&out.join("input"))?.frames;
     let (frames, height, width) = truth.dim();
     say(format!("made masks and a snapshot of {frames} frames of {height}x{width}"));
     // 2. The service.

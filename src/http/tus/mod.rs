@@ -4,18 +4,21 @@
 mod append;
 pub mod headers;
 
+use axum::Json;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
 
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Caller, Params};
-use crate::job::{PartialId, Sha256};
-use crate::store::{FoundPartial, NewPartial, Partial, PartialFile};
+use super::extract::{Caller, Params, QueryOf, request_key};
+use super::page::{Limit, PageBody};
+use crate::job::{Lab, PartialId, Sha256, Timestamp};
+use crate::store::{FoundPartial, Inserted, NewPartial, Partial, PartialFile};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -28,7 +31,9 @@ const VERSION: HeaderValue = HeaderValue::from_static("1.0.0");
 /// Speaks version 1.0.0 alone, and says so in every answer.
 pub(super) async fn version(request: Request, next: Next) -> Response {
     let spoken = request.headers().get(&RESUMABLE);
-    let mut response = if spoken == Some(&VERSION) || request.method() == Method::OPTIONS {
+    // The list of uploads is none of tus.
+    let is_free = matches!(*request.method(), Method::OPTIONS | Method::GET);
+    let mut response = if spoken == Some(&VERSION) || is_free {
         next.run(request).await
     } else {
         let detail = "the header Tus-Resumable must be 1.0.0";
@@ -38,6 +43,43 @@ pub(super) async fn version(request: Request, next: Next) -> Response {
     };
     response.headers_mut().insert(RESUMABLE, VERSION);
     response
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    #[serde(default)]
+    limit: Limit,
+    cursor: Option<PartialId>,
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct UploadBody {
+    id: PartialId,
+    /// Bytes of the whole file, and those that have come.
+    length: u64,
+    received: u64,
+    metadata: String,
+    /// The blob that it has become.
+    sha256: Option<Sha256>,
+    expires_at: Timestamp,
+}
+
+/// `GET /v1/uploads`: those that have begun, newest first.
+pub(super) async fn list(
+    Caller(app, access): Caller,
+    QueryOf(query): QueryOf<ListQuery>,
+) -> Result<Json<PageBody<UploadBody>>> {
+    let page = app.store.partials(&access.lab, query.cursor, query.limit.get()).await?;
+    let show = |upload: Partial| UploadBody {
+        id: upload.id,
+        length: upload.facts.length,
+        received: upload.received,
+        metadata: upload.facts.metadata,
+        sha256: upload.result,
+        expires_at: upload.expires_at,
+    };
+    Ok(Json(PageBody::new(page, |upload| upload.id.to_string(), show)))
 }
 
 /// `OPTIONS /v1/uploads`: what this service can do.
@@ -59,11 +101,24 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
     }
     let metadata = text(&headers, &METADATA)?.unwrap_or_default();
     let expected = expected(metadata).map_err(malformed)?;
+    let key = request_key(&headers, &(length, metadata))?;
+    if let Some(id) = app.store.made_with(&access.lab, "upload", key.as_ref()).await? {
+        return begun(&app, &access.lab, Inserted::Before(id)).await;
+    }
     app.admission.check_length(&access, length).await?;
     app.admission.check_room("the upload", length).await?;
     let Access { lab, token, .. } = access;
-    let facts = NewPartial { lab, token, length, metadata: metadata.to_owned(), expected };
-    let upload = app.store.begin_partial(facts, app.settings.upload_age()).await?;
+    let facts =
+        NewPartial { lab: lab.clone(), token, length, metadata: metadata.to_owned(), expected };
+    let age = app.settings.upload_age();
+    let inserted = app.store.begin_partial(facts, age, key.as_ref()).await?;
+    begun(&app, &lab, inserted).await
+}
+
+/// The answer to a request that has begun an upload, or had begun it before: where its pieces go. It is
+/// 201 in any case, which is what clients of tus expect.
+async fn begun(app: &App, lab: &Lab, inserted: Inserted<PartialId>) -> Result<Response> {
+    let upload = app.store.partial(lab, inserted.id()).await?;
     let location = [(header::LOCATION, format!("/v1/uploads/{}", upload.id))];
     Ok((StatusCode::CREATED, location, state(&upload)).into_response())
 }

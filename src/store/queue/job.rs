@@ -6,7 +6,7 @@ use super::graph;
 use crate::job::{JobId, JobState, Lab, TaskState};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_scalar};
-use crate::store::tables::jobs;
+use crate::store::tables::jobs::{self, JobChanges};
 use crate::store::{Store, dir, on_files};
 
 impl Store {
@@ -24,6 +24,38 @@ impl Store {
         let to = if running { JobState::Cancelling } else { JobState::Cancelled };
         jobs::set_state(&mut transaction, id, to, None).await?;
         graph::cancel_waiting(&mut transaction, id).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+
+    /// Changes the label of a job, and the priority of one that has not ended: of its tasks that wait, too.
+    /// Errors: [`StoreError::Ended`] for the priority of a job that has ended.
+    pub async fn change_job(&self, lab: &Lab, id: JobId, changes: &JobChanges) -> Result<()> {
+        self.job(lab, id).await?;
+        let mut transaction = self.write().await?;
+        let state = jobs::state(&mut transaction, id).await?;
+        if let Some(priority) = changes.priority {
+            if state.is_final() {
+                return Err(StoreError::Ended(state));
+            }
+            sql!(
+                "UPDATE jobs SET priority = ?1, spec = json_set(spec, '$.priority', ?1) WHERE id = ?2",
+                [priority, id]
+            )
+            .execute(&mut *transaction)
+            .await?;
+            sql!("UPDATE tasks SET priority = ? WHERE job = ?", [priority, id])
+                .execute(&mut *transaction)
+                .await?;
+        }
+        if let Some(label) = &changes.label {
+            sql!(
+                "UPDATE jobs SET label = ?1, spec = json_set(spec, '$.label', ?1) WHERE id = ?2",
+                [label, id]
+            )
+            .execute(&mut *transaction)
+            .await?;
+        }
         transaction.commit().await?;
         Ok(())
     }

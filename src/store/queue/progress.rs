@@ -14,7 +14,7 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::forecast::{Forecast, Left, Unfinished};
-use crate::job::{JobId, JobState, Lab, TaskStage, TaskState};
+use crate::job::{JobId, JobState, Lab, TaskKind, TaskStage, TaskState};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
@@ -64,6 +64,15 @@ pub struct JobProgress {
     pub iterations_done: u64,
     /// Deep passes done, over all tiles and the pilot.
     pub passes_done: u64,
+}
+
+/// What a job that is not there yet would wait for.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Estimate {
+    /// Seconds until it would end; none if no worker lives.
+    pub eta_seconds: Option<f64>,
+    /// Its place among the jobs that wait, from 1.
+    pub queue_position: usize,
 }
 
 /// The mark of a job: it differs when the job's state or what its workers have told differs.
@@ -155,6 +164,26 @@ impl Store {
             }
         }
         Ok(marks)
+    }
+
+    /// What a job with these tasks would wait for if it came now, at the priority that most have.
+    pub async fn estimate(&self, tasks: &[(TaskKind, f64)]) -> Result<Estimate> {
+        let forecast = self.forecast().await?;
+        let left = |of_tiles: bool| {
+            let of_kind = |kind: TaskKind| kind.tile().is_some() == of_tiles;
+            let costs = tasks.iter().filter(|(kind, _)| of_kind(*kind)).map(|(_, cost)| *cost);
+            costs.fold(Left { sum: 0.0, longest: 0.0 }, |left, cost| Left {
+                sum: left.sum + cost,
+                longest: left.longest.max(cost),
+            })
+        };
+        // One that is not on record yet stands behind all others.
+        let job = JobId::new();
+        let seconds = forecast.eta_seconds(job, (left(true), left(false)), None);
+        Ok(Estimate {
+            eta_seconds: seconds.map(|seconds| round(seconds, 1)),
+            queue_position: forecast.position(job),
+        })
     }
 
     /// What is ahead of every unfinished job, a moment ago or now.

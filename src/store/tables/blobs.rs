@@ -6,7 +6,7 @@ use strum::Display;
 
 use crate::job::{Lab, Sha256, Timestamp, TokenId};
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{integer, sql, sql_as, sql_scalar};
+use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 use crate::store::staging::StagedBlob;
 use crate::store::{Store, dir, on_files};
 
@@ -17,6 +17,28 @@ pub struct Blob {
     pub size: u64,
     /// When the lab first sent it.
     pub created_at: Timestamp,
+}
+
+/// An upload in a list.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+pub struct BlobRow {
+    #[serde(flatten)]
+    #[sqlx(flatten)]
+    pub blob: Blob,
+    /// True while something of the lab refers to it: it is not deleted then.
+    pub in_use: bool,
+}
+
+/// The condition under which something of a lab refers to an upload of its, named as columns of `h`.
+macro_rules! in_use {
+    () => {
+        "(EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = h.sha256)
+          OR EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = h.sha256)
+          OR EXISTS (SELECT 1 FROM calibration_captures AS c
+                     JOIN calibration_requests AS r USING (calibration)
+                     WHERE r.lab = h.lab AND c.sha256 = h.sha256)
+          OR EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = h.sha256))"
+    };
 }
 
 /// Where a file comes from.
@@ -61,6 +83,53 @@ impl Store {
     pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob> {
         let mut connection = self.readers.acquire().await?;
         held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))
+    }
+
+    /// A page of the lab's uploads, newest first, after the one that `after` tells of.
+    pub async fn uploads(
+        &self,
+        lab: &Lab,
+        after: Option<(Timestamp, Sha256)>,
+        limit: u32,
+    ) -> Result<Page<BlobRow>> {
+        let (time, sha256) = after.unzip();
+        let items = sql_as!(
+            concat!(
+                "SELECT h.sha256, size, h.created_at, ",
+                in_use!(),
+                " AS in_use
+                 FROM holdings AS h JOIN blobs USING (sha256)
+                 WHERE h.lab = ?1 AND (?2 IS NULL OR (h.created_at, h.sha256) < (?2, ?3))
+                 ORDER BY h.created_at DESC, h.sha256 DESC LIMIT ?4"
+            ),
+            [lab, time, sha256, i64::from(limit) + 1]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        Ok(Page::cut(items, limit))
+    }
+
+    /// Deletes an upload of a lab to which nothing of the lab refers. Its bytes go with it if nobody else
+    /// has them.
+    pub async fn delete_upload(&self, lab: &Lab, sha256: Sha256) -> Result<()> {
+        let mut transaction = self.write().await?;
+        let used: Option<bool> = sql_scalar!(
+            concat!("SELECT ", in_use!(), " FROM holdings AS h WHERE lab = ? AND sha256 = ?"),
+            [lab, sha256]
+        )
+        .fetch_optional(&mut *transaction)
+        .await?;
+        match used {
+            None => return Err(StoreError::missing("blob", sha256)),
+            Some(true) => return Err(StoreError::FileInUse(sha256)),
+            Some(false) => {}
+        }
+        sql!("DELETE FROM holdings WHERE lab = ? AND sha256 = ?", [lab, sha256])
+            .execute(&mut *transaction)
+            .await?;
+        self.release(&mut transaction, sha256).await?;
+        transaction.commit().await?;
+        Ok(())
     }
 
     /// Puts a file in its place and writes its row, in one step for all other processes.
@@ -117,14 +186,7 @@ impl Store {
     pub async fn collect(&self, before: Timestamp) -> Result<usize> {
         let mut transaction = self.write().await?;
         sql!(
-            "DELETE FROM holdings AS h WHERE touched_at < ?
-               AND NOT EXISTS (SELECT 1 FROM calibrations AS c
-                               WHERE c.lab = h.lab AND masks = sha256)
-               AND NOT EXISTS (SELECT 1 FROM measurements AS m
-                               WHERE m.lab = h.lab AND data = sha256)
-               AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c WHERE c.sha256 = h.sha256)
-               AND NOT EXISTS (SELECT 1 FROM models AS m
-                               WHERE m.lab = h.lab AND file = sha256)",
+            concat!("DELETE FROM holdings AS h WHERE touched_at < ? AND NOT ", in_use!()),
             [before]
         )
         .execute(&mut *transaction)

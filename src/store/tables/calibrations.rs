@@ -12,7 +12,7 @@ use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timesta
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{
-    Page, Reference, integer, refuse_if_used, require, sql, sql_as, sql_scalar,
+    Filter, Page, Reference, integer, refuse_if_used, require, sql, sql_as, sql_scalar,
 };
 
 /// What is known of a calibration when its masks have been checked.
@@ -91,24 +91,24 @@ impl Store {
 
     /// The lab's calibration with this identifier if its masks are not there; none otherwise.
     pub async fn unready(&self, lab: &Lab, id: CalibrationId) -> Result<Option<Unready>> {
-        Ok(self.find_unready(lab, Some(id), None, 1).await?.items.pop())
+        let only = Filter { calibration: Some(id), ..Filter::default() };
+        Ok(self.find_unready(lab, only, 1).await?.items.pop())
     }
 
-    /// A page of the lab's calibrations whose masks are not there, newest first, older than `after`.
+    /// A page of the lab's calibrations whose masks are not there, newest first.
     pub async fn all_unready(
         &self,
         lab: &Lab,
-        after: Option<CalibrationId>,
+        filter: Filter<CalibrationId>,
         limit: u32,
     ) -> Result<Page<Unready>> {
-        self.find_unready(lab, None, after, limit).await
+        self.find_unready(lab, filter, limit).await
     }
 
     async fn find_unready(
         &self,
         lab: &Lab,
-        only: Option<CalibrationId>,
-        after: Option<CalibrationId>,
+        filter: Filter<CalibrationId>,
         limit: u32,
     ) -> Result<Page<Unready>> {
         let rows = sql!(
@@ -118,29 +118,63 @@ impl Store {
              FROM calibration_requests JOIN tasks USING (calibration)
              WHERE calibration_requests.lab = ?1 AND captures IS NOT NULL AND state <> ?2
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR calibration < ?4)
+               AND (?6 IS NULL OR created_at >= ?6) AND (?7 IS NULL OR created_at < ?7)
              ORDER BY calibration DESC LIMIT ?5",
-            [lab, TaskState::Done, only, after, i64::from(limit) + 1]
+            [
+                lab,
+                TaskState::Done,
+                filter.calibration,
+                filter.after,
+                i64::from(limit) + 1,
+                filter.created.from,
+                filter.created.before
+            ]
         )
         .fetch_all(&self.readers)
         .await?;
         Ok(Page::cut(rows.iter().map(unready).collect::<Result<_, _>>()?, limit))
     }
 
-    /// A page of the lab's calibrations, newest first, older than `after`.
+    /// A page of the lab's calibrations whose masks are there, newest first.
     pub async fn calibrations(
         &self,
         lab: &Lab,
-        after: Option<CalibrationId>,
+        filter: Filter<CalibrationId>,
         limit: u32,
     ) -> Result<Page<Calibration>> {
         let items = sql_as!(
             "SELECT * FROM calibrations WHERE lab = ?1 AND (?2 IS NULL OR id < ?2)
+               AND (?4 IS NULL OR created_at >= ?4) AND (?5 IS NULL OR created_at < ?5)
              ORDER BY id DESC LIMIT ?3",
-            [lab, after, i64::from(limit) + 1]
+            [lab, filter.after, i64::from(limit) + 1, filter.created.from, filter.created.before]
         )
         .fetch_all(&self.readers)
         .await?;
         Ok(Page::cut(items, limit))
+    }
+
+    /// Gives a calibration another name, or none.
+    pub async fn rename_calibration(
+        &self,
+        lab: &Lab,
+        id: CalibrationId,
+        name: Option<&Label>,
+    ) -> Result<()> {
+        let mut transaction = self.write().await?;
+        let renamed = sql!(
+            "UPDATE calibration_requests SET name = ? WHERE calibration = ? AND lab = ?",
+            [name, id, lab]
+        )
+        .execute(&mut *transaction)
+        .await?;
+        if renamed.rows_affected() == 0 {
+            return Err(StoreError::missing("calibration", id));
+        }
+        sql!("UPDATE calibrations SET name = ? WHERE id = ?", [name, id])
+            .execute(&mut *transaction)
+            .await?;
+        transaction.commit().await?;
+        Ok(())
     }
 
     /// Deletes a calibration that no measurement and no model refers to.
@@ -177,8 +211,10 @@ pub async fn insert_made(
     prepared: Sha256,
     facts: NewCalibration,
 ) -> Result<()> {
-    let request = "SELECT lab, created_at FROM calibration_requests WHERE calibration = ?";
-    let (lab, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
+    let request = "SELECT lab, name, created_at FROM calibration_requests WHERE calibration = ?";
+    let (lab, name, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
+    // It may have been renamed since the worker began.
+    let facts = NewCalibration { name, ..facts };
     insert(connection, &lab, &Calibration { id, prepared, created_at, facts }).await?;
     sql!("DELETE FROM calibration_captures WHERE calibration = ?", [id])
         .execute(connection)

@@ -8,7 +8,7 @@ use crate::job::{
 };
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
+use crate::store::rows::{Page, Span, integer, sql, sql_as, sql_scalar};
 
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct Job {
@@ -26,14 +26,24 @@ pub struct Job {
 
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
-    pub state: Option<JobState>,
+    /// Only those in one of these states; none for all.
+    pub states: Option<Vec<JobState>>,
     pub calibration: Option<CalibrationId>,
     pub measurement: Option<MeasurementId>,
     pub label: Option<Label>,
     /// Only those with this text in the label or the identifier, in upper or lower case.
     pub search: Option<Label>,
+    pub created: Span,
     /// Only those older than this one.
     pub after: Option<JobId>,
+}
+
+/// What a user changes of a job.
+#[derive(Debug, Clone, Default)]
+pub struct JobChanges {
+    /// The new label, or none any more.
+    pub label: Option<Option<Label>>,
+    pub priority: Option<i32>,
 }
 
 impl Store {
@@ -45,26 +55,35 @@ impl Store {
     pub async fn jobs(&self, lab: &Lab, filter: &JobFilter, limit: u32) -> Result<Page<Job>> {
         let items = sql_as!(
             "SELECT * FROM jobs
-             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state = ?2)
+             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
                AND (?5 IS NULL OR label = ?5)
                AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
+               AND (?9 IS NULL OR created_at >= ?9) AND (?10 IS NULL OR created_at < ?10)
              AND lab = ?8
              ORDER BY id DESC LIMIT ?7",
             [
                 filter.after,
-                filter.state,
+                filter.states.as_ref().map(Json),
                 filter.calibration,
                 filter.measurement,
                 &filter.label,
                 &filter.search,
                 i64::from(limit) + 1,
-                lab
+                lab,
+                filter.created.from,
+                filter.created.before
             ]
         )
         .fetch_all(&self.readers)
         .await?;
         Ok(Page::cut(items, limit))
+    }
+
+    /// The state of the lab's job.
+    pub async fn job_state(&self, lab: &Lab, id: JobId) -> Result<JobState> {
+        let state = sql_scalar!("SELECT state FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
+        state.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {

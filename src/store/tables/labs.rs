@@ -1,11 +1,12 @@
 //! Table `labs`: the share of the machine that each has.
 
+use serde::Serialize;
 use sqlx::{FromRow, SqliteConnection};
 
 use crate::job::Lab;
 use crate::store::Store;
 use crate::store::error::Result;
-use crate::store::rows::sql;
+use crate::store::rows::{sql, sql_as};
 
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct LabRow {
@@ -18,7 +19,33 @@ pub struct LabRow {
     pub cost_left: f64,
 }
 
+/// What a lab has here.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+pub struct LabUse {
+    /// Uploads, and their bytes.
+    pub uploads: u64,
+    pub upload_bytes: u64,
+    /// Bytes of the frames and other files of its jobs.
+    pub result_bytes: u64,
+    /// Jobs that wait and run.
+    pub jobs: u64,
+}
+
 impl Store {
+    pub async fn lab_use(&self, lab: &Lab) -> Result<LabUse> {
+        let found = sql_as!(
+            "SELECT
+                 (SELECT count(*) FROM holdings WHERE lab = ?1) AS uploads,
+                 (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
+                  WHERE lab = ?1) AS upload_bytes,
+                 (SELECT coalesce(sum(size), 0) FROM result_files JOIN jobs ON jobs.id = job
+                  WHERE lab = ?1) AS result_bytes,
+                 (SELECT count(*) FROM jobs WHERE lab = ?1 AND finished_at IS NULL) AS jobs",
+            [lab]
+        );
+        Ok(found.fetch_one(&self.readers).await?)
+    }
+
     pub async fn labs(&self) -> Result<Vec<LabRow>> {
         let rows = sqlx::query_as(
             "SELECT labs.lab, share, count(jobs.id) AS jobs,

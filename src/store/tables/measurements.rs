@@ -73,12 +73,37 @@ impl Store {
         let rows = sql!(
             "SELECT * FROM measurements
              WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
+               AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
              ORDER BY id DESC LIMIT ?4",
-            [lab, filter.after, filter.calibration, i64::from(limit) + 1]
+            [
+                lab,
+                filter.after,
+                filter.calibration,
+                i64::from(limit) + 1,
+                filter.created.from,
+                filter.created.before
+            ]
         )
         .fetch_all(&self.readers)
         .await?;
         Ok(Page::cut(rows.iter().map(measurement).collect::<Result<_, _>>()?, limit))
+    }
+
+    /// Gives a measurement another name, or none.
+    pub async fn rename_measurement(
+        &self,
+        lab: &Lab,
+        id: MeasurementId,
+        name: Option<&Label>,
+    ) -> Result<()> {
+        let renamed =
+            sql!("UPDATE measurements SET name = ? WHERE id = ? AND lab = ?", [name, id, lab])
+                .execute(&self.writer)
+                .await?;
+        match renamed.rows_affected() {
+            0 => Err(StoreError::missing("measurement", id)),
+            _ => Ok(()),
+        }
     }
 
     /// Deletes a measurement that no job refers to.

@@ -3,6 +3,7 @@
 pub(super) mod blobs;
 pub(super) mod calibrations;
 pub(super) mod jobs;
+pub(super) mod keys;
 pub(super) mod labs;
 pub(super) mod measurements;
 mod models;
@@ -14,10 +15,11 @@ pub(super) mod tasks;
 mod tokens;
 pub(super) mod workers;
 
-pub use blobs::{Blob, Origin};
+pub use blobs::{Blob, BlobRow, Origin};
 pub use calibrations::{Calibration, NewCalibration, Unready};
-pub use jobs::{Job, JobFilter};
-pub use labs::LabRow;
+pub use jobs::{Job, JobChanges, JobFilter};
+pub use keys::{Inserted, RequestKey};
+pub use labs::{LabRow, LabUse};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FoundPartial, NewPartial, Partial, PartialFile};

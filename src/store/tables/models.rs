@@ -8,6 +8,7 @@ use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha25
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Filter, Page, Reference, refuse_if_used, require, sql, sql_as};
+use crate::store::tables::keys::{self, Inserted, MODEL, RequestKey};
 
 /// What is known of an end-to-end network when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
@@ -38,10 +39,19 @@ impl From<Model> for JobModel {
 }
 
 impl Store {
-    pub async fn add_model(&self, lab: &Lab, content: NewModel) -> Result<Model> {
+    /// Errors: [`StoreError::KeyReused`].
+    pub async fn add_model(
+        &self,
+        lab: &Lab,
+        content: NewModel,
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<ModelId>> {
         let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
         let NewModel { name, calibration, file, facts } = &model.content;
         let mut transaction = self.write().await?;
+        if let Some(before) = keys::found(&mut transaction, lab, MODEL, key).await? {
+            return Ok(Inserted::Before(before));
+        }
         let references = [Reference::Calibration(*calibration), Reference::Blob(*file)];
         require(&mut transaction, &references).await?;
         sql!(
@@ -51,8 +61,9 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
+        keys::insert(&mut transaction, lab, MODEL, key, model.id).await?;
         transaction.commit().await?;
-        Ok(model)
+        Ok(Inserted::New(model.id))
     }
 
     pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model> {
@@ -69,12 +80,31 @@ impl Store {
         let items = sql_as!(
             "SELECT * FROM models
              WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
+               AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
              ORDER BY id DESC LIMIT ?4",
-            [lab, filter.after, filter.calibration, i64::from(limit) + 1]
+            [
+                lab,
+                filter.after,
+                filter.calibration,
+                i64::from(limit) + 1,
+                filter.created.from,
+                filter.created.before
+            ]
         )
         .fetch_all(&self.readers)
         .await?;
         Ok(Page::cut(items, limit))
+    }
+
+    /// Gives a model another name, or none.
+    pub async fn rename_model(&self, lab: &Lab, id: ModelId, name: Option<&Label>) -> Result<()> {
+        let renamed = sql!("UPDATE models SET name = ? WHERE id = ? AND lab = ?", [name, id, lab])
+            .execute(&self.writer)
+            .await?;
+        match renamed.rows_affected() {
+            0 => Err(StoreError::missing("model", id)),
+            _ => Ok(()),
+        }
     }
 
     /// Deletes a model that no job refers to. Its file is left to [`Self::collect`].

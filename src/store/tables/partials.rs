@@ -10,7 +10,8 @@ use sqlx::FromRow;
 
 use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{integer, sql, sql_as, sql_scalar};
+use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
+use crate::store::tables::keys::{self, Inserted, RequestKey, UPLOAD};
 use crate::store::{Store, dir, on_files};
 
 #[derive(Debug, Clone, FromRow)]
@@ -123,7 +124,13 @@ fn lock(path: &Path) -> Result<Lock> {
 
 impl Store {
     /// Begins an upload, which is given up when nothing more has come for `age`.
-    pub async fn begin_partial(&self, facts: NewPartial, age: Duration) -> Result<Partial> {
+    /// Errors: [`StoreError::KeyReused`].
+    pub async fn begin_partial(
+        &self,
+        facts: NewPartial,
+        age: Duration,
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<PartialId>> {
         let id = PartialId::new();
         let expires_at = after(age);
         let path = self.dir().partial(id);
@@ -135,6 +142,13 @@ impl Store {
             Ok(file)
         })
         .await?;
+        let mut transaction = self.write().await?;
+        if let Some(before) = keys::found(&mut transaction, &facts.lab, UPLOAD, key).await? {
+            drop(transaction);
+            let path = self.dir().partial(id);
+            on_files(move || dir::remove(&path)).await?;
+            return Ok(Inserted::Before(before));
+        }
         sql!(
             "INSERT INTO partials (id, lab, token, length, metadata, expected, expires_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -148,9 +162,29 @@ impl Store {
                 expires_at
             ]
         )
-        .execute(&self.writer)
+        .execute(&mut *transaction)
         .await?;
-        Ok(Partial { id, facts, received: 0, result: None, expires_at })
+        keys::insert(&mut transaction, &facts.lab, UPLOAD, key, id).await?;
+        transaction.commit().await?;
+        Ok(Inserted::New(id))
+    }
+
+    /// A page of the lab's uploads in pieces that have not expired, newest first, older than `after`.
+    pub async fn partials(
+        &self,
+        lab: &Lab,
+        after: Option<PartialId>,
+        limit: u32,
+    ) -> Result<Page<Partial>> {
+        let items = sql_as!(
+            "SELECT * FROM partials
+             WHERE lab = ?1 AND expires_at > ?2 AND (?3 IS NULL OR id < ?3)
+             ORDER BY id DESC LIMIT ?4",
+            [lab, Timestamp::now(), after, i64::from(limit) + 1]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        Ok(Page::cut(items, limit))
     }
 
     /// The lab's upload with this identifier, unless it has expired.

@@ -46,7 +46,7 @@ impl Lab {
         };
         let lab = crate::job::Lab::local();
         let name = "optics of May".parse().unwrap();
-        self.store.add_captures(&lab, Some(&name), &captures).await.unwrap()
+        self.store.add_captures(&lab, Some(&name), &captures, None).await.unwrap().id()
     }
 
     async fn unready(&self, id: CalibrationId) -> Option<Unready> {
@@ -198,7 +198,7 @@ async fn captures_that_are_gone_are_named() {
         patterns: None,
         saturation: None,
     };
-    let refused = lab.store.add_captures(&crate::job::Lab::local(), None, &captures).await;
+    let refused = lab.store.add_captures(&crate::job::Lab::local(), None, &captures, None).await;
     assert!(matches!(refused, Err(StoreError::NotFound { what: "blob", id })
         if id == gone.to_string()));
     assert!(lab.claim().await.is_none());

@@ -12,7 +12,7 @@ async fn a_key_makes_one_job() {
     let Inserted::New(first) = lab.add(0, Some("k"), b"a").await.unwrap() else { panic!() };
     assert_eq!(lab.add(0, Some("k"), b"a").await.unwrap(), Inserted::Before(first));
     let other = lab.add(0, Some("k"), b"b").await;
-    assert!(matches!(other, Err(StoreError::KeyReused { job, .. }) if job == first));
+    assert!(matches!(other, Err(StoreError::KeyReused { id, .. }) if id == first.to_string()));
     assert_eq!(
         lab.store
             .jobs(&crate::job::Lab::local(), &JobFilter::default(), 10)
@@ -82,8 +82,8 @@ async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
     let trial = ModelTrial { height: 64, width: 96, cpu_seconds: 1.0, peak_rss_bytes: 1 << 20 };
     let facts = ModelFacts { inputs: Vec::new(), outputs: Vec::new(), fixed_size: true, trial };
     let new = NewModel { name: None, calibration, file: file.sha256, facts };
-    let model = lab.store.add_model(&local, new).await.unwrap();
-    assert_eq!(lab.store.model(&local, model.id).await.unwrap(), model);
+    let id = lab.store.add_model(&local, new, None).await.unwrap().id();
+    let model = lab.store.model(&local, id).await.unwrap();
     lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
     let soon = Timestamp(Timestamp::now().0 + 1000);
     assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the data of the measurement");

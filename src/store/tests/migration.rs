@@ -5,7 +5,7 @@ use sqlx::{ConnectOptions, Connection};
 use strum::VariantArray;
 
 use crate::job::{Lab, TaskState, WorkerId};
-use crate::store::{Purpose, Store, Work};
+use crate::store::{Filter, Purpose, Store, Work};
 
 /// The last migration before calibrations became tasks.
 const BEFORE: i64 = 70;
@@ -87,7 +87,7 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
 
     // As users see them.
     let (local, other) = (Lab::local(), "other".parse::<Lab>().unwrap());
-    let all = store.all_unready(&local, None, 10).await.unwrap().items;
+    let all = store.all_unready(&local, Filter::default(), 10).await.unwrap().items;
     let seen: Vec<_> = all
         .iter()
         .map(|unready| {
@@ -98,7 +98,7 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
     let three = (id(3), "three", 30, Some("no light"));
     assert_eq!(seen, [three, (id(2), "two", 20, None), (id(1), "one", 10, None)]);
     assert_eq!((all[1].fraction, all[1].frames), (0.5, 1));
-    assert_eq!(store.all_unready(&other, None, 10).await.unwrap().items.len(), 1);
+    assert_eq!(store.all_unready(&other, Filter::default(), 10).await.unwrap().items.len(), 1);
     assert!(store.calibration(&local, id(4).parse().unwrap()).await.is_ok());
 
     // As workers see them: what a silent one holds comes back, too.

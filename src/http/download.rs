@@ -1,0 +1,82 @@
+//! A file as an answer, whole or in part, with ETag and Range.
+
+use std::path::Path;
+
+use axum::body::Body;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use tokio::fs::File;
+use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
+use tokio_util::io::ReaderStream;
+
+use super::conditional::{self, Wanted};
+use super::error::{ApiError, Code, Result};
+use crate::job::Sha256;
+
+/// What is told of a file.
+#[derive(Debug)]
+pub(super) struct Download {
+    pub(super) sha256: Sha256,
+    pub(super) size: u64,
+    /// The media type.
+    pub(super) kind: &'static str,
+    /// Whether a browser shows or saves it, and under which name.
+    pub(super) disposition: String,
+    /// Whether ranges of it may be asked for.
+    pub(super) in_parts: bool,
+}
+
+impl Download {
+    /// The file at `path`, the part of it that is asked for, or word that the client has it.
+    pub(super) async fn send(&self, path: &Path, headers: &HeaderMap) -> Result<Response> {
+        let etag = conditional::etag(&self.sha256);
+        if conditional::is_known(headers, &etag) {
+            return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
+        }
+        let (status, start, length) = self.portion(&etag, headers)?;
+        let mut response = (status, part(path, start, length).await?).into_response();
+        let fields = response.headers_mut();
+        fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(self.kind));
+        fields.insert(header::CONTENT_LENGTH, length.into());
+        let ranges = if self.in_parts { "bytes" } else { "none" };
+        fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static(ranges));
+        fields.insert(header::ETAG, value(etag));
+        fields.insert(header::CONTENT_DISPOSITION, value(self.disposition.clone()));
+        if status == StatusCode::PARTIAL_CONTENT {
+            let range = format!("bytes {start}-{}/{}", start + length - 1, self.size);
+            fields.insert(header::CONTENT_RANGE, value(range));
+        }
+        Ok(response)
+    }
+
+    /// Status, first byte and length of what is asked for.
+    fn portion(&self, etag: &str, headers: &HeaderMap) -> Result<(StatusCode, u64, u64)> {
+        let whole = (StatusCode::OK, 0, self.size);
+        if !self.in_parts {
+            return Ok(whole);
+        }
+        match conditional::wanted(headers, etag, self.size) {
+            Wanted::Whole => Ok(whole),
+            Wanted::Part { start, length } => Ok((StatusCode::PARTIAL_CONTENT, start, length)),
+            Wanted::Outside => Err(outside(self.size)),
+        }
+    }
+}
+
+fn outside(size: u64) -> ApiError {
+    let detail = format!("the file has {size} bytes, counted from 0");
+    ApiError::new(Code::RangeNotSatisfiable, detail)
+        .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
+}
+
+async fn part(path: &Path, start: u64, length: u64) -> Result<Body> {
+    let mut file = File::open(path).await.map_err(|error| ApiError::internal(&error))?;
+    if start > 0 {
+        file.seek(SeekFrom::Start(start)).await.map_err(|error| ApiError::internal(&error))?;
+    }
+    Ok(Body::from_stream(ReaderStream::with_capacity(file.take(length), 64 * 1024)))
+}
+
+fn value(text: String) -> HeaderValue {
+    HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
+}

@@ -1,0 +1,57 @@
+//! `/v1/me`: who asks, what is allowed, and what is taken up of it.
+
+use axum::Json;
+use serde::Serialize;
+
+use super::error::Result;
+use super::extract::Caller;
+use crate::job::{Lab, Role, TokenId};
+use crate::store::LabUse;
+
+#[derive(Debug, Serialize)]
+pub(super) struct MeBody {
+    lab: Lab,
+    role: Role,
+    /// None on a service without tokens.
+    token: Option<TokenId>,
+    limits: LimitsBody,
+    #[serde(rename = "use")]
+    taken: UseBody,
+}
+
+#[derive(Debug, Serialize)]
+struct LimitsBody {
+    /// Of one upload.
+    upload_bytes: u64,
+    /// Of uploads that the token may keep; none: no limit.
+    token_bytes: Option<u64>,
+    /// Memory of a worker: jobs that need more are refused.
+    worker_memory_bytes: u64,
+}
+
+#[derive(Debug, Serialize)]
+struct UseBody {
+    /// Of uploads that the token keeps or has begun; none without a token.
+    token_bytes: Option<u64>,
+    #[serde(flatten)]
+    lab: LabUse,
+}
+
+pub(super) async fn show(Caller(app, access): Caller) -> Result<Json<MeBody>> {
+    let token_bytes = match access.token {
+        Some(token) => Some(app.store.token_bytes(token).await?),
+        None => None,
+    };
+    let lab = app.store.lab_use(&access.lab).await?;
+    Ok(Json(MeBody {
+        lab: access.lab,
+        role: access.role,
+        token: access.token,
+        limits: LimitsBody {
+            upload_bytes: app.settings.max_upload_bytes,
+            token_bytes: access.max_bytes,
+            worker_memory_bytes: app.settings.worker_memory_bytes,
+        },
+        taken: UseBody { token_bytes, lab },
+    }))
+}

@@ -1,0 +1,94 @@
+//! `/v1/samples`: a job to try the service with, of the clip that comes with the program.
+
+use std::fs::File;
+use std::io;
+use std::path::Path;
+
+use axum::Json;
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+
+use super::calibrations::{self, CalibrationRequest};
+use super::error::{ApiError, Result};
+use super::extract::{Body, Caller, idempotency_key};
+use super::intake;
+use super::jobs::{self, JobBody};
+use super::measurements::{self, MeasurementRequest};
+use crate::intake::sample;
+use crate::job::{Algorithm, JobRequest, Label, Sha256, SnapshotSelection};
+use crate::store::{RequestKey, StagedBlob, Store};
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SampleRequest {
+    #[serde(default = "default_algorithm")]
+    algorithm: Algorithm,
+    label: Option<Label>,
+}
+
+fn default_algorithm() -> Algorithm {
+    Algorithm::PnpTvFastdvdnet
+}
+
+#[derive(Debug, Serialize)]
+struct SampleBody {
+    masks: Sha256,
+    data: Sha256,
+    /// The true frames, for the route `quality`.
+    truth: Sha256,
+    job: JobBody,
+}
+
+pub(super) async fn create(
+    Caller(app, access): Caller,
+    headers: HeaderMap,
+    Body(request): Body<SampleRequest>,
+) -> Result<Response> {
+    // Apart from the keys with which the lab makes such things itself.
+    let key = idempotency_key(&headers)?.map(|key| format!("/v1/samples {key}"));
+    let staged = intake::run(&app, |store, _| simulate(store)).await?;
+    app.admission.check_length(&access, staged.iter().map(StagedBlob::size).sum()).await?;
+    let mut files = Vec::new();
+    for file in staged {
+        files.push(app.store.store_upload(&access.lab, access.token, file).await?.0.sha256);
+    }
+    let [masks, data, truth] = [files[0], files[1], files[2]];
+    let request_key = |file: Sha256| key.clone().map(|key| RequestKey { key, request: file });
+    let named = CalibrationRequest::of_masks(name(), masks);
+    let made = calibrations::make(&app, &access.lab, named, request_key(masks).as_ref()).await?;
+    let named = MeasurementRequest::of_data(name(), made.id(), data);
+    let made = measurements::make(&app, &access.lab, named, request_key(data).as_ref()).await?;
+    let job = JobRequest {
+        measurement: made.id(),
+        calibration: None,
+        snapshots: SnapshotSelection::All,
+        algorithm: request.algorithm,
+        model: None,
+        schedule: None,
+        tile: None,
+        priority: 0,
+        label: request.label,
+    };
+    let (status, job) = jobs::make(&app, &access.lab, job, key).await?;
+    let location = [(header::LOCATION, job.place())];
+    Ok((status, location, Json(SampleBody { masks, data, truth, job })).into_response())
+}
+
+fn name() -> Option<Label> {
+    "sample".parse().ok()
+}
+
+/// Files of masks, measurement and true frames. Blocks.
+fn simulate(store: &Store) -> Result<[StagedBlob; 3]> {
+    let folder = store.staged_dir()?;
+    let made = sample(folder.path())?;
+    let staged = |path: &Path| -> Result<StagedBlob> {
+        let mut writer = store.blob_writer()?;
+        File::open(path)
+            .and_then(|mut file| io::copy(&mut file, &mut writer))
+            .map_err(|error| ApiError::internal(&error))?;
+        Ok(writer.finish()?)
+    };
+    Ok([staged(&made.masks)?, staged(&made.measurement)?, staged(&made.truth)?])
+}
