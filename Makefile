@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: demo test deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release install dist demo test clients deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -20,11 +20,32 @@ test: runtime judges $(TRAINING)/.stamp ## all tests
 deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
 	$(JUDGES)/bin/python tests/judges/deploy.py .
 
+clients: ## the contract before Redocly and Spectral, and clients of it by openapi-python-client and openapi-typescript
+	@tests/judges/clients/run.sh $(VENV)/clients
+
 e2e: runtime ## the dashboard in a real browser; ends with one line of JSON; SHORT=1
 	@SHORT=$(SHORT) tests/e2e/run.sh
 
 serve: runtime ## the service on 127.0.0.1:8080, data in ./data
 	$(CARGO) run --release --quiet -- serve --data data
+
+# What `sci-recon --version` says: the version, and the commit that it is built from.
+PACKAGE := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
+COMMIT := $(shell git describe --always --dirty --exclude '*' 2>/dev/null)
+PROGRAM := $${CARGO_TARGET_DIR:-target}/release/sci-recon
+PREFIX ?= /usr/local
+release: runtime
+	SCI_RECON_VERSION="$(PACKAGE)$(if $(COMMIT), ($(COMMIT)))" $(CARGO) build --release --locked
+
+install: release ## program, library, models, unit, completions and man pages below PREFIX=/usr/local (DESTDIR for packages)
+	@scripts/install.sh "$(PROGRAM)" "$(DESTDIR)$(PREFIX)" "$(PREFIX)"
+
+ARCHIVE := sci-recon-$(PACKAGE)-x86_64-linux
+dist: release ## the same as an archive, dist/sci-recon-VERSION-x86_64-linux.tar.gz, which runs where it is unpacked
+	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
+	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
+	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
+	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
 
 runtime: ## libonnxruntime into ./runtime, from its pinned PyPI wheel
 	@scripts/fetch-onnxruntime.sh
@@ -130,4 +151,4 @@ docs:
 
 clean:
 	$(CARGO) clean
-	rm -rf runtime .venv demo-output e2e-output eval-output tests/e2e/node_modules
+	rm -rf dist runtime .venv demo-output e2e-output eval-output tests/e2e/node_modules

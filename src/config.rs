@@ -5,12 +5,20 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
 
 #[cfg(feature = "nats")]
 use crate::job::Pool;
 use crate::job::WorkerId;
+use crate::pipeline::networks::{NetworkError, find_library};
 use crate::recon::prior::onnx::Device;
+
+/// The version of the program, with the commit that it was built from where `make` has told it.
+pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {
+    Some(version) => version,
+    None => env!("CARGO_PKG_VERSION"),
+};
 
 /// Serves the HTTP API and runs workers.
 #[derive(Debug, Clone, Args)]
@@ -53,11 +61,11 @@ pub struct ServeArguments {
     pub engine: EngineArguments,
 
     /// Memory that one worker may need; jobs that need more are refused.
-    #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", default_value_t = 4 << 30)]
+    #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 4 << 30)]
     pub worker_memory_bytes: u64,
 
     /// Largest upload in bytes.
-    #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", default_value_t = 8 << 30)]
+    #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 8 << 30)]
     pub max_upload_bytes: u64,
 
     /// Uploads that are received at the same time; more are told to come back later.
@@ -65,7 +73,7 @@ pub struct ServeArguments {
     pub max_uploads: usize,
 
     /// Bytes of the disk that uploads leave free.
-    #[arg(long, env = "SCI_RECON_MIN_FREE_BYTES", value_name = "BYTES", default_value_t = 1 << 30)]
+    #[arg(long, env = "SCI_RECON_MIN_FREE_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 1 << 30)]
     pub min_free_bytes: u64,
 
     /// Seconds without a byte after which an upload is given up.
@@ -104,7 +112,7 @@ pub struct ServeArguments {
 
     /// Free bytes of the disk below which unused uploads and the oldest ended jobs go before their
     /// time; those of the last hour stay. 0: never.
-    #[arg(long, env = "SCI_RECON_LOW_WATER_BYTES", value_name = "BYTES", default_value_t = 0)]
+    #[arg(long, env = "SCI_RECON_LOW_WATER_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 0)]
     pub low_water_bytes: u64,
 
     /// How log lines look.
@@ -163,7 +171,7 @@ pub struct RemoteArguments {
     pub cache: Option<PathBuf>,
 
     /// Bytes that the cache may hold.
-    #[arg(long, env = "SCI_RECON_CACHE_BYTES", value_name = "N", default_value_t = 4 << 30)]
+    #[arg(long, env = "SCI_RECON_CACHE_BYTES", value_name = "N", value_parser = bytes, default_value_t = 4 << 30)]
     pub cache_bytes: u64,
 
     /// Seconds without a tile after which the worker ends [default: it waits for ever].
@@ -231,7 +239,8 @@ pub struct WorkerArguments {
 /// Where and how workers compute.
 #[derive(Debug, Clone, Args)]
 pub struct EngineArguments {
-    /// The libonnxruntime [default: the one beside the program].
+    /// The libonnxruntime [default: the one near the program: beside it, in ../lib/sci-recon, ../lib or
+    /// ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
@@ -248,6 +257,13 @@ pub struct EngineArguments {
     /// worker is held to hang: the worker ends, and another one tries the task.
     #[arg(long, env = "SCI_RECON_STALL_SECONDS", value_name = "SECONDS", default_value_t = 300)]
     pub stall_seconds: u64,
+}
+
+/// Reads a number of bytes: `1000000`, `10GB` (powers of 1000) or `8GiB` (of 1024).
+pub fn bytes(text: &str) -> Result<u64, String> {
+    let size: Result<ByteSize, String> = text.parse();
+    size.map(|size| size.as_u64())
+        .map_err(|_| format!("{text:?} is no size; it should be like 1000000, 10GB or 8GiB"))
 }
 
 /// How log lines look.
@@ -316,6 +332,11 @@ impl ServeArguments {
 }
 
 impl EngineArguments {
+    /// Whether there is a libonnxruntime.
+    pub fn check_library(&self) -> Result<(), NetworkError> {
+        find_library(self.onnxruntime.as_deref()).map(drop)
+    }
+
     /// Name of the execution provider for the device. Workers refuse a device that can't be read,
     /// with the reason.
     #[must_use]
@@ -354,7 +375,7 @@ impl WorkerArguments {
 
 #[cfg(test)]
 mod tests {
-    use super::{ServeArguments, WorkerArguments};
+    use super::{ServeArguments, WorkerArguments, bytes};
     use clap::Parser;
 
     #[derive(Debug, Parser)]
@@ -381,6 +402,16 @@ mod tests {
         let error = serve(&["--listen", "0.0.0.0:80"]).unwrap_err().to_string();
         assert!(error.contains("--allow-remote"), "{error}");
         assert!(serve(&["--listen", "0.0.0.0:80", "--allow-remote"]).is_ok());
+    }
+
+    #[test]
+    fn sizes_are_numbers_with_or_without_a_unit() {
+        for (text, size) in [("1000000", 1_000_000), ("10GB", 10_000_000_000), ("8GiB", 8 << 30)] {
+            assert_eq!(bytes(text), Ok(size), "{text}");
+        }
+        for bad in ["", "GB", "-1", "10 XB", "lots"] {
+            assert!(bytes(bad).is_err(), "{bad}");
+        }
     }
 
     #[test]

@@ -33,7 +33,8 @@ pub(super) struct ScheduleArguments {
 /// Where networks run.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
-    /// The libonnxruntime [default: the one beside the program].
+    /// The libonnxruntime [default: the one near the program: beside it, in ../lib/sci-recon, ../lib or
+    /// ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
     /// Where the network runs: cpu, or cuda:0 for the first GPU.

@@ -17,11 +17,14 @@ pub mod check_model;
 #[cfg(feature = "nats")]
 pub mod cluster;
 pub mod demo;
+pub mod health;
 pub mod lab;
 pub mod optics;
 pub mod reconstruct;
 pub mod schedule;
 pub mod serve;
+pub mod settings;
+pub mod shell;
 pub mod simulate;
 pub mod token;
 pub mod worker;

@@ -70,6 +70,11 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         .await
         .map_err(|source| ServeError::Listen { address: settings.listen, source })?;
     let address = listener.local_addr().map_err(io("learn the address"))?;
+    if let Err(missing) = settings.engine.check_library() {
+        tracing::error!(
+            "{missing}. Until then jobs with networks are refused; /readyz says so, too"
+        );
+    }
     tracing::info!(%address, data = %store.dir().root().display(), swept, "listening");
     announce(store.dir().root(), address)?;
     // 4. Workers and maintenance, until the signal.

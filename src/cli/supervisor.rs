@@ -91,6 +91,8 @@ impl Slot {
             WorkerArguments { id: Some(id), supervised: true, ..self.arguments.clone() };
         Command::new(&self.program)
             .args(arguments.command_line())
+            // All that it needs has been told.
+            .env_remove("SCI_RECON_CONFIG")
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             // Away from the terminal: Ctrl-C is for the server, which then tells the workers.

@@ -44,7 +44,7 @@ struct Create {
     #[arg(long, value_name = "ROLE", default_value = "submit")]
     role: Role,
     /// Bytes of uploads that it may keep here [default: no limit].
-    #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u64).range(..1 << 53))]
+    #[arg(long, value_name = "BYTES", value_parser = crate::config::bytes)]
     max_bytes: Option<u64>,
     /// Makes the data folder, if there is none yet.
     #[arg(long)]

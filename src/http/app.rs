@@ -13,7 +13,7 @@ use super::model_check::Checker;
 use super::pictures::Pictures;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
-use crate::job::Timestamp;
+use crate::job::{Timestamp, without_paths};
 use crate::store::Store;
 
 /// What all handlers share; cheap to clone.
@@ -57,6 +57,17 @@ impl App {
             settings: settings.clone(),
             store,
         }))
+    }
+}
+
+impl App {
+    /// Whether jobs with networks can be done; if not, why, and what to do. Looked up each time: the library
+    /// may be put in its place while the service runs.
+    pub(super) fn networks(&self) -> Result<(), String> {
+        let elsewhere = self.settings.without_tiles() || self.settings.workers == Some(0);
+        // Workers that others start bring their own.
+        let found = if elsewhere { Ok(()) } else { self.settings.engine.check_library() };
+        found.map_err(|error| without_paths(&error.to_string()))
     }
 }
 

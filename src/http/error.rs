@@ -212,6 +212,8 @@ impl From<StoreError> for ApiError {
             full if full.is_disk_full() => return disk_full(full),
             StoreError::Database(_)
             | StoreError::Migrate(_)
+            | StoreError::Upgrade { .. }
+            | StoreError::Newer { .. }
             | StoreError::Io { .. }
             | StoreError::NoFolder(_)
             | StoreError::Taken(_)

@@ -75,7 +75,9 @@ pub(super) fn measurement(
     let saturated = intake::measurement(opened, exposure, limits, |y| writer.write_frame(y))?;
     let file = writer.finish()?.finish()?;
     let masks = store.dir().blob(&calibration.prepared);
-    let found = intake::judge(&masks, file.path(), saturated.as_deref(), limits)?;
+    let darkened = !exposure.dark.is_empty();
+    let both = (masks.as_path(), file.path());
+    let found = intake::judge(both, saturated.as_deref(), darkened, limits)?;
     Ok(Prepared { info, full_scale, found, file })
 }
 

@@ -236,7 +236,11 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec> {
     let resolved = request.resolve(calibration.id, shape, model);
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
+    // If the report is not made yet, its end adds the warning.
+    let report = app.store.report(calibration.id).await?;
+    spec.warnings.extend(report.and_then(|report| report.warning()));
     check_memory(app, &spec)?;
+    check_networks(app, &spec)?;
     Ok(spec)
 }
 
@@ -259,6 +263,19 @@ fn check_memory(app: &App, spec: &JobSpec) -> Result<()> {
         spec.tile.size, spec.shape.frames
     );
     Err(ApiError::field("/tile/size", detail))
+}
+
+/// Refuses a job with a network while none can be run.
+fn check_networks(app: &App, spec: &JobSpec) -> Result<()> {
+    if spec.model.is_none() && !spec.schedule.needs_network() {
+        return Ok(());
+    }
+    app.networks().map_err(|missing| {
+        let name = spec.algorithm.into_str();
+        let detail =
+            format!("{name} runs a network, and this service has {missing}; gap-tv3d needs none");
+        ApiError::field("/algorithm", detail)
+    })
 }
 
 async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody> {

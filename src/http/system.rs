@@ -13,6 +13,7 @@ use serde::Serialize;
 
 use super::app::App;
 use super::error::Result;
+use crate::config::VERSION;
 use crate::job::{JobState, TaskState, Timestamp};
 use crate::store::WorkerRow;
 use strum::VariantArray;
@@ -66,7 +67,7 @@ struct LimitsBody {
 pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>> {
     let settings = &app.settings;
     Ok(Json(SystemBody {
-        version: env!("CARGO_PKG_VERSION"),
+        version: VERSION,
         started_at: app.started_at,
         now: Timestamp::now(),
         device: settings.engine.device.clone(),
@@ -114,9 +115,13 @@ async fn disk(app: &App) -> Result<DiskBody> {
 #[derive(Debug, Serialize)]
 struct Readiness {
     ready: bool,
+    /// True if some jobs can't be done, and others can.
+    degraded: bool,
     database: String,
     disk: String,
     workers: String,
+    /// What jobs with networks need.
+    networks: String,
 }
 
 /// `GET /livez`: the process answers.
@@ -131,7 +136,11 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
     let [database, disk, workers] =
         checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
     let status = if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
-    (status, Json(Readiness { ready, database, disk, workers })).into_response()
+    let networks = app.networks();
+    let degraded = networks.is_err();
+    let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
+    let body = Readiness { ready, degraded, database, disk, workers, networks };
+    (status, Json(body)).into_response()
 }
 
 async fn database_answers(app: &App) -> Result<(), String> {

@@ -134,11 +134,11 @@ impl FrameReader for Exposed {
 }
 
 /// Holds samples of snapshots \[S,H,W\] against masks \[B,H,W\], both as prepared files. `saturated` is
-/// the share of full pixels of each snapshot.
+/// the share of full pixels of each snapshot, `darkened` whether a dark was subtracted.
 pub fn judge(
-    masks: &Path,
-    snapshots: &Path,
+    (masks, snapshots): (&Path, &Path),
     saturated: Option<&[f64]>,
+    darkened: bool,
     limits: &Limits,
 ) -> Result<Vec<Finding>, FormatError> {
     let (masks, snapshots) = (Reader::open(masks, limits)?, Reader::open(snapshots, limits)?);
@@ -149,7 +149,7 @@ pub fn judge(
         let share = saturated.and_then(|shares| shares.get(snapshot)).copied();
         let Some(figures) = study(&masks, &snapshots, snapshot)?.finish() else { continue };
         let number = u32::try_from(snapshot).ok();
-        let judged = judge_measurement(&figures, share).into_iter();
+        let judged = judge_measurement(&figures, share, darkened).into_iter();
         findings.extend(judged.map(|found| Finding { snapshot: number, ..Finding::from(found) }));
     }
     Ok(findings)
@@ -173,14 +173,15 @@ fn study(
     Ok(study)
 }
 
-/// Windows with their margins along a side: all of it if it is short.
+/// Windows with their margins along a side, from even pixels on: all of it if it is short.
 fn windows(length: usize) -> Vec<std::ops::Range<usize>> {
     let side = WINDOW + 2 * REACH;
     let count = (length / side).clamp(1, WINDOWS);
     let side = if count == 1 { length.min(2 * side) } else { side };
     let start = |index: usize| match count {
-        1 => (length - side) / 2,
-        _ => index * (length - side) / (count - 1),
+        1 => ((length - side) / 2) & !1,
+        // Even, so that the phases of a mosaic are the same in all.
+        _ => (index * (length - side) / (count - 1)) & !1,
     };
     (0..count).map(|index| start(index)..start(index) + side).collect()
 }

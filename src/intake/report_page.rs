@@ -17,7 +17,7 @@ pub fn report_page(title: &str, report: &CalibrationReport) -> String {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
                 title { "Calibration " (title) }
-                link rel="stylesheet" href="/dashboard/style.css";
+                link rel="stylesheet" href="../../../dashboard/style.css";
             }
             body {
                 main {

@@ -142,6 +142,20 @@ pub struct PatternReport {
 const SCHEMA: &str = "sci-recon/calibration-report/1";
 
 impl CalibrationReport {
+    /// What jobs are to be told of a calibration that is bad.
+    pub fn warning(&self) -> Option<Finding> {
+        let grave = self.findings.iter().filter(|finding| finding.severity == Severity::Error);
+        let reasons: Vec<&str> = grave.map(|finding| finding.code.as_str()).collect();
+        (self.grade == Grade::Bad).then(|| Finding {
+            code: "bad_calibration".into(),
+            severity: Severity::Error,
+            detail: format!("the calibration is bad: {}", reasons.join(", ")),
+            remedy: "read its report, mend what it names, and calibrate again".into(),
+            frames: Vec::new(),
+            snapshot: None,
+        })
+    }
+
     /// Of figures and what was found in them. `captures` come with the scale of the masks.
     pub fn new(
         figures: &MaskFigures,

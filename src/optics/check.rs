@@ -13,6 +13,14 @@ use super::findings::{Finding, Severity};
 pub const REACH: usize = 4;
 /// A shift is believed if it gains so many times what chance would.
 const SURE: f64 = 30.0;
+/// The share of the mean by which the phases of a mosaic differ, and the standard errors that make it sure.
+/// Clips behind masks of single pixels stay below 0.7 % and 3.
+const MOSAIC: f64 = 0.02;
+const SURE_OF_MOSAIC: f64 = 8.0;
+/// The share of a measurement's light that its masks need not explain.
+const OFFSET: f64 = 0.03;
+/// Where the mean brightness of a scene lies.
+const LEVELS: std::ops::RangeInclusive<f64> = 0.05..=1.05;
 /// Side of the blocks in which the scene is taken to be even.
 const BLOCK: usize = 8;
 
@@ -30,6 +38,16 @@ pub struct MeasurementStudy {
     pixels: f64,
     values: u64,
     negative: u64,
+    /// Of each row of blocks.
+    phases: Vec<Phases>,
+}
+
+/// What pixels of odd and even rows and columns have more than their mean, by (row, column) modulo 2: of a
+/// measurement \[4\], and of its masks \[B,4\].
+#[derive(Debug)]
+struct Phases {
+    y: [f64; 4],
+    masks: Vec<[f64; 4]>,
 }
 
 /// What a measurement tells about its masks. Values have the measurement's full scale divided out.
@@ -53,6 +71,9 @@ pub struct MeasurementFigures {
     pub explained: f64,
     /// The same without a shift.
     pub explained_unmoved: f64,
+    /// How much pixels of every second row and column differ from the others, as a share of the mean, beyond
+    /// what their masks explain; and how many standard errors that is.
+    pub mosaic: (f64, f64),
     /// How surely the shift is better: the gain over what chance would give, for each frame's
     /// brightness.
     pub certainty: f64,
@@ -75,12 +96,13 @@ impl MeasurementStudy {
             pixels: 0.0,
             values: 0,
             negative: 0,
+            phases: Vec::new(),
         }
     }
 
     /// Looks at a window of the masks \[B,h,w\] and of the measurement \[h,w\], which has a margin of
-    /// [`REACH`] pixels on each side that only masks are read from. Windows too small for a block
-    /// tell nothing.
+    /// [`REACH`] pixels on each side that only masks are read from, and begins at an even row and column.
+    /// Windows too small for a block tell nothing.
     pub fn add(&mut self, masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) {
         self.values += y.len() as u64;
         self.negative += y.iter().filter(|value| **value < 0.0).count() as u64;
@@ -92,6 +114,11 @@ impl MeasurementStudy {
         }
         let part = |row: usize, column: usize| s![row..row + rows, column..column + columns];
         let y = y.slice(part(REACH, REACH));
+        for row in (0..rows).step_by(BLOCK) {
+            let strip = |image: ArrayView2<'_, f32>| phases(image.slice(s![row..row + BLOCK, ..]));
+            let here = |mask: ArrayView2<'_, f32>| strip(mask.slice(part(REACH, REACH)));
+            self.phases.push(Phases { y: strip(y), masks: masks.outer_iter().map(here).collect() });
+        }
         self.pixels += y.len() as f64;
         self.sum += y.iter().map(|&value| f64::from(value)).sum::<f64>();
         let y = less_block_means(y);
@@ -137,6 +164,7 @@ impl MeasurementStudy {
         let mean = self.sum / self.pixels;
         let error = (scatter * means.dot(&inverse.dot(&means))).max(0.0).sqrt();
         let place = |index: usize| REACH as i32 - index as i32;
+        let mosaic = mosaic(&self.phases, &brightness, mean);
         Some(MeasurementFigures {
             mean,
             negative,
@@ -144,12 +172,40 @@ impl MeasurementStudy {
             offset_uncertainty: error,
             brightness: brightness.to_vec(),
             uncertainty: errors,
+            mosaic,
             shift: (place(best.0.0), place(best.0.1)),
             explained: best.1,
             explained_unmoved: unmoved,
             certainty: gain * self.pixels / (1.0 - best.1).max(1e-3) / self.frames as f64,
         })
     }
+}
+
+/// The means of the pixels by (row, column) modulo 2, less the mean of all.
+fn phases(image: ArrayView2<'_, f32>) -> [f64; 4] {
+    let mean = |phase: usize| {
+        let values = image.slice(s![phase / 2..;2, phase % 2..;2]);
+        values.iter().map(|&value| f64::from(value)).sum::<f64>() / values.len().max(1) as f64
+    };
+    let means = [0, 1, 2, 3].map(mean);
+    means.map(|value| value - means.iter().sum::<f64>() / 4.0)
+}
+
+/// The largest share of the mean by which a phase differs from what the masks explain, and the standard
+/// errors that this is: a sensor's mosaic is the same everywhere, and what a scene does changes its sign.
+fn mosaic(phases: &[Phases], brightness: &Array1<f64>, mean: f64) -> (f64, f64) {
+    let count = phases.len() as f64;
+    let of_phase = |phase: usize| {
+        let rest = |strip: &Phases| {
+            let explained = strip.masks.iter().zip(brightness).map(|(mask, x)| mask[phase] * x);
+            (strip.y[phase] - explained.sum::<f64>()) / mean
+        };
+        let average = phases.iter().map(rest).sum::<f64>() / count;
+        let scatter = phases.iter().map(|strip| (rest(strip) - average).powi(2)).sum::<f64>();
+        let error = (scatter / (count - 1.0).max(1.0) / count).sqrt();
+        (average.abs(), average.abs() / error.max(1e-9))
+    };
+    (0..4).map(of_phase).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default()
 }
 
 /// The array less the mean of each block of [`BLOCK`] x [`BLOCK`].
@@ -190,8 +246,12 @@ fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
 }
 
 /// What is wrong with a measurement; `saturated` is the share of its pixels that were full, if it is
-/// known when they are.
-pub fn judge_measurement(figures: &MeasurementFigures, saturated: Option<f64>) -> Vec<Finding> {
+/// known when they are, and `darkened` says whether a dark was subtracted.
+pub fn judge_measurement(
+    figures: &MeasurementFigures,
+    saturated: Option<f64>,
+    darkened: bool,
+) -> Vec<Finding> {
     let mut findings = Vec::new();
     if let Some(share) = saturated.filter(|share| *share > 0.001) {
         findings.push(Finding::new(
@@ -209,7 +269,11 @@ pub fn judge_measurement(figures: &MeasurementFigures, saturated: Option<f64>) -
             "negative",
             if figures.negative > 0.1 { Severity::Error } else { Severity::Warning },
             format!("{:.1} % of the values are below 0", figures.negative * 100.0),
-            "the dark was brighter than the measurement: take scene_black at the measurement's exposure",
+            if darkened {
+                "the dark was brighter than the measurement: take scene_black at the measurement's exposure"
+            } else {
+                "what was subtracted before was too much: send the numbers of the camera, and name a dark"
+            },
         ));
     }
     let moved = figures.shift != (0, 0)
@@ -246,7 +310,20 @@ pub fn judge_measurement(figures: &MeasurementFigures, saturated: Option<f64>) -
         ));
         return findings;
     }
+    if figures.mosaic.0 > MOSAIC && figures.mosaic.1 > SURE_OF_MOSAIC {
+        findings.push(Finding::new(
+            "mosaic",
+            Severity::Error,
+            format!(
+                "pixels of every second row and column differ from the others by {:.0} % in the mean: this \
+                 looks like the raw mosaic of a colour sensor that is taken as grey",
+                figures.mosaic.0 * 100.0
+            ),
+            "export one colour, or grey pictures, of captures and measurement alike",
+        ));
+    }
     findings.extend(missing(figures));
+    findings.extend(light(figures, darkened));
     findings.extend(level(figures));
     findings
 }
@@ -272,35 +349,49 @@ fn missing(figures: &MeasurementFigures) -> Option<Finding> {
     Some(Finding { frames, ..Finding::new("missing_pattern", Severity::Error, detail, remedy) })
 }
 
-fn level(figures: &MeasurementFigures) -> Vec<Finding> {
-    let mut findings = Vec::new();
-    let level = figures.brightness.iter().sum::<f64>() / figures.brightness.len().max(1) as f64;
+/// Light that no mask explains: a dark that is missing, or another one's.
+fn light(figures: &MeasurementFigures, darkened: bool) -> Option<Finding> {
     let share = figures.offset / figures.mean;
-    if figures.mean > 0.0
-        && share.abs() > 0.15
-        && figures.offset.abs() > 4.0 * figures.offset_uncertainty
-    {
-        let what = if share > 0.0 { "more" } else { "less" };
-        findings.push(Finding::new(
-            "wrong_dark",
-            Severity::Error,
-            format!(
-                "the measurement has {:.0} % {what} light than its masks explain: the dark that was \
-                 subtracted is not its own",
-                share.abs() * 100.0
-            ),
-            "take scene_black at the measurement's exposure, the LCoS all black, and subtract that",
-        ));
+    let sure = figures.offset.abs() > 4.0 * figures.offset_uncertainty;
+    if figures.mean <= 0.0 || share.abs() < OFFSET || !sure {
+        return None;
     }
-    if !(0.005..=1.5).contains(&level) {
-        findings.push(Finding::new(
+    let what = if share > 0.0 { "more" } else { "less" };
+    let seen = format!(
+        "the measurement has {:.0} % {what} light than its masks explain",
+        share.abs() * 100.0
+    );
+    let severity = if share.abs() > 0.15 { Severity::Error } else { Severity::Warning };
+    let remedy = "take scene_black at the measurement's exposure, the LCoS all black, and name it as the dark";
+    Some(match (darkened, share > 0.0) {
+        (true, _) => {
+            let detail = format!("{seen}: the dark that was subtracted is not its own");
+            Finding::new("wrong_dark", severity, detail, remedy)
+        }
+        (false, true) => {
+            Finding::new("no_dark", severity, format!("{seen}, and no dark was named"), remedy)
+        }
+        (false, false) => {
+            let detail = format!("{seen}: too much was subtracted before it was sent");
+            Finding::new("negative_offset", severity, detail, remedy)
+        }
+    })
+}
+
+fn level(figures: &MeasurementFigures) -> Option<Finding> {
+    let level = figures.brightness.iter().sum::<f64>() / figures.brightness.len().max(1) as f64;
+    (!LEVELS.contains(&level)).then(|| {
+        Finding::new(
             "level",
             Severity::Warning,
-            format!("the scene's mean brightness is {level:.3} times the full scale"),
-            "state the measurement's full_scale for its exposure; a scene lies between 0 and 1",
-        ));
-    }
-    findings
+            format!(
+                "the scene's mean brightness is {level:.3} times the full scale; a scene lies between 0 and \
+                 1, and is seldom darker than {} in the mean",
+                LEVELS.start()
+            ),
+            "state the measurement's full_scale for its exposure and its bits",
+        )
+    })
 }
 
 #[cfg(test)]
@@ -325,7 +416,64 @@ mod tests {
         let mut study = MeasurementStudy::new(masks.dim().0);
         study.add(masks.view(), y.view());
         let figures = study.finish().unwrap();
-        judge_measurement(&figures, Some(0.0)).iter().map(|finding| finding.code).collect()
+        judge_measurement(&figures, Some(0.0), true).iter().map(|finding| finding.code).collect()
+    }
+
+    /// Codes of a measurement for which no dark was named.
+    fn undarkened(masks: &Array3<f32>, y: &Array2<f32>) -> Vec<&'static str> {
+        let mut study = MeasurementStudy::new(masks.dim().0);
+        study.add(masks.view(), y.view());
+        let found = judge_measurement(&study.finish().unwrap(), Some(0.0), false);
+        found.iter().map(|finding| finding.code).collect()
+    }
+
+    /// Masks of single open and closed pixels, which tell most about an offset.
+    fn fine_masks(frames: usize, side: usize) -> Array3<f32> {
+        let mut state = 7u32;
+        Array3::from_shape_simple_fn((frames, side, side), || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            if state >> 31 == 1 { 1.0 } else { 0.0 }
+        })
+    }
+
+    #[test]
+    fn a_small_offset_is_seen_and_no_dark_is_blamed_that_is_none() {
+        let masks = fine_masks(8, 208);
+        let y = noisy(measure(masks.view(), scene(8, 208).view()).unwrap(), 0.02, 1).unwrap();
+        let mean = y.mean().unwrap();
+        assert!(undarkened(&masks, &y).is_empty(), "{:?}", undarkened(&masks, &y));
+        // 50 of 710 counts.
+        let lifted = &y + 0.07 * mean;
+        assert_eq!(undarkened(&masks, &lifted), ["no_dark"]);
+        assert_eq!(codes(&masks, &lifted), ["wrong_dark"]);
+        assert_eq!(codes(&masks, &(&y - 0.07 * mean)), ["wrong_dark"]);
+        assert_eq!(undarkened(&masks, &(&y - 0.07 * mean)), ["negative_offset"]);
+    }
+
+    #[test]
+    fn a_full_scale_that_is_wrong_by_ten_is_named() {
+        let masks = fine_masks(8, 208);
+        let y = noisy(measure(masks.view(), scene(8, 208).view()).unwrap(), 0.02, 1).unwrap();
+        assert_eq!(codes(&masks, &(&y * 10.0)), ["level"]);
+        assert_eq!(codes(&masks, &(&y / 10.0)), ["level"]);
+    }
+
+    #[test]
+    fn the_mosaic_of_a_colour_sensor_is_no_grey_picture() {
+        let masks = fine_masks(8, 208);
+        let gains = [0.7, 1.0, 1.0, 0.8];
+        let coloured = |y: &Array2<f32>| {
+            Array2::from_shape_fn(y.dim(), |at| y[at] * gains[at.0 % 2 * 2 + at.1 % 2])
+        };
+        for seed in 0..3 {
+            let y = measure(masks.view(), scene(8, 208).view()).unwrap();
+            let y = noisy(y, 0.02, seed).unwrap();
+            assert!(codes(&masks, &coloured(&y)).contains(&"mosaic"), "seed {seed}");
+            // Stripes that happen to have a period of two pixels somewhere are the scene's.
+            let mut striped = y.clone();
+            striped.slice_mut(s![..60;2, ..]).mapv_inplace(|value| value * 0.8);
+            assert!(!codes(&masks, &striped).contains(&"mosaic"), "seed {seed}");
+        }
     }
 
     #[test]

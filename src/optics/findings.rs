@@ -163,7 +163,19 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
              distance, aberrations)",
         ));
     }
-    if figures.mean_deviation() < 0.03 && figures.frame_means.len() > 1 {
+    if figures.largest > 0.0 && figures.largest < 0.5 {
+        // Not the optics: whatever they do, the most open pixel is near 1.
+        findings.push(Finding::new(
+            "mask_scale",
+            Severity::Warning,
+            format!(
+                "the largest mask value is {:.3} of the full scale, and should be near it: the masks may \
+                 be numbers of fewer bits than their type has",
+                figures.largest
+            ),
+            "state the full_scale of the masks: 4095 for 12-bit numbers in 16 bits, 16383 for 14-bit ones",
+        ));
+    } else if figures.mean_deviation() < 0.03 && figures.frame_means.len() > 1 {
         findings.push(Finding::new(
             "weak_modulation",
             Severity::Warning,

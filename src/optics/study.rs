@@ -42,6 +42,8 @@ pub struct MaskFigures {
     pub stuck_open: u64,
     /// Values that are 0.
     pub zeros: u64,
+    /// The largest value.
+    pub largest: f32,
     /// The values below which 1 % and 99 % of all values lie.
     pub percentiles: (f32, f32),
 }
@@ -151,6 +153,7 @@ impl MaskStudy {
             dead: self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64,
             stuck_open: self.stuck_open,
             zeros: self.zeros,
+            largest: percentile(&self.histogram, 1.0),
             percentiles: (percentile(&self.histogram, 0.01), percentile(&self.histogram, 0.99)),
             mean: self.mean,
             deviation: self.deviation,

@@ -128,15 +128,18 @@ fn read(path: &Path) -> Result<Vec<u8>, NetworkError> {
     fs::read(path).map_err(|reason| NetworkError::Model { path: path.to_owned(), reason })
 }
 
-/// The library's name beside the executable.
+/// The library's name.
 const LIBRARY: &str = "libonnxruntime.so";
+/// Where it is looked for, from the folder of the program: beside it, where `make install` puts it, in the
+/// lib folder of a system, and where scripts/fetch-onnxruntime.sh does in a source tree.
+const PLACES: [&str; 4] = [".", "../lib/sci-recon", "../lib", "../../runtime"];
 
 /// Why there is no denoiser.
 #[derive(Debug, thiserror::Error)]
 pub enum NetworkError {
     #[error(
         "no libonnxruntime: {0}; name it with --onnxruntime or ORT_DYLIB_PATH, or fetch it with \
-         scripts/fetch-onnxruntime.sh"
+         scripts/fetch-onnxruntime.sh FOLDER of the source tree and put it beside the program"
     )]
     Missing(String),
     #[error("model {}: {reason}", path.display())]
@@ -158,7 +161,7 @@ pub struct NetworkSource {
 }
 
 impl NetworkSource {
-    /// `library` is a libonnxruntime, or none for the one beside the executable.
+    /// `library` is a libonnxruntime, or none for the one near the executable ([`find_library`]).
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
         Self { library, models: None, device, version: Arc::default() }
     }
@@ -228,18 +231,35 @@ impl NetworkSource {
     }
 
     fn path(&self) -> Result<PathBuf, NetworkError> {
-        if let Some(library) = &self.library {
-            return existing(library).ok_or_else(|| {
-                NetworkError::Missing(format!("there is no file {}", library.display()))
-            });
-        }
-        let executable = std::env::current_exe()
-            .map_err(|error| NetworkError::Missing(format!("the program's own path: {error}")))?;
-        let beside = executable.with_file_name(LIBRARY);
-        existing(&beside).ok_or_else(|| {
-            NetworkError::Missing("none is named and none is beside the program".into())
-        })
+        find_library(self.library.as_deref())
     }
+}
+
+/// The libonnxruntime that is named, or else the one near the program. It is not opened.
+/// Errors: there is none.
+pub fn find_library(named: Option<&Path>) -> Result<PathBuf, NetworkError> {
+    // An empty variable is one that is not set.
+    if let Some(library) = named.filter(|path| !path.as_os_str().is_empty()) {
+        return existing(library).ok_or_else(|| {
+            NetworkError::Missing(format!("there is no file {}", library.display()))
+        });
+    }
+    let executable = std::env::current_exe().and_then(|path| path.canonicalize());
+    let executable = executable
+        .map_err(|error| NetworkError::Missing(format!("the program's own path: {error}")))?;
+    near(&executable).ok_or_else(|| {
+        let folder = executable.parent().unwrap_or(Path::new("/")).display();
+        NetworkError::Missing(format!(
+            "none is named, and none is in {folder} or, from there, in {}",
+            PLACES[1..].join(", ")
+        ))
+    })
+}
+
+/// The library at the first place from an executable where there is one.
+fn near(executable: &Path) -> Option<PathBuf> {
+    let folder = executable.parent()?;
+    PLACES.iter().find_map(|place| existing(&folder.join(place).join(LIBRARY)))
 }
 
 /// Networks of one thread: each is loaded at its first use and stays warm.
@@ -304,7 +324,9 @@ fn version_in(library: &[u8]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::{ModelFile, NetworkSource, carried, version_in};
+    use std::fs;
+
+    use super::{LIBRARY, ModelFile, NetworkSource, PLACES, carried, near, version_in};
     use crate::job::{Algorithm, Sha256};
     use crate::recon::prior::Network;
     use crate::recon::prior::onnx::Device;
@@ -315,6 +337,20 @@ mod tests {
         assert_eq!(version_in(library).as_deref(), Some("1.31.1"));
         assert_eq!(version_in(b"\0VERS_\0"), None);
         assert_eq!(version_in(b"nothing"), None);
+    }
+
+    #[test]
+    fn a_library_is_found_where_it_is_put() {
+        for place in PLACES {
+            let root = tempfile::tempdir().unwrap();
+            let folder = root.path().join("target/release");
+            fs::create_dir_all(&folder).unwrap();
+            let program = folder.join("sci-recon");
+            assert_eq!(near(&program), None);
+            fs::create_dir_all(folder.join(place)).unwrap();
+            fs::write(folder.join(place).join(LIBRARY), "").unwrap();
+            assert_eq!(near(&program), Some(folder.join(place).join(LIBRARY)));
+        }
     }
 
     #[test]

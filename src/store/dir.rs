@@ -18,6 +18,7 @@ use crate::job::{JobId, PartialId, Sha256};
 /// results/JOB/          manifest.json and one folder for each snapshot
 /// partial/ID            uploads that come in pieces
 /// quarantine/TIME/      what no record knows of, for some days
+/// before-updates/       copies of the database from before updates of the program
 /// tmp/                  files that are being written, locked by their writers
 /// ```
 #[derive(Debug, Clone)]
@@ -90,6 +91,11 @@ impl DataDir {
 
     pub(crate) fn tmp(&self) -> PathBuf {
         self.root.join("tmp")
+    }
+
+    /// Copies of the database from before updates of the program.
+    pub(crate) fn before_updates(&self) -> PathBuf {
+        self.root.join("before-updates")
     }
 
     /// What no row knows of is kept here for some days.

@@ -12,6 +12,29 @@ pub enum StoreError {
     Database(#[from] sqlx::Error),
     #[error("the database can't be brought up to date: {0}")]
     Migrate(#[from] sqlx::migrate::MigrateError),
+    #[error(
+        "the database can't be brought up to date: {error}. Its copy from before is {copy}; the version \
+         before serves it (docs/operations.md, upgrade and rollback)",
+        copy = copy.display()
+    )]
+    Upgrade { error: sqlx::migrate::MigrateError, copy: PathBuf },
+    #[error(
+        "{folder}: the database was brought up to date by version {by} (schema {found}); this is version \
+         {own} (schema {schema}). Nothing was changed. To go on, start that version again, or go back{copy} \
+         (docs/operations.md, upgrade and rollback)",
+        folder = folder.display(),
+        own = env!("CARGO_PKG_VERSION"),
+        copy = copy.as_ref().map_or(String::new(), |path| format!(" to {}", path.display()))
+    )]
+    Newer {
+        folder: PathBuf,
+        /// The version that wrote the marker.
+        by: String,
+        found: i64,
+        schema: i64,
+        /// The last copy from before that this program can serve.
+        copy: Option<PathBuf>,
+    },
     #[error("can't {action} {path}: {source}", path = path.display())]
     Io { action: &'static str, path: PathBuf, source: std::io::Error },
     #[error("the database holds {value:?} as {column}, which can't be")]

@@ -19,6 +19,7 @@ use uuid::Uuid;
 use super::dir::{self, DataDir, on_files};
 use super::error::{Result, StoreError};
 use super::rows::sql;
+use super::upgrade;
 
 /// Who opens a data folder, and so what may become of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,6 +71,14 @@ pub(super) async fn check(dir: &DataDir, purpose: Purpose, schema: i64) -> Resul
     })
     .await?;
     let database = look(&dir.database()).await?;
+    if let Database::Named { schema: found, .. } = database
+        && found > schema
+    {
+        let by = marker.and_then(Result::ok).map_or_else(|| "?".into(), |marker| marker.version);
+        let copy = upgrade::last_copy(dir, schema)?;
+        let folder = dir.root().to_owned();
+        return Err(StoreError::Newer { folder, by, found, schema, copy });
+    }
     judge(marker.as_ref(), &database, has_files, purpose, schema).map_err(|refusal| match refusal {
         None => StoreError::NoFolder(dir.root().to_owned()),
         Some((found, remedy)) => {

@@ -26,6 +26,7 @@ mod submit;
 mod tables;
 #[cfg(test)]
 mod tests;
+mod upgrade;
 
 use std::fs::File;
 use std::path::Path;
@@ -91,6 +92,7 @@ impl Store {
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
         identity::check(&dir, purpose, schema()).await?;
         dir.fill()?;
+        let copy = if serves { upgrade::save(&dir, schema()).await? } else { None };
         let options = SqliteConnectOptions::new()
             .filename(dir.database())
             .create_if_missing(serves)
@@ -111,7 +113,10 @@ impl Store {
             .connect_with(options.clone());
         let writer = writer.await?;
         // Where the folder is only used, nothing is left to do: this refuses a newer database.
-        MIGRATIONS.run(&writer).await?;
+        MIGRATIONS.run(&writer).await.map_err(|error| match copy {
+            Some(copy) => StoreError::Upgrade { error, copy },
+            None => error.into(),
+        })?;
         let readers = SqlitePoolOptions::new()
             .max_connections(4)
             .idle_timeout(None)

@@ -5,6 +5,7 @@ if anything is wrong.
 """
 
 import json
+import os
 import pathlib
 import shutil
 import subprocess
@@ -83,6 +84,35 @@ def systemd(root, wrong):
     return None
 
 
+def nginx(root, wrong):
+    program = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin")
+    if not program or not shutil.which("openssl"):
+        return "nginx"
+    with tempfile.TemporaryDirectory() as folder:
+        key, certificate = f"{folder}/key.pem", f"{folder}/cert.pem"
+        run("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate,
+            "-days", "1", "-subj", "/CN=bench.example")
+        site = (root / "deploy/nginx/sci-recon.conf").read_text()
+        site = site.replace("/etc/ssl/bench.example.pem", certificate)
+        site = site.replace("/etc/ssl/private/bench.example.key", key)
+        whole = pathlib.Path(folder, "nginx.conf")
+        whole.write_text(f"pid {folder}/pid; error_log {folder}/log; events {{}} http {{ {site} }}")
+        status, told = run(program, "-t", "-q", "-c", str(whole))
+        if status:
+            wrong.append(f"nginx -t: {told}")
+    return None
+
+
+def caddy(root, wrong):
+    if not shutil.which("caddy"):
+        return "caddy"
+    file = str(root / "deploy/caddy/Caddyfile")
+    status, told = run("caddy", "adapt", "--adapter", "caddyfile", "--config", file)
+    if status:
+        wrong.append(f"caddy adapt: {told}")
+    return None
+
+
 def dashboard(root, wrong):
     board = json.loads((root / "deploy/grafana/sci-recon.json").read_text())
     names = {name for panel in board["panels"] for target in panel.get("targets", [])
@@ -104,7 +134,7 @@ def main():
     root, wrong = pathlib.Path(sys.argv[1]), []
     kubernetes(root, wrong)
     dashboard(root, wrong)
-    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd)) if name]
+    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd, nginx, caddy)) if name]
     if absent:
         print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
     for reason in wrong:

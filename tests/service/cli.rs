@@ -386,3 +386,42 @@ fn the_demo_shows_what_the_service_is_for() {
     let frames = files.path("demo/frames/pnp-tv-fastdvdnet");
     assert_eq!(std::fs::read_dir(frames).unwrap().count(), 8);
 }
+
+#[test]
+fn settings_come_from_a_file_and_say_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("sci.toml");
+    let config = file.to_str().unwrap();
+    std::fs::write(&file, "data = \"/nowhere\"\n[serve]\nmax-upload-bytes = \"10GB\"\n").unwrap();
+    let shown = sci_recon(&["--config", config, "config", "show", "serve", "--", "--workers", "4"]);
+    let text = String::from_utf8(shown.stdout).unwrap();
+    let line = |key: &str| text.lines().find(|line| line.starts_with(key)).unwrap().to_owned();
+    assert!(line("data ").contains("/nowhere") && line("data ").contains("sci.toml"), "{text}");
+    assert!(line("max-upload-bytes").contains("10GB"), "{text}");
+    assert!(line("workers").contains('4') && line("workers").contains("command line"), "{text}");
+    assert!(line("max-jobs").contains("1000") && line("max-jobs").contains("default"), "{text}");
+    // A command takes it from there, too.
+    let refused = refused(&["--config", config, "token", "list"]);
+    assert!(refused.contains("/nowhere"), "{refused}");
+    std::fs::write(&file, "[serve]\nmax-uploads-bytes = 1\n").unwrap();
+    let refused = self::refused(&["serve", "--config", config, "--data", "/nowhere"]);
+    assert!(refused.contains("max-uploads-bytes"), "{refused}");
+    let refused = sci_recon(&["serve", "--data", "/nowhere", "--max-upload-bytes", "10 apples"]);
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("10GB"), "{refused:?}");
+}
+
+#[test]
+fn shells_and_man_get_what_they_want() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().to_str().unwrap();
+    assert!(sci_recon(&["man", "--out", out]).status.success());
+    for page in ["sci-recon.1", "sci-recon-serve.1", "sci-recon-token-create.1"] {
+        let text = std::fs::read_to_string(folder.path().join(page)).unwrap();
+        assert!(text.contains(".SH NAME"), "{page}");
+    }
+    for shell in ["bash", "zsh", "fish"] {
+        let output = sci_recon(&["completions", shell]);
+        let text = String::from_utf8(output.stdout).unwrap();
+        assert!(output.status.success() && text.contains("max-upload-bytes"), "{shell}");
+    }
+}

@@ -125,6 +125,25 @@ async fn health_says_what_is_missing() {
 }
 
 #[tokio::test]
+async fn without_onnxruntime_only_jobs_with_networks_are_refused() {
+    let nowhere = [("ORT_DYLIB_PATH", "/nowhere/libonnxruntime.so")];
+    let app = TestApp::in_environment(&["--workers", "1"], &nowhere).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let mut body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
+    let refused = app.post("/v1/jobs", &body).await;
+    let detail = refused.problem(422, "invalid_request");
+    assert!(detail.contains("fetch-onnxruntime.sh") && !detail.contains("/nowhere"), "{detail}");
+    assert_eq!(refused.json()["pointer"], "/algorithm");
+    body["algorithm"] = json!("gap-tv");
+    let job = app.submit(&body).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let ready = app.get("/readyz").await.expect(200).json();
+    assert_eq!((&ready["ready"], &ready["degraded"]), (&json!(true), &json!(true)));
+    let networks = ready["networks"].as_str().unwrap();
+    assert!(networks.contains("no libonnxruntime"), "{networks}");
+}
+
+#[tokio::test]
 async fn figures_are_counted() {
     let app = TestApp::start().await;
     app.scene(&Scene::SMALL).await;
@@ -154,6 +173,25 @@ async fn a_second_server_on_the_same_folder_is_refused() {
     let text = String::from_utf8(output.stderr).unwrap();
     assert!(text.contains("another server uses"), "{text}");
     app.get("/livez").await.expect(200);
+}
+
+#[tokio::test]
+async fn a_container_asks_whether_the_service_is_ready() {
+    let mut app = TestApp::with(&["--workers", "1"]).await;
+    let data = app.data().to_owned();
+    let health = || {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        command.args(["health", "--data"]).arg(&data).output().unwrap()
+    };
+    let limit = std::time::Instant::now() + std::time::Duration::from_secs(60);
+    while !health().status.success() {
+        assert!(std::time::Instant::now() < limit, "it does not become ready");
+        tokio::time::sleep(std::time::Duration::from_millis(200)).await;
+    }
+    assert!(String::from_utf8(health().stdout).unwrap().contains("\"ready\":true"));
+    assert!(app.stop().success());
+    let gone = health();
+    assert!(gone.status.code() == Some(1) && !gone.stderr.is_empty(), "{gone:?}");
 }
 
 #[tokio::test]

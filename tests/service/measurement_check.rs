@@ -3,8 +3,9 @@
 use serde_json::{Value, json};
 
 use crate::app::TestApp;
+use crate::app::id;
 use crate::calibration::{Lab, SIDE, found};
-use crate::samples::npy;
+use crate::samples::{Scene, npy, npy_header};
 
 impl Lab {
     /// Sends the measurement; gives the body of a request.
@@ -51,7 +52,7 @@ async fn a_measurement_is_checked_against_its_calibration() {
     let fine = post(&|_| ()).await;
     assert_eq!(codes(&fine), Vec::<String>::new(), "{fine:#}");
     let undarkened = post(&|body| body["dark"] = json!([])).await;
-    assert_eq!(codes(&undarkened), ["wrong_dark"]);
+    assert_eq!(codes(&undarkened), ["no_dark"]);
     let too_dark = post(&|body| body["dark"] = captures["white"].clone()).await;
     assert!(codes(&too_dark).contains(&"negative".to_owned()), "{too_dark:#}");
     let data = app.upload(lab.moved(2, 1)).await;
@@ -85,4 +86,69 @@ async fn a_measurement_is_checked_against_its_calibration() {
     let answer = app.post("/v1/measurements", &body).await;
     answer.problem(422, "size_mismatch");
     assert_eq!(answer.json()["pointer"], "/dark/0");
+}
+
+/// Large enough for small faults to be seen.
+const SCENE: Scene = Scene { frames: 4, height: 256, width: 256, snapshots: 1 };
+
+/// The values of a .npy file of float32, changed, as such a file again.
+fn changed(file: &[u8], values: usize, change: impl Fn(usize, f32) -> f32) -> Vec<u8> {
+    let (head, data) = file.split_at(file.len() - 4 * values);
+    let value = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().unwrap());
+    let new = data.chunks_exact(4).map(value).enumerate();
+    let new = new.flat_map(|(at, value)| change(at, value).to_le_bytes());
+    head.iter().copied().chain(new).collect()
+}
+
+#[tokio::test]
+async fn what_was_wrong_without_a_word_is_named() {
+    let app = TestApp::start().await;
+    let calibration = id(&app.calibrate(SCENE.masks()).await.expect(201));
+    let pixels = SCENE.height * SCENE.width;
+    let codes = async |change: &dyn Fn(usize, f32) -> f32| {
+        let data = changed(&SCENE.snapshots(), pixels, change);
+        let measurement = app.measure(&calibration, data).await.expect(201).json();
+        found(&measurement["warnings"]).into_iter().map(|(code, _)| code).collect::<Vec<_>>()
+    };
+    assert_eq!(codes(&|_, value| value).await, Vec::<String>::new());
+    // No dark is blamed that was not given.
+    assert_eq!(codes(&|_, value| value + 0.05).await, ["no_dark"]);
+    assert_eq!(codes(&|_, value| value * 10.0).await, ["level"]);
+    assert_eq!(codes(&|_, value| value / 10.0).await, ["level"]);
+    let gain = |at: usize| [0.7, 1.0, 1.0, 0.8][at / SCENE.width % 2 * 2 + at % 2];
+    assert!(codes(&|at, value| value * gain(at)).await.contains(&"mosaic".to_owned()));
+}
+
+#[tokio::test]
+async fn jobs_are_warned_of_a_bad_calibration_and_masks_of_their_bits() {
+    let mut app = TestApp::start().await;
+    // The same pattern twice, of 12 bits in 16.
+    let masks = changed(&SCENE.masks(), 4 * SCENE.height * SCENE.width, |_, value| value);
+    let plane = SCENE.height * SCENE.width;
+    let values: Vec<f32> = masks[masks.len() - 16 * plane..]
+        .chunks_exact(4)
+        .map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap()))
+        .collect();
+    let twice = (0..4 * plane).map(|at| values[if at / plane == 3 { at - plane } else { at }]);
+    let mut file = npy_header("<u2", &[4, SCENE.height, SCENE.width]);
+    file.extend(twice.flat_map(|value| ((value * 4095.0) as u16).to_le_bytes()));
+    let calibration = id(&app.calibrate(file).await.expect(201));
+    let measurement = id(&app.measure(&calibration, SCENE.snapshots()).await.expect(201));
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let early = app.submit(&body).await;
+    app.restart_with(&["--workers", "1"]);
+    let warned = |job: &Value| {
+        let codes = found(&job["warnings"]).into_iter().map(|(code, _)| code);
+        codes.filter(|code| code == "bad_calibration").count()
+    };
+    assert_eq!(warned(&app.ended(&early).await), 1, "the report came after the job");
+    let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await.expect(200);
+    assert_eq!(report.json()["grade"], "bad");
+    let codes: Vec<String> =
+        found(&report.json()["findings"]).into_iter().map(|(code, _)| code).collect();
+    assert!(codes.contains(&"mask_scale".into()), "{codes:?}");
+    assert!(codes.contains(&"repeated_pattern".into()), "{codes:?}");
+    assert!(!codes.contains(&"weak_modulation".into()), "the optics are not to blame: {codes:?}");
+    let late = app.submit(&body).await;
+    assert_eq!(warned(&app.ended(&late).await), 1);
 }

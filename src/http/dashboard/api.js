@@ -1,11 +1,12 @@
 // The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
 
+import { place } from "./dom.js";
 import { authorization, signIn } from "./token.js";
 
 /** As `fetch`, with the token that the service wants, if it wants one. */
 export async function ask(path, options = {}) {
   const token = authorization();
-  const response = await fetch(path, { ...options, headers: { ...options.headers, ...token } });
+  const response = await fetch(place(path), { ...options, headers: { ...options.headers, ...token } });
   return response.status === 401 && signIn(token.Authorization) ? ask(path, options) : response;
 }
 
@@ -63,7 +64,7 @@ export async function send(method, path, body) {
 export function upload(file, progress, signal) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
-    request.open("POST", "/v1/blobs");
+    request.open("POST", place("/v1/blobs"));
     request.setRequestHeader("Content-Type", "application/octet-stream");
     for (const [name, value] of Object.entries(authorization())) request.setRequestHeader(name, value);
     request.upload.onprogress = (event) => progress(event.loaded, event.total || file.size);

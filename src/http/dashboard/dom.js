@@ -2,6 +2,11 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 
+/** An address of the service from where this page is, which may be below a path of a proxy. */
+export function place(path) {
+  return path.startsWith("/") ? `.${path}` : path;
+}
+
 /** An HTML element with properties and children; null, undefined and false children are left out. */
 export function h(tag, properties, ...children) {
   return fill(document.createElement(tag), properties, children);
@@ -18,6 +23,7 @@ function fill(element, properties, children) {
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else if (name === "class") element.setAttribute("class", value);
     else if (name === "value" || name === "checked" || name === "selected") element[name] = value;
+    else if (name === "href") element.setAttribute(name, place(value));
     else element.setAttribute(name, value === true ? "" : String(value));
   }
   append(element, children);

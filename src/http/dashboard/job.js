@@ -1,6 +1,6 @@
 // One job: how far it is, what went in, what came out.
 
-import { announce, facts, h, put, say, trouble } from "./dom.js";
+import { announce, facts, h, put, say, trouble, place } from "./dom.js";
 import { bytes, duration, figure, momentInFull, nameOf, shapeOf, stageOf } from "./format.js";
 import { actions } from "./actions.js";
 import { gaveUp, get } from "./api.js";
@@ -169,7 +169,7 @@ function repeat(found) {
   };
   // A label may hold quotes, which the shell would take for its own.
   const json = JSON.stringify(body).replaceAll("'", "'\\''");
-  const text = `curl -sS ${location.origin}/v1/jobs --json '${json}'`;
+  const text = `curl -sS ${new URL(place("/v1/jobs"), document.baseURI)} --json '${json}'`;
   const copy = h("button", { type: "button", class: "small" }, "Copy");
   copy.addEventListener("click", async () => {
     await navigator.clipboard.writeText(text);

@@ -20,6 +20,6 @@ export function signIn(tried) {
   refused = !text;
   if (refused) return false;
   const secure = location.protocol === "https:" ? "; Secure" : "";
-  document.cookie = `${NAME}=${encodeURIComponent(text)}; path=/; SameSite=Strict${secure}`;
+  document.cookie = `${NAME}=${encodeURIComponent(text)}; path=${new URL(".", document.baseURI).pathname}; SameSite=Strict${secure}`;
   return true;
 }

@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 use sqlx::SqliteConnection;
+use sqlx::types::Json;
 
 use super::lease::{self, Heartbeat, Lease, Outcome};
 use super::{graph, job};
@@ -124,6 +125,15 @@ impl Store {
             let prepared = staged.sha256();
             self.publish(transaction, staged, Origin::Prepared).await?;
             calibrations::insert_made(transaction, id, prepared, facts).await?;
+        }
+        if let Some(warning) = done.report.warning() {
+            sql!(
+                "UPDATE jobs SET spec = json_insert(spec, '$.warnings[#]', json(?))
+                 WHERE calibration = ? AND finished_at IS NULL",
+                [Json(&warning), id]
+            )
+            .execute(&mut *transaction)
+            .await?;
         }
         reports::insert(transaction, id, &done.report, done.maps).await
     }

@@ -147,3 +147,81 @@ async fn the_states_of_tasks_are_those_of_the_table() {
         .unwrap();
     assert!(table.contains(&names), "{table}");
 }
+
+/// A folder with the database of the version before, and a connection to it.
+async fn old_folder() -> (tempfile::TempDir, sqlx::SqliteConnection) {
+    let folder = tempfile::tempdir().unwrap();
+    let options = SqliteConnectOptions::new()
+        .filename(folder.path().join("sci-recon.db"))
+        .create_if_missing(true)
+        .foreign_keys(true);
+    let mut connection = options.connect().await.unwrap();
+    sqlx::migrate!().run_to(BEFORE, &mut connection).await.unwrap();
+    (folder, connection)
+}
+
+fn saved(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let entries = std::fs::read_dir(folder.join("before-updates"));
+    entries.into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
+}
+
+const SERVE: Purpose = Purpose::Serve { accept_database: false };
+
+#[tokio::test]
+async fn the_database_is_saved_before_it_is_brought_up_to_date() {
+    let (folder, connection) = old_folder().await;
+    connection.close().await.unwrap();
+    Store::open(folder.path(), SERVE).await.unwrap().close().await;
+    let copies = saved(folder.path());
+    assert_eq!(copies.len(), 1);
+    assert!(copies[0].to_str().unwrap().ends_with(&format!("-schema-{BEFORE:04}.db")));
+    // Nothing is saved that is up to date.
+    Store::open(folder.path(), SERVE).await.unwrap().close().await;
+    assert_eq!(saved(folder.path()), copies);
+    // Back to it, for one start that takes the database for right.
+    let database = folder.path().join("sci-recon.db");
+    std::fs::copy(&copies[0], &database).unwrap();
+    assert!(Store::open(folder.path(), SERVE).await.is_err(), "it is older than its folder");
+    let accept = Purpose::Serve { accept_database: true };
+    Store::open(folder.path(), accept).await.unwrap().close().await;
+}
+
+#[tokio::test]
+async fn an_update_that_fails_names_the_copy() {
+    let (folder, mut connection) = old_folder().await;
+    // In the way of a later migration.
+    sqlx::query("CREATE TABLE labs (lab TEXT)").execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    let error = Store::open(folder.path(), SERVE).await.unwrap_err().to_string();
+    let copy = saved(folder.path()).pop().unwrap();
+    assert!(error.contains("can't be brought up to date"), "{error}");
+    assert!(error.contains(copy.to_str().unwrap()), "{error}");
+    let options = SqliteConnectOptions::new().filename(&copy).read_only(true);
+    let mut connection = options.connect().await.unwrap();
+    let newest = "SELECT max(version) FROM _sqlx_migrations";
+    let newest: i64 = sqlx::query_scalar(newest).fetch_one(&mut connection).await.unwrap();
+    assert_eq!(newest, BEFORE);
+}
+
+#[tokio::test]
+async fn a_newer_database_is_refused_in_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::open(folder.path(), SERVE).await.unwrap();
+    let newer =
+        "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+                 VALUES (9999, 'later', 1, x'00', 0)";
+    sqlx::query(newer).execute(&store.writer).await.unwrap();
+    store.close().await;
+    drop(store);
+    let kept = folder.path().join("before-updates");
+    std::fs::create_dir(&kept).unwrap();
+    for name in ["1-schema-0070.db", "2-schema-9998.db"] {
+        std::fs::write(kept.join(name), "").unwrap();
+    }
+    for purpose in [SERVE, Purpose::Serve { accept_database: true }, Purpose::Use] {
+        let error = Store::open(folder.path(), purpose).await.unwrap_err().to_string();
+        assert!(error.contains("schema 9999") && error.contains("Nothing was changed"), "{error}");
+        assert!(error.contains(env!("CARGO_PKG_VERSION")), "{error}");
+        assert!(error.contains("1-schema-0070.db") && !error.contains("9998"), "{error}");
+    }
+}

@@ -1,0 +1,78 @@
+//! `sci-recon health`: whether the service of a data folder is ready, for what watches a container.
+
+use std::fs;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use serde::Deserialize;
+
+use super::CliError;
+use crate::cli::error::Result;
+
+/// The longest that an answer may take.
+const PATIENCE: Duration = Duration::from_secs(4);
+
+/// Asks the service of a data folder whether it is ready; ends with 1 if it is not.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Folder of the service's data.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    data: PathBuf,
+}
+
+#[derive(Debug, Deserialize)]
+struct Announcement {
+    address: SocketAddr,
+}
+
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let path = arguments.data.join("server.json");
+    let failed = |error: &dyn std::fmt::Display| {
+        CliError::Failure(format!("no service says that it is here ({}): {error}", path.display()))
+    };
+    let text = fs::read_to_string(&path).map_err(|error| failed(&error))?;
+    let announced: Announcement = serde_json::from_str(&text).map_err(|error| failed(&error))?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
+    println!("{}", runtime.block_on(ask(announced.address))?);
+    Ok(())
+}
+
+/// What `/readyz` answers.
+async fn ask(address: SocketAddr) -> Result<String> {
+    let broken = |error: reqwest::Error| CliError::Failure(format!("no answer: {error}"));
+    let url = format!("http://{}/readyz", reachable(address));
+    let client = reqwest::Client::builder().timeout(PATIENCE).no_proxy().build();
+    let answer = client.map_err(broken)?.get(url).send().await.map_err(broken)?;
+    let ready = answer.status().is_success();
+    let text = answer.text().await.map_err(broken)?;
+    if ready { Ok(text) } else { Err(CliError::Failure(text)) }
+}
+
+/// An address of this machine at which one that listens at all of them answers.
+fn reachable(address: SocketAddr) -> SocketAddr {
+    let ip = match address.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        ip => ip,
+    };
+    SocketAddr::new(ip, address.port())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::reachable;
+
+    #[test]
+    fn a_service_that_listens_everywhere_is_asked_here() {
+        for (told, asked) in [
+            ("0.0.0.0:80", "127.0.0.1:80"),
+            ("[::]:80", "[::1]:80"),
+            ("10.0.0.7:80", "10.0.0.7:80"),
+        ] {
+            assert_eq!(reachable(told.parse().unwrap()), asked.parse().unwrap());
+        }
+    }
+}

@@ -1,0 +1,27 @@
+#!/usr/bin/env bash
+# The contract before linters, and clients generated from it: none may find an error, and the generators must
+# not warn. Needs node, npm and Python 3.
+#
+#   tests/judges/clients/run.sh FOLDER     FOLDER keeps the tools for the next run
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+contract=$here/../../../openapi.yaml
+mkdir -p "$1"
+tools=$(cd "$1" && pwd)
+cp "$here/package.json" "$tools/"
+(cd "$tools" && npm install --silent --no-audit --no-fund >npm.log 2>&1) || { cat "$tools/npm.log" >&2; exit 1; }
+[ -x "$tools/python/bin/python" ] || python3 -m venv "$tools/python"
+"$tools/python/bin/python" -m pip install --quiet --requirement "$here/requirements.txt"
+export PATH=$tools/node_modules/.bin:$tools/python/bin:$PATH
+out=$(mktemp -d)
+trap 'rm -rf "$out"' EXIT
+
+redocly lint --format summary "$contract"
+spectral lint --ruleset "$here/spectral.yaml" "$contract"
+openapi-typescript "$contract" --output "$out/api.d.ts" 2>&1 | tee "$out/typescript.log"
+if grep -qi warn "$out/typescript.log"; then exit 1; fi
+tsc --noEmit --strict "$out/api.d.ts"
+openapi-python-client generate --path "$contract" --config "$here/openapi-python-client.yaml" \
+  --output-path "$out/client" --fail-on-warning
+python -m compileall -q "$out/client"
+echo '{"clients": "generated without a warning", "linters": "no error"}'
