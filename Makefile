@@ -56,9 +56,10 @@ $(JUDGES)/.stamp: tests/judges/requirements.txt
 	$(JUDGES)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-faults: runtime ## 200 random kills, pieces sent twice, faults at file operations, damaged data, hanging tasks
+faults: runtime ## 200 random kills (also of uploads, calibrations, deletes, copies), faults at file operations, damaged data
 	SCI_RECON_KILLS=200 SCI_RECON_FAULT_POINTS=25 $(PYTHON) scripts/figures.py faults \
-		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable:: identity::
+		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable:: identity:: \
+		copies:: limits:: conditions:: storm::
 
 load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once (12 GB of disk)
 	$(PYTHON) scripts/figures.py load \

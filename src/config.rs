@@ -60,7 +60,8 @@ pub struct ServeArguments {
     #[command(flatten)]
     pub engine: EngineArguments,
 
-    /// Memory that one worker may need; jobs that need more are refused.
+    /// Memory that one worker may need; jobs that need more are refused. A task that takes a quarter and 256 MiB
+    /// more than this fails.
     #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 4 << 30)]
     pub worker_memory_bytes: u64,
 
@@ -68,8 +69,9 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 8 << 30)]
     pub max_upload_bytes: u64,
 
-    /// Uploads that are received at the same time; more are told to come back later.
-    #[arg(long, env = "SCI_RECON_MAX_UPLOADS", value_name = "N", default_value_t = 32)]
+    /// Uploads that are received at the same time; more are told to come back later. A lab has half of these
+    /// places at most, and one that has none always gets one.
+    #[arg(long, env = "SCI_RECON_MAX_UPLOADS", value_name = "N", default_value_t = 64)]
     pub max_uploads: usize,
 
     /// Bytes of the disk that uploads leave free.
@@ -85,11 +87,22 @@ pub struct ServeArguments {
     )]
     pub upload_idle_seconds: u64,
 
+    /// Bytes in a second that an upload must bring in the mean of that time, so that slow ones don't keep the
+    /// places of others.
+    #[arg(
+        long,
+        env = "SCI_RECON_UPLOAD_BYTES_PER_SECOND",
+        value_name = "BYTES",
+        default_value_t = 1000
+    )]
+    pub upload_bytes_per_second: u64,
+
     /// Seconds that an answer may take (other than uploads, checks of uploads, and downloads).
     #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
     pub request_seconds: u64,
 
-    /// Jobs that may wait and run; more are told to come back later.
+    /// Jobs that may wait and run; more are told to come back later, but not those of a lab that has less than
+    /// an equal part of them.
     #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
     pub max_jobs: u64,
 
@@ -104,6 +117,12 @@ pub struct ServeArguments {
     /// Days for which files are kept in quarantine/ that no record knows of, as a crash may leave them.
     #[arg(long, env = "SCI_RECON_QUARANTINE_DAYS", value_name = "DAYS", default_value_t = 7)]
     pub quarantine_days: u32,
+
+    /// Bytes in a second at which all stored files are compared with their hashes, in the background, at most
+    /// once a day; 0: never.
+    #[arg(long, env = "SCI_RECON_SCRUB_BYTES", value_name = "BYTES", value_parser = bytes,
+          default_value_t = 10 << 20)]
+    pub scrub_bytes: u64,
 
     /// Goes on where database and folder do not belong together: takes the database for right, and moves
     /// files that it does not know to quarantine/. For one start, after the reason has been understood.
@@ -219,6 +238,10 @@ pub struct WorkerArguments {
     #[arg(long, hide = true)]
     pub without_tiles: bool,
 
+    /// The most memory that it may take; a task that wants more fails [default: no limit].
+    #[arg(long, env = "SCI_RECON_WORKER_LIMIT_BYTES", value_name = "BYTES")]
+    pub memory_bytes: Option<u64>,
+
     /// Where and how it computes.
     #[command(flatten)]
     pub engine: EngineArguments,
@@ -252,6 +275,11 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,
+
+    /// Leaves workers all files and connections that their user may have. Otherwise those of this machine see
+    /// the data folder and the system's libraries alone, and make no connections.
+    #[arg(long, env = "SCI_RECON_UNCONFINED")]
+    pub unconfined: bool,
 
     /// Seconds without progress, on top of four times the planned time of a task, after which its
     /// worker is held to hang: the worker ends, and another one tries the task.
@@ -363,6 +391,12 @@ impl WorkerArguments {
         if let Some(id) = self.id {
             option("--id", id.to_string().into());
         }
+        if let Some(bytes) = self.memory_bytes {
+            option("--memory-bytes", bytes.to_string().into());
+        }
+        if self.engine.unconfined {
+            line.push("--unconfined".into());
+        }
         if self.without_tiles {
             line.push("--without-tiles".into());
         }
@@ -423,6 +457,9 @@ mod tests {
             "--onnxruntime",
             "lib.so",
             "--supervised",
+            "--unconfined",
+            "--memory-bytes",
+            "1000",
             "--without-tiles",
             "--log-format",
             "json",

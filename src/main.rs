@@ -33,6 +33,7 @@ enum Command {
     Token(cli::token::Arguments),
     Lab(cli::lab::Arguments),
     Backup(cli::backup::Arguments),
+    Verify(cli::verify::Arguments),
     CheckModel(cli::check_model::Arguments),
     #[cfg(feature = "nats")]
     Cluster(cli::cluster::Arguments),
@@ -88,6 +89,7 @@ fn run(line: Vec<OsString>) -> ExitCode {
         Command::Token(arguments) => cli::token::run(&arguments),
         Command::Lab(arguments) => cli::lab::run(&arguments),
         Command::Backup(arguments) => cli::backup::run(&arguments),
+        Command::Verify(arguments) => cli::verify::run(&arguments),
         Command::CheckModel(arguments) => cli::check_model::run(&arguments),
         #[cfg(feature = "nats")]
         Command::Cluster(arguments) => cli::cluster::run(&arguments),

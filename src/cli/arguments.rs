@@ -1,7 +1,7 @@
 //! Arguments that several commands share.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -80,6 +80,16 @@ impl ScheduleArguments {
 }
 
 impl NetworkArguments {
+    /// Whether the network runs on the processor.
+    pub(super) fn on_cpu(&self) -> bool {
+        self.device == "cpu"
+    }
+
+    /// The libonnxruntime that was named.
+    pub(super) fn library(&self) -> Option<&Path> {
+        self.onnxruntime.as_deref()
+    }
+
     pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable is one that is not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());

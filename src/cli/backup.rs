@@ -6,10 +6,11 @@ use clap::Args;
 
 use super::CliError;
 use crate::cli::error::Result;
-use crate::store::{Purpose, Store};
+use crate::store::{Backup, Purpose, Store};
 
-/// Copies a data folder while the service runs, and checks the hash of every file. To restore it,
-/// serve the copy (or a copy of it).
+/// Copies a data folder while the service runs, and compares every file with the record of it. The copy
+/// appears when it is whole; until then it is NAME.unfinished, which no service takes. To restore it, serve
+/// the copy (or a copy of it). Ends with 1 if a file is damaged or missing.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data.
@@ -34,10 +35,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         store.close().await;
         Ok::<_, CliError>(backup)
     })?;
-    let (files, bytes, damaged) = (backup.files, backup.bytes, backup.damaged);
-    println!("{}", serde_json::json!({"files": files, "bytes": bytes, "damaged": damaged}));
-    if damaged.is_empty() {
+    let Backup { files, bytes, damaged, missing } = backup;
+    println!(
+        "{}",
+        serde_json::json!({"files": files, "bytes": bytes, "damaged": damaged, "missing": missing})
+    );
+    if damaged.is_empty() && missing.is_empty() {
         return Ok(());
     }
-    Err(CliError::Failure(format!("the copy is complete, but damaged: {}", damaged.join(", "))))
+    let bad = [damaged, missing].concat().join(", ");
+    Err(CliError::Failure(format!("the copy has all there is, but damaged or missing are: {bad}")))
 }

@@ -7,10 +7,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 use ndarray::{Array2, Array3};
-use rustix::process::{Resource, Rlimit};
 
 use super::CliError;
 use super::arguments::NetworkArguments;
+use super::confine::{confine, folders_of, limit_memory};
 use crate::cli::error::Result;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
@@ -21,6 +21,9 @@ use crate::recon::tile::TilePlan;
 
 /// How much the check stands back for others.
 const NICE: i32 = 10;
+
+/// Characters that are kept of a tensor's name.
+const NAME: usize = 100;
 
 /// Check whether a network can be used by `learned` for masks of a size, and run it once on a dark
 /// scene. Prints one JSON object: what was found, or why it is refused.
@@ -41,6 +44,9 @@ pub struct Arguments {
     /// The most memory that the check may take [default: no limit].
     #[arg(long, value_name = "BYTES")]
     memory_bytes: Option<u64>,
+    /// Leaves the check all files and connections that its user may have.
+    #[arg(long, hide = true)]
+    unconfined: bool,
     #[command(flatten)]
     engine: NetworkArguments,
 }
@@ -50,8 +56,15 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
     if let Some(bytes) = arguments.memory_bytes {
-        let limit = Rlimit { current: Some(bytes), maximum: Some(bytes) };
-        rustix::process::setrlimit(Resource::Data, limit).map_err(|error| refused(&error))?;
+        limit_memory(bytes).map_err(CliError::Failure)?;
+    }
+    // What the driver of a GPU opens is its own affair.
+    if !arguments.unconfined && arguments.engine.on_cpu() {
+        let library = folders_of(arguments.engine.library());
+        let readable = library.iter().map(PathBuf::as_path).chain([&*arguments.file]);
+        if let Err(why) = confine(&readable.collect::<Vec<_>>(), &[]) {
+            eprintln!("the check is not confined: {why}");
+        }
     }
     let network = arguments.engine.network()?;
     // Without a library nothing can be said of the network.
@@ -92,7 +105,8 @@ fn facts(
 }
 
 fn tensor(TensorInfo { name, sides, .. }: TensorInfo) -> ModelTensor {
-    ModelTensor { name, shape: sides }
+    // A name is any text of the file.
+    ModelTensor { name: name.chars().take(NAME).collect(), shape: sides }
 }
 
 /// The size of the tiles of a job that names none.

@@ -41,7 +41,7 @@ pub(super) async fn guard(cache: &Path, stop: impl Future<Output = ()>) -> Resul
         died = match judge(status) {
             WorkerEnd::Left => return Ok(()),
             WorkerEnd::Killed => Some("killed".to_owned()),
-            WorkerEnd::Crashed(how) => Some(how),
+            WorkerEnd::Starved(how) | WorkerEnd::Crashed(how) => Some(how),
         };
         tracing::error!(how = died, "the worker process has died, and another one takes its place");
         pause = if start.elapsed() > HEALTHY { PAUSES.0 } else { (pause * 2).min(PAUSES.1) };

@@ -1,4 +1,4 @@
-//! `sci-recon lab`: the labs that a service has, and their shares of the machine.
+//! `sci-recon lab`: the labs that a service has, their shares of the machine, and their limits.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -8,9 +8,9 @@ use clap::{Args, Subcommand};
 use super::CliError;
 use crate::cli::error::Result;
 use crate::job::Lab;
-use crate::store::{LabRow, Purpose, Store};
+use crate::store::{Entitlement, LabRow, Purpose, Store};
 
-/// Lists labs and sets their shares of the machine. The service may be running.
+/// Lists labs, and sets their shares of the machine and their limits. The service may be running.
 ///
 /// Tasks are handed out by priority, then to each lab in turn. While two labs have work waiting, one with
 /// twice the share gets twice the processor time.
@@ -32,9 +32,27 @@ enum Action {
         /// The lab's name.
         lab: Lab,
         /// Its share of the machine, beside the shares of the other labs; every lab begins with 1.
-        #[arg(long, value_name = "N", value_parser = share)]
-        share: f64,
+        #[arg(long, value_name = "N", value_parser = share, required_unless_present_any = ["bytes", "jobs"])]
+        share: Option<f64>,
+        /// Bytes that it may keep here, in uploads, what is prepared of them, and results, or none for no limit.
+        #[arg(long, value_name = "N", value_parser = limit)]
+        bytes: Option<Limit>,
+        /// Jobs that it may have waiting and running, or none for no limit of its own.
+        #[arg(long, value_name = "N", value_parser = limit)]
+        jobs: Option<Limit>,
     },
+}
+
+/// A limit, or word that there is to be none.
+#[derive(Debug, Clone, Copy)]
+struct Limit(Option<u64>);
+
+fn limit(text: &str) -> Result<Limit, String> {
+    if text == "none" {
+        return Ok(Limit(None));
+    }
+    let number = text.parse().ok().filter(|number| i64::try_from(*number).is_ok());
+    number.map(|number| Limit(Some(number))).ok_or_else(|| "a limit is a number, or none".into())
 }
 
 fn share(text: &str) -> Result<f64, String> {
@@ -50,21 +68,40 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
     runtime.block_on(async {
         let store = Store::open(&arguments.data, Purpose::Use).await?;
-        if let Action::Set { lab, share } = &arguments.action {
-            store.set_share(lab, *share).await?;
+        if let Action::Set { lab, share, bytes, jobs } = &arguments.action {
+            let to = Entitlement {
+                share: *share,
+                max_bytes: bytes.map(|limit| limit.0),
+                max_jobs: jobs.map(|limit| limit.0),
+            };
+            store.entitle(lab, to).await?;
         }
-        let text = table(&store.labs().await?);
+        let mut rows = Vec::new();
+        for row in store.labs().await? {
+            let bytes = store.lab_bytes(&row.lab).await?;
+            rows.push((row, bytes));
+        }
+        let text = table(&rows);
         store.close().await;
         let mut stdout = std::io::stdout();
         writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
     })
 }
 
-fn table(labs: &[LabRow]) -> String {
-    let head = format!("{:40}  {:>8}  {:>8}  {:>16}", "lab", "share", "jobs", "CPU seconds left");
-    let line = |lab: &LabRow| {
-        let LabRow { lab, share, jobs, cost_left } = lab;
-        format!("{:40}  {share:>8}  {jobs:>8}  {cost_left:>16.0}", lab.as_str())
+fn table(labs: &[(LabRow, u64)]) -> String {
+    let head = format!(
+        "{:40}  {:>8}  {:>8}  {:>8}  {:>16}  {:>16}  {:>16}",
+        "lab", "share", "jobs", "of", "bytes", "of", "CPU seconds left"
+    );
+    let limit = |limit: Option<u64>| limit.map_or_else(|| "none".into(), |limit| limit.to_string());
+    let line = |(row, bytes): &(LabRow, u64)| {
+        let LabRow { lab, share, max_bytes, max_jobs, jobs, cost_left } = row;
+        format!(
+            "{:40}  {share:>8}  {jobs:>8}  {:>8}  {bytes:>16}  {:>16}  {cost_left:>16.0}",
+            lab.as_str(),
+            limit(*max_jobs),
+            limit(*max_bytes)
+        )
     };
     std::iter::once(head).chain(labs.iter().map(line)).collect::<Vec<_>>().join("\n")
 }

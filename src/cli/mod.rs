@@ -1,6 +1,7 @@
 //! The commands, one file each.
 
 mod arguments;
+mod confine;
 mod error;
 #[cfg(feature = "nats")]
 mod guard;
@@ -27,6 +28,7 @@ pub mod settings;
 pub mod shell;
 pub mod simulate;
 pub mod token;
+pub mod verify;
 pub mod worker;
 
 pub use arguments::{NetworkArguments, algorithms};

@@ -91,6 +91,11 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let figures = metrics.clone();
     let maintenance = maintain(store.clone(), move || figures.upkeep(), settings.clone());
     tokio::spawn(closing.clone().run_until_cancelled_owned(maintenance));
+    if settings.scrub_bytes > 0 {
+        let (store, rate) = (store.clone(), settings.scrub_bytes);
+        let scrub = async move { store.scrub(rate).await };
+        tokio::spawn(closing.clone().run_until_cancelled_owned(scrub));
+    }
     let closer = closing.clone();
     tokio::spawn(async move {
         signal.await;
@@ -131,12 +136,20 @@ fn announce(root: &Path, address: SocketAddr) -> Result<(), ServeError> {
     writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(io("print the address"))
 }
 
+/// What a worker may take in fact, of address space, where this much was planned at most of resident memory.
+fn allowance(planned: u64) -> u64 {
+    planned.saturating_add(planned / 4).saturating_add(256 << 20)
+}
+
 fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
     WorkerArguments {
         data: Some(root.to_owned()),
         #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
         without_tiles: settings.without_tiles(),
+        // A GPU's driver maps far more than it uses.
+        memory_bytes: (settings.engine.device == "cpu")
+            .then(|| allowance(settings.worker_memory_bytes)),
         engine: settings.engine.clone(),
         log_format: settings.log_format,
         id: None,

@@ -15,6 +15,7 @@ use tokio::task::JoinSet;
 
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
+use crate::pipeline::usage::peak_rss_of;
 use crate::store::{Store, WorkerEnd};
 
 /// How long a worker may take to give its task back.
@@ -22,6 +23,8 @@ pub(super) const GRACE: Duration = Duration::from_secs(8);
 /// The shortest and the longest pause before a worker is started again.
 pub(super) const PAUSES: (Duration, Duration) =
     (Duration::from_millis(100), Duration::from_secs(15));
+/// Time between looks at a worker's memory.
+const MEMORY_LOOK: Duration = Duration::from_millis(500);
 /// Time between looks at a worker's signs of life.
 const LOOK: Duration = Duration::from_secs(5);
 /// A worker that gives no sign of life for so long hangs as a whole; its lease has run out.
@@ -104,6 +107,7 @@ impl Slot {
     async fn watch(&mut self, id: WorkerId, mut child: Child) {
         let stdin = child.stdin.take();
         let store = self.store.clone();
+        let mut memory = Memory::of(child.id());
         let ended = tokio::select! {
             status = child.wait() => Some(status),
             () = stopped(&mut self.stop) => None,
@@ -111,9 +115,10 @@ impl Slot {
                 tracing::warn!(worker = %id, "a worker gives no sign of life and is killed");
                 Some(child.kill().await.and(child.wait().await))
             }
+            never = memory.watch() => match never {},
         };
         let end = match ended {
-            Some(Ok(status)) => judge(status),
+            Some(Ok(status)) => memory.explain(judge(status), self.arguments.memory_bytes),
             Some(Err(error)) => WorkerEnd::Crashed(error.to_string()),
             None => {
                 drop(stdin);
@@ -129,12 +134,14 @@ impl Slot {
         let reason = match end {
             WorkerEnd::Left => "left",
             WorkerEnd::Killed => "killed",
+            WorkerEnd::Starved(_) => "starved",
             WorkerEnd::Crashed(_) => "crashed",
         };
         metrics::counter!("sci_recon_worker_exits_total", "reason" => reason).increment(1);
         match end {
             WorkerEnd::Left => tracing::info!(worker = %id, "a worker has ended"),
             WorkerEnd::Killed => tracing::warn!(worker = %id, "a worker was killed"),
+            WorkerEnd::Starved(how) => tracing::error!(worker = %id, how, "a worker had no memory"),
             WorkerEnd::Crashed(how) => tracing::error!(worker = %id, how, "a worker has died"),
         }
         if let Err(error) = self.store.worker_ended(id, end).await {
@@ -142,6 +149,63 @@ impl Slot {
             tracing::error!(worker = %id, %error, "the task of a worker can't be freed");
         }
     }
+}
+
+/// The memory of a worker, as far as it shows from outside.
+struct Memory {
+    process: Option<u32>,
+    /// The most that it was seen to have, in bytes.
+    peak: u64,
+    /// Kills by the kernel for want of memory, among the processes of this service, before it began.
+    kills: Option<u64>,
+}
+
+impl Memory {
+    fn of(process: Option<u32>) -> Self {
+        Self { process, peak: 0, kills: kills_for_memory() }
+    }
+
+    async fn watch(&mut self) -> std::convert::Infallible {
+        loop {
+            if let Some(process) = self.process {
+                self.peak = self.peak.max(peak_rss_of(process));
+            }
+            tokio::time::sleep(MEMORY_LOOK).await;
+        }
+    }
+
+    /// The same end, with what memory had to do with it.
+    fn explain(&self, end: WorkerEnd, limit: Option<u64>) -> WorkerEnd {
+        let peak = format!("its memory was seen at {} MiB", self.peak >> 20);
+        match end {
+            WorkerEnd::Killed if kills_for_memory() > self.kills => {
+                WorkerEnd::Starved(format!("the machine had no memory left for it; {peak}"))
+            }
+            WorkerEnd::Crashed(how) => WorkerEnd::Crashed(match limit {
+                Some(limit) => format!("{how}; {peak} of the {} MiB it may take", limit >> 20),
+                None => format!("{how}; {peak}"),
+            }),
+            end => end,
+        }
+    }
+}
+
+/// How often the kernel has killed a process of this control group for want of memory; none if it does not
+/// tell.
+fn kills_for_memory() -> Option<u64> {
+    let groups = std::fs::read_to_string("/proc/self/cgroup").ok()?;
+    let file = groups.lines().find_map(|line| {
+        let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
+        let path = path.trim_end_matches('/');
+        match controllers {
+            "" => Some(format!("/sys/fs/cgroup{path}/memory.events")),
+            "memory" => Some(format!("/sys/fs/cgroup/memory{path}/memory.oom_control")),
+            _ => None,
+        }
+    })?;
+    let events = std::fs::read_to_string(file).ok()?;
+    let line = events.lines().find_map(|line| line.strip_prefix("oom_kill "))?;
+    line.trim().parse().ok()
 }
 
 async fn stopped(stop: &mut watch::Receiver<bool>) {

@@ -1,12 +1,13 @@
 //! `sci-recon worker`: does the tasks of a data folder, or tiles of a server elsewhere.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use tokio::io::AsyncReadExt;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
+use super::confine::{confine, folders_of, limit_memory};
 #[cfg(feature = "nats")]
 use super::guard::guard;
 use super::{CliError, logging};
@@ -24,6 +25,18 @@ use crate::worker::{Local, Worker, WorkerError};
 pub fn run(settings: &WorkerArguments) -> Result<()> {
     logging::start(settings.log_format);
     stand_back(settings.engine.nice)?;
+    if let Some(bytes) = settings.memory_bytes {
+        limit_memory(bytes).map_err(CliError::Failure)?;
+    }
+    // What the driver of a GPU opens is its own affair.
+    let confined = !settings.engine.unconfined && settings.engine.device == "cpu";
+    if let Some(data) = settings.data.as_deref().filter(|_| confined) {
+        let library = folders_of(settings.engine.onnxruntime.as_deref());
+        let readable: Vec<&Path> = library.iter().map(PathBuf::as_path).collect();
+        if let Err(why) = confine(&readable, &[data]) {
+            tracing::warn!(why, "the worker is not confined");
+        }
+    }
     let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
     let network = NetworkSource::new(library, Device::parse(&settings.engine.device)?);
     let failed = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());

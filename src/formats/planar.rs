@@ -42,6 +42,11 @@ pub fn writer<W: Write>(
     Ok(StackWriter::new(to, frames, height, width))
 }
 
+/// Bytes of a prepared array of this shape.
+pub fn bytes(info: &StackInfo) -> u64 {
+    HEADER_BYTES + info.voxels() * SAMPLE_BYTES
+}
+
 /// An open prepared array. Reads at positions, so it may be shared between threads.
 #[derive(Debug)]
 pub struct Reader {
@@ -64,7 +69,7 @@ impl Reader {
         file.read_exact_at(&mut header, 0).map_err(FormatError::io("read the header"))?;
         let info = parse_header(&header)?;
         limits.check_info(&info)?;
-        let promised = HEADER_BYTES + info.voxels() * SAMPLE_BYTES;
+        let promised = bytes(&info);
         let shape = format!("{} frames of {}x{}", info.frames, info.height, info.width);
         if length < promised {
             return Err(FormatError::Truncated {

@@ -52,7 +52,7 @@ pub(super) struct Access {
     pub(super) lab: Lab,
     pub(super) role: Role,
     pub(super) token: Option<TokenId>,
-    /// Bytes of uploads that the token may keep here.
+    /// Bytes of uploads, and of what is prepared of them, that the token may keep here.
     pub(super) max_bytes: Option<u64>,
 }
 

@@ -7,12 +7,14 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::Mutex;
 
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
+use super::shares::{Place, Places};
 use crate::config::ServeArguments;
-use crate::store::Store;
+use crate::job::Lab;
+use crate::store::{Store, StoreError};
 
 /// What an upload that does not say its length reserves at a time.
 const STEP: u64 = 64 << 20;
@@ -24,7 +26,10 @@ pub(super) struct Admission {
     min_free_bytes: u64,
     /// Bytes reserved for uploads that are coming in.
     reserved: Arc<AtomicU64>,
-    slots: Arc<Semaphore>,
+    places: Places,
+    /// Held from the look at the disk until what was let in is on record: of two that want the last room one
+    /// gets it.
+    gate: Mutex<()>,
 }
 
 /// Bytes of the disk reserved for an upload; what is not written is given back when this is dropped.
@@ -47,18 +52,22 @@ impl Admission {
             max_upload_bytes: settings.max_upload_bytes,
             min_free_bytes: settings.min_free_bytes,
             reserved: Arc::default(),
-            slots: Arc::new(Semaphore::new(settings.max_uploads)),
+            places: Places::new(settings.max_uploads),
+            gate: Mutex::default(),
         }
     }
 
-    /// Takes one of the slots for uploads.
-    pub(super) fn slot(&self) -> Result<OwnedSemaphorePermit> {
-        self.slots.clone().try_acquire_owned().map_err(|_| {
-            ApiError::new(Code::TooManyUploads, "all places for uploads are taken; try again soon")
+    /// Takes one of the places for uploads.
+    pub(super) fn place(&self, lab: &Lab) -> Result<Place> {
+        self.places.take(lab).ok_or_else(|| {
+            let detail =
+                "all places for uploads are taken, or this lab has its share; try again soon";
+            ApiError::new(Code::TooManyUploads, detail)
         })
     }
 
     pub(super) async fn reserve(&self, length: u64) -> Result<Reservation> {
+        let _gate = self.gate.lock().await;
         let reserved = self.reserved.clone();
         // First the reservation and then the look: of two that want the last room, none gets too
         // much.
@@ -98,10 +107,17 @@ impl Admission {
         Err(ApiError::new(Code::InsufficientStorage, detail))
     }
 
-    /// Refuses a job, or an upload in pieces, that the disk has no room for. What is accepted is
-    /// reserved by the database.
-    pub(super) async fn check_room(&self, what: &str, needed: u64) -> Result<()> {
-        self.check_disk(needed, what, needed).await
+    /// Has `accept` put on record what the disk has room for, and by that reserve it: a job, an upload in
+    /// pieces, masks that are to be made.
+    pub(super) async fn with_room<T>(
+        &self,
+        what: &str,
+        needed: u64,
+        accept: impl Future<Output = Result<T, StoreError>>,
+    ) -> Result<T> {
+        let _gate = self.gate.lock().await;
+        self.check_disk(needed, what, needed).await?;
+        Ok(accept.await?)
     }
 
     pub(super) fn check_size(&self, length: u64) -> Result<()> {
@@ -112,17 +128,9 @@ impl Admission {
         Err(ApiError::new(Code::TooLarge, detail))
     }
 
-    /// Refuses an upload that is too large, or with which the token would keep more than it may.
+    /// Refuses an upload that is too large, or with which lab or token would keep more than they may.
     pub(super) async fn check_length(&self, access: &Access, length: u64) -> Result<()> {
         self.check_size(length)?;
-        let (Some(token), Some(limit)) = (access.token, access.max_bytes) else { return Ok(()) };
-        let kept = self.store.token_bytes(token).await?;
-        if kept.saturating_add(length) <= limit {
-            return Ok(());
-        }
-        let detail = format!(
-            "the upload has {length} bytes, and the token keeps {kept} of the {limit} it may"
-        );
-        Err(ApiError::new(Code::QuotaExceeded, detail))
+        Ok(self.store.check_quota(&access.lab, access.token, length).await?)
     }
 }

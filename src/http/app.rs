@@ -1,9 +1,10 @@
 //! What all handlers share.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::extract::FromRef;
-use tokio::sync::Semaphore;
+use tokio::sync::Mutex;
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
@@ -11,10 +12,14 @@ use super::events::Events;
 use super::metrics::Metrics;
 use super::model_check::Checker;
 use super::pictures::Pictures;
+use super::shares::Turns;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
 use crate::job::{Timestamp, without_paths};
 use crate::store::Store;
+
+/// Files of a lab that may wait to be checked.
+const CHECKS: usize = 32;
 
 /// What all handlers share; cheap to clone.
 #[derive(Debug, Clone)]
@@ -29,7 +34,9 @@ pub struct Services {
     pub(super) limits: Limits,
     pub(super) admission: Admission,
     /// One file is checked at a time: each takes a core and a frame of memory.
-    pub(super) intake: Arc<Semaphore>,
+    pub(super) intake: Turns,
+    /// When it was last tried whether files can be written, and what came of it.
+    pub(super) disk_tried: Mutex<Option<(Instant, std::result::Result<(), String>)>>,
     pub(super) checker: Checker,
     pub(super) metrics: Metrics,
     pub(super) events: Events,
@@ -51,7 +58,8 @@ impl App {
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
-            intake: Arc::new(Semaphore::new(1)),
+            intake: Turns::new(1, CHECKS),
+            disk_tried: Mutex::default(),
             checker: Checker::new(settings),
             metrics,
             settings: settings.clone(),

@@ -5,20 +5,20 @@ use std::str::FromStr;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{FromRequest, Multipart, Request};
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ContentLength, HeaderMapExt};
 use serde::Deserialize;
 use serde_with::DeserializeFromStr;
-use tokio::sync::OwnedSemaphorePermit;
 
 use super::access::Access;
 use super::admission::Reservation;
 use super::app::App;
 use super::download::Download;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Caller, Params, QueryOf};
+use super::extract::{Caller, Params, QueryOf, check_digest, check_encoding, content_digest};
 use super::page::{Limit, PageBody};
+use super::shares::Place;
 use super::upload;
 use crate::job::{Sha256, Timestamp};
 use crate::store::{Blob, BlobRow, StagedBlob};
@@ -34,9 +34,12 @@ pub(super) async fn create(
         Err(refusal) => return Err(refuse(refusal, &headers, request.into_body()).await),
     };
     let staged = if is_form(&headers) {
+        // The digest is that of the form, not of the file.
         receive_form(&app, room, request).await?
     } else {
-        upload::receive(&app, room, request.into_body().into_data_stream()).await?
+        let staged = upload::receive(&app, room, request.into_body().into_data_stream()).await?;
+        check_digest(content_digest(&headers)?, || staged.sha256())?;
+        staged
     };
     store(&app, &access, staged).await
 }
@@ -53,6 +56,7 @@ pub(super) async fn put(
         Err(refusal) => return Err(refuse(refusal, &headers, body).await),
     };
     let staged = upload::receive(&app, room, body.into_data_stream()).await?;
+    check_digest(content_digest(&headers)?, || staged.sha256())?;
     if staged.sha256() != sha256 {
         let detail = format!("the address says {sha256}, the bytes have {}", staged.sha256());
         return Err(ApiError::new(Code::HashMismatch, detail));
@@ -107,6 +111,7 @@ pub(super) async fn list(
 pub(super) async fn content(
     Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
+    method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
     let blob = app.store.upload(&access.lab, sha256).await?;
@@ -117,7 +122,8 @@ pub(super) async fn content(
         disposition: format!("attachment; filename=\"{sha256}.bin\""),
         in_parts: true,
     };
-    let mut response = download.send(&app.store.dir().blob(&sha256), &headers).await?;
+    let open = app.store.open_blob(sha256);
+    let mut response = download.send(open, (&method, &headers)).await?;
     let fields = response.headers_mut();
     fields.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     fields.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static("sandbox"));
@@ -133,14 +139,12 @@ pub(super) async fn delete(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Takes one of the slots for uploads and reserves room on the disk; refuses an upload that says by
+/// Takes one of the places for uploads and reserves room on the disk; refuses an upload that says by
 /// its length that it can't be taken, before its first byte.
-async fn begin(
-    app: &App,
-    access: &Access,
-    headers: &HeaderMap,
-) -> Result<(OwnedSemaphorePermit, Reservation)> {
-    let slot = app.admission.slot()?;
+async fn begin(app: &App, access: &Access, headers: &HeaderMap) -> Result<(Place, Reservation)> {
+    check_encoding(headers)?;
+    content_digest(headers)?;
+    let slot = app.admission.place(&access.lab)?;
     let length = headers.typed_get::<ContentLength>().map_or(0, |length| length.0);
     app.admission.check_length(access, length).await?;
     Ok((slot, app.admission.reserve(length).await?))
@@ -174,8 +178,6 @@ async fn receive_form(app: &App, room: Reservation, request: Request) -> Result<
 }
 
 async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response> {
-    // Again, for an upload that did not say its length before.
-    app.admission.check_length(access, staged.size()).await?;
     let (blob, new) = app.store.store_upload(&access.lab, access.token, staged).await?;
     let status = if new { StatusCode::CREATED } else { StatusCode::OK };
     let location = [(header::LOCATION, format!("/v1/blobs/{}", blob.sha256))];

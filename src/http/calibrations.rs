@@ -5,6 +5,7 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
+use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
@@ -131,7 +132,7 @@ pub(super) async fn create(
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
-    let (status, id) = created(make(&app, &access.lab, request, key.as_ref()).await?);
+    let (status, id) = created(make(&app, &access, request, key.as_ref()).await?);
     let body = body(&app, &access.lab, id).await?;
     let made = body.state == CalibrationState::Ready;
     let status = if made { status } else { StatusCode::ACCEPTED };
@@ -142,28 +143,28 @@ pub(super) async fn create(
 /// Makes one, or finds the one that was made with the same key.
 pub(super) async fn make(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
-    match app.store.made_with(lab, "calibration", key).await? {
+    match app.store.made_with(&access.lab, "calibration", key).await? {
         Some(id) => Ok(Inserted::Before(id)),
-        None => insert(app, lab, request, key).await,
+        None => insert(app, access, request, key).await,
     }
 }
 
 /// Makes a calibration of masks, or has one made of captures.
 async fn insert(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
     let CalibrationRequest { name, masks, full_scale, captures } = request;
     match (masks, captures) {
-        (Some(masks), None) => of_masks(app, lab, (name, masks, full_scale), key).await,
+        (Some(masks), None) => of_masks(app, access, (name, masks, full_scale), key).await,
         (None, Some(captures)) if full_scale.is_none() => {
-            of_captures(app, lab, (name, captures), key).await
+            of_captures(app, access, (name, captures), key).await
         }
         (None, Some(_)) => {
             let detail = "captures have no full scale: white and black give their masks' scale";
@@ -175,35 +176,44 @@ async fn insert(
 
 async fn of_masks(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     (name, masks, full_scale): (Option<Label>, Sha256, Option<f32>),
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
+    let (lab, token) = (&access.lab, access.token);
     app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
-    let prepared =
-        intake::run(app, move |store, limits| intake::masks(store, limits, &masks, full_scale));
+    let file = intake::upload(app, masks).await.map_err(|error| error.at("/masks"))?;
+    let prepared = intake::run(app, access, move |desk| intake::masks(desk, &file, full_scale));
     let prepared = prepared.await?;
     let facts = facts(name, masks, &prepared);
-    Ok(app.store.add_calibration(lab, facts, prepared.file, key).await?)
+    let made = app.store.add_calibration((lab, token), facts, prepared.file, key).await?;
+    drop(prepared.room);
+    Ok(made)
 }
 
 /// Puts captures in the queue, once they look as if they could be calibrated with.
 async fn of_captures(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     (name, captures): (Option<Label>, Captures),
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
+    let (lab, token) = (&access.lab, access.token);
     captures.check().map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     for (place, upload) in captures.uploads() {
         app.store.upload(lab, upload).await.map_err(|error| ApiError::reference(&place, error))?;
+        intake::upload(app, upload).await.map_err(|error| error.at(&place))?;
     }
-    let captures = intake::run(app, move |store, limits| {
-        check_sizes(&captures.map(|upload| store.dir().blob(upload)), limits)?;
-        Ok(captures)
+    let store = app.store.clone();
+    let (captures, bytes) = intake::run(app, access, move |desk| {
+        let files = captures.map(|upload| store.dir().blob(upload));
+        let bytes = check_sizes(&files, desk.limits())?;
+        Ok((captures, bytes))
     })
     .await?;
-    Ok(app.store.add_captures(lab, name.as_ref(), &captures, key).await?)
+    let add = app.store.add_captures((lab, token), name.as_ref(), (&captures, bytes), key);
+    // Twice: as they are measured, and on their scale.
+    app.admission.with_room("the calibration", 2 * bytes, add).await
 }
 
 async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody> {

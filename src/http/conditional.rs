@@ -1,11 +1,11 @@
-//! Conditional and partial requests (RFC 9110): `If-None-Match`, `If-Range` and `Range`.
+//! Conditional and partial requests (RFC 9110): `If-Match`, `If-None-Match`, `If-Range` and `Range`.
 
-use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use headers::{ETag, HeaderMapExt, IfNoneMatch};
+use headers::{ETag, HeaderMapExt, IfMatch, IfNoneMatch};
 use serde::Serialize;
 
-use super::error::{ApiError, Result};
+use super::error::{ApiError, Code, Result};
 use crate::job::Sha256;
 
 /// A strong ETag: the hash of the content.
@@ -21,9 +21,31 @@ pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     }
 }
 
+/// Refuses a request about another state of a thing than the one with this ETag (`If-Match`, compared
+/// strongly).
+pub(super) fn check_match(headers: &HeaderMap, etag: &str) -> Result<()> {
+    let wanted = headers.typed_get::<IfMatch>();
+    match (wanted, etag.parse::<ETag>()) {
+        (Some(wanted), Ok(found)) if !wanted.precondition_passes(&found) => {
+            let detail = format!("If-Match names another state than this one, which is {etag}");
+            Err(ApiError::new(Code::PreconditionFailed, detail))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The ETag under which [`json`] answers with this.
+pub(super) fn etag_of<T: Serialize>(body: &T) -> Result<String> {
+    let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
+    Ok(etag(&Sha256::of(&text)))
+}
+
 /// Content with its ETag, or word that the client has it.
 pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -> Response {
     let etag = etag(&Sha256::of(&bytes));
+    if let Err(refusal) = check_match(headers, &etag) {
+        return refusal.into_response();
+    }
     let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
     if is_known(headers, &etag) {
         return (StatusCode::NOT_MODIFIED, tags).into_response();
@@ -48,9 +70,12 @@ pub(super) enum Wanted {
     Outside,
 }
 
-/// Reads `Range` and `If-Range` for a file of `size` bytes. Several ranges at once, other units and
+/// Reads `Range` and `If-Range` for a file of `size` bytes. Ranges are defined for GET alone. Several ranges at once, other units and
 /// what can't be read are ignored, as the RFC allows: the whole file is the answer then.
-pub(super) fn wanted(headers: &HeaderMap, etag: &str, size: u64) -> Wanted {
+pub(super) fn wanted(method: &Method, headers: &HeaderMap, etag: &str, size: u64) -> Wanted {
+    if method != Method::GET {
+        return Wanted::Whole;
+    }
     let text = |name: HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
     let Some(range) = text(header::RANGE) else { return Wanted::Whole };
     if headers.contains_key(header::IF_RANGE) && text(header::IF_RANGE) != Some(etag) {
@@ -88,8 +113,12 @@ fn number(text: &str) -> Option<u64> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Wanted, is_known, wanted};
-    use axum::http::HeaderMap;
+    use super::{Wanted, check_match, is_known};
+    use axum::http::{HeaderMap, Method};
+
+    fn wanted(headers: &HeaderMap, etag: &str, size: u64) -> Wanted {
+        super::wanted(&Method::GET, headers, etag, size)
+    }
 
     fn headers(pairs: &[(&'static str, &'static str)]) -> HeaderMap {
         pairs.iter().map(|(name, value)| (name.parse().unwrap(), value.parse().unwrap())).collect()
@@ -127,6 +156,23 @@ mod tests {
         assert_eq!(with("\"t\""), Wanted::Part { start: 0, length: 2 });
         assert_eq!(with("\"old\""), Wanted::Whole);
         assert_eq!(with("W/\"t\""), Wanted::Whole, "weak tags do not serve for ranges");
+    }
+
+    #[test]
+    fn a_head_has_no_ranges() {
+        let part = headers(&[("range", "bytes=0-1")]);
+        assert_eq!(super::wanted(&Method::HEAD, &part, "\"t\"", 10), Wanted::Whole);
+    }
+
+    #[test]
+    fn another_state_than_the_one_that_is_meant_is_refused() {
+        for list in ["\"t\"", "\"a\", \"t\"", "*"] {
+            assert!(check_match(&headers(&[("if-match", list)]), "\"t\"").is_ok(), "{list}");
+        }
+        for list in ["\"x\"", "W/\"t\""] {
+            assert!(check_match(&headers(&[("if-match", list)]), "\"t\"").is_err(), "{list}");
+        }
+        assert!(check_match(&headers(&[]), "\"t\"").is_ok());
     }
 
     #[test]

@@ -1,9 +1,7 @@
 //! A file as an answer, whole or in part, with ETag and Range.
 
-use std::path::Path;
-
 use axum::body::Body;
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
@@ -12,6 +10,7 @@ use tokio_util::io::ReaderStream;
 use super::conditional::{self, Wanted};
 use super::error::{ApiError, Code, Result};
 use crate::job::Sha256;
+use crate::store::StoreError;
 
 /// What is told of a file.
 #[derive(Debug)]
@@ -27,14 +26,19 @@ pub(super) struct Download {
 }
 
 impl Download {
-    /// The file at `path`, the part of it that is asked for, or word that the client has it.
-    pub(super) async fn send(&self, path: &Path, headers: &HeaderMap) -> Result<Response> {
+    /// The file that `open` gives, the part of it that is asked for, or word that the client has it.
+    pub(super) async fn send(
+        &self,
+        open: impl Future<Output = Result<std::fs::File, StoreError>>,
+        (method, headers): (&Method, &HeaderMap),
+    ) -> Result<Response> {
         let etag = conditional::etag(&self.sha256);
+        conditional::check_match(headers, &etag)?;
         if conditional::is_known(headers, &etag) {
             return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
         }
-        let (status, start, length) = self.portion(&etag, headers)?;
-        let mut response = (status, part(path, start, length).await?).into_response();
+        let (status, start, length) = self.portion(&etag, (method, headers))?;
+        let mut response = (status, part(open.await?, start, length).await?).into_response();
         let fields = response.headers_mut();
         fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(self.kind));
         fields.insert(header::CONTENT_LENGTH, length.into());
@@ -50,12 +54,16 @@ impl Download {
     }
 
     /// Status, first byte and length of what is asked for.
-    fn portion(&self, etag: &str, headers: &HeaderMap) -> Result<(StatusCode, u64, u64)> {
+    fn portion(
+        &self,
+        etag: &str,
+        (method, headers): (&Method, &HeaderMap),
+    ) -> Result<(StatusCode, u64, u64)> {
         let whole = (StatusCode::OK, 0, self.size);
         if !self.in_parts {
             return Ok(whole);
         }
-        match conditional::wanted(headers, etag, self.size) {
+        match conditional::wanted(method, headers, etag, self.size) {
             Wanted::Whole => Ok(whole),
             Wanted::Part { start, length } => Ok((StatusCode::PARTIAL_CONTENT, start, length)),
             Wanted::Outside => Err(outside(self.size)),
@@ -69,8 +77,8 @@ fn outside(size: u64) -> ApiError {
         .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
 }
 
-async fn part(path: &Path, start: u64, length: u64) -> Result<Body> {
-    let mut file = File::open(path).await.map_err(|error| ApiError::internal(&error))?;
+async fn part(file: std::fs::File, start: u64, length: u64) -> Result<Body> {
+    let mut file = File::from_std(file);
     if start > 0 {
         file.seek(SeekFrom::Start(start)).await.map_err(|error| ApiError::internal(&error))?;
     }

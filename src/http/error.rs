@@ -53,6 +53,7 @@ codes! {
     UploadStalled: StatusCode::REQUEST_TIMEOUT, "The upload came to a halt", true;
     OffsetMismatch: StatusCode::CONFLICT, "The piece does not follow", false;
     TusVersion: StatusCode::PRECONDITION_FAILED, "Not in this version of tus", false;
+    PreconditionFailed: StatusCode::PRECONDITION_FAILED, "It is in another state", false;
     UploadBusy: StatusCode::LOCKED, "Another request is at it", true;
     UploadDamaged: StatusCode::GONE, "Bytes of the upload are lost", false;
     ChecksumMismatch: *CHECKSUM_STATUS, "The piece has come damaged", true;
@@ -68,12 +69,14 @@ codes! {
     IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "The key was used for another request", false;
     TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads at once", true;
     TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many requests wait", true;
+    TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Enough files wait to be checked", true;
     QueueFull: StatusCode::TOO_MANY_REQUESTS, "Enough jobs wait", true;
     Internal: StatusCode::INTERNAL_SERVER_ERROR, "The service has failed", true;
+    FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "The stored file is damaged", false;
     Unavailable: StatusCode::SERVICE_UNAVAILABLE, "The service can't serve this now", true;
     TimedOut: StatusCode::SERVICE_UNAVAILABLE, "The answer took too long", true;
     InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "The disk is full", true;
-    QuotaExceeded: StatusCode::INSUFFICIENT_STORAGE, "The token's limit is reached", false;
+    QuotaExceeded: StatusCode::INSUFFICIENT_STORAGE, "A limit is reached", false;
 }
 
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
@@ -204,12 +207,20 @@ impl From<StoreError> for ApiError {
             StoreError::KeyReused { .. } => Code::IdempotencyKeyReused,
             StoreError::HashMismatch { .. } => Code::HashMismatch,
             StoreError::QueueFull { .. } => Code::QueueFull,
+            StoreError::Quota { .. } => Code::QuotaExceeded,
+            StoreError::ManyPartials(_) => Code::TooManyUploads,
             StoreError::Short { .. } => {
                 tracing::error!(%error, "bytes of an upload are lost");
                 Code::UploadDamaged
             }
-            StoreError::Interrupted => Code::Unavailable,
+            StoreError::Damaged { .. } => Code::FileDamaged,
+            StoreError::Interrupted | StoreError::Restless(_) => Code::Unavailable,
             full if full.is_disk_full() => return disk_full(full),
+            busy if busy.is_busy() => {
+                tracing::warn!(%error, "the database is busy");
+                let detail = "the database is busy; nothing was changed: try again";
+                return Self::new(Code::Unavailable, detail);
+            }
             StoreError::Database(_)
             | StoreError::Migrate(_)
             | StoreError::Upgrade { .. }

@@ -14,16 +14,20 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream;
 use serde::Serialize;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, broadcast};
+use tokio::sync::broadcast;
+use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
-use crate::job::{JobId, Lab};
+use super::shares::{Place, Places};
+use crate::job::{JobId, Lab, TokenId};
 use crate::store::{JobMark, Store};
 
 /// Time between two looks.
 const LOOK: Duration = Duration::from_secs(1);
+/// Time between two looks at whether a listener may still listen.
+const TOKEN_LOOK: Duration = Duration::from_secs(3);
 /// Listeners at the same time: each holds a connection.
 const LISTENERS: usize = 128;
 /// The most jobs that an event names; beyond that a list is cheaper to read again.
@@ -51,7 +55,8 @@ type Changes = Arc<HashMap<Lab, String>>;
 #[derive(Debug, Clone)]
 pub(super) struct Events {
     sender: broadcast::Sender<Changes>,
-    slots: Arc<Semaphore>,
+    places: Places,
+    store: Store,
     waiters: Waiters,
     closing: CancellationToken,
 }
@@ -60,9 +65,10 @@ impl Events {
     /// Begins to look, until `closing`.
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
-        tokio::spawn(closing.clone().run_until_cancelled_owned(look(store, sender.clone())));
-        let slots = Arc::new(Semaphore::new(LISTENERS));
-        Self { sender, slots, waiters: Waiters::default(), closing }
+        let looking = look(store.clone(), sender.clone());
+        tokio::spawn(closing.clone().run_until_cancelled_owned(looking));
+        let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
+        Self { sender, places, store, waiters, closing }
     }
 }
 
@@ -201,15 +207,21 @@ impl Change {
 }
 
 pub(super) async fn listen(State(events): State<Events>, access: Access) -> Result<Response> {
-    let slot = events.slots.clone().try_acquire_owned().map_err(|_| {
-        ApiError::new(Code::Unavailable, "all places for listeners are taken; poll instead")
+    let place = events.places.take(&access.lab).ok_or_else(|| {
+        let detail = "all places for listeners are taken, or this lab has its share; poll instead";
+        ApiError::new(Code::Unavailable, detail)
     })?;
+    let mut look = tokio::time::interval(TOKEN_LOOK);
+    look.reset();
     let listener = Listener {
         lab: access.lab,
+        token: access.token,
+        store: events.store.clone(),
+        look,
         receiver: events.sender.subscribe(),
         closing: events.closing.clone(),
         greeted: false,
-        _slot: slot,
+        _place: place,
     };
     let events = stream::unfold(listener, Listener::next);
     // Proxies must not gather events into larger packets.
@@ -219,13 +231,27 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
 
 struct Listener {
     lab: Lab,
+    /// It ends when this is revoked.
+    token: Option<TokenId>,
+    store: Store,
+    look: Interval,
     receiver: broadcast::Receiver<Changes>,
     closing: CancellationToken,
     greeted: bool,
-    _slot: OwnedSemaphorePermit,
+    _place: Place,
 }
 
 impl Listener {
+    /// True if its token was revoked, or the service, which was open, is not any more.
+    async fn has_left(&self) -> bool {
+        let may = match self.token {
+            Some(token) => self.store.token_holds(token).await,
+            None => self.store.is_open().await,
+        };
+        // A failing database shows in every other answer, too.
+        matches!(may, Ok(false))
+    }
+
     async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
         if !self.greeted {
             self.greeted = true;
@@ -235,6 +261,12 @@ impl Listener {
             let received = tokio::select! {
                 received = self.receiver.recv() => received,
                 () = self.closing.cancelled() => return None,
+                _ = self.look.tick() => {
+                    if self.has_left().await {
+                        return None;
+                    }
+                    continue;
+                }
             };
             match received {
                 Ok(changes) => {

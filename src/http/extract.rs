@@ -4,7 +4,9 @@ use axum::body::Bytes;
 use axum::extract::rejection::{BytesRejection, PathRejection, QueryRejection};
 use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -84,12 +86,58 @@ where
             let detail = "the body must be sent as Content-Type: application/json";
             return Err(ApiError::new(Code::UnsupportedMediaType, detail));
         }
+        check_encoding(request.headers())?;
+        let promised = content_digest(request.headers())?;
         let bytes = Bytes::from_request(request, state).await.map_err(unreadable)?;
+        check_digest(promised, || Sha256::of(&bytes))?;
         if bytes.is_empty() {
             return Err(ApiError::new(Code::EmptyBody, "a JSON object is needed as the body"));
         }
         parse(&bytes).map(Self)
     }
+}
+
+/// Refuses a body that is compressed: its bytes would be stored, and hashed, as they are.
+pub(super) fn check_encoding(headers: &HeaderMap) -> Result<()> {
+    let coded = headers.get_all(header::CONTENT_ENCODING).iter().find(|coding| {
+        !coding.to_str().is_ok_and(|coding| coding.trim().eq_ignore_ascii_case("identity"))
+    });
+    let Some(coding) = coded else { return Ok(()) };
+    let detail = format!("send the body as it is: {coding:?} is not undone here");
+    let identity = HeaderValue::from_static("identity");
+    Err(ApiError::new(Code::UnsupportedMediaType, detail)
+        .with_header(header::ACCEPT_ENCODING, identity))
+}
+
+/// The SHA-256 that `Content-Digest` promises (RFC 9530); none if it names none. Other algorithms are ignored.
+pub(super) fn content_digest(headers: &HeaderMap) -> Result<Option<Sha256>> {
+    let malformed = || {
+        let detail = "Content-Digest has sha-256, but not as :BASE64: of 32 bytes";
+        ApiError::new(Code::MalformedRequest, detail)
+    };
+    for value in headers.get_all("content-digest") {
+        for member in value.to_str().map_err(|_| malformed())?.split(',') {
+            let Some((name, digest)) = member.trim().split_once('=') else { continue };
+            if name != "sha-256" {
+                continue;
+            }
+            let digest = digest.strip_prefix(':').and_then(|text| text.strip_suffix(':'));
+            let bytes = digest.and_then(|text| STANDARD.decode(text).ok()).ok_or_else(malformed)?;
+            return Ok(Some(Sha256::new(bytes.try_into().map_err(|_| malformed())?)));
+        }
+    }
+    Ok(None)
+}
+
+/// Refuses a body whose bytes are not those that were promised.
+pub(super) fn check_digest(promised: Option<Sha256>, found: impl FnOnce() -> Sha256) -> Result<()> {
+    let Some(promised) = promised else { return Ok(()) };
+    let found = found();
+    if found == promised {
+        return Ok(());
+    }
+    let detail = format!("Content-Digest says {promised}, the bytes have {found}");
+    Err(ApiError::new(Code::HashMismatch, detail))
 }
 
 fn is_json(headers: &HeaderMap) -> bool {

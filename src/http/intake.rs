@@ -1,6 +1,13 @@
 //! Uploads on their way to a calibration or measurement: what passes the checks of [`crate::intake`] is
-//! written as a prepared array. Blocks; one at a time runs, where blocking is allowed.
+//! written as a prepared array. Blocks; one at a time runs, where blocking is allowed, and labs take
+//! turns.
 
+use std::path::{Path, PathBuf};
+
+use tokio::runtime::Handle;
+
+use super::access::Access;
+use super::admission::Reservation;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
 use crate::formats::mat::SceneArray;
@@ -8,7 +15,7 @@ use crate::formats::validate::MaskStatistics;
 use crate::formats::{Limits, StackInfo, StackWriter, planar};
 use crate::intake::{self, Exposure, Source};
 use crate::job::{Finding, Sha256};
-use crate::store::{BlobWriter, Calibration, StagedBlob, Store};
+use crate::store::{BlobWriter, Calibration, StagedBlob, Store, StoreError};
 
 /// What an upload turned out to be.
 pub(super) struct Prepared<T> {
@@ -16,52 +23,88 @@ pub(super) struct Prepared<T> {
     pub(super) full_scale: f32,
     pub(super) found: T,
     pub(super) file: StagedBlob,
+    /// Room on the disk, held until the file is on record.
+    pub(super) room: Reservation,
 }
 
-/// Runs a check where it may block, after those that came before it.
-pub(super) async fn run<T, F>(app: &App, check: F) -> Result<T>
+/// For whom a check is made, where it may block.
+pub(super) struct Desk {
+    app: App,
+    access: Access,
+    runtime: Handle,
+}
+
+/// Runs a check where it may block, when it is the lab's turn.
+pub(super) async fn run<T, F>(app: &App, access: &Access, check: F) -> Result<T>
 where
     T: Send + 'static,
-    F: FnOnce(&Store, &Limits) -> Result<T> + Send + 'static,
+    F: FnOnce(&Desk) -> Result<T> + Send + 'static,
 {
-    let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
-    let permit = app.intake.clone().acquire_owned().await.map_err(stopped)?;
-    let (store, limits) = (app.store.clone(), app.limits);
+    let turn = app.intake.take(&access.lab).await?;
+    let desk = Desk { app: app.clone(), access: access.clone(), runtime: Handle::current() };
     let checked = tokio::task::spawn_blocking(move || {
         // Held until the check ends, also if the user does not wait for it.
-        let _permit = permit;
-        check(&store, &limits)
+        let _turn = turn;
+        check(&desk)
     });
     checked.await.map_err(|error| ApiError::internal(&error))?
 }
 
+impl Desk {
+    pub(super) fn store(&self) -> &Store {
+        &self.app.store
+    }
+
+    pub(super) fn limits(&self) -> &Limits {
+        &self.app.limits
+    }
+
+    /// A prepared array to be written, if the disk has room for it, and the lab and its token may keep it.
+    fn writer(&self, info: &StackInfo) -> Result<(StackWriter<BlobWriter>, Reservation)> {
+        let bytes = planar::bytes(info);
+        let Access { lab, token, .. } = &self.access;
+        let room = self.runtime.block_on(async {
+            self.app.store.check_quota(lab, *token, bytes).await?;
+            self.app.admission.reserve(bytes).await
+        })?;
+        let writer = self.app.store.blob_writer()?;
+        Ok((planar::writer(writer, info.frames, info.height, info.width)?, room))
+    }
+}
+
+/// Where an upload lies, whose bytes are those that were sent.
+/// Errors: 410 if they are not any more.
+pub(super) async fn upload(app: &App, sha256: Sha256) -> Result<PathBuf> {
+    app.store.intact_blob(sha256).await.map_err(|error| match error {
+        StoreError::Damaged { .. } => ApiError::new(Code::UploadDamaged, error.to_string()),
+        error => error.into(),
+    })
+}
+
 /// Checks masks and writes them on [0, 1].
 pub(super) fn masks(
-    store: &Store,
-    limits: &Limits,
-    upload: &Sha256,
+    desk: &Desk,
+    upload: &Path,
     full_scale: Option<f32>,
 ) -> Result<Prepared<MaskStatistics>> {
-    let path = store.dir().blob(upload);
-    let opened = Source::upload(&path, SceneArray::Masks, full_scale, *limits).open()?;
+    let opened = Source::upload(upload, SceneArray::Masks, full_scale, *desk.limits()).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
-    let mut writer = writer(store, &info)?;
+    let (mut writer, room) = desk.writer(&info)?;
     let found = intake::masks(opened, |mask| writer.write_frame(mask))?;
-    Ok(Prepared { info, full_scale, found, file: writer.finish()?.finish()? })
+    Ok(Prepared { info, full_scale, found, file: writer.finish()?.finish()?, room })
 }
 
 /// Writes a measurement with its dark subtracted and its full scale divided out, and checks it
 /// against the masks of its calibration.
 pub(super) fn measurement(
-    store: &Store,
-    limits: &Limits,
-    upload: &Sha256,
+    desk: &Desk,
+    upload: &Path,
     full_scale: Option<f32>,
     exposure: &Exposure,
     calibration: &Calibration,
 ) -> Result<Prepared<Vec<Finding>>> {
-    let path = store.dir().blob(upload);
-    let opened = Source::upload(&path, SceneArray::Measurements, full_scale, *limits).open()?;
+    let opened =
+        Source::upload(upload, SceneArray::Measurements, full_scale, *desk.limits()).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
     let masks = &calibration.facts;
     if (info.height, info.width) != (masks.height, masks.width) {
@@ -71,16 +114,13 @@ pub(super) fn measurement(
         );
         return Err(ApiError::new(Code::SizeMismatch, detail).at("/data"));
     }
-    let mut writer = writer(store, &info)?;
+    let (mut writer, room) = desk.writer(&info)?;
+    let limits = desk.limits();
     let saturated = intake::measurement(opened, exposure, limits, |y| writer.write_frame(y))?;
     let file = writer.finish()?.finish()?;
-    let masks = store.dir().blob(&calibration.prepared);
+    let masks = desk.app.store.dir().blob(&calibration.prepared);
     let darkened = !exposure.dark.is_empty();
     let both = (masks.as_path(), file.path());
     let found = intake::judge(both, saturated.as_deref(), darkened, limits)?;
-    Ok(Prepared { info, full_scale, found, file })
-}
-
-fn writer(store: &Store, info: &StackInfo) -> Result<StackWriter<BlobWriter>> {
-    Ok(planar::writer(store.blob_writer()?, info.frames, info.height, info.width)?)
+    Ok(Prepared { info, full_scale, found, file, room })
 }

@@ -207,10 +207,9 @@ async fn insert(
         return Ok(Inserted::Before(job));
     }
     let spec = resolve(app, &lab, request).await?;
-    app.admission.check_room("the job", spec.disk_bytes()).await?;
-    let most_jobs = app.settings.max_jobs;
+    let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
     let new = NewJob { most_jobs, lab, spec, request: hash, idempotency_key };
-    Ok(app.store.add_job(new).await?)
+    app.admission.with_room("the job", needed, app.store.add_job(new)).await
 }
 
 /// Checks a request against the measurement that it names.
@@ -360,7 +359,9 @@ pub(super) async fn estimate(
 pub(super) async fn cancel(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
+    headers: HeaderMap,
 ) -> Result<Response> {
+    check_match(&app, &access.lab, id, &headers).await?;
     app.store.cancel_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
@@ -368,9 +369,19 @@ pub(super) async fn cancel(
 pub(super) async fn retry(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
+    headers: HeaderMap,
 ) -> Result<Response> {
+    check_match(&app, &access.lab, id, &headers).await?;
     app.store.retry_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
+}
+
+/// Refuses a change of a job that the client has seen in another state.
+async fn check_match(app: &App, lab: &Lab, id: JobId, headers: &HeaderMap) -> Result<()> {
+    if !headers.contains_key(header::IF_MATCH) {
+        return Ok(());
+    }
+    conditional::check_match(headers, &conditional::etag_of(&body(app, lab, id).await?)?)
 }
 
 async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response> {
@@ -381,7 +392,9 @@ async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response> {
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
+    headers: HeaderMap,
 ) -> Result<StatusCode> {
+    check_match(&app, &access.lab, id, &headers).await?;
     app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -5,6 +5,7 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
+use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
@@ -12,7 +13,7 @@ use super::intake::{self, Prepared};
 use super::page::{ListQuery, PageBody, Renaming};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
-use crate::job::{CalibrationId, Finding, InvalidField, Lab, Label, MeasurementId, Sha256};
+use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
 use crate::store::{Inserted, Measurement, NewMeasurement, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -55,7 +56,7 @@ pub(super) async fn create(
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
-    let (status, id) = created(make(&app, &access.lab, request, key.as_ref()).await?);
+    let (status, id) = created(make(&app, &access, request, key.as_ref()).await?);
     let location = [(header::LOCATION, format!("/v1/measurements/{id}"))];
     let measurement = app.store.measurement(&access.lab, id).await?;
     Ok((status, location, Json(measurement)).into_response())
@@ -64,42 +65,46 @@ pub(super) async fn create(
 /// Makes one, or finds the one that was made with the same key.
 pub(super) async fn make(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: MeasurementRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<MeasurementId>> {
-    match app.store.made_with(lab, "measurement", key).await? {
+    match app.store.made_with(&access.lab, "measurement", key).await? {
         Some(id) => Ok(Inserted::Before(id)),
-        None => insert(app, lab, request, key).await,
+        None => insert(app, access, request, key).await,
     }
 }
 
 /// Checks a measurement and puts it on record.
 async fn insert(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: MeasurementRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<MeasurementId>> {
     check_times(&request)?;
+    let lab = &access.lab;
     let (data, full_scale) = (request.data, request.full_scale);
     let calibration = app.store.calibration(lab, request.calibration).await;
     let calibration = calibration.map_err(|error| ApiError::reference("/calibration", error))?;
     app.store.upload(lab, data).await.map_err(|error| ApiError::reference("/data", error))?;
-    for (index, dark) in request.dark.iter().enumerate() {
-        let there = app.store.upload(lab, *dark).await;
-        there.map_err(|error| ApiError::reference(&format!("/dark/{index}"), error))?;
+    let file = intake::upload(app, data).await.map_err(|error| error.at("/data"))?;
+    let mut dark = Vec::with_capacity(request.dark.len());
+    for (index, upload) in request.dark.iter().enumerate() {
+        let place = format!("/dark/{index}");
+        let there = app.store.upload(lab, *upload).await;
+        there.map_err(|error| ApiError::reference(&place, error))?;
+        dark.push(intake::upload(app, *upload).await.map_err(|error| error.at(&place))?);
     }
-    let exposure = Exposure {
-        dark: request.dark.iter().map(|dark| app.store.dir().blob(dark)).collect(),
-        saturation: request.saturation,
-    };
-    let prepared = intake::run(app, move |store, limits| {
-        intake::measurement(store, limits, &data, full_scale, &exposure, &calibration)
+    let exposure = Exposure { dark, saturation: request.saturation };
+    let prepared = intake::run(app, access, move |desk| {
+        intake::measurement(desk, &file, full_scale, &exposure, &calibration)
     });
-    let Prepared { info, full_scale, found, file } = prepared.await?;
+    let Prepared { info, full_scale, found, file, room } = prepared.await?;
     let facts = facts(request, &info, full_scale, found);
-    Ok(app.store.add_measurement(lab, facts, file, key).await?)
+    let made = app.store.add_measurement((lab, access.token), facts, file, key).await?;
+    drop(room);
+    Ok(made)
 }
 
 /// Refuses times that can't be: they become the times of frames.

@@ -56,6 +56,7 @@ fn describe() {
     describe_gauge!("sci_recon_workers", "Worker processes alive.");
     describe_gauge!("sci_recon_blobs", "Files in the content-addressed store.");
     describe_gauge!("sci_recon_blob_bytes", Unit::Bytes, "Bytes of files in that store.");
+    describe_gauge!("sci_recon_damaged_files", "Stored files known to be damaged or missing.");
     describe_gauge!("sci_recon_disk_free_bytes", Unit::Bytes, "Bytes free on the disk.");
     describe_gauge!("sci_recon_disk_size_bytes", Unit::Bytes, "Bytes of the disk.");
 }

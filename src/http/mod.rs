@@ -32,6 +32,7 @@ mod reports;
 mod results;
 mod router;
 mod samples;
+mod shares;
 mod system;
 mod tiles;
 pub mod tus;

@@ -6,15 +6,18 @@ use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
 use tokio::process::Command;
-use tokio::sync::Semaphore;
 
 use super::error::{ApiError, Code, Result};
+use super::shares::Turns;
 use crate::config::{EngineArguments, ServeArguments};
-use crate::job::{ModelFacts, ModelVerdict, without_paths};
+use crate::job::{Lab, ModelFacts, ModelVerdict, without_paths};
 use crate::store::NewCalibration;
 
 /// The longest check: loading the network and one run.
 const TIME: Duration = Duration::from_secs(300);
+
+/// Characters of a reason that are told.
+const REASON: usize = 2000;
 
 /// How a check is started.
 #[derive(Debug)]
@@ -23,8 +26,8 @@ pub(super) struct Checker {
     program: Option<PathBuf>,
     engine: EngineArguments,
     memory_bytes: u64,
-    /// One check at a time; not that of other files, which would wait for minutes.
-    turn: Semaphore,
+    /// Two at a time, of two labs; not with the checks of other files, which would wait for minutes.
+    turns: Turns,
 }
 
 impl Checker {
@@ -33,7 +36,7 @@ impl Checker {
             program: std::env::current_exe().ok(),
             engine: settings.engine.clone(),
             memory_bytes: settings.worker_memory_bytes,
-            turn: Semaphore::new(1),
+            turns: Turns::new(2, 4),
         }
     }
 
@@ -53,21 +56,29 @@ impl Checker {
         if let Some(library) = &self.engine.onnxruntime {
             command.arg("--onnxruntime").arg(library);
         }
+        if self.engine.unconfined {
+            command.arg("--unconfined");
+        }
         command.stdin(Stdio::null()).kill_on_drop(true);
         Some(command)
     }
 
-    /// Checks whether an upload is a network for these masks, and runs it once; one check at a time.
+    /// Checks whether an upload is a network for these masks, and runs it once, when it is the lab's turn.
     /// Errors: 422 with what it has and what is needed; 503 if no network can be run here.
-    pub(super) async fn check(&self, file: &Path, masks: &NewCalibration) -> Result<ModelFacts> {
+    pub(super) async fn check(
+        &self,
+        lab: &Lab,
+        file: &Path,
+        masks: &NewCalibration,
+    ) -> Result<ModelFacts> {
         let unavailable = |why: &str| ApiError::new(Code::Unavailable, why);
-        let stopped = |_| unavailable("the service is shutting down");
-        let _permit = self.turn.acquire().await.map_err(stopped)?;
+        let _turn = self.turns.take(lab).await?;
         let mut command = self
             .command(file, masks)
             .ok_or_else(|| unavailable("the service can't start the check of a network"))?;
-        let refused =
-            |why: String| ApiError::new(Code::InvalidContent, without_paths(&why)).at("/file");
+        // A network's names are any text of any length.
+        let cut = |why: String| without_paths(&why).chars().take(REASON).collect::<String>();
+        let refused = |why: String| ApiError::new(Code::InvalidContent, cut(why)).at("/file");
         let output = match tokio::time::timeout(TIME, command.output()).await {
             Ok(output) => output.map_err(|error| ApiError::internal(&error))?,
             Err(_) => {

@@ -5,11 +5,13 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
+use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
+use super::intake;
 use super::page::{ListQuery, PageBody, Renaming};
-use crate::job::{CalibrationId, Lab, Label, ModelId, Sha256};
+use crate::job::{CalibrationId, Label, ModelId, Sha256};
 use crate::store::{Inserted, Model, NewModel, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -26,7 +28,7 @@ pub(super) async fn create(
     Body(request): Body<ModelRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
-    let (status, id) = created(make(&app, &access.lab, request, key.as_ref()).await?);
+    let (status, id) = created(make(&app, &access, request, key.as_ref()).await?);
     let location = [(header::LOCATION, format!("/v1/models/{id}"))];
     let model = app.store.model(&access.lab, id).await?;
     Ok((status, location, Json(model)).into_response())
@@ -35,28 +37,30 @@ pub(super) async fn create(
 /// Makes one, or finds the one that was made with the same key.
 async fn make(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: ModelRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<ModelId>> {
-    match app.store.made_with(lab, "model", key).await? {
+    match app.store.made_with(&access.lab, "model", key).await? {
         Some(id) => Ok(Inserted::Before(id)),
-        None => insert(app, lab, request, key).await,
+        None => insert(app, access, request, key).await,
     }
 }
 
 /// Checks a network and registers it.
 async fn insert(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: ModelRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<ModelId>> {
     let ModelRequest { name, calibration, file } = request;
+    let lab = &access.lab;
     let found = app.store.calibration(lab, calibration).await;
     let masks = found.map_err(|error| ApiError::reference("/calibration", error))?.facts;
     app.store.upload(lab, file).await.map_err(|error| ApiError::reference("/file", error))?;
-    let facts = app.checker.check(&app.store.dir().blob(&file), &masks).await?;
+    let path = intake::upload(app, file).await.map_err(|error| error.at("/file"))?;
+    let facts = app.checker.check(lab, &path, &masks).await?;
     let new = NewModel { name, calibration, file, facts };
     Ok(app.store.add_model(lab, new, key).await?)
 }

@@ -85,9 +85,12 @@ fn meaning(code: Code) -> &'static str {
         }
         Code::OffsetMismatch => "HEAD of the upload tells where the next piece begins.",
         Code::TusVersion => "Send the header Tus-Resumable: 1.0.0.",
+        Code::PreconditionFailed => {
+            "If-Match names a state that is over. Ask for the thing again, and decide anew."
+        }
         Code::UploadBusy => "Another request writes to this upload. Wait for it, or for its end.",
         Code::UploadDamaged => {
-            "Bytes that had come are no longer on the disk. Delete the upload and send the file again."
+            "Bytes that had come are no longer on the disk as they were. Send the file again."
         }
         Code::ChecksumMismatch => "The piece was damaged on its way. Send it again.",
         Code::InUse => "Others refer to it. Delete those first; the detail counts them.",
@@ -109,11 +112,15 @@ fn meaning(code: Code) -> &'static str {
             "The key belongs to another request. Take a new key for each thing that is to be made."
         }
         Code::TooManyUploads => {
-            "All places for uploads are taken. Come back after Retry-After seconds."
+            "All places for uploads are taken, or the lab has its share, or too many of its uploads in pieces \
+             are not complete. Come back after Retry-After seconds."
         }
         Code::TooManyWaiters => {
             "So many requests of the lab wait for the end of jobs that this one may not. Ask without wait, or \
              listen to /v1/events, which tells of all jobs at once."
+        }
+        Code::TooManyChecks => {
+            "So many files of the lab wait to be checked that this one may not. Come back when some are done."
         }
         Code::QueueFull => {
             "So many jobs wait that no more are taken. Come back later, or cancel some."
@@ -121,13 +128,17 @@ fn meaning(code: Code) -> &'static str {
         Code::Internal => {
             "The log of the service has the cause, under the identifier of the request."
         }
+        Code::FileDamaged => {
+            "The disk of the service has lost or changed the file; no byte of it is sent. Retry its job, and it \
+             is made again."
+        }
         Code::Unavailable => "The service is stopping, or has no place for this just now.",
         Code::TimedOut => "The answer took longer than answers may.",
         Code::InsufficientStorage => {
             "Delete jobs and uploads that nobody needs, or ask for a larger disk."
         }
         Code::QuotaExceeded => {
-            "Delete uploads, or have the limit raised. The detail has the numbers."
+            "Delete uploads, jobs or what was prepared, or have the limit raised. The detail has the numbers."
         }
     }
 }

@@ -1,24 +1,23 @@
 //! How good frames are, where the truth is known: PSNR and SSIM against an upload.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use axum::http::HeaderMap;
 use axum::response::Response;
 use ndarray::{Array2, Axis};
 use serde::{Deserialize, Serialize};
 
-use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
+use super::results::result_file;
 use crate::formats::mat::SceneArray;
 use crate::formats::{FormatError, Limits, npy};
 use crate::intake::{Opened, Source};
 use crate::job::{JobId, SceneShape, Sha256};
 use crate::pipeline::quality::{FrameQuality, Quality};
-use crate::store::{Job, StoreError};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -42,24 +41,15 @@ pub(super) async fn show(
 ) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
     app.store.upload(&access.lab, query.truth).await?;
-    let path = frames(&app, &job, snapshot).await?;
+    result_file(&app, &job, Some(snapshot), "frames.npy").await?;
+    let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
     let (shape, truth) = (job.spec.shape, query.truth);
-    let frames = intake::run(&app, move |store, limits| {
-        let upload = store.dir().blob(&truth);
-        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *limits);
+    let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
+    let frames = intake::run(&app, &access, move |desk| {
+        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *desk.limits());
         compare(&path, truth.open()?, snapshot as usize, shape)
     });
     conditional::json(&QualityBody { truth, quality: frames.await?.into() }, &headers)
-}
-
-async fn frames(app: &App, job: &Job, snapshot: u32) -> Result<PathBuf> {
-    match app.store.result_file(job, Some(snapshot), "frames.npy").await {
-        Ok((_, path)) => Ok(path),
-        Err(StoreError::NotFound { .. }) => {
-            Err(ApiError::new(Code::NotReady, "the frames are not written yet"))
-        }
-        Err(error) => Err(error.into()),
-    }
 }
 
 /// Compares the frames of a snapshot with those of a truth that has the frames of this snapshot, or

@@ -1,7 +1,9 @@
 //! Results: frames, stacks and manifests of a job, with ETag and Range.
 
+use std::path::PathBuf;
+
 use axum::Json;
-use axum::http::{HeaderMap, Uri};
+use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use serde::Serialize;
 
@@ -54,10 +56,11 @@ fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
 pub(super) async fn job_manifest(
     Caller(app, access): Caller,
     Params(job): Params<JobId>,
+    method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
     let job = app.store.job(&access.lab, job).await?;
-    send(&app, &job, None, "manifest.json", &headers).await
+    send(&app, &job, None, "manifest.json", (&method, &headers)).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr` or
@@ -66,17 +69,19 @@ pub(super) async fn file(
     Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
     uri: Uri,
+    method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
     let name = uri.path().rsplit('/').next().unwrap_or_default();
-    send(&app, &job, Some(snapshot), name, &headers).await
+    send(&app, &job, Some(snapshot), name, (&method, &headers)).await
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}`, where the frame is `1.exr` or `1.png`.
 pub(super) async fn frame(
     Caller(app, access): Caller,
     Params((job, snapshot, frame)): Params<(JobId, u32, String)>,
+    method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
@@ -85,7 +90,7 @@ pub(super) async fn frame(
         let detail = format!("frames are 1.exr to {frames}.exr, and the same with .png");
         ApiError::new(Code::NotFound, detail)
     })?;
-    send(&app, &job, Some(snapshot), &name, &headers).await
+    send(&app, &job, Some(snapshot), &name, (&method, &headers)).await
 }
 
 /// The result file that `1.exr` or `1.png` means, counted from 1 to `frames`.
@@ -106,15 +111,9 @@ async fn send(
     job: &Job,
     snapshot: Option<u32>,
     name: &str,
-    headers: &HeaderMap,
+    request: (&Method, &HeaderMap),
 ) -> Result<Response> {
-    let (file, path) = match app.store.result_file(job, snapshot, name).await {
-        Err(StoreError::NotFound { .. }) => {
-            let detail = format!("{name} is not there yet; the job's state says how far it is");
-            return Err(ApiError::new(Code::NotReady, detail));
-        }
-        other => other?,
-    };
+    let (file, _) = result_file(app, job, snapshot, name).await?;
     let download = Download {
         sha256: file.sha256,
         size: file.size,
@@ -123,7 +122,25 @@ async fn send(
         // Part of a JSON document would not be one.
         in_parts: media_type(name) != "application/json",
     };
-    download.send(&path, headers).await
+    let open = async { Ok(app.store.open_result(job, snapshot, name).await?.2) };
+    download.send(open, request).await
+}
+
+/// A result file as it is on record, and where it lies.
+/// Errors: 404 if it is not there yet.
+pub(super) async fn result_file(
+    app: &App,
+    job: &Job,
+    snapshot: Option<u32>,
+    name: &str,
+) -> Result<(ResultFile, PathBuf)> {
+    match app.store.result_file(job, snapshot, name).await {
+        Err(StoreError::NotFound { .. }) => {
+            let detail = format!("{name} is not there yet; the job's state says how far it is");
+            Err(ApiError::new(Code::NotReady, detail))
+        }
+        found => Ok(found?),
+    }
 }
 
 fn media_type(name: &str) -> &'static str {

@@ -47,7 +47,7 @@ pub(super) async fn create(
 ) -> Result<Response> {
     // Apart from the keys with which the lab makes such things itself.
     let key = idempotency_key(&headers)?.map(|key| format!("/v1/samples {key}"));
-    let staged = intake::run(&app, |store, _| simulate(store)).await?;
+    let staged = intake::run(&app, &access, |desk| simulate(desk.store())).await?;
     app.admission.check_length(&access, staged.iter().map(StagedBlob::size).sum()).await?;
     let mut files = Vec::new();
     for file in staged {
@@ -56,9 +56,9 @@ pub(super) async fn create(
     let [masks, data, truth] = [files[0], files[1], files[2]];
     let request_key = |file: Sha256| key.clone().map(|key| RequestKey { key, request: file });
     let named = CalibrationRequest::of_masks(name(), masks);
-    let made = calibrations::make(&app, &access.lab, named, request_key(masks).as_ref()).await?;
+    let made = calibrations::make(&app, &access, named, request_key(masks).as_ref()).await?;
     let named = MeasurementRequest::of_data(name(), made.id(), data);
-    let made = measurements::make(&app, &access.lab, named, request_key(data).as_ref()).await?;
+    let made = measurements::make(&app, &access, named, request_key(data).as_ref()).await?;
     let job = JobRequest {
         measurement: made.id(),
         calibration: None,

@@ -2,7 +2,7 @@
 //! it, `/metrics` for Prometheus; and the contract, `/openapi.yaml`.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::Json;
 use axum::extract::State;
@@ -15,11 +15,14 @@ use super::app::App;
 use super::error::Result;
 use crate::config::VERSION;
 use crate::job::{JobState, TaskState, Timestamp};
-use crate::store::WorkerRow;
+use crate::store::{StoreError, WorkerRow};
 use strum::VariantArray;
 
 /// Workers that were silent for longer are not counted.
 const WORKER_AGE: Duration = Duration::from_secs(15);
+
+/// Time between two tries whether files can be written.
+const DISK_LOOK: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Serialize)]
 pub(super) struct SystemBody {
@@ -131,7 +134,8 @@ pub(super) async fn live() -> Json<serde_json::Value> {
 
 /// `GET /readyz`: database, disk and workers are there. A long queue is no fault.
 pub(super) async fn ready(State(app): State<App>) -> Response {
-    let checks = [database_answers(&app).await, disk_has_room(&app), workers_live(&app).await];
+    let checks =
+        [database_answers(&app).await, disk_takes_files(&app).await, workers_live(&app).await];
     let ready = checks.iter().all(Result::is_ok);
     let [database, disk, workers] =
         checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
@@ -144,15 +148,30 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
 }
 
 async fn database_answers(app: &App) -> Result<(), String> {
-    app.store.ping().await.map_err(|_| "the database does not answer".to_owned())
+    app.store.ping().await.map_err(|_| "the database does not answer".to_owned())?;
+    app.store.database_damage().map_or(Ok(()), |_| {
+        Err("the database is damaged; the log says where: restore a backup".to_owned())
+    })
 }
 
-fn disk_has_room(app: &App) -> Result<(), String> {
+async fn disk_takes_files(app: &App) -> Result<(), String> {
     let (free, _) = app.store.dir().disk().map_err(|_| "the disk does not answer".to_owned())?;
     if free < app.settings.min_free_bytes {
         return Err(format!("{free} bytes are free, {} should be", app.settings.min_free_bytes));
     }
-    Ok(())
+    // Anybody may ask, and a file costs a wait for the disk.
+    let mut tried = app.disk_tried.lock().await;
+    if let Some((at, found)) = &*tried
+        && at.elapsed() < DISK_LOOK
+    {
+        return found.clone();
+    }
+    let found = app.store.try_disk().await.map_err(|error| match error {
+        StoreError::Io { source, .. } => format!("no file can be written: {}", source.kind()),
+        _ => "no file can be written".to_owned(),
+    });
+    *tried = Some((Instant::now(), found.clone()));
+    found
 }
 
 async fn workers_live(app: &App) -> Result<(), String> {
@@ -185,6 +204,7 @@ pub(super) async fn metrics(State(app): State<App>) -> Result<Response> {
     let (files, bytes) = app.store.blob_totals().await?;
     gauge!("sci_recon_blobs").set(files as f64);
     gauge!("sci_recon_blob_bytes").set(bytes as f64);
+    gauge!("sci_recon_damaged_files").set(app.store.damaged_files().await? as f64);
     let (free, size) = app.store.dir().disk()?;
     gauge!("sci_recon_disk_free_bytes").set(free as f64);
     gauge!("sci_recon_disk_size_bytes").set(size as f64);

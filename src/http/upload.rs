@@ -1,7 +1,7 @@
 //! Receiving a file: from the network to the disk, hashed on the way, a few chunks in memory.
 
 use std::io::Write;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use futures_util::{Stream, StreamExt};
@@ -77,8 +77,8 @@ where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
 {
-    let mut size = 0;
-    while let Some(chunk) = next(app, stream).await? {
+    let (mut size, mut pace) = (0, Pace::default());
+    while let Some(chunk) = next(app, &mut pace, stream).await? {
         size += chunk.len() as u64;
         app.admission.check_size(size)?;
         app.admission.take(room, chunk.len() as u64).await?;
@@ -90,13 +90,49 @@ where
     Ok(())
 }
 
-pub(super) async fn next<S, E>(app: &App, stream: &mut S) -> Result<Option<Bytes>>
+/// How fast an upload comes: bytes, and the time that was waited for them; what our disk takes is not the
+/// client's.
+#[derive(Debug, Default)]
+pub(super) struct Pace {
+    waited: Duration,
+    bytes: u64,
+}
+
+impl Pace {
+    /// Refuses an upload that came too slowly for as long as one may be silent.
+    fn check(&mut self, app: &App) -> Result<()> {
+        let (window, least) = (app.settings.upload_idle(), app.settings.upload_bytes_per_second);
+        if self.waited < window {
+            return Ok(());
+        }
+        let seconds = self.waited.as_secs().max(1);
+        if self.bytes < least.saturating_mul(seconds) {
+            let detail = format!(
+                "{} bytes came in {seconds} seconds, less than {least} in a second; send the file again \
+                 by a faster way, or in pieces",
+                self.bytes
+            );
+            return Err(ApiError::new(Code::UploadStalled, detail));
+        }
+        *self = Self::default();
+        Ok(())
+    }
+}
+
+pub(super) async fn next<S, E>(app: &App, pace: &mut Pace, stream: &mut S) -> Result<Option<Bytes>>
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
     E: std::fmt::Display,
 {
-    match tokio::time::timeout(app.settings.upload_idle(), stream.next()).await {
-        Ok(Some(Ok(chunk))) => Ok(Some(chunk)),
+    let before = Instant::now();
+    let came = tokio::time::timeout(app.settings.upload_idle(), stream.next()).await;
+    pace.waited += before.elapsed();
+    match came {
+        Ok(Some(Ok(chunk))) => {
+            pace.bytes += chunk.len() as u64;
+            pace.check(app)?;
+            Ok(Some(chunk))
+        }
         Ok(None) => Ok(None),
         Ok(Some(Err(error))) => {
             let detail = format!("the upload was broken off: {error}");

@@ -83,9 +83,10 @@ pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
     tell(&study(masks, 1.0, progress)?, None, None)
 }
 
-/// Looks at the headers of captures: they must be stacks of one size, before hours of averaging.
+/// Looks at the headers of captures: they must be stacks of one size, before hours of averaging. Gives the bytes
+/// of the masks that are made of them.
 /// Errors: files that can't be read, or differ in size, by their place in a request.
-pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<()> {
+pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<u64> {
     let mut first = None;
     for (place, paths) in files.lists() {
         for (index, path) in paths.iter().enumerate() {
@@ -102,7 +103,8 @@ pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<()> {
             }
         }
     }
-    Ok(())
+    let (height, width) = first.unwrap_or_default();
+    Ok((files.masks.len() * height * width * size_of::<f32>()) as u64)
 }
 
 /// What the captures of masks have told.

@@ -57,7 +57,8 @@ impl JobState {
             (Queued, Running | Cancelled | Failed)
                 | (Running, Succeeded | Failed | Cancelling | Cancelled)
                 | (Cancelling, Cancelled)
-                | (Failed | Cancelled, Queued)
+                // A job whose results were damaged on the disk is done again.
+                | (Failed | Cancelled | Succeeded, Queued)
         );
         if legal { Ok(to) } else { Err(IllegalTransition { from: self, to }) }
     }
@@ -78,12 +79,12 @@ mod tests {
     }
 
     #[test]
-    fn success_is_for_ever_and_the_other_ends_can_be_retried() {
-        for to in JobState::VARIANTS.iter().copied() {
-            assert!(JobState::Succeeded.step(to).is_err());
+    fn ends_can_be_retried_and_lead_nowhere_else() {
+        for end in [JobState::Succeeded, JobState::Failed, JobState::Cancelled] {
+            for to in JobState::VARIANTS.iter().copied() {
+                assert_eq!(end.step(to).is_ok(), to == JobState::Queued);
+            }
         }
-        assert_eq!(JobState::Failed.step(JobState::Queued), Ok(JobState::Queued));
-        assert_eq!(JobState::Cancelled.step(JobState::Queued), Ok(JobState::Queued));
         assert!(JobState::Cancelling.step(JobState::Running).is_err());
         assert!(JobState::Cancelling.step(JobState::Succeeded).is_err());
     }

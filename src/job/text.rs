@@ -96,6 +96,10 @@ impl Sha256 {
         Self(bytes)
     }
 
+    pub fn bytes(&self) -> [u8; 32] {
+        self.0
+    }
+
     /// The hash and the number of the bytes that are left to read.
     pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
         use sha2::Digest;

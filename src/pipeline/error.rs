@@ -54,6 +54,16 @@ impl PipelineError {
         move |error| Self::Record { what, problem: error.to_string() }
     }
 
+    /// True if the disk is full or a quota is used up.
+    pub fn is_disk_full(&self) -> bool {
+        use io::ErrorKind::{QuotaExceeded, StorageFull};
+        match self {
+            Self::Format(error) => error.is_disk_full(),
+            Self::File { source, .. } => matches!(source.kind(), QuotaExceeded | StorageFull),
+            _ => false,
+        }
+    }
+
     /// Whether another attempt may succeed: the machine failed, not the data.
     pub fn is_retryable(&self) -> bool {
         match self {

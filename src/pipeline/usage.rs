@@ -24,7 +24,16 @@ fn children_ticks() -> u64 {
 
 /// Largest resident memory of this process so far in bytes (VmHWM); 0 where /proc can't be read.
 pub fn peak_rss_bytes() -> u64 {
-    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    peak_rss_in("/proc/self/status")
+}
+
+/// The same of another process; 0 if it is gone.
+pub fn peak_rss_of(process: u32) -> u64 {
+    peak_rss_in(&format!("/proc/{process}/status"))
+}
+
+fn peak_rss_in(status: &str) -> u64 {
+    let status = fs::read_to_string(status).unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
     let kibibytes = line.and_then(|rest| rest.split_whitespace().next()?.parse::<u64>().ok());
     kibibytes.unwrap_or(0) * 1024

@@ -37,14 +37,7 @@ impl Store {
     /// then.
     pub async fn quarantine_orphans(&self, all: bool) -> Result<usize> {
         // 1. Without the lock: nearly all are known.
-        let known = self.known_things().await?;
-        let root = self.dir().clone();
-        let unknown = on_files(move || {
-            let mut things = things(&root)?;
-            things.retain(|(thing, _)| !known.contains(thing));
-            Ok(things)
-        })
-        .await?;
+        let unknown = self.unlisted().await?;
         // 2. With it: files change together with their rows.
         let mut orphans = Vec::new();
         if !unknown.is_empty() {
@@ -83,6 +76,27 @@ impl Store {
         .await
     }
 
+    /// What lies in the folder and, at this moment, stands in no record.
+    async fn unlisted(&self) -> Result<Vec<(Thing, PathBuf)>> {
+        let (known, root) = (self.known_things().await?, self.dir().clone());
+        on_files(move || {
+            let mut things = things(&root)?;
+            things.retain(|(thing, _)| !known.contains(thing));
+            Ok(things)
+        })
+        .await
+    }
+
+    /// Number of blobs, results and partial uploads that no row knows of.
+    pub(super) async fn unknown_things(&self) -> Result<usize> {
+        let mut unknown = 0;
+        for (thing, path) in self.unlisted().await? {
+            let mut connection = self.readers.acquire().await?;
+            unknown += usize::from(path.exists() && !is_known(&mut connection, &thing).await?);
+        }
+        Ok(unknown)
+    }
+
     async fn known_things(&self) -> Result<HashSet<Thing>> {
         let mut known = HashSet::new();
         let mut rows = sqlx::query_scalar("SELECT sha256 FROM blobs").fetch(&self.readers);
@@ -117,7 +131,11 @@ impl Store {
                 break;
             }
             match self.remove_job(id).await {
-                Ok(()) => removed += 1,
+                Ok(()) => {
+                    removed += 1;
+                    // Before the disk is asked again.
+                    self.discarded().await;
+                }
                 // Taken up again or deleted meanwhile.
                 Err(StoreError::NotFinal(_) | StoreError::NotFound { .. }) => {}
                 Err(error) => return Err(error),

@@ -172,6 +172,14 @@ pub(crate) fn sync_dir(path: &Path) -> Result<()> {
         .map_err(StoreError::io("write to the disk the folder", path))
 }
 
+/// Lets nobody but the owner look into a folder, or into a file.
+pub(crate) fn restrict(path: &Path) -> Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    let is_dir = fs::metadata(path).is_ok_and(|meta| meta.is_dir());
+    let mode = fs::Permissions::from_mode(if is_dir { 0o700 } else { 0o600 });
+    fs::set_permissions(path, mode).map_err(StoreError::io("keep for its owner", path))
+}
+
 /// Renames a file or folder that is on the disk already, for good.
 pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<()> {
     fs::rename(from, to).map_err(StoreError::io("move a file to", to))?;

@@ -74,8 +74,24 @@ pub enum StoreError {
          and send the file again"
     )]
     Short { id: crate::job::PartialId, found: u64, recorded: u64 },
-    #[error("{jobs} jobs wait or run, and no more than {most} may")]
-    QueueFull { jobs: u64, most: u64 },
+    /// A stored file is gone, or its bytes are not those on record.
+    #[error("the {what} {name} is damaged on the disk of the service; {}", if *what == "result" {
+        "retry its job, and it is made again"
+    } else {
+        "send it, or what it was made of, again"
+    })]
+    Damaged { what: &'static str, name: String },
+    /// The data changed faster than they could be written out.
+    #[error(
+        "in {0} tries no moment was found at which nothing was deleted; try again when less is done"
+    )]
+    Restless(u32),
+    #[error("{jobs} jobs {whose}wait or run, and no more than {most} may")]
+    QueueFull { whose: &'static str, jobs: u64, most: u64 },
+    #[error("it needs {needed} bytes, and the {whose} keeps {kept} of the {limit} it may")]
+    Quota { whose: &'static str, kept: u64, needed: u64, limit: u64 },
+    #[error("{0} uploads of this lab are not complete; end some before another is begun")]
+    ManyPartials(u64),
     #[error("the Idempotency-Key {key:?} was used for another request, which made {what} {id}")]
     KeyReused { key: String, what: &'static str, id: String },
     /// A task that blocks was broken off, as at shutdown.
@@ -102,6 +118,19 @@ impl StoreError {
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
+    }
+
+    /// True if others had the database for too long.
+    pub fn is_busy(&self) -> bool {
+        match self {
+            // SQLITE_BUSY and SQLITE_LOCKED, which may come with a reason in the upper bits
+            Self::Database(sqlx::Error::Database(error)) => error
+                .code()
+                .and_then(|code| code.parse::<u32>().ok())
+                .is_some_and(|code| matches!(code & 0xff, 5 | 6)),
+            Self::Database(sqlx::Error::PoolTimedOut) => true,
+            _ => false,
+        }
     }
 
     /// True if the disk is full or a quota is used up.

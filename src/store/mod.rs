@@ -16,10 +16,14 @@
 use crate::store::error::Result;
 mod backup;
 mod cleaning;
+mod clock;
 mod dir;
 mod error;
+mod hashes;
 mod identity;
+mod integrity;
 mod queue;
+mod records;
 mod rows;
 mod staging;
 mod submit;
@@ -30,7 +34,8 @@ mod upgrade;
 
 use std::fs::File;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use sqlx::sqlite::{
@@ -43,19 +48,21 @@ pub use dir::DataDir;
 pub(crate) use dir::on_files;
 pub use error::StoreError;
 pub use identity::Purpose;
+pub use integrity::Audit;
 pub use queue::{
     Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Estimate,
-    Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MessagePlace,
-    Product, ProgressStage, RemoteBeat, RemoteTask, Work, WorkerEnd,
+    Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
+    MessagePlace, Product, ProgressStage, RemoteBeat, RemoteTask, Work, WorkerEnd,
 };
 pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::NewJob;
 pub use tables::{
-    Blob, BlobRow, Calibration, FoundPartial, Inserted, Job, JobChanges, JobFilter, LabRow, LabUse,
-    Measurement, Model, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial,
-    PartialFile, RequestKey, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
-    TileState, Token, Unready, WorkerPlace, WorkerRow, WorkerTask,
+    Blob, BlobRow, Calibration, Entitlement, FIRST_RESERVE, FoundPartial, Inserted, Job,
+    JobChanges, JobFilter, LabRow, LabUse, Measurement, Model, NewCalibration, NewMeasurement,
+    NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey, TaskCounts, TaskRecord,
+    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow,
+    WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.
@@ -67,6 +74,12 @@ pub struct Store {
     readers: SqlitePool,
     /// What is ahead of every job, as it was a moment ago.
     forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
+    /// Hashes of files that were read before they were handed out.
+    hashes: Arc<hashes::Hashes>,
+    /// How much is being removed from the disk.
+    going: Arc<AtomicUsize>,
+    /// What was last found wrong with the database.
+    damage: Arc<Mutex<Option<String>>>,
     /// The lock of the server, if this is its store.
     _server: Option<Arc<File>>,
 }
@@ -99,6 +112,8 @@ impl Store {
             .foreign_keys(true)
             .busy_timeout(Duration::from_secs(15))
             .journal_mode(SqliteJournalMode::Wal)
+            // A worker may write to the data folder alone, and not where SQLite puts its temporary files.
+            .pragma("temp_store", "memory")
             // NORMAL survives a killed process, but a power cut could take back the last commits,
             // and an answered request must not be lost. Commits are few (a heartbeat of each
             // worker every two seconds), so a sync for each costs nothing that is felt.
@@ -123,8 +138,24 @@ impl Store {
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
-        let store = Self { dir, writer, readers, forecast: Arc::default(), _server: server };
+        let (forecast, hashes) = (Arc::default(), Arc::default());
+        let store = Self {
+            dir,
+            writer,
+            readers,
+            forecast,
+            hashes,
+            going: Arc::default(),
+            damage: Arc::default(),
+            _server: server,
+        };
         if serves {
+            for path in [store.dir.root().to_owned(), store.dir.database()] {
+                if let Err(error) = dir::restrict(&path) {
+                    tracing::warn!(%error, "others may look into the data");
+                }
+            }
+            store.note_time(Duration::ZERO).await?;
             identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
             store.write_marker().await?;
             store.advance_generation().await?;
@@ -158,6 +189,36 @@ impl Store {
     pub async fn ping(&self) -> Result<()> {
         sqlx::query("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
         Ok(())
+    }
+
+    /// Has SQLite look for damage in the whole database, and remembers what it says.
+    pub async fn look_at_database(&self) -> Result<()> {
+        let verdict: String =
+            sqlx::query_scalar("PRAGMA quick_check(1)").fetch_one(&self.readers).await?;
+        let damage = Some(verdict).filter(|verdict| verdict != "ok");
+        if let Some(damage) = &damage {
+            tracing::error!(damage, "the database is damaged");
+        }
+        *self.damage.lock().unwrap_or_else(PoisonError::into_inner) = damage;
+        Ok(())
+    }
+
+    /// What is wrong with the database, if the last look has found something.
+    pub fn database_damage(&self) -> Option<String> {
+        self.damage.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Tries whether files can be made and written.
+    pub async fn try_disk(&self) -> Result<()> {
+        let (store, byte) = (self.clone(), b"?");
+        on_files(move || {
+            let mut file = store.blob_writer()?;
+            let written = std::io::Write::write_all(&mut file, byte);
+            written.map_err(StoreError::io("write to", &store.dir().tmp()))?;
+            // Dropped, and so removed.
+            file.finish().map(|_| ())
+        })
+        .await
     }
 
     pub(crate) async fn write(&self) -> Result<WriteTransaction> {

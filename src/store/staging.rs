@@ -6,13 +6,15 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use sha2::Digest;
 use uuid::Uuid;
 
 use super::Store;
-use super::dir;
 use super::error::{Result, StoreError};
+use super::{dir, on_files};
 use crate::job::{ResultFile, Sha256};
 
 /// A temporary file or folder; its lock and its removal.
@@ -69,6 +71,36 @@ impl Store {
         let path = self.temporary_path();
         fs::hard_link(original, &path).map_err(StoreError::io("link", &path))?;
         Ok(StagedPath(Temporary::new(path, lock)?))
+    }
+
+    /// Takes a file or a folder out of its place, at once and as a whole; its bytes go in the background, as large
+    /// files take long and others wait for the lock of the database. It may be gone already.
+    pub(super) async fn discard(&self, place: PathBuf) -> Result<()> {
+        let rest = self.temporary_path();
+        let moved = rest.clone();
+        let found = on_files(move || match fs::rename(&place, &moved) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(StoreError::io("remove", &place)(error)),
+            Ok(()) => place.parent().map_or(Ok(()), dir::sync_dir).map(|()| true),
+        })
+        .await?;
+        if found {
+            let going = self.going.clone();
+            going.fetch_add(1, Ordering::AcqRel);
+            tokio::spawn(async move {
+                // What a crash or an error leaves of it is swept.
+                let _ = on_files(move || dir::remove(&rest)).await;
+                going.fetch_sub(1, Ordering::AcqRel);
+            });
+        }
+        Ok(())
+    }
+
+    /// Waits until the bytes of all that was discarded are gone.
+    pub(super) async fn discarded(&self) {
+        while self.going.load(Ordering::Acquire) > 0 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
     }
 
     /// A new empty folder for the results of a task. Blocks on the disk.
@@ -163,8 +195,14 @@ impl StagedBlob {
         if let Some(folder) = place.parent() {
             dir::make_dir_durably(folder)?;
         }
-        // Also over a file that is there: it has the same bytes, or is damaged.
+        // Also over a file that is there: it has the same bytes, or is damaged. Its bytes go in the background:
+        // how long that takes would tell that another lab had sent the same.
+        let old = self.temporary.path.with_extension("old");
+        let replaced = fs::hard_link(place, &old).is_ok();
         dir::rename_durably(&self.temporary.path, place)?;
+        if replaced {
+            std::thread::spawn(move || dir::remove(&old));
+        }
         // Two names of one file stay two: it was stored before, by an attempt that a crash ended.
         dir::remove(&self.temporary.path)?;
         self.temporary.moved = true;

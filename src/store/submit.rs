@@ -8,12 +8,12 @@ use super::queue::graph;
 use super::rows::{Reference, require, sql_as};
 use super::staging::StagedBlob;
 use super::tables::blobs::Origin;
-use super::tables::calibrations::{self, Calibration, NewCalibration};
-use super::tables::jobs;
+use super::tables::calibrations::{self, Asked, Calibration, NewCalibration};
 use super::tables::keys::{self, CALIBRATION, Inserted, MEASUREMENT, RequestKey};
 use super::tables::measurements::{self, Measurement, NewMeasurement};
+use super::tables::{jobs, quota};
 use crate::job::{
-    CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp,
+    CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp, TokenId,
 };
 
 #[derive(Debug, Clone)]
@@ -30,7 +30,8 @@ pub struct NewJob {
 
 impl Store {
     /// Accepts a job: the job and its tasks, or nothing.
-    /// Errors: [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::NotFound`] if
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::Quota`];
+    /// [`StoreError::NotFound`] if
     /// the measurement or the model is gone.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted> {
         let mut transaction = self.write().await?;
@@ -39,7 +40,8 @@ impl Store {
         {
             return Ok(Inserted::Before(job));
         }
-        check_queue(&mut transaction, new.most_jobs).await?;
+        quota::check_jobs(&mut transaction, &new.lab, new.most_jobs).await?;
+        quota::check(&mut transaction, &new.lab, None, new.spec.disk_bytes()).await?;
         let mut references = vec![Reference::Measurement(new.spec.measurement)];
         references.extend(new.spec.model.as_ref().map(|model| Reference::Model(model.id)));
         require(&mut transaction, &references).await?;
@@ -67,7 +69,7 @@ impl Store {
     /// Errors: [`StoreError::KeyReused`].
     pub async fn add_calibration(
         &self,
-        lab: &Lab,
+        (lab, token): (&Lab, Option<TokenId>),
         facts: NewCalibration,
         prepared: StagedBlob,
         key: Option<&RequestKey>,
@@ -84,23 +86,24 @@ impl Store {
             return Ok(Inserted::Before(before));
         }
         require(&mut transaction, &[Reference::Blob(facts.masks)]).await?;
+        quota::check(&mut transaction, lab, token, prepared.size()).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
-        calibrations::insert(&mut transaction, lab, &calibration).await?;
-        let name = facts.name.as_ref();
-        calibrations::insert_request(&mut transaction, lab, id, name, None).await?;
+        calibrations::insert(&mut transaction, (lab, token), &calibration).await?;
+        let asked = Asked { id, token, name: facts.name.as_ref(), captures: None, bytes: 0 };
+        calibrations::insert_request(&mut transaction, lab, &asked).await?;
         graph::insert_calibration(&mut transaction, lab, id).await?;
         keys::insert(&mut transaction, lab, CALIBRATION, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
 
-    /// Records a calibration whose masks, and their report, are to be made of captures.
-    /// Errors: [`StoreError::KeyReused`].
+    /// Records a calibration whose masks, of so many bytes, and their report, are to be made of captures.
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::Quota`].
     pub async fn add_captures(
         &self,
-        lab: &Lab,
+        (lab, token): (&Lab, Option<TokenId>),
         name: Option<&Label>,
-        captures: &Captures,
+        (captures, bytes): (&Captures, u64),
         key: Option<&RequestKey>,
     ) -> Result<Inserted<CalibrationId>> {
         let id = CalibrationId::new();
@@ -108,7 +111,9 @@ impl Store {
         if let Some(before) = keys::found(&mut transaction, lab, CALIBRATION, key).await? {
             return Ok(Inserted::Before(before));
         }
-        calibrations::insert_request(&mut transaction, lab, id, name, Some(captures)).await?;
+        quota::check(&mut transaction, lab, token, bytes).await?;
+        let asked = Asked { id, token, name, captures: Some(captures), bytes };
+        calibrations::insert_request(&mut transaction, lab, &asked).await?;
         graph::insert_calibration(&mut transaction, lab, id).await?;
         keys::insert(&mut transaction, lab, CALIBRATION, key, id).await?;
         transaction.commit().await?;
@@ -119,7 +124,7 @@ impl Store {
     /// Errors: [`StoreError::KeyReused`].
     pub async fn add_measurement(
         &self,
-        lab: &Lab,
+        (lab, token): (&Lab, Option<TokenId>),
         facts: NewMeasurement,
         prepared: StagedBlob,
         key: Option<&RequestKey>,
@@ -137,19 +142,13 @@ impl Store {
             return Ok(Inserted::Before(before));
         }
         require(&mut transaction, &references).await?;
+        quota::check(&mut transaction, lab, token, prepared.size()).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
-        measurements::insert(&mut transaction, lab, &measurement).await?;
+        measurements::insert(&mut transaction, (lab, token), &measurement).await?;
         keys::insert(&mut transaction, lab, MEASUREMENT, key, measurement.id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(measurement.id))
     }
-}
-
-/// Refuses a job if enough wait and run.
-async fn check_queue(connection: &mut SqliteConnection, most: u64) -> Result<()> {
-    let jobs = "SELECT count(*) FROM jobs WHERE finished_at IS NULL";
-    let jobs = sqlx::query_scalar(jobs).fetch_one(connection).await?;
-    if jobs < most { Ok(()) } else { Err(StoreError::QueueFull { jobs, most }) }
 }
 
 /// A key as it is stored: good for one job of a lab.

@@ -72,7 +72,8 @@ impl Lab {
             clipped_negatives: 0,
         };
         let masks = upload(b"prepared masks");
-        let calibration = store.add_calibration(&local, facts, masks, None).await.unwrap().id();
+        let whose = (&local, None);
+        let calibration = store.add_calibration(whose, facts, masks, None).await.unwrap().id();
         let facts = NewMeasurement {
             name: None,
             calibration,
@@ -89,7 +90,7 @@ impl Lab {
             warnings: Vec::new(),
         };
         let data = upload(b"prepared data");
-        let measurement = store.add_measurement(&local, facts, data, None).await.unwrap().id();
+        let measurement = store.add_measurement(whose, facts, data, None).await.unwrap().id();
         let worker = WorkerId::new();
         store.worker_started(worker, 1, &WorkerPlace::default()).await.unwrap();
         let lab = Self { store, measurement, worker, _folder: folder };

@@ -181,6 +181,10 @@ impl Transport for Local {
         Ok(self.store.fail(lease, reason, retry).await?)
     }
 
+    async fn postpone(&self, lease: &Lease, reason: &str) -> Result<(), TransportError> {
+        Ok(self.store.postpone(lease, reason).await?)
+    }
+
     async fn give_back(&self, lease: &Lease) -> Result<(), TransportError> {
         Ok(self.store.give_back(lease).await?)
     }

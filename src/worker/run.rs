@@ -285,6 +285,11 @@ impl<T: Transport> Worker<T> {
     }
 
     async fn failed(&self, lease: &Lease, error: &TaskError) {
+        if error.is_disk_full() {
+            tracing::warn!(%error, "the task waits until the disk has room");
+            let reason = without_paths(&error.to_string());
+            return said(self.transport.postpone(lease, &reason).await);
+        }
         tracing::error!(%error, "the task failed");
         // The user reads the reason, and has no business with the folders of this machine.
         let reason = without_paths(&error.to_string());

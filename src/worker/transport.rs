@@ -10,6 +10,7 @@ use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::formats::FormatError;
 use crate::intake::{CaptureFiles, IntakeError};
 use crate::job::{
     JobId, JobSpec, Label, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange, TaskProgress,
@@ -21,7 +22,9 @@ use crate::pipeline::manifest::{JobTasks, Recipe};
 use crate::pipeline::networks::ModelFile;
 use crate::pipeline::tile::TileInput;
 use crate::recon::tile::Tile;
-use crate::store::{BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath};
+use crate::store::{
+    BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath, StoreError,
+};
 
 /// The queue or the files can't be reached.
 pub type TransportError = Box<dyn Error + Send + Sync>;
@@ -60,6 +63,11 @@ pub trait Transport: Clone + Send + 'static {
 
     /// Tells why a task could not be done, and whether another attempt may succeed.
     async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError>;
+
+    /// Gives a task back for a while, as the disk is full.
+    async fn postpone(&self, lease: &Lease, reason: &str) -> Result<(), TransportError> {
+        self.fail(lease, reason, true).await
+    }
 
     /// Gives a task back unharmed: the worker is to end, or the job was cancelled.
     async fn give_back(&self, lease: &Lease) -> Result<(), TransportError>;
@@ -183,6 +191,21 @@ pub enum TaskError {
 }
 
 impl TaskError {
+    /// Whether there was no room on the disk: the task is not to blame, and goes on when there is.
+    pub(super) fn is_disk_full(&self) -> bool {
+        match self {
+            Self::Pipeline(error) => error.is_disk_full(),
+            Self::Intake(IntakeError::Format { source, .. }) => source.is_disk_full(),
+            Self::Intake(_) => false,
+            Self::Transport(error) => {
+                let store =
+                    error.downcast_ref::<StoreError>().is_some_and(StoreError::is_disk_full);
+                let format = error.downcast_ref::<FormatError>();
+                store || format.is_some_and(FormatError::is_disk_full)
+            }
+        }
+    }
+
     pub(super) fn is_retryable(&self) -> bool {
         match self {
             Self::Pipeline(error) => error.is_retryable(),

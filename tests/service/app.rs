@@ -146,6 +146,17 @@ impl TestApp {
         (self.process, self.url) = begun.expect("the server starts");
     }
 
+    /// The same, if the server starts on what is there now; false if it does not.
+    pub fn revive(&mut self) -> bool {
+        self.kill();
+        let begun = spawn(&self.data, &self.arguments, &[], Stdio::inherit());
+        let starts = begun.is_some();
+        if let Some(begun) = begun {
+            (self.process, self.url) = begun;
+        }
+        starts
+    }
+
     /// SIGKILL.
     pub fn kill(&mut self) {
         // It may be dead already.

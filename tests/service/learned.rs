@@ -160,6 +160,42 @@ async fn what_is_no_network_for_these_masks_is_refused() {
     app.delete(&format!("/v1/models/{model}")).await.problem(404, "not_found");
 }
 
+/// It was modest when it was tried in the dark.
+#[tokio::test]
+async fn a_network_that_is_greedy_in_the_light_costs_its_own_job_and_no_more() {
+    let Some(python) = python() else { return };
+    let (folder, scene) = (tempfile::tempdir().unwrap(), Scene::SMALL);
+    let sly = train(&python, folder.path(), scene, "sly");
+    let app = TestApp::with(&["--workers", "1", "--worker-memory-bytes", "1073741824"]).await;
+    let (calibration, measurement) = app.scene(&scene).await;
+    let model = register(&app, &calibration, &sly).await.expect(201).json();
+    let body = json!({"measurement": measurement, "algorithm": "learned", "model": model["id"]});
+    let job = app.submit(&body).await;
+    let mut peak = 0;
+    let done = loop {
+        for worker in app.workers() {
+            let status = std::fs::read_to_string(format!("/proc/{worker}/status"));
+            let status = status.unwrap_or_default();
+            let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+            let kib = line.and_then(|rest| rest.split_whitespace().next()?.parse::<u64>().ok());
+            peak = peak.max(kib.unwrap_or_default() >> 10);
+        }
+        let found = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
+        if found["state"] == "failed" || found["state"] == "succeeded" {
+            break found;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    };
+    let error = done["error"].as_str().unwrap_or_default();
+    eprintln!("the worker had {peak} MiB at most; the job says: {error}");
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let words = error.to_lowercase();
+    assert!(words.contains("alloc") || words.contains("memory"), "{error}");
+    assert!(peak < 1600, "{peak} MiB");
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+}
+
 #[test]
 fn the_command_line_runs_a_network_too() {
     let Some(python) = python() else { return };

@@ -148,6 +148,7 @@ async fn draw(
     // What is done stays the same under this address for ever; private, as results are.
     let keep = if picture.settled { "private, max-age=86400, immutable" } else { "no-cache" };
     let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, keep.to_owned())];
+    conditional::check_match(headers, &etag)?;
     if conditional::is_known(headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
     }

@@ -124,9 +124,11 @@ impl Named for OfJob {
             JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
             JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
             JobPicture::Residual => {
-                let masks = masks_of(app, &app.store.calibration(lab, job.spec.calibration).await?);
+                let masks = app.store.calibration(lab, job.spec.calibration).await?;
+                let masks = masks_of(app, &masks).await?;
                 let measurement = app.store.measurement(lab, job.spec.measurement).await?;
-                Ok(stack.residual(&masks, &snapshots_of(app, &measurement), snapshot as usize))
+                let measurement = snapshots_of(app, &measurement).await?;
+                Ok(stack.residual(&masks, &measurement, snapshot as usize))
             }
             _ => Err(outside(format!(
                 "frames are counted from 1 to {frames}, differences from 2, rows from 0 to {}",
@@ -138,7 +140,8 @@ impl Named for OfJob {
 
 impl Named for OfMeasurement {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
-        let stack = snapshots_of(app, &app.store.measurement(lab, self.measurement).await?);
+        let measurement = app.store.measurement(lab, self.measurement).await?;
+        let stack = snapshots_of(app, &measurement).await?;
         let (MeasurementPicture(snapshot), count) = (self.picture, stack.shape.0);
         if snapshot < count {
             return Ok(stack.frame(snapshot));
@@ -149,7 +152,8 @@ impl Named for OfMeasurement {
 
 impl Named for OfCalibration {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
-        let stack = masks_of(app, &app.store.calibration(lab, self.calibration).await?);
+        let calibration = app.store.calibration(lab, self.calibration).await?;
+        let stack = masks_of(app, &calibration).await?;
         let count = stack.shape.0;
         match self.picture {
             CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
@@ -167,27 +171,29 @@ fn outside(detail: String) -> ApiError {
     ApiError::new(Code::NotFound, detail)
 }
 
-fn masks_of(app: &App, calibration: &Calibration) -> Stack {
+async fn masks_of(app: &App, calibration: &Calibration) -> Result<Stack> {
     let facts = &calibration.facts;
-    prepared(app, calibration.prepared, (facts.frames, facts.height, facts.width))
+    prepared(app, calibration.prepared, (facts.frames, facts.height, facts.width)).await
 }
 
-fn snapshots_of(app: &App, measurement: &Measurement) -> Stack {
+async fn snapshots_of(app: &App, measurement: &Measurement) -> Result<Stack> {
     let facts = &measurement.facts;
-    prepared(app, measurement.prepared, (facts.snapshots as usize, facts.height, facts.width))
+    let shape = (facts.snapshots as usize, facts.height, facts.width);
+    prepared(app, measurement.prepared, shape).await
 }
 
-fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Stack {
-    let files = Files::Prepared(app.store.dir().blob(&sha256));
-    Stack { shape, identity: sha256.to_string(), files }
+async fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Result<Stack> {
+    let files = Files::Prepared(app.store.intact_blob(sha256).await?);
+    Ok(Stack { shape, identity: sha256.to_string(), files })
 }
 
-/// The frames of a snapshot: those of the result, or the tiles that are done, on the preview.
+/// The frames of a snapshot: those of the result, or the tiles that are done, on the preview. The bytes of
+/// these are compared with the record when they are assembled.
 async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let spec = &job.spec;
     let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
-    match app.store.result_file(job, Some(snapshot), "frames.npy").await {
-        Ok((file, path)) => {
+    match app.store.open_result(job, Some(snapshot), "frames.npy").await {
+        Ok((file, path, _)) => {
             return Ok(Stack {
                 shape,
                 identity: file.sha256.to_string(),

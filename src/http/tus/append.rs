@@ -4,9 +4,10 @@ use axum::body::{Body, Bytes};
 use tokio::sync::mpsc;
 
 use super::headers::Checksum;
+use crate::http::admission::Reservation;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
-use crate::http::upload::{CHUNKS, next};
+use crate::http::upload::{CHUNKS, Pace, next};
 use crate::store::{PartialFile, StoreError};
 
 /// Appends what comes. A cut connection keeps what has come before it, unless a checksum was named
@@ -14,6 +15,7 @@ use crate::store::{PartialFile, StoreError};
 pub(super) async fn append(
     app: &App,
     file: PartialFile,
+    mut room: Reservation,
     checksum: Option<Checksum>,
     body: Body,
 ) -> Result<PartialFile> {
@@ -21,7 +23,7 @@ pub(super) async fn append(
     let (length, received) = (file.upload().facts.length, file.upload().received);
     let (sender, receiver) = mpsc::channel(CHUNKS);
     let writer = tokio::task::spawn_blocking(move || write(file, receiver, checksum));
-    let pumped = pump(app, length, length - received, body, sender).await;
+    let pumped = pump(app, &mut room, (length, length - received), body, sender).await;
     let mut written = writer.await.map_err(|_| StoreError::Interrupted)??;
     match (&pumped, written.sum_holds) {
         (Err(_), _) if whole => {}
@@ -42,19 +44,20 @@ pub(super) async fn append(
 /// Hands the chunks of the body on, no more than the upload still wants.
 async fn pump(
     app: &App,
-    length: u64,
-    mut left: u64,
+    room: &mut Reservation,
+    (length, mut left): (u64, u64),
     body: Body,
     sender: mpsc::Sender<Bytes>,
 ) -> Result<()> {
     let mut stream = body.into_data_stream();
-    // What an upload in pieces still wants is promised to it by the database.
-    while let Some(chunk) = next(app, &mut stream).await? {
+    let mut pace = Pace::default();
+    while let Some(chunk) = next(app, &mut pace, &mut stream).await? {
         let Some(rest) = left.checked_sub(chunk.len() as u64) else {
             let detail = format!("the upload was begun with a length of {length}");
             return Err(ApiError::new(Code::TooLarge, detail));
         };
         left = rest;
+        app.admission.take(room, chunk.len() as u64).await?;
         // A writer that takes no more has failed, and says why itself.
         if sender.send(chunk).await.is_err() {
             break;

@@ -4,6 +4,8 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha1::Digest;
 
+use crate::job::Sha256;
+
 /// The longest `Upload-Metadata` that is kept.
 const MAX_METADATA: usize = 4096;
 
@@ -56,6 +58,11 @@ impl Checksum {
             return Err(format!("a {name} has {length} bytes, not {}", expected.len()));
         }
         Ok(Self { hasher, expected })
+    }
+
+    /// The SHA-256 that the bytes should have.
+    pub fn sha256(expected: Sha256) -> Self {
+        Self { hasher: Hasher::Sha256(sha2::Sha256::new()), expected: expected.bytes().to_vec() }
     }
 
     /// Goes on with these bytes.

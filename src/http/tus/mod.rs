@@ -15,10 +15,10 @@ use serde::{Deserialize, Serialize};
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Caller, Params, QueryOf, request_key};
+use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, request_key};
 use super::page::{Limit, PageBody};
 use crate::job::{Lab, PartialId, Sha256, Timestamp};
-use crate::store::{FoundPartial, Inserted, NewPartial, Partial, PartialFile};
+use crate::store::{FIRST_RESERVE, FoundPartial, Inserted, NewPartial, Partial, PartialFile};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -106,12 +106,13 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
         return begun(&app, &access.lab, Inserted::Before(id)).await;
     }
     app.admission.check_length(&access, length).await?;
-    app.admission.check_room("the upload", length).await?;
     let Access { lab, token, .. } = access;
     let facts =
         NewPartial { lab: lab.clone(), token, length, metadata: metadata.to_owned(), expected };
-    let age = app.settings.upload_age();
-    let inserted = app.store.begin_partial(facts, age, key.as_ref()).await?;
+    // More is reserved as it grows.
+    let first = length.min(FIRST_RESERVE);
+    let begin = app.store.begin_partial(facts, app.settings.upload_age(), key.as_ref());
+    let inserted = app.admission.with_room("the upload", first, begin).await?;
     begun(&app, &lab, inserted).await
 }
 
@@ -168,7 +169,7 @@ pub(super) async fn patch(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response> {
-    let permit = app.admission.slot()?;
+    let permit = app.admission.place(&access.lab)?;
     let upload = to_the_end(async move {
         let _permit = permit;
         piece(&app, &access, id, &headers, body).await
@@ -196,9 +197,13 @@ async fn piece(
         let detail = "a piece must be sent as Content-Type: application/offset+octet-stream";
         return Err(ApiError::new(Code::UnsupportedMediaType, detail));
     }
+    check_encoding(headers)?;
     let offset = number(headers, &OFFSET)?;
     let checksum = text(headers, &CHECKSUM)?.map(headers::Checksum::parse).transpose();
-    let checksum = checksum.map_err(malformed)?;
+    let mut checksum = checksum.map_err(malformed)?;
+    if checksum.is_none() {
+        checksum = content_digest(headers)?.map(headers::Checksum::sha256);
+    }
     let (upload, file) = match app.store.open_partial(&access.lab, id).await? {
         FoundPartial::Open(file) => (file.upload().clone(), Some(file)),
         FoundPartial::Stored(upload) => (upload, None),
@@ -209,7 +214,11 @@ async fn piece(
         return Err(ApiError::new(Code::OffsetMismatch, detail));
     }
     let Some(file) = file else { return Ok(upload) };
-    let file = append::append(app, file, checksum, body).await?;
+    // Of a piece that does not say its length, room is reserved as it comes.
+    let length = text(headers, &header::CONTENT_LENGTH)?.and_then(|text| text.parse().ok());
+    let length: u64 = length.unwrap_or_default();
+    let room = app.admission.reserve(length.min(upload.facts.length - upload.received)).await?;
+    let file = append::append(app, file, room, checksum, body).await?;
     finish(app, file).await
 }
 

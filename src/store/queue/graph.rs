@@ -6,7 +6,7 @@ use sqlx::SqliteConnection;
 use crate::job::{CalibrationId, JobId, JobSpec, Lab, TaskId, TaskKind, TaskState};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
-use crate::store::tables::{labs, sums, tasks};
+use crate::store::tables::{labs, results, sums, tasks};
 
 /// Above that of every job: people wait for calibrations before they measure.
 const CALIBRATION_PRIORITY: i32 = 1000;
@@ -128,11 +128,45 @@ pub(super) async fn unblock(
     Ok(())
 }
 
+/// Drops the results of these snapshots, which are damaged, and has [`restart`] make them again: the tiles
+/// that are not stored any more, the assembly, and the manifest of the job, which tells of all.
+pub(super) async fn undo(
+    connection: &mut SqliteConnection,
+    job: JobId,
+    snapshots: &[i64],
+) -> Result<()> {
+    if snapshots.is_empty() {
+        return Ok(());
+    }
+    for snapshot in snapshots {
+        sql!(
+            "UPDATE tasks SET state = ? WHERE job = ? AND snapshot = ?
+                 AND (kind = 'assemble' OR kind = 'tile' AND result IS NULL)",
+            [TaskState::Cancelled, job, snapshot]
+        )
+        .execute(&mut *connection)
+        .await?;
+        sql!("DELETE FROM result_files WHERE job = ? AND snapshot = ?", [job, snapshot])
+            .execute(&mut *connection)
+            .await?;
+    }
+    sql!("DELETE FROM result_files WHERE job = ? AND snapshot = ?", [job, results::WHOLE_JOB])
+        .execute(&mut *connection)
+        .await?;
+    sql!(
+        "UPDATE tasks SET state = ? WHERE job = ? AND kind = 'manifest'",
+        [TaskState::Cancelled, job]
+    )
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
 /// Has the tasks of a job that were given up or cancelled wait again, as at its start. What is done
 /// stays done.
 pub(super) async fn restart(connection: &mut SqliteConnection, job: JobId) -> Result<()> {
     sql!(
-        "UPDATE tasks SET failures = 0, losses = 0, ready_at = 0,
+        "UPDATE tasks SET failures = 0, losses = 0, starved = 0, ready_at = 0,
              state = CASE kind WHEN 'prepare' THEN ?2 ELSE ?3 END
          WHERE job = ?1 AND state IN (?4, ?5)",
         [job, TaskState::Ready, TaskState::Blocked, TaskState::Failed, TaskState::Cancelled]

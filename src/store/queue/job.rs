@@ -3,11 +3,12 @@
 use sqlx::SqliteConnection;
 
 use super::graph;
-use crate::job::{JobId, JobState, Lab, TaskState};
+use crate::job::{IllegalTransition, JobId, JobState, Lab, TaskState};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::jobs::{self, JobChanges};
-use crate::store::{Store, dir, on_files};
+use crate::store::tables::sums;
+use crate::store::{Store, records};
 
 impl Store {
     /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
@@ -60,13 +61,21 @@ impl Store {
         Ok(())
     }
 
-    /// Takes up a failed or cancelled job again. What is done stays done.
-    /// Errors: [`StoreError::State`] if the job has not failed or been cancelled.
+    /// Takes up a failed or cancelled job again, or one of which results are known to be damaged. What is
+    /// done and sound stays done.
+    /// Errors: [`StoreError::State`] if the job has not failed or been cancelled, and nothing is damaged.
     pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
         let mut transaction = self.write().await?;
+        let from = jobs::state(&mut transaction, id).await?;
+        let damaged = records::damaged_snapshots(&mut transaction, id).await?;
+        if from == JobState::Succeeded && damaged.is_empty() {
+            return Err(IllegalTransition { from, to: JobState::Queued }.into());
+        }
         jobs::set_state(&mut transaction, id, JobState::Queued, None).await?;
+        graph::undo(&mut transaction, id, &damaged).await?;
         graph::restart(&mut transaction, id).await?;
+        sums::recount(&mut transaction, id).await?;
         transaction.commit().await?;
         Ok(())
     }
@@ -87,10 +96,9 @@ impl Store {
         }
         self.drop_tiles(&mut transaction, id).await?;
         sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
-        let folder = self.dir().results(id);
         // Under the lock and before the commit, so that no row is left whose files are gone for
         // longer than a crash takes; a second DELETE then removes the row.
-        on_files(move || dir::remove(&folder)).await?;
+        self.discard(self.dir().results(id)).await?;
         transaction.commit().await?;
         Ok(())
     }

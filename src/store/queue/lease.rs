@@ -1,7 +1,8 @@
 //! How a task is held, and how it and its worker are parted other than by success.
 //!
 //! Two kinds of trouble are counted apart. A *failure* is the task's own doing (an error that the
-//! worker told, a fault that killed it) and a few are enough to give up. A *loss* may be anyone's (a
+//! worker told, a fault that killed it) and a few are enough to give up; so are a few deaths for want of
+//! memory, of which the kernel tells. A *loss* may be anyone's (a
 //! SIGKILL, a power cut, a lease that ran out) and many are borne before the task is held to be the
 //! cause. Both are bounded, so a task that kills its workers comes to an end.
 
@@ -20,8 +21,12 @@ use crate::store::tables::{sums, workers};
 
 /// So many failures of a task, and it is given up, and its job or calibration with it.
 pub const MAX_FAILURES: u32 = 3;
+/// So many deaths for want of memory at a task, and it is given up in the same way.
+pub const MAX_STARVED: u32 = 5;
 /// So many losses of a task, and it is given up in the same way.
 pub const MAX_LOSSES: u32 = 25;
+/// The pause of a task that waits for room on the disk, in milliseconds.
+const POSTPONED: i64 = 10_000;
 /// No lease lasts longer (in milliseconds): one that ends later was given before the clock was set back.
 pub(super) const LONGEST_LEASE: i64 = 600_000;
 
@@ -59,8 +64,10 @@ pub enum Heartbeat {
 pub enum WorkerEnd {
     /// It ended by itself and gave its task back, if it had one.
     Left,
-    /// It was killed from outside (or by the kernel, for memory): the task may be innocent.
+    /// It was killed from outside: the task may be innocent.
     Killed,
+    /// The kernel killed it for want of memory, as this text tells: the task is under suspicion.
+    Starved(String),
     /// It died of a fault, such as SIGSEGV or a panic: the task is under suspicion.
     Crashed(String),
 }
@@ -69,8 +76,12 @@ pub enum WorkerEnd {
 #[derive(Debug)]
 pub(super) enum Loss {
     Released,
+    /// The machine can't do it now: the disk is full.
+    Postponed(String),
     /// The worker was killed or fell silent.
     Lost(String),
+    /// The worker was killed for want of memory.
+    Starved(String),
     Crashed(String),
     /// The worker told an error; true if another attempt could do better.
     Failed(String, bool),
@@ -130,6 +141,12 @@ impl Store {
     /// [`MAX_FAILURES`] times in all; otherwise its job or calibration has failed, for this reason.
     pub async fn fail(&self, lease: &Lease, reason: &str, retryable: bool) -> Result<()> {
         self.part(lease, &Loss::Failed(reason.to_owned(), retryable)).await
+    }
+
+    /// Gives a task back that can't be done now, for a reason that is not its own. It is tried again after a
+    /// pause, as often as need be.
+    pub async fn postpone(&self, lease: &Lease, reason: &str) -> Result<()> {
+        self.part(lease, &Loss::Postponed(reason.to_owned())).await
     }
 
     /// Gives a task back unharmed, as at a shutdown or when its job was cancelled; the attempt does not
@@ -192,6 +209,7 @@ impl Store {
         let loss = match end {
             WorkerEnd::Left => Loss::Released,
             WorkerEnd::Killed => Loss::Lost("the worker process was killed".into()),
+            WorkerEnd::Starved(how) => Loss::Starved(how.clone()),
             WorkerEnd::Crashed(how) => Loss::Crashed(format!("the worker process died: {how}")),
         };
         let mut transaction = self.write().await?;
@@ -258,13 +276,14 @@ pub(super) async fn lose(
     loss: &Loss,
 ) -> Result<()> {
     let row = sql!(
-        "SELECT job, calibration, kind, snapshot, tile, failures, losses FROM tasks WHERE id = ?",
+        "SELECT job, calibration, kind, snapshot, tile, failures, losses, starved FROM tasks WHERE id = ?",
         [task]
     )
     .fetch_one(&mut *connection)
     .await?;
     let owner = tasks::owner(&row)?;
     let (mut failures, mut losses): (u32, u32) = (row.try_get("failures")?, row.try_get("losses")?);
+    let mut starved: u32 = row.try_get("starved")?;
     let wanted = match owner {
         Owner::Job(job) => job::is_wanted(connection, job).await?,
         // Its task would have been deleted with it.
@@ -273,16 +292,18 @@ pub(super) async fn lose(
     let (outcome, reason, mut hopeless) = match loss {
         Loss::Released if wanted => (Outcome::Released, None, false),
         Loss::Released => (Outcome::Cancelled, None, false),
-        Loss::Lost(reason) => (Outcome::Lost, Some(reason.as_str()), false),
+        Loss::Postponed(reason) => (Outcome::Released, Some(reason.as_str()), false),
+        Loss::Lost(reason) | Loss::Starved(reason) => (Outcome::Lost, Some(reason.as_str()), false),
         Loss::Crashed(reason) => (Outcome::Crashed, Some(reason.as_str()), false),
         Loss::Failed(reason, retryable) => (Outcome::Failed, Some(reason.as_str()), !retryable),
     };
     match loss {
-        Loss::Released => {}
+        Loss::Released | Loss::Postponed(_) => {}
         Loss::Lost(_) => losses += 1,
+        Loss::Starved(_) => starved += 1,
         Loss::Crashed(_) | Loss::Failed(..) => failures += 1,
     }
-    hopeless |= failures >= MAX_FAILURES || losses >= MAX_LOSSES;
+    hopeless |= failures >= MAX_FAILURES || losses >= MAX_LOSSES || starved >= MAX_STARVED;
     end_attempt(connection, task, outcome, reason).await?;
     let state = match (wanted, hopeless) {
         (false, _) => TaskState::Cancelled,
@@ -292,13 +313,16 @@ pub(super) async fn lose(
     // After its own failure the task waits: 2, then 4 seconds.
     let ready_at = match loss {
         Loss::Crashed(_) | Loss::Failed(..) => Timestamp::now().0 + (1000 << failures),
+        // Others may need less by then.
+        Loss::Starved(_) => Timestamp::now().0 + (1000 << starved),
+        Loss::Postponed(_) => Timestamp::now().0 + POSTPONED,
         Loss::Released | Loss::Lost(_) => 0,
     };
     sql!(
         "UPDATE tasks SET state = ?, worker = NULL, lease_until = NULL, stage = NULL, fraction = 0,
-             iterations = 0, passes = 0, failures = ?, losses = ?, ready_at = ?
+             iterations = 0, passes = 0, failures = ?, losses = ?, starved = ?, ready_at = ?
          WHERE id = ?",
-        [state, failures, losses, ready_at, task]
+        [state, failures, losses, starved, ready_at, task]
     )
     .execute(&mut *connection)
     .await?;
@@ -306,13 +330,14 @@ pub(super) async fn lose(
     let Owner::Job(job) = owner else { return Ok(()) };
     if state == TaskState::Failed {
         let kind = tasks::kind(&row)?;
-        let error = failure_text(kind, failures, losses, reason.unwrap_or("no reason is known"));
+        let error =
+            failure_text(kind, failures + losses + starved, reason.unwrap_or("no reason is known"));
         job::fail(connection, job, &error).await?;
     }
     job::settle(connection, job).await
 }
 
-fn failure_text(kind: TaskKind, failures: u32, losses: u32, reason: &str) -> String {
+fn failure_text(kind: TaskKind, attempts: u32, reason: &str) -> String {
     let place = match kind {
         TaskKind::Tile { snapshot, tile } => format!("tile {tile} of snapshot {snapshot}"),
         TaskKind::Assemble { snapshot } => format!("assembling snapshot {snapshot}"),
@@ -322,7 +347,6 @@ fn failure_text(kind: TaskKind, failures: u32, losses: u32, reason: &str) -> Str
         TaskKind::Manifest => "writing the manifest".into(),
         TaskKind::Calibration => "the calibration".into(),
     };
-    let attempts = failures + losses;
     let times = if attempts > 1 { format!(" ({attempts} attempts)") } else { String::new() };
     format!("{place}: {reason}{times}")
 }

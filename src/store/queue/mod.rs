@@ -17,6 +17,6 @@ mod remote;
 pub use claim::{CalibrationTask, Claimant, ClaimedTask, JobTask, Work};
 pub use complete::{CalibrationDone, Completion, Product};
 pub(super) use forecast::Forecast;
-pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, WorkerEnd};
+pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, WorkerEnd};
 pub use progress::{Estimate, JobMark, JobProgress, ProgressStage};
 pub use remote::{Begun, MessagePlace, RemoteBeat, RemoteTask};

@@ -8,7 +8,8 @@ use crate::job::{Lab, Sha256, Timestamp, TokenId};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 use crate::store::staging::StagedBlob;
-use crate::store::{Store, dir, on_files};
+use crate::store::tables::quota;
+use crate::store::{Store, on_files};
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
 pub struct Blob {
@@ -55,6 +56,7 @@ pub enum Origin {
 impl Store {
     /// Stores an upload of a lab. Says whether it is new to the lab: that another one has it shows
     /// nowhere. It counts against the limit of the token that sent it first.
+    /// Errors: [`StoreError::Quota`].
     pub async fn store_upload(
         &self,
         lab: &Lab,
@@ -64,20 +66,35 @@ impl Store {
         let sha256 = staged.sha256();
         let mut transaction = self.write().await?;
         let before = held(&mut transaction, lab, sha256).await?;
-        self.publish(&mut transaction, staged, Origin::Upload).await?;
-        let now = Timestamp::now();
+        if before.is_none() {
+            quota::check(&mut transaction, lab, token, staged.size()).await?;
+        }
+        self.hold(&mut transaction, lab, token, staged).await?;
+        let blob = held(&mut transaction, lab, sha256).await?;
+        transaction.commit().await?;
+        let blob = blob.ok_or_else(|| StoreError::missing("blob", sha256))?;
+        Ok((blob, before.is_none()))
+    }
+
+    /// Puts an upload in its place and writes down that the lab has sent it.
+    pub(super) async fn hold(
+        &self,
+        transaction: &mut SqliteConnection,
+        lab: &Lab,
+        token: Option<TokenId>,
+        staged: StagedBlob,
+    ) -> Result<()> {
+        let (sha256, now) = (staged.sha256(), Timestamp::now());
+        self.publish(transaction, staged, Origin::Upload).await?;
         sql!(
             "INSERT INTO holdings (lab, sha256, token, created_at, touched_at)
              VALUES (?, ?, ?, ?, ?)
              ON CONFLICT (lab, sha256) DO UPDATE SET touched_at = excluded.touched_at",
             [lab, sha256, token, now, now]
         )
-        .execute(&mut *transaction)
+        .execute(transaction)
         .await?;
-        let blob = held(&mut transaction, lab, sha256).await?;
-        transaction.commit().await?;
-        let blob = blob.ok_or_else(|| StoreError::missing("blob", sha256))?;
-        Ok((blob, before.is_none()))
+        Ok(())
     }
 
     pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob> {
@@ -147,7 +164,7 @@ impl Store {
             "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)
              VALUES (?, ?, ?, ?, ?)
              ON CONFLICT (sha256) DO UPDATE SET
-                 touched_at = excluded.touched_at,
+                 touched_at = excluded.touched_at, damaged_at = NULL,
                  origin = CASE excluded.origin WHEN 'upload' THEN 'upload' ELSE origin END",
             [sha256, integer(size), origin.to_string(), now, now]
         )
@@ -178,8 +195,7 @@ impl Store {
             return Ok(());
         }
         // Before the commit: after it, another process could put the same content in place.
-        let place = self.dir().blob(&sha256);
-        on_files(move || dir::remove(&place)).await
+        self.discard(self.dir().blob(&sha256)).await
     }
 
     /// Removes the uploads that nothing refers to and nobody has sent since `before`. Says how many.
@@ -206,8 +222,7 @@ impl Store {
         .fetch_all(&mut *transaction)
         .await?;
         for sha256 in &hashes {
-            let place = self.dir().blob(sha256);
-            on_files(move || dir::remove(&place)).await?;
+            self.discard(self.dir().blob(sha256)).await?;
         }
         transaction.commit().await?;
         Ok(hashes.len())

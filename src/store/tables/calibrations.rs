@@ -8,7 +8,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
 use sqlx::{FromRow, Row, SqliteConnection};
 
-use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timestamp};
+use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{
@@ -211,29 +211,42 @@ pub async fn insert_made(
     prepared: Sha256,
     facts: NewCalibration,
 ) -> Result<()> {
-    let request = "SELECT lab, name, created_at FROM calibration_requests WHERE calibration = ?";
-    let (lab, name, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
+    let request =
+        "SELECT lab, token, name, created_at FROM calibration_requests WHERE calibration = ?";
+    let (lab, token, name, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
     // It may have been renamed since the worker began.
     let facts = NewCalibration { name, ..facts };
-    insert(connection, &lab, &Calibration { id, prepared, created_at, facts }).await?;
+    insert(connection, (&lab, token), &Calibration { id, prepared, created_at, facts }).await?;
     sql!("DELETE FROM calibration_captures WHERE calibration = ?", [id])
         .execute(connection)
         .await?;
     Ok(())
 }
 
-/// Writes down what is asked for: masks of captures (as JSON), or without them a report.
+/// What is asked for.
+#[derive(Debug)]
+pub struct Asked<'a> {
+    pub id: CalibrationId,
+    /// Whose limit it counts against.
+    pub token: Option<TokenId>,
+    pub name: Option<&'a Label>,
+    /// Of which masks are to be made; without them a report is.
+    pub captures: Option<&'a Captures>,
+    /// Bytes of the masks that are to be made.
+    pub bytes: u64,
+}
+
+/// Writes down what is asked for.
 pub async fn insert_request(
     connection: &mut SqliteConnection,
     lab: &Lab,
-    id: CalibrationId,
-    name: Option<&Label>,
-    captures: Option<&Captures>,
+    &Asked { id, token, name, captures, bytes }: &Asked<'_>,
 ) -> Result<()> {
     sql!(
-        "INSERT INTO calibration_requests (calibration, lab, name, captures, created_at)
-         VALUES (?, ?, ?, ?, ?)",
-        [id, lab, name, captures.map(Json), Timestamp::now()]
+        "INSERT INTO calibration_requests (calibration, lab, token, name, captures, prepared_bytes,
+             created_at)
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+        [id, lab, token, name, captures.map(Json), integer(bytes), Timestamp::now()]
     )
     .execute(&mut *connection)
     .await?;
@@ -253,16 +266,17 @@ pub async fn insert_request(
 /// Writes the row of a calibration whose masks are there.
 pub async fn insert(
     connection: &mut SqliteConnection,
-    lab: &Lab,
+    (lab, token): (&Lab, Option<TokenId>),
     calibration: &Calibration,
 ) -> Result<()> {
     let facts = &calibration.facts;
     sql!(
-        "INSERT INTO calibrations (lab, id, name, masks, prepared, format, sample, frames, height,
+        "INSERT INTO calibrations (lab, token, id, name, masks, prepared, format, sample, frames, height,
              width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
+            token,
             calibration.id,
             &facts.name,
             facts.masks,

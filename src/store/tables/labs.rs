@@ -1,4 +1,4 @@
-//! Table `labs`: the share of the machine that each has.
+//! Table `labs`: the share of the machine that each has, and its limits.
 
 use serde::Serialize;
 use sqlx::{FromRow, SqliteConnection};
@@ -6,13 +6,17 @@ use sqlx::{FromRow, SqliteConnection};
 use crate::job::Lab;
 use crate::store::Store;
 use crate::store::error::Result;
-use crate::store::rows::{sql, sql_as};
+use crate::store::rows::{integer, sql, sql_as};
 
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct LabRow {
     pub lab: Lab,
     /// Its share of the machine, beside the shares of the others that want it.
     pub share: f64,
+    /// Bytes that it may keep here; none: no limit.
+    pub max_bytes: Option<u64>,
+    /// Jobs that it may have waiting and running; none: no limit of its own.
+    pub max_jobs: Option<u64>,
     /// Jobs that wait and run.
     pub jobs: u64,
     /// Planned CPU-seconds that are left of them.
@@ -29,6 +33,17 @@ pub struct LabUse {
     pub result_bytes: u64,
     /// Jobs that wait and run.
     pub jobs: u64,
+}
+
+/// What a lab is to be entitled to; what is none stays as it is.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Entitlement {
+    /// Above 0.
+    pub share: Option<f64>,
+    /// Bytes, or none for no limit.
+    pub max_bytes: Option<Option<u64>>,
+    /// Jobs, or none for no limit.
+    pub max_jobs: Option<Option<u64>>,
 }
 
 impl Store {
@@ -48,7 +63,7 @@ impl Store {
 
     pub async fn labs(&self) -> Result<Vec<LabRow>> {
         let rows = sqlx::query_as(
-            "SELECT labs.lab, share, count(jobs.id) AS jobs,
+            "SELECT labs.lab, share, max_bytes, max_jobs, count(jobs.id) AS jobs,
                  coalesce(sum(tiles_left + others_left), 0.0) AS cost_left
              FROM labs
              LEFT JOIN jobs ON jobs.lab = labs.lab AND finished_at IS NULL
@@ -58,16 +73,26 @@ impl Store {
         Ok(rows.fetch_all(&self.readers).await?)
     }
 
-    /// Sets a lab's share of the machine, which is above 0. A lab that is not on record yet is put there.
-    pub async fn set_share(&self, lab: &Lab, share: f64) -> Result<()> {
+    /// Sets what a lab is entitled to. A lab that is not on record yet is put there.
+    pub async fn entitle(&self, lab: &Lab, to: Entitlement) -> Result<()> {
+        let mut transaction = self.write().await?;
+        know(&mut transaction, lab).await?;
+        let Entitlement { share, max_bytes, max_jobs } = to;
         sql!(
-            "INSERT INTO labs (lab, share) VALUES (?, ?)
-             ON CONFLICT (lab) DO UPDATE SET share = excluded.share",
-            [lab, share]
+            "UPDATE labs SET share = coalesce(?2, share), max_bytes = iif(?3, ?4, max_bytes),
+                 max_jobs = iif(?5, ?6, max_jobs) WHERE lab = ?1",
+            [
+                lab,
+                share,
+                max_bytes.is_some(),
+                max_bytes.flatten().map(integer),
+                max_jobs.is_some(),
+                max_jobs.flatten().map(integer)
+            ]
         )
-        .execute(&self.writer)
+        .execute(&mut *transaction)
         .await?;
-        Ok(())
+        Ok(transaction.commit().await?)
     }
 }
 

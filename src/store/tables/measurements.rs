@@ -5,7 +5,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
 use sqlx::{Row, SqliteConnection};
 
-use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp};
+use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp, TokenId};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Filter, Page, integer, list, number, refuse_if_used, sql, sql_scalar};
@@ -124,17 +124,18 @@ impl Store {
 
 pub async fn insert(
     connection: &mut SqliteConnection,
-    lab: &Lab,
+    (lab, token): (&Lab, Option<TokenId>),
     measurement: &Measurement,
 ) -> Result<()> {
     let facts = &measurement.facts;
     sql!(
-        "INSERT INTO measurements (lab, id, name, calibration, data, prepared, format, sample,
+        "INSERT INTO measurements (lab, token, id, name, calibration, data, prepared, format, sample,
              snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings,
              created_at)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
+            token,
             measurement.id,
             &facts.name,
             facts.calibration,

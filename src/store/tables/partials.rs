@@ -12,6 +12,7 @@ use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 use crate::store::tables::keys::{self, Inserted, RequestKey, UPLOAD};
+use crate::store::tables::quota;
 use crate::store::{Store, dir, on_files};
 
 #[derive(Debug, Clone, FromRow)]
@@ -40,6 +41,12 @@ pub struct Partial {
     /// When it is given up if nothing more comes.
     pub expires_at: Timestamp,
 }
+
+/// Bytes that are reserved for an upload of which little has come. More are as it grows, so that nobody takes
+/// the disk by an announcement.
+pub const FIRST_RESERVE: u64 = 64 << 20;
+/// How long an upload is kept of which nothing has come.
+const EMPTY: Duration = Duration::from_secs(3600);
 
 /// The file of a partial upload and its row, for one request alone: the lock of the file is held until
 /// this is dropped, over data and row, so that nobody appends at an offset that is no longer true.
@@ -123,8 +130,8 @@ fn lock(path: &Path) -> Result<Lock> {
 }
 
 impl Store {
-    /// Begins an upload, which is given up when nothing more has come for `age`.
-    /// Errors: [`StoreError::KeyReused`].
+    /// Begins an upload, which is given up when nothing more has come for `age`; sooner if nothing has at all.
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::Quota`]; [`StoreError::ManyPartials`].
     pub async fn begin_partial(
         &self,
         facts: NewPartial,
@@ -132,9 +139,10 @@ impl Store {
         key: Option<&RequestKey>,
     ) -> Result<Inserted<PartialId>> {
         let id = PartialId::new();
-        let expires_at = after(age);
+        let expires_at = after(age.min(EMPTY));
         let path = self.dir().partial(id);
         // Locked until its row is there, so that it is nobody's for no moment.
+        let made = path.clone();
         let _lock = on_files(move || {
             let file = File::create_new(&path).map_err(StoreError::io("make", &path))?;
             file.lock().map_err(StoreError::io("lock", &path))?;
@@ -142,13 +150,26 @@ impl Store {
             Ok(file)
         })
         .await?;
+        let written = self.write_partial(id, &facts, expires_at, key).await;
+        if !matches!(written, Ok(Inserted::New(_))) {
+            on_files(move || dir::remove(&made)).await?;
+        }
+        written
+    }
+
+    async fn write_partial(
+        &self,
+        id: PartialId,
+        facts: &NewPartial,
+        expires_at: Timestamp,
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<PartialId>> {
         let mut transaction = self.write().await?;
         if let Some(before) = keys::found(&mut transaction, &facts.lab, UPLOAD, key).await? {
-            drop(transaction);
-            let path = self.dir().partial(id);
-            on_files(move || dir::remove(&path)).await?;
             return Ok(Inserted::Before(before));
         }
+        quota::check_partials(&mut transaction, &facts.lab).await?;
+        quota::check(&mut transaction, &facts.lab, facts.token, facts.length).await?;
         sql!(
             "INSERT INTO partials (id, lab, token, length, metadata, expected, expires_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -187,14 +208,11 @@ impl Store {
         Ok(Page::cut(items, limit))
     }
 
-    /// The lab's upload with this identifier, unless it has expired.
+    /// The lab's upload with this identifier, also if it has expired and was not removed yet.
     pub async fn partial(&self, lab: &Lab, id: PartialId) -> Result<Partial> {
-        let partial = sql_as!(
-            "SELECT * FROM partials WHERE id = ? AND lab = ? AND expires_at > ?",
-            [id, lab, Timestamp::now()]
-        )
-        .fetch_optional(&self.readers)
-        .await?;
+        let partial = sql_as!("SELECT * FROM partials WHERE id = ? AND lab = ?", [id, lab])
+            .fetch_optional(&self.readers)
+            .await?;
         partial.ok_or_else(|| StoreError::missing("upload", id))
     }
 
@@ -274,10 +292,13 @@ impl Store {
             self.end_partial(upload.id).await?;
             return Err(StoreError::HashMismatch { expected, found });
         }
-        self.store_upload(&upload.facts.lab, upload.facts.token, staged).await?;
+        // Its bytes were counted from its announcement on: no limit is asked again.
+        let mut transaction = self.write().await?;
+        self.hold(&mut transaction, &upload.facts.lab, upload.facts.token, staged).await?;
         sql!("UPDATE partials SET result = ? WHERE id = ?", [found, upload.id])
-            .execute(&self.writer)
+            .execute(&mut *transaction)
             .await?;
+        transaction.commit().await?;
         on_files(move || dir::remove(&path)).await?;
         upload.result = Some(found);
         Ok(upload)
@@ -301,9 +322,16 @@ impl Store {
         on_files(move || dir::remove(&path)).await
     }
 
-    /// Ends the uploads that have expired, but none to which a piece is being written. Says how many.
-    pub async fn expire_partials(&self) -> Result<usize> {
-        let due = sql_scalar!("SELECT id FROM partials WHERE expires_at <= ?", [Timestamp::now()]);
+    /// Ends the uploads that have expired, but none to which a piece is being written, nor one that only a clock
+    /// that was wrong made old. Says how many. `age` is how long an upload is kept after its last piece.
+    pub async fn expire_partials(&self, age: Duration) -> Result<usize> {
+        let empty = age.min(EMPTY);
+        // What ends now began its age so long ago.
+        let (last_empty, last) = (self.ago(empty).await?, self.ago(age).await?);
+        let due = sql_scalar!(
+            "SELECT id FROM partials WHERE expires_at <= iif(received = 0, ?, ?)",
+            [later(last_empty, empty), later(last, age)]
+        );
         let mut ended = 0;
         for id in due.fetch_all(&self.readers).await? {
             let path = self.dir().partial(id);
@@ -324,16 +352,20 @@ impl Store {
         Ok(ended)
     }
 
-    /// Bytes of the disk that were promised and are not written: the rest of uploads in pieces, and
-    /// of jobs what is not assembled.
+    /// Bytes of the disk that were promised and are not written: the next ones of uploads in pieces, masks
+    /// that are made of captures (twice, as they are scaled at the end), and of jobs what is not assembled.
     pub async fn promised_bytes(&self) -> Result<u64> {
         let bytes: f64 = sql_scalar!(
-            "SELECT (SELECT coalesce(sum(length - received), 0) FROM partials WHERE result IS NULL)
+            "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
+                     FROM partials WHERE result IS NULL)
+                  + (SELECT coalesce(sum(2 * prepared_bytes), 0)
+                     FROM calibration_requests JOIN tasks USING (calibration)
+                     WHERE tasks.state NOT IN (?1, 'failed'))
                   + (SELECT coalesce(sum(disk_bytes * (
-                         SELECT count(*) FILTER (WHERE state <> ?) * 1.0 / count(*)
+                         SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
                          FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
                      FROM jobs WHERE finished_at IS NULL)",
-            [TaskState::Done]
+            [TaskState::Done, integer(FIRST_RESERVE)]
         )
         .fetch_one(&self.readers)
         .await?;
@@ -343,8 +375,12 @@ impl Store {
 }
 
 fn after(age: Duration) -> Timestamp {
+    later(Timestamp::now(), age)
+}
+
+fn later(moment: Timestamp, age: Duration) -> Timestamp {
     let age = i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2);
-    Timestamp(Timestamp::now().0.saturating_add(age))
+    Timestamp(moment.0.saturating_add(age))
 }
 
 fn short(upload: &Partial, found: u64) -> StoreError {

@@ -11,7 +11,7 @@ use crate::store::rows::{integer, sql};
 use crate::store::{Job, Store};
 
 /// The snapshot of files that belong to the whole job.
-const WHOLE_JOB: i64 = -1;
+pub(in crate::store) const WHOLE_JOB: i64 = -1;
 
 impl Store {
     /// A result file of a snapshot (or, with none, of the whole job), and where it lies.

@@ -1,11 +1,12 @@
 //! Table `tokens`: who may come in.
 
-use sqlx::{FromRow, Row};
+use sqlx::FromRow;
 
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{integer, sql, sql_as, sql_scalar};
+use crate::store::rows::{integer, sql, sql_as};
+use crate::store::tables::quota;
 
 /// A token on record, without the secret.
 #[derive(Debug, Clone, PartialEq, Eq, FromRow)]
@@ -16,7 +17,7 @@ pub struct Token {
     pub role: Role,
     /// Whom it was given to.
     pub note: Option<Label>,
-    /// Bytes of uploads that it may keep here; none: no limit.
+    /// Bytes of uploads, and of what is prepared of them, that it may keep here; none: no limit.
     pub max_bytes: Option<u64>,
     pub created_at: Timestamp,
     pub revoked_at: Option<Timestamp>,
@@ -49,18 +50,22 @@ impl Store {
         Ok(sql_as!(token, [secret.hash()]).fetch_optional(&self.readers).await?)
     }
 
+    /// Whether a token still opens anything.
+    pub async fn token_holds(&self, id: TokenId) -> Result<bool> {
+        let token = "SELECT 1 FROM tokens WHERE id = ? AND revoked_at IS NULL";
+        Ok(sql!(token, [id]).fetch_optional(&self.readers).await?.is_some())
+    }
+
     /// All tokens, oldest first, each with the bytes that it keeps here.
     pub async fn tokens(&self) -> Result<Vec<(Token, u64)>> {
-        let rows = sqlx::query(
-            "SELECT *, (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                        WHERE token = tokens.id)
-                    + (SELECT coalesce(sum(length), 0) FROM partials
-                       WHERE token = tokens.id AND result IS NULL) AS bytes
-             FROM tokens ORDER BY id",
-        )
-        .fetch_all(&self.readers)
-        .await?;
-        rows.iter().map(|row| Ok((Token::from_row(row)?, row.try_get("bytes")?))).collect()
+        let tokens: Vec<Token> =
+            sqlx::query_as("SELECT * FROM tokens ORDER BY id").fetch_all(&self.readers).await?;
+        let mut listed = Vec::with_capacity(tokens.len());
+        for token in tokens {
+            let bytes = quota::token_bytes(&mut *self.readers.acquire().await?, token.id).await?;
+            listed.push((token, bytes));
+        }
+        Ok(listed)
     }
 
     /// Revokes a token, for ever. A second time changes nothing.
@@ -82,19 +87,5 @@ impl Store {
     pub async fn is_open(&self) -> Result<bool> {
         let row = sqlx::query("SELECT 1 FROM tokens LIMIT 1").fetch_optional(&self.readers).await?;
         Ok(row.is_none())
-    }
-
-    /// Bytes of uploads that a token keeps here, or has begun.
-    pub async fn token_bytes(&self, id: TokenId) -> Result<u64> {
-        let bytes = sql_scalar!(
-            "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                     WHERE token = ?1)
-                  + (SELECT coalesce(sum(length), 0) FROM partials
-                     WHERE token = ?1 AND result IS NULL)",
-            [id]
-        )
-        .fetch_one(&self.readers)
-        .await?;
-        Ok(bytes)
     }
 }

@@ -46,7 +46,8 @@ impl Lab {
         };
         let lab = crate::job::Lab::local();
         let name = "optics of May".parse().unwrap();
-        self.store.add_captures(&lab, Some(&name), &captures, None).await.unwrap().id()
+        let captures = (&captures, 1);
+        self.store.add_captures((&lab, None), Some(&name), captures, None).await.unwrap().id()
     }
 
     async fn unready(&self, id: CalibrationId) -> Option<Unready> {
@@ -198,7 +199,8 @@ async fn captures_that_are_gone_are_named() {
         patterns: None,
         saturation: None,
     };
-    let refused = lab.store.add_captures(&crate::job::Lab::local(), None, &captures, None).await;
+    let whose = (&crate::job::Lab::local(), None);
+    let refused = lab.store.add_captures(whose, None, (&captures, 1), None).await;
     assert!(matches!(refused, Err(StoreError::NotFound { what: "blob", id })
         if id == gone.to_string()));
     assert!(lab.claim().await.is_none());

@@ -2,7 +2,7 @@
 
 use super::{Lab, tile};
 use crate::job::{JobState, TaskKind, TaskProgress};
-use crate::store::{Heartbeat, MAX_FAILURES, MAX_LOSSES, WorkerEnd};
+use crate::store::{Heartbeat, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, WorkerEnd};
 
 #[tokio::test]
 async fn an_error_that_no_repetition_helps_fails_the_job_at_once() {
@@ -34,6 +34,26 @@ async fn a_task_that_crashes_its_workers_is_given_up() {
     }
     let error = lab.store.job(&crate::job::Lab::local(), job).await.unwrap().error.unwrap();
     assert_eq!(error, "preparing: the worker process died: signal 11 (3 attempts)");
+}
+
+#[tokio::test]
+async fn a_task_that_takes_all_memory_is_given_up_and_one_without_room_is_not() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    for _ in 0..30 {
+        lab.skip_pauses().await;
+        let task = lab.claim().await.unwrap();
+        lab.store.postpone(&task.lease, "no space left on device").await.unwrap();
+    }
+    assert_eq!(lab.state(job).await, JobState::Running);
+    for _ in 0..MAX_STARVED {
+        lab.skip_pauses().await;
+        lab.claim().await.unwrap();
+        let end = WorkerEnd::Starved("the machine had no memory left for it".into());
+        lab.store.worker_ended(lab.worker, &end).await.unwrap();
+    }
+    let error = lab.store.job(&crate::job::Lab::local(), job).await.unwrap().error.unwrap();
+    assert_eq!(error, "preparing: the machine had no memory left for it (5 attempts)");
 }
 
 #[tokio::test]

@@ -2,6 +2,7 @@
 
 use super::{Lab, id};
 use crate::job::{Algorithm, JobId, TaskKind};
+use crate::store::Entitlement;
 
 fn named(name: &str) -> crate::job::Lab {
     name.parse().unwrap()
@@ -55,7 +56,8 @@ async fn a_lab_with_one_job_does_not_wait_for_all_jobs_of_another() {
 #[tokio::test]
 async fn a_share_is_a_share_of_what_is_computed() {
     let lab = Lab::new().await;
-    lab.store.set_share(&named("second"), 3.0).await.unwrap();
+    let to = Entitlement { share: Some(3.0), ..Entitlement::default() };
+    lab.store.entitle(&named("second"), to).await.unwrap();
     let first = lab.submit_for("first", 0).await;
     let second = lab.submit_for("second", 0).await;
     // Until tiles alone are left, of which each lab has four that cost the same.

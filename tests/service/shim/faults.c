@@ -2,9 +2,9 @@
  *
  * FAULT_PROGRAM  the first argument of the programs that are meant: serve or worker
  * FAULT_AT       the number of the file operation that goes wrong, from 1
- * FAULT_KIND     kill: the process dies before the operation; full: it and the next writes of the
- *                process fail for want of space
- * FAULT_TOKEN    a file; the process that removes it has the fault, so that there is one
+ * FAULT_KIND     kill: the process dies before the operation; stop: it is suspended; full: it and the
+ *                next writes of the process fail for want of space
+ * FAULT_TOKEN    a file of one byte; the process that sets it to 1 has the fault, so that there is one
  * FAULT_FULL     a file; as long as it is there, nothing can be written
  * FAULT_CLOCK    a file of 8 bytes, seconds that the wall clock is off
  */
@@ -24,9 +24,10 @@
 #include <unistd.h>
 
 static long at = -1;
-static int kind_full, failing;
+static int kind_full, kind_stop, failing;
 static atomic_long count;
-static const char *token, *full;
+static const char *full;
+static volatile char *token;
 static volatile long long *skew;
 
 static int meant(const char *program) {
@@ -42,9 +43,16 @@ static int meant(const char *program) {
 __attribute__((constructor)) static void begin(void) {
     const char *program = getenv("FAULT_PROGRAM"), *number = getenv("FAULT_AT");
     const char *kind = getenv("FAULT_KIND"), *clock = getenv("FAULT_CLOCK");
-    token = getenv("FAULT_TOKEN");
+    if (getenv("FAULT_TOKEN")) {
+        /* Open from the start: later the program may give up the right to. */
+        int file = open(getenv("FAULT_TOKEN"), O_RDWR);
+        void *page = mmap(NULL, 1, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+        if (page != MAP_FAILED) token = page;
+        close(file);
+    }
     full = getenv("FAULT_FULL");
     kind_full = kind && strcmp(kind, "full") == 0;
+    kind_stop = kind && strcmp(kind, "stop") == 0;
     if (number && program && meant(program)) at = atol(number);
     if (clock) {
         int file = open(clock, O_RDONLY);
@@ -64,9 +72,9 @@ static int fault(int writes) {
     if (writes && full && access(full, F_OK) == 0) return 1;
     if (at < 0) return 0;
     long now = atomic_fetch_add(&count, 1) + 1;
-    if (now == at && unlink(token) == 0) {
-        if (!kind_full) kill(getpid(), SIGKILL);
-        failing = 1;
+    if (now == at && token && __sync_bool_compare_and_swap(token, 0, 1)) {
+        if (!kind_full) kill(getpid(), kind_stop ? SIGSTOP : SIGKILL);
+        failing = kind_full;
     }
     return failing && now < at + 8 && writes;
 }
@@ -107,9 +115,19 @@ int mkdir(const char *path, mode_t mode) {
     if (fault(1)) FAIL;
     return real(path, mode);
 }
+int link(const char *from, const char *to) {
+    REAL(link);
+    if (fault(1)) FAIL;
+    return real(from, to);
+}
+int linkat(int from_folder, const char *from, int to_folder, const char *to, int flags) {
+    REAL(linkat);
+    if (fault(1)) FAIL;
+    return real(from_folder, from, to_folder, to, flags);
+}
 int unlink(const char *path) {
     REAL(unlink);
-    if (!token || strcmp(path, token) != 0) fault(0);
+    fault(0);
     return real(path);
 }
 int clock_gettime(clockid_t clock, struct timespec *now) {

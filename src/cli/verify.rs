@@ -1,0 +1,38 @@
+//! `sci-recon verify`: compares the records of a data folder, or of a copy, with the disk.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::CliError;
+use crate::cli::error::Result;
+use crate::store::{Audit, Purpose, Store};
+
+/// Compares all that is on record with the disk: every file's hash, and the database with itself. The folder
+/// may be a service's that runs, or a backup. Changes nothing. Ends with 1 if something is damaged or missing.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Folder of a service's data, or a backup of one.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    data: PathBuf,
+}
+
+/// Looks, and prints what was found as one JSON line.
+pub fn run(arguments: &Arguments) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
+    let audit = runtime.block_on(async {
+        let store = Store::open(&arguments.data, Purpose::Use).await?;
+        let audit = store.verify().await?;
+        store.close().await;
+        Ok::<_, CliError>(audit)
+    })?;
+    let good = audit.is_good();
+    let Audit { files, bytes, database, damaged, missing, unknown } = audit;
+    let found = serde_json::json!({
+        "files": files, "bytes": bytes, "database": database, "damaged": damaged,
+        "missing": missing, "unknown": unknown,
+    });
+    println!("{found}");
+    if good { Ok(()) } else { Err(CliError::Failure("the data are damaged".into())) }
+}

@@ -1,0 +1,205 @@
+//! What stands in the headers of requests is honoured, and trouble of the machine is told as what it is.
+
+use std::os::unix::fs::PermissionsExt;
+use std::time::{Duration, Instant};
+
+use reqwest::{Method, RequestBuilder};
+use serde_json::json;
+use sqlx::Connection;
+
+use crate::app::TestApp;
+use crate::crashes::Shim;
+use crate::faults::sha256;
+use crate::samples::Scene;
+
+/// SHA-256 of "abc" in base64.
+const ABC: &str = "sha-256=:ungWv48Bz+pBQUDeXa4iI7ADYaOWF3qctBD/YfIAFa0=:";
+const OTHER: &str = "sha-256=:AAAWv48Bz+pBQUDeXa4iI7ADYaOWF3qctBD/YfIAFa0=:";
+
+#[tokio::test]
+async fn if_match_names_the_state_that_is_meant() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let frames = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
+    for path in [frames.clone(), format!("/v1/jobs/{job}")] {
+        let etag = app.get(&path).await.expect(200).header("etag").to_owned();
+        let with = |tag: &str| app.request(Method::GET, &path).header("if-match", tag);
+        app.send(with(&etag)).await.expect(200);
+        app.send(with("*")).await.expect(200);
+        app.send(with("\"old\"")).await.problem(412, "precondition_failed");
+    }
+    let delete = app.request(Method::DELETE, &format!("/v1/jobs/{job}"));
+    app.send(delete.header("if-match", "\"old\"")).await.problem(412, "precondition_failed");
+    // A HEAD has no ranges (RFC 9110, 14.2).
+    let head = app.request(Method::HEAD, &frames).header("range", "bytes=0-9");
+    let head = app.send(head).await.expect(200);
+    let whole = app.get(&frames).await.expect(200).bytes.len();
+    assert_eq!(head.header("content-length"), whole.to_string());
+    let part = app.request(Method::GET, &frames).header("range", "bytes=0-9");
+    assert_eq!(app.send(part).await.expect(206).bytes.len(), 10);
+}
+
+#[tokio::test]
+async fn a_body_is_what_its_headers_say() {
+    let app = TestApp::start().await;
+    let post = || app.request(Method::POST, "/v1/blobs").body("abc");
+    let hash = sha256(b"abc");
+    let put = || app.request(Method::PUT, &format!("/v1/blobs/{hash}")).body("abc");
+    for (name, value) in [("content-encoding", "gzip"), ("content-encoding", "identity, br")] {
+        for request in [post(), put()] {
+            let refused = app.send(request.header(name, value)).await;
+            assert!(
+                refused.problem(415, "unsupported_media_type").contains("gzip") || value != "gzip"
+            );
+            assert_eq!(refused.header("accept-encoding"), "identity");
+        }
+    }
+    let digest = |request: RequestBuilder, value: &str| request.header("content-digest", value);
+    app.send(digest(post(), OTHER)).await.problem(422, "hash_mismatch");
+    app.send(digest(put(), OTHER)).await.problem(422, "hash_mismatch");
+    app.send(digest(post(), "sha-256=:x:")).await.problem(400, "malformed_request");
+    app.get(&format!("/v1/blobs/{hash}")).await.problem(404, "not_found");
+    app.send(digest(post(), &format!("sha-512=:AA==:, {ABC}"))).await.expect(201);
+    app.send(digest(put(), ABC)).await.expect(200);
+    let json = |value: &str| {
+        let request = app.request(Method::POST, "/v1/calibrations").json(&json!({"masks": hash}));
+        digest(request, value)
+    };
+    app.send(json(OTHER)).await.problem(422, "hash_mismatch");
+    let zipped = app.request(Method::POST, "/v1/jobs").json(&json!({}));
+    app.send(zipped.header("content-encoding", "gzip"))
+        .await
+        .problem(415, "unsupported_media_type");
+    // Of a piece it is a checksum.
+    let tus = |method, path: &str| app.request(method, path).header("tus-resumable", "1.0.0");
+    let begun = app.send(tus(Method::POST, "/v1/uploads").header("upload-length", 3)).await;
+    let path = begun.expect(201).header("location").to_owned();
+    let piece = || {
+        let kind = "application/offset+octet-stream";
+        let request = tus(Method::PATCH, &path).header("upload-offset", 0).body("abc");
+        request.header("content-type", kind)
+    };
+    app.send(digest(piece(), OTHER)).await.problem(460, "checksum_mismatch");
+    app.send(digest(piece(), ABC)).await.expect(204);
+}
+
+#[tokio::test]
+async fn a_busy_database_is_no_fault_of_the_service() {
+    let app = TestApp::with(&["--workers", "0", "--request-seconds", "60"]).await;
+    let mut database = app.database().await;
+    let lock = database.begin_with("BEGIN IMMEDIATE").await.unwrap();
+    let busy = app.send(app.request(Method::POST, "/v1/blobs").body("abc")).await;
+    busy.problem(503, "unavailable");
+    assert!(!busy.header("retry-after").is_empty());
+    lock.rollback().await.unwrap();
+    app.upload(b"abc".to_vec()).await;
+}
+
+#[tokio::test]
+async fn the_folder_is_its_owners() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data");
+    std::fs::create_dir(&data).unwrap();
+    std::fs::set_permissions(&data, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let app = TestApp::on(folder, "data", &["--workers", "0"]).await;
+    let mode = |name: &str| {
+        let path = app.data().join(name);
+        std::fs::metadata(path).unwrap().permissions().mode() & 0o777
+    };
+    assert_eq!((mode(""), mode("sci-recon.db")), (0o700, 0o600));
+}
+
+#[tokio::test]
+async fn readiness_is_tried_and_not_guessed() {
+    let shim = Shim::build();
+    let full = shim.file("full");
+    let faults = [("FAULT_FULL", full.to_str().unwrap())];
+    let mut app = shim.service(&["--workers", "1"], &faults).await;
+    let start = Instant::now();
+    while app.get("/readyz").await.status != 200 {
+        assert!(start.elapsed().as_secs() < 60);
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    // Nothing can be written, though bytes are free: a read-only disk, or one without inodes.
+    std::fs::write(&full, "").unwrap();
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    let ready = app.get("/readyz").await.expect(503).json();
+    assert!(ready["disk"].as_str().unwrap().contains("no file can be written"), "{ready}");
+    std::fs::remove_file(&full).unwrap();
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    app.get("/readyz").await.expect(200);
+    // A page of the database is overwritten by something else: one without which the service starts.
+    app.stop();
+    let path = app.data().join("sci-recon.db");
+    let whole = std::fs::read(&path).unwrap();
+    let mut found = false;
+    for page in (whole.len() / 8192..whole.len() / 4096).rev().step_by(3) {
+        let mut bytes = whole.clone();
+        bytes[page * 4096..page * 4096 + 64].fill(0xa5);
+        std::fs::write(&path, bytes).unwrap();
+        if !app.revive() {
+            continue;
+        }
+        let start = Instant::now();
+        let said = loop {
+            let ready = app.get("/readyz").await.json();
+            if ready["database"] != "ok" || start.elapsed().as_secs() > 20 {
+                break ready["database"].as_str().unwrap().to_owned();
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        };
+        assert!(said != "ok", "page {page} is damaged, and the database is {said}");
+        found = true;
+        app.kill();
+    }
+    assert!(found, "the service starts with no damage at all");
+}
+
+#[tokio::test]
+async fn a_clock_that_is_set_right_deletes_nothing_young() {
+    let shim = Shim::build();
+    let clock = shim.file("clock");
+    let year: i64 = 365 * 86_400;
+    std::fs::write(&clock, (-year).to_le_bytes()).unwrap();
+    let faults = [("FAULT_CLOCK", clock.to_str().unwrap())];
+    let mut app = shim.service(&["--workers", "0", "--job-days", "1"], &faults).await;
+    let upload = app.upload(b"sent a moment ago".to_vec()).await;
+    let begin = app.request(Method::POST, "/v1/uploads").header("tus-resumable", "1.0.0");
+    let begun = app.send(begin.header("upload-length", 10)).await.expect(201);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
+    // The next server has the right time, and cleans at its start.
+    app.restart();
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    app.get(&format!("/v1/blobs/{upload}")).await.expect(200);
+    app.get(&format!("/v1/jobs/{job}")).await.expect(200);
+    let place = begun.header("location").to_owned();
+    let head = app.request(Method::HEAD, &place).header("tus-resumable", "1.0.0");
+    app.send(head).await.expect(200);
+}
+
+#[tokio::test]
+async fn deleting_a_large_job_holds_up_nobody() {
+    let app = TestApp::start().await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
+    let folder = app.data().join("results").join(&job).join("snapshot_0000/frames");
+    std::fs::create_dir_all(&folder).unwrap();
+    for number in 0..60_000 {
+        std::fs::write(folder.join(number.to_string()), "").unwrap();
+    }
+    let start = Instant::now();
+    app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
+    let took = start.elapsed();
+    assert!(!app.data().join("results").join(&job).exists());
+    let start = Instant::now();
+    while std::fs::read_dir(app.data().join("tmp")).unwrap().count() > 0 {
+        assert!(start.elapsed().as_secs() < 60, "the files stay");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    eprintln!("the delete took {took:?}, its files {:?} more", start.elapsed());
+}

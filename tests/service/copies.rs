@@ -1,0 +1,274 @@
+//! Copies of everything, and what is found damaged: nothing wrong is served, and what can be made again is.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use rand::Rng;
+use serde_json::{Value, json};
+
+use crate::app::TestApp;
+use crate::crashes::Shim;
+use crate::faults::{results, sha256};
+use crate::samples::Scene;
+
+fn quick(measurement: &str) -> Value {
+    json!({
+        "measurement": measurement,
+        "algorithm": "gap-tv",
+        "tile": {"size": 48, "overlap": 8},
+        "schedule": {"stages": [{"prior": "tv", "iterations": 20, "tv_weight": 0.05}]},
+    })
+}
+
+/// Turns a bit in the middle; `seen` says whether the time of the last change shows it.
+fn turn_a_bit(path: &Path, seen: bool) {
+    use std::os::unix::fs::FileExt;
+    let file = std::fs::File::options().read(true).write(true).open(path).unwrap();
+    let meta = file.metadata().unwrap();
+    let (mut byte, middle) = ([0], meta.len() / 2);
+    file.read_exact_at(&mut byte, middle).unwrap();
+    file.write_all_at(&[byte[0] ^ 0x10], middle).unwrap();
+    if !seen {
+        file.set_modified(meta.modified().unwrap()).unwrap();
+    }
+}
+
+fn command(name: &str, data: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.arg(name).arg("--data").arg(data);
+    command
+}
+
+/// What a command says of a folder, and whether it ended well.
+fn figures(output: &Output) -> (bool, Value) {
+    let said = String::from_utf8_lossy(&output.stderr);
+    let figures = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{said}"));
+    (output.status.success(), figures)
+}
+
+fn verify(data: &Path) -> (bool, Value) {
+    figures(&command("verify", data).output().unwrap())
+}
+
+/// What `serve` says of a folder that it refuses.
+fn refused(data: &Path) -> String {
+    let mut serve = command("serve", data);
+    serve.args(["--listen", "127.0.0.1:0", "--workers", "0", "--accept-database"]);
+    let mut child = serve.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let start = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if start.elapsed().as_secs() > 30 {
+            child.kill().unwrap();
+            panic!("{} is served", data.display());
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let output = child.wait_with_output().unwrap();
+    assert!(!output.status.success());
+    String::from_utf8(output.stderr).unwrap()
+}
+
+async fn done(app: &TestApp) -> (String, String) {
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&quick(&measurement)).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    (measurement, job)
+}
+
+fn frames_of(app: &TestApp, job: &str) -> PathBuf {
+    app.data().join("results").join(job).join("snapshot_0000/frames.npy")
+}
+
+#[tokio::test]
+async fn a_damaged_result_is_not_served_and_is_made_again() {
+    let app = TestApp::with(&["--workers", "1", "--scrub-bytes", "0"]).await;
+    let (_, job) = done(&app).await;
+    let before = results(&app, &job).await;
+    let path = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
+    let etag = app.get(&path).await.expect(200).header("etag").to_owned();
+    let address = format!("/v1/jobs/{job}/retry");
+    let retry = async || app.post(&address, &json!({})).await;
+    let detail = retry().await.problem(409, "illegal_state");
+    assert!(detail.contains("succeeded"), "{detail}");
+
+    turn_a_bit(&frames_of(&app, &job), true);
+    let detail = app.get(&path).await.problem(500, "file_damaged");
+    assert!(detail.contains("frames.npy") && detail.contains("retry"), "{detail}");
+    let range = app.request(reqwest::Method::GET, &path).header("range", "bytes=0-9");
+    app.send(range).await.problem(500, "file_damaged");
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/pictures/frame-1"))
+        .await
+        .problem(500, "file_damaged");
+    // What is sound is served, and who has the right bytes learns that they are right.
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/stack.exr")).await.expect(200);
+    let known = app.request(reqwest::Method::GET, &path).header("if-none-match", &etag);
+    app.send(known).await.expect(304);
+    let (good, found) = verify(app.data());
+    assert!(!good);
+    assert_eq!(found["damaged"].as_array().unwrap().len(), 1, "{found}");
+
+    retry().await.expect(202);
+    app.get(&path).await.problem(404, "not_ready");
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert_eq!(results(&app, &job).await, before, "the same frames again");
+    let again = app.get(&path).await.expect(200);
+    assert_eq!(
+        (again.header("etag"), format!("\"{}\"", sha256(&again.bytes))),
+        (&*etag, etag.clone())
+    );
+    // A file that is gone is told in the same way.
+    std::fs::remove_file(frames_of(&app, &job)).unwrap();
+    app.get(&path).await.problem(500, "file_damaged");
+    retry().await.expect(202);
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert_eq!(results(&app, &job).await, before);
+    let (good, found) = verify(app.data());
+    assert!(good, "{found}");
+}
+
+#[tokio::test]
+async fn a_damaged_upload_is_not_computed_with() {
+    let app = TestApp::start().await;
+    let masks = app.upload(Scene::SMALL.masks()).await;
+    turn_a_bit(&app.data().join("blobs").join(&masks[..2]).join(&masks[2..]), true);
+    let answer = app.post("/v1/calibrations", &json!({ "masks": masks })).await;
+    assert!(answer.problem(410, "upload_damaged").contains(&masks));
+    assert_eq!(answer.json()["pointer"], "/masks");
+    // Sent again, it is whole.
+    app.calibrate(Scene::SMALL.masks()).await.expect(201);
+}
+
+#[tokio::test]
+async fn the_slow_look_finds_what_the_disk_has_changed_by_itself() {
+    let app = TestApp::with(&["--workers", "1", "--scrub-bytes", "0"]).await;
+    let (_, job) = done(&app).await;
+    let path = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
+    let app = app.again(&["--workers", "0", "--scrub-bytes", "1000000000"]).await;
+    app.get(&path).await.expect(200);
+    // The first look may be over: a day is set back.
+    let mut database = app.database().await;
+    turn_a_bit(&frames_of(&app, &job), false);
+    let start = Instant::now();
+    loop {
+        let again = "UPDATE scrub SET started_at = started_at - 86400001, place = NULL";
+        sqlx::query(again).execute(&mut database).await.unwrap();
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        let figures = app.get("/metrics").await.expect(200).bytes;
+        if String::from_utf8(figures).unwrap().contains("\nsci_recon_damaged_files 1\n") {
+            break;
+        }
+        assert!(start.elapsed().as_secs() < 60, "the turned bit is not found");
+    }
+    app.get(&path).await.problem(500, "file_damaged");
+    app.get(&format!("/v1/jobs/{job}/snapshots/1/frames.npy")).await.expect(200);
+}
+
+#[tokio::test]
+async fn what_is_missing_is_named_by_a_copy_and_by_verify() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, job) = done(&app).await;
+    let masks = app.upload(b"a file that goes".to_vec()).await;
+    let folder = tempfile::tempdir().unwrap();
+    let back_up = |name: &str| {
+        let out = folder.path().join(name);
+        figures(&command("backup", app.data()).arg("--out").arg(&out).output().unwrap())
+    };
+    let (good, found) = back_up("whole");
+    assert!(good && found["missing"] == json!([]), "{found}");
+    assert!(verify(&folder.path().join("whole")).0);
+    let blob = format!("blobs/{}/{}", &masks[..2], &masks[2..]);
+    std::fs::remove_file(app.data().join(&blob)).unwrap();
+    std::fs::remove_file(frames_of(&app, &job)).unwrap();
+    let frames = format!("results/{job}/snapshot_0000/frames.npy");
+    for (good, found) in [back_up("less"), verify(app.data()), verify(&folder.path().join("less"))]
+    {
+        assert!(!good);
+        assert_eq!(found["missing"], json!([blob, frames]), "{found}");
+        assert_eq!(found["damaged"], json!([]), "{found}");
+    }
+    // A copy is looked at in the same way.
+    let copied = folder.path().join("whole").join(&blob);
+    turn_a_bit(&copied, false);
+    let (good, found) = verify(&folder.path().join("whole"));
+    assert!(!good && found["damaged"] == json!([blob]), "{found}");
+}
+
+fn disturbed(shim: &Shim, data: &Path, out: &Path, kind: &str, at: u64) -> Command {
+    let token = shim.file("token");
+    std::fs::write(&token, [0]).unwrap();
+    let mut backup = command("backup", data);
+    backup.arg("--out").arg(out).env("LD_PRELOAD", shim.library()).env("FAULT_TOKEN", token);
+    backup.env("FAULT_PROGRAM", "backup").env("FAULT_KIND", kind).env("FAULT_AT", at.to_string());
+    backup
+}
+
+#[tokio::test]
+async fn a_copy_that_was_killed_is_no_service() {
+    let shim = Shim::build();
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, job) = done(&app).await;
+    let expected = results(&app, &job).await;
+    let folder = tempfile::tempdir().unwrap();
+    let (out, unfinished) = (folder.path().join("copy"), folder.path().join("copy.unfinished"));
+    let (mut killed, mut at) = (0, 1);
+    loop {
+        let output = disturbed(&shim, app.data(), &out, "kill", at).output().unwrap();
+        if output.status.success() {
+            break;
+        }
+        killed += 1;
+        assert!(!out.exists(), "a part of a copy has its name");
+        assert!(killed < 200, "{}", String::from_utf8_lossy(&output.stderr));
+        if unfinished.join("blobs").exists() && killed % 5 == 0 {
+            let said = refused(&unfinished);
+            assert!(said.contains("copy.unfinished"), "{said}");
+        }
+        at += 1 + at / 12;
+    }
+    println!("{}", json!({"target": "killed_copies", "ok": killed >= 10, "killed": killed}));
+    assert!(killed >= 10, "{killed}");
+    assert!(verify(&out).0 && !unfinished.exists());
+    let restored = TestApp::on(folder, "copy", &["--workers", "1"]).await;
+    assert_eq!(results(&restored, &job).await, expected);
+}
+
+struct Suspended(Child);
+
+impl Drop for Suspended {
+    fn drop(&mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+#[tokio::test]
+async fn a_copy_that_is_suspended_holds_up_nobody() {
+    let shim = Shim::build();
+    let app = TestApp::with(&["--workers", "0"]).await;
+    for number in 0..30u32 {
+        app.upload(number.to_string().into_bytes()).await;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (mut stopped, mut slowest) = (0, Duration::ZERO);
+    for at in [2, 5, 9, 20, 40, 60, 80] {
+        let out = folder.path().join(format!("copy-{at}"));
+        let mut backup = disturbed(&shim, app.data(), &out, "stop", at);
+        let backup = Suspended(backup.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
+        let stat = format!("/proc/{}/stat", backup.0.id());
+        let start = Instant::now();
+        while start.elapsed().as_secs() < 20 {
+            let stat = std::fs::read_to_string(&stat).unwrap_or_default();
+            if stat.contains(") T ") || stat.contains(") Z ") {
+                stopped += u32::from(stat.contains(") T "));
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        let start = Instant::now();
+        app.upload(rand::rng().random::<[u8; 16]>().to_vec()).await;
+        slowest = slowest.max(start.elapsed());
+    }
+    assert!(stopped >= 4, "{stopped}");
+    assert!(slowest.as_secs() < 5, "an upload waited for {slowest:?}");
+}

@@ -1,0 +1,207 @@
+//! Limits hold, however many requests come at once, and no lab locks the others out.
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use futures_util::future::join_all;
+use reqwest::{Method, RequestBuilder, StatusCode};
+use serde_json::json;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use crate::app::{Answer, TestApp};
+use crate::samples::{Scene, npy_header};
+
+/// A service with two labs, and a token of each.
+async fn two_labs(arguments: &[&str]) -> (TestApp, String, String) {
+    let app = TestApp::with(arguments).await;
+    let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
+    (app, a, b)
+}
+
+fn as_lab(app: &TestApp, token: &str, method: Method, path: &str) -> RequestBuilder {
+    app.sign_out();
+    app.request(method, path).bearer_auth(token)
+}
+
+fn entitle(app: &TestApp, arguments: &[&str]) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let output = command.args(["lab", "--data"]).arg(app.data()).arg("set").args(arguments);
+    let output = output.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn announce(app: &TestApp, length: u64) -> RequestBuilder {
+    let request = app.request(Method::POST, "/v1/uploads").header("tus-resumable", "1.0.0");
+    request.header("upload-length", length)
+}
+
+fn taken(answers: &[Answer]) -> usize {
+    answers.iter().filter(|answer| answer.status == StatusCode::CREATED).count()
+}
+
+#[tokio::test]
+async fn of_many_requests_at_once_no_more_are_taken_than_the_limit_has_room_for() {
+    let app = TestApp::start().await;
+    app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "1000000"]));
+    let upload = |number: u8| {
+        let request = app.request(Method::POST, "/v1/blobs").body(vec![number; 300_000]);
+        app.send(request)
+    };
+    let answers = join_all((0..14).map(upload)).await;
+    assert_eq!(taken(&answers), 3);
+    for answer in answers.iter().filter(|answer| answer.status.as_u16() != 201) {
+        answer.problem(507, "quota_exceeded");
+    }
+    let answers = join_all((0..20).map(|_| app.send(announce(&app, 90_000)))).await;
+    assert_eq!(taken(&answers), 1, "100,000 bytes were left");
+}
+
+#[tokio::test]
+async fn prepared_arrays_count_too() {
+    let app = TestApp::start().await;
+    app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "200000"]));
+    // 8 bits a value; 32 in the prepared array.
+    let masks = [npy_header("|u1", &[8, 96, 96]), vec![200; 8 * 96 * 96]].concat();
+    let answer = app.calibrate(masks.clone()).await;
+    let detail = answer.problem(507, "quota_exceeded");
+    assert!(detail.contains("294944"), "{detail}");
+    assert_eq!(std::fs::read_dir(app.data().join("tmp")).unwrap().count(), 0);
+    app.sign_in(&app.token(&["create", "--lab", "b", "--max-bytes", "400000"]));
+    app.calibrate(masks).await.expect(201);
+    app.send(announce(&app, 50_000)).await.problem(507, "quota_exceeded");
+    app.send(announce(&app, 30_000)).await.expect(201);
+}
+
+#[tokio::test]
+async fn empty_announcements_do_not_take_the_disk() {
+    let (app, a, b) = two_labs(&["--workers", "0", "--max-upload-bytes", "1000000000000000"]).await;
+    let disk = rustix::fs::statvfs(app.data()).unwrap();
+    let free = disk.f_bavail * disk.f_frsize;
+    app.sign_in(&a);
+    for _ in 0..20 {
+        app.send(announce(&app, free / 2)).await.expect(201);
+    }
+    app.sign_in(&b);
+    app.upload(vec![1; 1000]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    // So many of one lab, and no more.
+    app.sign_in(&a);
+    let mut begun = 20;
+    let refused = loop {
+        let answer = app.send(announce(&app, 10)).await;
+        if answer.status != StatusCode::CREATED {
+            break answer;
+        }
+        begun += 1;
+    };
+    assert!(refused.problem(429, "too_many_uploads").contains("64"));
+    assert_eq!(begun, 64);
+    app.sign_in(&b);
+    app.send(announce(&app, 10)).await.expect(201);
+}
+
+#[tokio::test]
+async fn a_lab_has_limits_of_its_own_and_locks_no_other_out() {
+    let (app, a, b) = two_labs(&["--workers", "0", "--max-jobs", "4"]).await;
+    let mut jobs = Vec::new();
+    for token in [&a, &b] {
+        app.sign_in(token);
+        let (_, measurement) = app.scene(&Scene::SMALL).await;
+        jobs.push(json!({"measurement": measurement, "algorithm": "gap-tv"}));
+    }
+    app.sign_in(&a);
+    for _ in 0..4 {
+        app.submit(&jobs[0]).await;
+    }
+    app.post("/v1/jobs", &jobs[0]).await.problem(429, "queue_full");
+    // All places are taken, but none is b's.
+    app.sign_in(&b);
+    app.submit(&jobs[1]).await;
+    app.submit(&jobs[1]).await;
+    app.post("/v1/jobs", &jobs[1]).await.problem(429, "queue_full");
+    entitle(&app, &["b", "--jobs", "2"]);
+    let app = app.again(&["--workers", "0", "--max-jobs", "1000"]).await;
+    app.sign_in(&b);
+    let detail = app.post("/v1/jobs", &jobs[1]).await.problem(429, "queue_full");
+    assert!(detail.contains("of this lab"), "{detail}");
+    entitle(&app, &["b", "--jobs", "none", "--bytes", "1000000"]);
+    let detail = app.post("/v1/jobs", &jobs[1]).await.problem(507, "quota_exceeded");
+    assert!(detail.contains("the lab keeps"), "{detail}");
+    entitle(&app, &["b", "--bytes", "none", "--share", "2"]);
+    app.submit(&jobs[1]).await;
+}
+
+/// An upload that has begun, and of which nothing more comes by itself.
+async fn begun(app: &TestApp, token: &str, length: usize) -> TcpStream {
+    let mut socket = TcpStream::connect(app.address()).await.unwrap();
+    let head = format!(
+        "POST /v1/blobs HTTP/1.1\r\nHost: {}\r\nAuthorization: Bearer {token}\r\n\
+         Content-Length: {length}\r\n\r\nabc",
+        app.address()
+    );
+    socket.write_all(head.as_bytes()).await.unwrap();
+    socket
+}
+
+#[tokio::test]
+async fn slow_uploads_of_a_lab_leave_places_for_others_and_end() {
+    let arguments = ["--workers", "0", "--max-uploads", "4", "--upload-idle-seconds", "2"];
+    let (app, a, b) = two_labs(&arguments).await;
+    let mut slow = Vec::new();
+    for _ in 0..4 {
+        slow.push(begun(&app, &a, 1_000_000).await);
+    }
+    let start = Instant::now();
+    while std::fs::read_dir(app.data().join("tmp")).unwrap().count() < 2 {
+        assert!(start.elapsed().as_secs() < 10);
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let send = |token: &str| as_lab(&app, token, Method::POST, "/v1/blobs").body("abc");
+    app.send(send(&a)).await.problem(429, "too_many_uploads");
+    app.send(send(&b)).await.expect(201);
+    // A byte in time, again and again, is not enough.
+    let mut dripping = begun(&app, &b, 1_000_000).await;
+    let mut answer = [0; 12];
+    let start = Instant::now();
+    loop {
+        assert!(start.elapsed().as_secs() < 30, "it goes on for ever");
+        let _ = dripping.write_all(b"x").await;
+        let read = dripping.read_exact(&mut answer);
+        if let Ok(read) = tokio::time::timeout(Duration::from_millis(500), read).await {
+            read.unwrap();
+            break;
+        }
+    }
+    assert_eq!(&answer, b"HTTP/1.1 408");
+}
+
+#[tokio::test]
+async fn listeners_of_a_lab_leave_places_and_end_with_their_token() {
+    let (app, a, b) = two_labs(&["--workers", "0"]).await;
+    let mut listening = Vec::new();
+    let refused = loop {
+        let answer = as_lab(&app, &a, Method::GET, "/v1/events").send().await.unwrap();
+        if answer.status() != 200 {
+            break answer;
+        }
+        listening.push(answer);
+        assert!(listening.len() <= 64, "a lab has half of the places at most");
+    };
+    Answer::read(refused).await.problem(503, "unavailable");
+    let mut others = as_lab(&app, &b, Method::GET, "/v1/events").send().await.unwrap();
+    assert_eq!(others.status(), 200);
+    let listed = app.token(&["list"]);
+    let revoked = listed.lines().nth(1).unwrap().split(' ').next().unwrap().to_owned();
+    app.token(&["revoke", &revoked]);
+    let start = Instant::now();
+    for mut stream in listening {
+        let end = async { while stream.chunk().await.is_ok_and(|chunk| chunk.is_some()) {} };
+        tokio::time::timeout(Duration::from_secs(20), end).await.unwrap();
+    }
+    assert!(start.elapsed().as_secs() < 20, "the streams of a revoked token go on");
+    others.chunk().await.unwrap().unwrap();
+    let more = tokio::time::timeout(Duration::from_secs(1), others.chunk()).await;
+    assert!(more.is_err(), "those of another token go on");
+}
