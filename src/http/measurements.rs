@@ -12,7 +12,9 @@ use super::intake::{self, Prepared};
 use super::page::{ListQuery, PageBody, Renaming};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
-use crate::job::{CalibrationId, Finding, InvalidField, Lab, Label, MeasurementId, Sha256};
+use crate::job::{
+    CalibrationId, Finding, InvalidField, Lab, Label, MeasurementId, Sequence, Sha256,
+};
 use crate::store::{Inserted, Measurement, NewMeasurement, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -32,6 +34,9 @@ pub(super) struct MeasurementRequest {
     camera_fps: Option<f64>,
     /// Seconds of one snapshot.
     exposure_s: Option<f64>,
+    /// Whether the snapshots follow one another; what the times say where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sequence: Option<Sequence>,
 }
 
 impl MeasurementRequest {
@@ -45,6 +50,7 @@ impl MeasurementRequest {
             full_scale: None,
             camera_fps: None,
             exposure_s: None,
+            sequence: None,
         }
     }
 }
@@ -90,6 +96,7 @@ async fn insert(
         let there = app.store.upload(lab, *dark).await;
         there.map_err(|error| ApiError::reference(&format!("/dark/{index}"), error))?;
     }
+    let frames = calibration.facts.frames;
     let exposure = Exposure {
         dark: request.dark.iter().map(|dark| app.store.dir().blob(dark)).collect(),
         saturation: request.saturation,
@@ -98,7 +105,7 @@ async fn insert(
         intake::measurement(store, limits, &data, full_scale, &exposure, &calibration)
     });
     let Prepared { info, full_scale, found, file } = prepared.await?;
-    let facts = facts(request, &info, full_scale, found);
+    let facts = facts(request, &info, full_scale, frames, found);
     Ok(app.store.add_measurement(lab, facts, file, key).await?)
 }
 
@@ -124,8 +131,10 @@ fn facts(
     request: MeasurementRequest,
     info: &StackInfo,
     full_scale: f32,
+    frames: usize,
     warnings: Vec<Finding>,
 ) -> NewMeasurement {
+    let told = Sequence::told_by(request.camera_fps, request.exposure_s, frames);
     NewMeasurement {
         name: request.name,
         calibration: request.calibration,
@@ -139,6 +148,7 @@ fn facts(
         full_scale,
         camera_fps: request.camera_fps,
         exposure_s: request.exposure_s,
+        sequence: request.sequence.unwrap_or(told),
         dark: request.dark,
         warnings,
     }

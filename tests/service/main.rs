@@ -27,6 +27,7 @@ mod pictures;
 mod pipeline;
 mod resumable;
 mod samples;
+mod sequences;
 mod upgrade;
 mod uploads;
 mod work;
