@@ -2,17 +2,18 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
 use crate::cli::error::Result;
-use crate::job::{Algorithm, InvalidField};
+use crate::job::{Algorithm, InvalidField, Sequence};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
-use strum::VariantArray;
+use strum::{VariantArray, VariantNames};
 
 /// Which algorithm, and how long.
 #[derive(Debug, Args)]
@@ -79,6 +80,29 @@ impl ScheduleArguments {
     }
 }
 
+/// Which snapshots of a file are meant: `all`, one index, or `FIRST-LAST` with both ends in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Snapshots {
+    pub(super) first: usize,
+    /// None for the last one that there is.
+    pub(super) last: Option<usize>,
+}
+
+impl FromStr for Snapshots {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("{text:?}; name one index, FIRST-LAST with both ends in, or all");
+        let index = |text: &str| text.parse::<usize>().map_err(|_| wrong());
+        let (first, last) = match text.split_once('-') {
+            None if text == "all" => return Ok(Self { first: 0, last: None }),
+            None => (index(text)?, index(text)?),
+            Some((first, last)) => (index(first)?, index(last)?),
+        };
+        if first <= last { Ok(Self { first, last: Some(last) }) } else { Err(wrong()) }
+    }
+}
+
 impl NetworkArguments {
     /// Whether the network runs on the processor.
     pub(super) fn on_cpu(&self) -> bool {
@@ -101,6 +125,11 @@ impl NetworkArguments {
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
     let own = &Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1];
     named(own)
+}
+
+/// Kinds of sequences.
+pub(super) fn sequence() -> impl TypedValueParser<Value = Sequence> {
+    PossibleValuesParser::new(Sequence::VARIANTS).try_map(|name: String| name.parse::<Sequence>())
 }
 
 fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {

@@ -34,5 +34,5 @@ pub mod worker;
 pub use arguments::{NetworkArguments, algorithms};
 pub use error::CliError;
 pub use masks::{MaskArguments, SimulatedMasks};
-pub use model::{Model, plan};
+pub use model::{Model, cut};
 pub use optics::OpticsFile;

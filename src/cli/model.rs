@@ -4,10 +4,9 @@ use std::path::Path;
 
 use super::CliError;
 use crate::cli::error::Result;
-use crate::job::{Algorithm, TileSpec};
+use crate::job::{Algorithm, Cut, Schedule, Sequence, TileSpec};
 use crate::pipeline::networks::{ModelFile, ModelRecord, NetworkSource};
 use crate::recon::learned::{Interface, PictureSize};
-use crate::recon::tile::TilePlan;
 
 /// An end-to-end network for one size of masks.
 pub struct Model {
@@ -35,24 +34,26 @@ impl Model {
     }
 }
 
-/// How masks of frames x rows x columns are cut: as asked for, else as the algorithm or the network
+/// How snapshots of frames x rows x columns are cut: as asked for, else as the algorithm or the network
 /// wants it.
-pub fn plan(
-    algorithm: Algorithm,
+pub fn cut(
+    (algorithm, schedule): (Algorithm, &Schedule),
     (tile, overlap): (Option<usize>, Option<usize>),
     model: Option<&Model>,
+    sequence: (Sequence, u32),
     dim: (usize, usize, usize),
-) -> Result<TilePlan> {
+) -> Result<Cut> {
     let (_, height, width) = dim;
     let fixed = model.map(|model| model.size(dim)).transpose()? == Some(PictureSize::Fixed);
     let usual = if fixed { TileSpec::whole(height, width) } else { algorithm.default_tile() };
     let (size, overlap) = (tile.unwrap_or(usual.size), overlap.unwrap_or(usual.overlap));
-    let plan = TilePlan::new(height, width, size, overlap)?;
-    if fixed && plan.len() > 1 {
+    let asked = fixed || tile.is_some();
+    let cut = Cut::new(sequence, schedule, (TileSpec { size, overlap }, asked), dim)?;
+    if fixed && cut.tiles(height, width)?.len() > 1 {
         return Err(CliError::Input(format!(
             "the network takes pictures of {height}x{width} pixels only, so they can't be cut into \
              tiles of {size}: leave --tile out"
         )));
     }
-    Ok(plan)
+    Ok(cut)
 }

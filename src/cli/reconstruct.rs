@@ -1,6 +1,7 @@
-//! `sci-recon reconstruct`: one snapshot, without a server.
+//! `sci-recon reconstruct`: snapshots, without a server.
 
 use std::fs::{self, File};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Instant;
@@ -10,26 +11,27 @@ use ndarray::{Array2, Array3};
 use serde::Serialize;
 
 use super::CliError;
-use super::arguments::{NetworkArguments, ScheduleArguments};
-use super::model::{Model, plan};
+use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, sequence};
+use super::model::{Model, cut};
 use super::progress::SnapshotBar;
 use crate::cli::error::Result;
 use crate::formats::mat::SceneArray;
-use crate::intake::{Scaled, Source, read_masks, read_snapshot, read_truth};
-use crate::job::{Algorithm, SceneShape, Schedule, Sha256};
-use crate::pipeline::blend;
+use crate::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
+use crate::job::{Algorithm, SceneShape, Schedule, Sequence, Sha256};
 use crate::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use crate::pipeline::networks::NetworkSource;
 use crate::pipeline::pilot::full_schedule;
-use crate::pipeline::quality::Quality;
-use crate::pipeline::records::{CostRecord, PilotRecord, RunRecord, TileRecord};
+use crate::pipeline::quality::{FrameQuality, Quality};
+use crate::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord};
 use crate::pipeline::scale::white;
-use crate::pipeline::snapshot::{SnapshotInput, Solved, Solver, solve};
+use crate::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use crate::pipeline::write::{check_output, replace_result, write_result};
+use crate::recon::sequence::SequencePlan;
 use crate::recon::tile::TilePlan;
 
-/// Reconstruct the frames of one snapshot from files, without a server.
+/// Reconstruct the frames of a snapshot, or of several that follow one another, from files, without a
+/// server.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Masks, one frame each: npy, TIFF, PNG, or a .mat scene's `mask`.
@@ -38,15 +40,19 @@ pub struct Arguments {
     /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a .mat scene's `meas`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     measurement: Option<PathBuf>,
-    /// True frames, to be compared with: those of the snapshot, or of all snapshots.
+    /// True frames, to be compared with: those of what is reconstructed, or of all snapshots.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// A .mat scene (level 5) with `mask`, `meas` and perhaps `orig`, instead of the three files.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["masks", "measurement", "truth"])]
     scene: Option<PathBuf>,
-    /// The snapshot, counted from 0.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    snapshot: usize,
+    /// The snapshots, counted from 0: one, a range with both ends in, or all.
+    #[arg(long, alias = "snapshot", value_name = "N|FIRST-LAST|all", default_value = "0")]
+    snapshots: Snapshots,
+    /// Whether several snapshots follow one another without a gap, and are reconstructed together where
+    /// that pays, or each alone.
+    #[arg(long, default_value_t = Sequence::Contiguous, value_parser = sequence())]
+    sequence: Sequence,
     /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
     /// uint16, 1 for floats and .mat scenes].
     #[arg(long, value_name = "VALUE")]
@@ -75,15 +81,17 @@ pub struct Arguments {
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels [default: 320, 384 for those of TV alone; for learned 256,
-    /// or the whole picture for a network that takes no other].
+    /// Largest side of a tile, in pixels [default: 320, 384 for those of TV alone, 240 where that makes
+    /// room for longer runs of snapshots; for learned 256, or the whole picture for a network that takes
+    /// no other].
     #[arg(long, value_name = "PIXELS")]
     tile: Option<usize>,
     /// Least overlap of neighbouring tiles, in pixels [default: 32, 16 for those of TV alone, or 0
     /// for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
-    /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json.
+    /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json; of several snapshots each has its
+    /// own folder there, snapshot_0000 and so on.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object.
@@ -95,8 +103,8 @@ pub struct Arguments {
 struct Setup {
     algorithm: Algorithm,
     schedule: Schedule,
-    snapshot: usize,
     plan: TilePlan,
+    runs: SequencePlan,
     network: NetworkSource,
     model: Option<Model>,
     threads: usize,
@@ -106,42 +114,77 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
     let input = Input::read(arguments)?;
-    if let Some(out) = &arguments.out {
-        check_output(out)?;
-    }
+    let folders = folders(arguments.out.as_deref(), &input.snapshots());
+    folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
     let algorithm = arguments.schedule.algorithm;
     let model = model(arguments, &network)?;
-    let cut = (arguments.tile, arguments.overlap);
-    let plan = plan(algorithm, cut, model.as_ref(), input.masks.array.dim())?;
+    let dim = input.masks.array.dim();
+    let snapshots = input.snapshots();
+    let cut = cut(
+        (algorithm, &schedule),
+        (arguments.tile, arguments.overlap),
+        model.as_ref(),
+        (arguments.sequence, snapshots.len() as u32),
+        dim,
+    )?;
+    let (plan, runs) = (cut.tiles(dim.1, dim.2)?, cut.run.plan(snapshots)?);
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let threads = arguments.threads.map_or(cores, usize::from);
-    let snapshot = arguments.snapshot;
-    let setup = Setup { algorithm, schedule, snapshot, plan, network, model, threads };
+    let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
 
     let (started, before) = (Instant::now(), cpu_seconds());
-    let (white, solved) = input.solve(&setup)?;
+    let white = input.white()?;
+    let solver = match &setup.model {
+        Some(model) => Solver::Network(&model.file),
+        None => Solver::Schedule(&setup.schedule),
+    };
+    let sequence = SequenceInput {
+        masks: input.masks.array.view(),
+        measurement: input.measurement.array.view(),
+        first: input.first,
+        white,
+        solver,
+        plan: &setup.plan,
+        runs: &setup.runs,
+    };
+    let bar = SnapshotBar::new(setup.plan.len() * setup.runs.runs().len());
+    let tell = |tile, share| bar.update(tile, share);
+    let solved = solve(&sequence, &setup.network, setup.threads, &tell)?;
+    drop(bar);
     let seconds = started.elapsed().as_secs_f64();
     let cpu_seconds = cpu_seconds() - before;
 
     let deep = setup.model.is_some() || setup.schedule.needs_network();
+    let onnxruntime = deep && arguments.out.is_some();
     let cost = CostRecord {
         provider: deep.then(|| setup.network.provider().into()),
-        onnxruntime: None,
+        onnxruntime: if onnxruntime { Some(setup.network.version()?) } else { None },
         cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };
     let run = RunRecord::ended(None, cost, Some(seconds));
-    let tiles = solved.tiles.iter().map(TileRecord::from).collect();
-    let mut manifest = input.recipe(&setup, white, &solved)?.snapshot(snapshot, tiles, run);
-    let truth = input.truth.as_ref().map(|truth| truth.view());
-    let compare = |truth| Quality::of_tiles(&setup.plan, &solved.tiles, truth);
-    let quality = truth.map(compare).transpose()?;
-    let report = Report::new(&manifest, quality);
-    if let Some(out) = &arguments.out {
-        manifest.run.cost.onnxruntime = if deep { Some(setup.network.version()?) } else { None };
-        write(out, manifest, &setup.plan, &solved)?;
+    let frames = sequence.masks.dim().0;
+    let frame = |index| solved.frame(&sequence, input.first + index / frames, index % frames);
+    let truth = input.truth.as_ref();
+    let quality = truth.map(|truth| Quality::of_frames(frame, truth.view())).transpose()?;
+    let recipe = input.recipe(&setup, white, &solved)?;
+    let report = Report::new(&recipe, &sequence, &solved, &run, quality);
+    for (snapshot, folder) in folders {
+        let tiles = solved.records(&sequence, snapshot);
+        let manifest = recipe.snapshot(snapshot, tiles, run.clone());
+        write(&folder, manifest, |k| solved.frame(&sequence, snapshot, k))?;
     }
     report.print(arguments)
+}
+
+/// Where the frames of each snapshot go.
+fn folders(out: Option<&Path>, snapshots: &Range<usize>) -> Vec<(usize, PathBuf)> {
+    let Some(out) = out else { return Vec::new() };
+    let folder = |snapshot| match snapshots.len() {
+        1 => out.to_owned(),
+        _ => out.join(format!("snapshot_{snapshot:04}")),
+    };
+    snapshots.clone().map(|snapshot| (snapshot, folder(snapshot))).collect()
 }
 
 fn model(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Model>> {
@@ -191,7 +234,10 @@ fn sha256(path: &Path) -> Result<Sha256> {
 struct Input<'a> {
     sources: Sources<'a>,
     masks: Scaled<Array3<f32>>,
-    measurement: Scaled<Array2<f32>>,
+    /// [S,H,W].
+    measurement: Scaled<Array3<f32>>,
+    /// The index of the first of them in the file.
+    first: usize,
     truth: Option<Array3<f32>>,
 }
 
@@ -199,10 +245,11 @@ impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let sources = Sources::new(arguments)?;
         let masks = read_masks(&sources.masks)?;
-        let (measurement, snapshots) = read_snapshot(&sources.measurement, arguments.snapshot)?;
+        let Snapshots { first, last } = arguments.snapshots;
+        let (measurement, snapshots) = read_snapshots(&sources.measurement, (first, last))?;
         let (frames, height, width) = masks.array.dim();
-        if measurement.array.dim() != (height, width) {
-            let (rows, columns) = measurement.array.dim();
+        let (count, rows, columns) = measurement.array.dim();
+        if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
                 "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
                  {height}x{width}; both must have the same height and width",
@@ -211,25 +258,20 @@ impl<'a> Input<'a> {
             )));
         }
         let truth = match &sources.truth {
-            Some(source) => read_truth(source, masks.array.dim(), arguments.snapshot, snapshots)?,
+            Some(source) => read_truth(source, masks.array.dim(), first..first + count, snapshots)?,
             None => None,
         };
-        Ok(Self { sources, masks, measurement, truth })
+        Ok(Self { sources, masks, measurement, first, truth })
     }
 
-    /// White level and tiles.
-    fn solve(&self, setup: &Setup) -> Result<(f32, Solved)> {
-        let (masks, measurement) = (self.masks.array.view(), self.measurement.array.view());
-        let white = white(masks, measurement)?;
-        let solver = match &setup.model {
-            Some(model) => Solver::Network(&model.file),
-            None => Solver::Schedule(&setup.schedule),
-        };
-        let (snapshot, plan) = (setup.snapshot, &setup.plan);
-        let input = SnapshotInput { snapshot, masks, measurement, white, solver, plan };
-        let bar = SnapshotBar::new(plan.len());
-        let tell = |tile, share| bar.update(tile, share);
-        Ok((white, solve(&input, &setup.network, setup.threads, &tell)?))
+    /// The snapshots, by their indices in the file.
+    fn snapshots(&self) -> Range<usize> {
+        self.first..self.first + self.measurement.array.dim().0
+    }
+
+    /// The white level of all snapshots, as a job has it.
+    fn white(&self) -> Result<f32> {
+        Ok(white(self.masks.array.view(), self.measurement.array.view())?)
     }
 
     fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
@@ -242,7 +284,7 @@ impl<'a> Input<'a> {
             algorithm: setup.algorithm,
             schedule: full_schedule(&setup.schedule, pilot.as_ref()),
             pilot,
-            shape: SceneShape { frames, height, width, snapshots: 1 },
+            shape: SceneShape { frames, height, width, snapshots: self.snapshots().len() as u32 },
             inputs: Inputs {
                 masks_sha256: sha256(self.sources.masks.path)?,
                 measurement_sha256: sha256(self.sources.measurement.path)?,
@@ -254,18 +296,19 @@ impl<'a> Input<'a> {
                 white,
             },
             tile_plan: setup.plan.clone(),
+            runs: setup.runs.clone(),
             warnings: Vec::new(),
             camera: (None, None),
         })
     }
 }
 
-fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Result<()> {
+fn write(out: &Path, manifest: Manifest, frame: impl Fn(usize) -> Array2<f32>) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(failed)?;
     // A failure on the way leaves an earlier result as it was.
     let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
-    write_result(made.path(), manifest, |k| Ok(blend::frame(plan, &solved.tiles, k)))?;
+    write_result(made.path(), manifest, |k| Ok(frame(k)))?;
     Ok(replace_result(made.path(), out)?)
 }
 
@@ -273,10 +316,14 @@ fn write(out: &Path, manifest: Manifest, plan: &TilePlan, solved: &Solved) -> Re
 #[derive(Debug, Serialize)]
 struct Report {
     algorithm: &'static str,
+    snapshots: usize,
+    /// Of all snapshots.
     frames: usize,
     height: usize,
     width: usize,
     psnr_db: Option<f64>,
+    /// Of each snapshot, where the truth is known.
+    psnr_db_by_snapshot: Vec<f64>,
     ssim: Option<f64>,
     seconds: f64,
     denoiser_passes: usize,
@@ -286,29 +333,46 @@ struct Report {
     /// None for a schedule without a network.
     provider: Option<String>,
     stop_reason: String,
-    /// How an adaptive schedule was decided.
+    /// The first and the last snapshot of each run that was reconstructed together.
+    runs: Vec<[usize; 2]>,
+    /// How an adaptive schedule was decided, and which snapshots belong together.
     pilot: Option<PilotRecord>,
 }
 
 impl Report {
-    /// Of a snapshot, and of its frames if the truth is known.
-    fn new(manifest: &Manifest, quality: Option<Quality>) -> Self {
-        let (content, run) = (&manifest.content, &manifest.run);
+    /// Of snapshots, and of their frames if the truth is known.
+    fn new(
+        recipe: &Recipe,
+        input: &SequenceInput<'_>,
+        solved: &Solved,
+        run: &RunRecord,
+        quality: Option<Quality>,
+    ) -> Self {
+        let (frames, height, width) = input.masks.dim();
+        let snapshots = input.measurement.dim().0;
+        let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
+        let summary = Summary::of(&tiles);
+        let by_frame = quality.as_ref().map_or(&[][..], |quality| &quality.frames);
+        let mean =
+            |of: &[FrameQuality]| of.iter().map(|frame| frame.psnr).sum::<f64>() / of.len() as f64;
         Self {
-            algorithm: content.recipe.algorithm.into_str(),
-            frames: content.frames,
-            height: content.height,
-            width: content.width,
+            algorithm: recipe.algorithm.into_str(),
+            snapshots,
+            frames: snapshots * frames,
+            height,
+            width,
             psnr_db: quality.as_ref().map(|quality| quality.psnr),
-            ssim: quality.and_then(|quality| quality.ssim),
+            psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
+            ssim: quality.as_ref().and_then(|quality| quality.ssim),
             seconds: run.seconds.unwrap_or_default(),
-            denoiser_passes: content.summary.denoiser_passes,
-            tv_iterations: content.summary.tv_iterations,
+            denoiser_passes: summary.denoiser_passes,
+            tv_iterations: summary.tv_iterations,
             cpu_seconds: run.cost.cpu_seconds,
             peak_rss_bytes: run.cost.peak_rss_bytes,
             provider: run.cost.provider.clone(),
-            stop_reason: content.summary.stop_reason.clone(),
-            pilot: content.recipe.pilot.clone(),
+            stop_reason: summary.stop_reason,
+            runs: input.runs.runs().iter().map(|run| [run.start, run.end - 1]).collect(),
+            pilot: recipe.pilot.clone(),
         }
     }
 
@@ -344,6 +408,18 @@ impl Report {
                 stage.along_time().map_or_else(String::new, |fate| format!(
                     ", total variation along time {fate}"
                 ))
+            );
+        }
+        for joint in self.pilot.iter().flat_map(|pilot| &pilot.joints) {
+            let error =
+                |error: Option<f64>| error.map_or("none".into(), |error| format!("{error:.4}"));
+            println!(
+                "snapshots {} and {}: {}, error at held-out pixels {} alone, {} together",
+                joint.after,
+                joint.after + 1,
+                if joint.together { "together" } else { "apart" },
+                error(joint.error_alone),
+                error(joint.error_together),
             );
         }
         if let Some(psnr) = self.psnr_db {

@@ -628,7 +628,7 @@ impl Transport for Remote {
         self.end(lease, End::GivenBack).await.map(|_| ())
     }
 
-    async fn redo(&self, _: &Lease, _: &[u32]) -> Result<(), TransportError> {
+    async fn redo(&self, _: &Lease, _: &[(u32, u32)]) -> Result<(), TransportError> {
         Err("a worker on another machine assembles nothing".into())
     }
 
@@ -646,7 +646,8 @@ impl Transport for Remote {
                 format!("masks {:?} and snapshots {:?} of a tile {place:?}", of(&masks), of(&y));
             return Err(PipelineError::Record { what: "tile's message", problem });
         }
-        Ok(TileInput { masks, y, plane: task.plane, white: task.white })
+        let pieces = task.pieces.clone();
+        Ok(TileInput { masks, y, plane: task.plane, white: task.white, pieces })
     }
 
     fn model(&self, sha256: Sha256) -> ModelFile {

@@ -17,8 +17,8 @@ use super::extract::{Body, Caller, Params, QueryOf, created, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
     Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
-    MeasurementId, ModelId, SceneShape, Schedule, Sha256, SnapshotRange, TileSpec, Timestamp,
-    priority_error,
+    MeasurementId, ModelId, RunSpec, SceneShape, Schedule, Sequence, Sha256, SnapshotRange,
+    TileSpec, Timestamp, priority_error,
 };
 use crate::store::{
     Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob, Page, Span, StoreError,
@@ -33,6 +33,8 @@ pub(super) struct JobBody {
     measurement: MeasurementId,
     shape: SceneShape,
     snapshots: SnapshotRange,
+    sequence: Sequence,
+    run: RunSpec,
     algorithm: Algorithm,
     /// The network of `learned`; null for all others.
     model: Option<ModelId>,
@@ -63,6 +65,8 @@ impl JobBody {
             measurement: spec.measurement,
             shape: spec.shape,
             snapshots: spec.snapshots,
+            sequence: spec.sequence,
+            run: spec.run,
             algorithm: spec.algorithm,
             model: spec.model.map(|model| model.id),
             schedule: spec.schedule,
@@ -232,7 +236,7 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec> {
             Some(model.map_err(|error| ApiError::reference("/model", error))?.into())
         }
     };
-    let resolved = request.resolve(calibration.id, shape, model);
+    let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
     // If the report is not made yet, its end adds the warning.

@@ -13,7 +13,7 @@ use super::intake::{self, Prepared};
 use super::page::{ListQuery, PageBody, Renaming};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
-use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sha256};
+use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sequence, Sha256};
 use crate::store::{Inserted, Measurement, NewMeasurement, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -33,6 +33,9 @@ pub(super) struct MeasurementRequest {
     camera_fps: Option<f64>,
     /// Seconds of one snapshot.
     exposure_s: Option<f64>,
+    /// Whether the snapshots follow one another; what the times say where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sequence: Option<Sequence>,
 }
 
 impl MeasurementRequest {
@@ -46,6 +49,7 @@ impl MeasurementRequest {
             full_scale: None,
             camera_fps: None,
             exposure_s: None,
+            sequence: None,
         }
     }
 }
@@ -96,12 +100,13 @@ async fn insert(
         there.map_err(|error| ApiError::reference(&place, error))?;
         dark.push(intake::upload(app, *upload).await.map_err(|error| error.at(&place))?);
     }
+    let frames = calibration.facts.frames;
     let exposure = Exposure { dark, saturation: request.saturation };
     let prepared = intake::run(app, access, move |desk| {
         intake::measurement(desk, &file, full_scale, &exposure, &calibration)
     });
     let Prepared { info, full_scale, found, file, room } = prepared.await?;
-    let facts = facts(request, &info, full_scale, found);
+    let facts = facts(request, &info, full_scale, frames, found);
     let made = app.store.add_measurement((lab, access.token), facts, file, key).await?;
     drop(room);
     Ok(made)
@@ -129,8 +134,10 @@ fn facts(
     request: MeasurementRequest,
     info: &StackInfo,
     full_scale: f32,
+    frames: usize,
     warnings: Vec<Finding>,
 ) -> NewMeasurement {
+    let told = Sequence::told_by(request.camera_fps, request.exposure_s, frames);
     NewMeasurement {
         name: request.name,
         calibration: request.calibration,
@@ -144,6 +151,7 @@ fn facts(
         full_scale,
         camera_fps: request.camera_fps,
         exposure_s: request.exposure_s,
+        sequence: request.sequence.unwrap_or(told),
         dark: request.dark,
         warnings,
     }

@@ -63,6 +63,7 @@ pub(super) async fn create(
         measurement: made.id(),
         calibration: None,
         snapshots: SnapshotSelection::All,
+        sequence: None,
         algorithm: request.algorithm,
         model: None,
         schedule: None,

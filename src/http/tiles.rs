@@ -8,7 +8,7 @@ use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
-use crate::job::JobId;
+use crate::job::{JobId, SnapshotRange};
 use crate::store::{TileHistory, TileState};
 
 #[derive(Debug, Serialize)]
@@ -23,6 +23,8 @@ struct TileBody {
     column: usize,
     height: usize,
     width: usize,
+    /// The run of snapshots that it belongs to.
+    snapshots: SnapshotRange,
     #[serde(flatten)]
     state: TileState,
 }
@@ -38,7 +40,8 @@ pub(super) async fn list(
     let show = |state: TileState| {
         let tile = plan.tile(state.tile as usize)?;
         let (row, column, height, width) = (tile.row, tile.column, tile.height, tile.width);
-        Some(TileBody { row, column, height, width, state })
+        let snapshots = SnapshotRange { first: state.run, count: state.snapshots };
+        Some(TileBody { row, column, height, width, snapshots, state })
     };
     let body = TilesBody { snapshot, items: states.into_iter().filter_map(show).collect() };
     conditional::json(&body, &headers)

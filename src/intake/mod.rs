@@ -15,6 +15,6 @@ pub use captures::{Calibrated, CaptureFiles, Progress, Report, calibrate, check_
 pub use check::{Exposure, judge, masks, measurement};
 pub use error::IntakeError;
 pub use open::{Opened, Source};
-pub use read::{Scaled, read_clip, read_masks, read_snapshot, read_truth};
+pub use read::{Scaled, read_clip, read_masks, read_snapshots, read_truth};
 pub use report_page::report_page;
 pub use sample::{Sample, sample};

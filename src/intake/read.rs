@@ -3,9 +3,10 @@
 use std::fmt::Display;
 use std::fs::{self, File};
 use std::io::{Read, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Array3, ArrayView2, s};
+use ndarray::{Array3, ArrayView2, s};
 use tempfile::NamedTempFile;
 use zip::ZipArchive;
 
@@ -32,35 +33,41 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     Ok(Scaled { array: stack.into_array()?, full_scale })
 }
 
-/// Snapshot `index` \[H,W\] of a measurement, checked, and how many there are.
-pub fn read_snapshot(source: &Source<'_>, index: usize) -> Result<(Scaled<Array2<f32>>, usize)> {
+/// Snapshots \[S,H,W\] of a measurement, checked, and how many there are in all. They are given by the
+/// indices of the first and the last; without a last one, to its end.
+pub fn read_snapshots(
+    source: &Source<'_>,
+    (first, last): (usize, Option<usize>),
+) -> Result<(Scaled<Array3<f32>>, usize)> {
     let opened = source.open()?;
     let (full_scale, snapshots) = (opened.full_scale.value(), opened.info.frames);
-    let (mut next, mut found) = (0, None);
+    let last = last.unwrap_or(snapshots.saturating_sub(1));
+    if last >= snapshots || last < first {
+        let asked = if first == last { first.to_string() } else { format!("{first} to {last}") };
+        let detail = format!(
+            "{} holds {snapshots} snapshots, counted from 0; there is no snapshot {asked}",
+            source.name
+        );
+        return Err(IntakeError::content("", &detail));
+    }
+    let (mut next, mut found) = (0, Stack::default());
     measurement(opened, &Exposure::default(), &source.limits, |snapshot| {
-        if next == index {
-            found = Some(snapshot.to_owned());
+        if (first..=last).contains(&next) {
+            found.push(snapshot)?;
         }
         next += 1;
         Ok(())
     })?;
-    let missing = || {
-        let detail = format!(
-            "{} holds {snapshots} snapshots, counted from 0; there is no snapshot {index}",
-            source.name
-        );
-        IntakeError::content("", &detail)
-    };
-    Ok((Scaled { array: found.ok_or_else(missing)?, full_scale }, snapshots))
+    Ok((Scaled { array: found.into_array()?, full_scale }, snapshots))
 }
 
-/// The true frames \[B,H,W\] of one snapshot, of a file that has those of this snapshot or of all. A .mat
-/// scene may go without; another file may not.
+/// The true frames \[S B,H,W\] of some snapshots of a measurement, of a file that has those of these
+/// snapshots or of all. A .mat scene may go without; another file may not.
 /// Errors: a file that can't be read; other sizes.
 pub fn read_truth(
     source: &Source<'_>,
     (frames, height, width): (usize, usize, usize),
-    snapshot: usize,
+    which: Range<usize>,
     snapshots: usize,
 ) -> Result<Option<Array3<f32>>> {
     let truth = match read_frames(source) {
@@ -70,22 +77,23 @@ pub fn read_truth(
         truth => truth?,
     };
     let (count, rows, columns) = truth.dim();
+    let wanted = frames * which.len();
     let first = match count {
         _ if (rows, columns) != (height, width) => None,
-        _ if count == frames => Some(0),
-        _ if count == frames * snapshots => Some(snapshot * frames),
+        _ if count == wanted => Some(0),
+        _ if count == frames * snapshots => Some(which.start * frames),
         _ => None,
     };
     let Some(first) = first else {
         let detail = format!(
-            "the true frames {} are {count}x{rows}x{columns}; {frames}x{height}x{width} (of the \
-             snapshot) or {}x{height}x{width} (of all snapshots) would fit",
+            "the true frames {} are {count}x{rows}x{columns}; {wanted}x{height}x{width} (of what is \
+             reconstructed) or {}x{height}x{width} (of all snapshots) would fit",
             source.path.display(),
             frames * snapshots
         );
         return Err(IntakeError::Size { place: String::new(), detail });
     };
-    Ok(Some(truth.slice(s![first..first + frames, .., ..]).to_owned()))
+    Ok(Some(truth.slice(s![first..first + wanted, .., ..]).to_owned()))
 }
 
 /// Frames \[T,H,W\] of a file, of an npz archive, or of a folder of pictures in the order of their

@@ -39,7 +39,8 @@ impl JobSpec {
     fn tile_bytes(&self) -> u64 {
         let side = |length: usize| length.min(self.tile.size) as u64;
         let pixels = side(self.shape.height) * side(self.shape.width);
-        let voxels = pixels * self.shape.frames as u64;
+        let run = self.run.length.min(self.snapshots.count);
+        let voxels = pixels * self.shape.frames as u64 * u64::from(run);
         if let Some(model) = &self.model {
             // What the trial took grows with the picture at most.
             let trial = (model.trial.pixels() as u64).max(1);
@@ -69,7 +70,8 @@ impl JobSpec {
 mod tests {
     use super::{BASE_BYTES, SOLVER_BYTES_PER_VOXEL};
     use crate::job::{
-        Algorithm, CalibrationId, JobSpec, MeasurementId, SceneShape, SnapshotRange, TileSpec,
+        Algorithm, CalibrationId, Cut, JobSpec, MeasurementId, RunSpec, SceneShape, Sequence,
+        SnapshotRange, TileSpec,
     };
 
     fn megabytes(algorithm: Algorithm, side: usize, frames: usize) -> u64 {
@@ -82,6 +84,8 @@ mod tests {
             measurement: MeasurementId::new(),
             shape: SceneShape { frames, height: side, width: side, snapshots: 1 },
             snapshots: SnapshotRange { first: 0, count: 1 },
+            sequence: Sequence::Separate,
+            run: RunSpec::ALONE,
             algorithm,
             model: None,
             schedule: algorithm.default_schedule(),
@@ -100,6 +104,24 @@ mod tests {
         assert_eq!(small.worker_bytes(), BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL);
         let large = JobSpec { tile: small_tiles, ..spec(Algorithm::GapTv, 1000, 10) };
         assert!(large.worker_bytes() < small.worker_bytes(), "previews by blocks are small");
+    }
+
+    #[test]
+    fn a_sequence_takes_no_more_than_a_long_snapshot() {
+        for algorithm in [Algorithm::GapTv, Algorithm::GapTv3d, Algorithm::PnpTvFastdvdnet] {
+            let large = |frames, snapshots: u32| {
+                let tile = (algorithm.default_tile(), false);
+                let schedule = algorithm.default_schedule();
+                let sequence = (Sequence::Contiguous, snapshots);
+                let cut = Cut::new(sequence, &schedule, tile, (frames, 3200, 3200)).unwrap();
+                let spec = spec(algorithm, 3200, frames);
+                let snapshots = SnapshotRange { first: 0, count: snapshots };
+                JobSpec { snapshots, tile: cut.tile, run: cut.run, ..spec }
+            };
+            let (sequence, single) = (large(10, 10), large(30, 1));
+            let (needed, today) = (sequence.worker_bytes() >> 20, single.worker_bytes() >> 20);
+            assert!(needed <= today, "{algorithm:?}: {needed} MiB, {today} MiB at Cr 30");
+        }
     }
 
     #[test]

@@ -27,7 +27,7 @@ pub use report::{
     CalibrationReport, CaptureReport, Finding, Grade, MaskReport, PatternReport, Severity,
 };
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
-pub use shape::{SceneShape, SnapshotRange, TileSpec};
+pub use shape::{Cut, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
 pub use task::{ResultFile, TaskKind, TaskProgress, TaskStage, TaskState};
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

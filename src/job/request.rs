@@ -6,10 +6,11 @@ use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
 use super::report::Finding;
-use super::shape::{SceneShape, SnapshotRange, TileSpec};
+use super::shape::{Cut, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
 use crate::recon::ReconError;
 use crate::recon::schedule::Schedule;
+use crate::recon::sequence::SequencePlan;
 use crate::recon::tile::TilePlan;
 
 /// The most tasks of one job; a larger one should be sent as several ranges of snapshots.
@@ -79,6 +80,9 @@ pub struct JobRequest {
     /// The snapshots; all where it is left out.
     #[serde(default)]
     pub snapshots: SnapshotSelection,
+    /// Whether the snapshots follow one another; what the measurement says where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sequence: Option<Sequence>,
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -105,6 +109,12 @@ pub struct JobSpec {
     pub measurement: MeasurementId,
     pub shape: SceneShape,
     pub snapshots: SnapshotRange,
+    /// Whether the snapshots follow one another.
+    #[serde(default = "separate")]
+    pub sequence: Sequence,
+    /// How they are reconstructed together.
+    #[serde(default)]
+    pub run: RunSpec,
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`]; none for all others.
     #[serde(default)]
@@ -118,14 +128,20 @@ pub struct JobSpec {
     pub warnings: Vec<Finding>,
 }
 
+/// Jobs of before there were sequences.
+fn separate() -> Sequence {
+    Sequence::Separate
+}
+
 impl JobRequest {
     /// Checks the request against the measurement and the model that it names, and fills in the
-    /// defaults.
+    /// defaults. `sequence` is what is known of the measurement.
     /// Errors: all that is wrong, each with its place in the request.
     pub fn resolve(
         self,
         calibration: CalibrationId,
         shape: SceneShape,
+        sequence: Sequence,
         model: Option<JobModel>,
     ) -> Result<JobSpec, Vec<InvalidField>> {
         let mut errors = Vec::new();
@@ -154,21 +170,27 @@ impl JobRequest {
             }
             errors.extend(faults.into_iter().map(|fault| fault.under("/schedule")));
         }
-        match TilePlan::new(shape.height, shape.width, tile.size, tile.overlap) {
-            Ok(plan) => errors.extend(too_many(plan.len(), snapshots)),
-            Err(error) => errors.push(InvalidField::new("/tile", error.to_string())),
-        }
+        let sequence = self.sequence.unwrap_or(sequence);
+        let size = (shape.frames, shape.height, shape.width);
+        let tile = (tile, self.tile.is_some());
+        let cut = Cut::new((sequence, snapshots.count), &schedule, tile, size);
+        let Cut { tile, run } = cut.unwrap_or_else(|error| {
+            errors.push(InvalidField::new("/tile", error.to_string()));
+            Cut { tile: tile.0, run: RunSpec::ALONE }
+        });
         errors.extend(priority_error(self.priority));
         if !errors.is_empty() {
             return Err(errors);
         }
         let (measurement, algorithm) = (self.measurement, self.algorithm);
         let (priority, label) = (self.priority, self.label);
-        Ok(JobSpec {
+        let spec = JobSpec {
             calibration,
             measurement,
             shape,
             snapshots,
+            sequence,
+            run,
             algorithm,
             model,
             schedule,
@@ -176,7 +198,11 @@ impl JobRequest {
             priority,
             label,
             warnings: Vec::new(),
-        })
+        };
+        match too_many(&spec) {
+            Some(error) => Err(vec![error]),
+            None => Ok(spec),
+        }
     }
 }
 
@@ -188,13 +214,16 @@ pub fn priority_error(priority: i32) -> Option<InvalidField> {
     })
 }
 
-fn too_many(tiles: usize, snapshots: SnapshotRange) -> Option<InvalidField> {
-    let tasks = (tiles as u64 + 1) * u64::from(snapshots.count) + 2;
+/// A job of more tasks than are taken.
+fn too_many(spec: &JobSpec) -> Option<InvalidField> {
+    let tiles = spec.tile_plan().ok()?.len() as u64;
+    let (runs, snapshots) = (spec.sequence_plan().ok()?.runs().len() as u64, spec.snapshots.count);
+    // Besides tiles a preview and an assembly of each snapshot, and three of the job.
+    let tasks = tiles * runs + 2 * u64::from(snapshots) + 3;
     (tasks > MAX_TASKS as u64).then(|| {
         let detail = format!(
-            "{tiles} tiles in each of {} snapshots make {tasks} tasks; at most {MAX_TASKS} fit \
-             into one job: use larger tiles or fewer snapshots",
-            snapshots.count
+            "{tiles} tiles in each of {runs} runs of {snapshots} snapshots make {tasks} tasks; at \
+             most {MAX_TASKS} fit into one job: use larger tiles or fewer snapshots"
         );
         InvalidField::new("/tile", detail)
     })
@@ -225,6 +254,20 @@ impl JobSpec {
         TilePlan::new(self.shape.height, self.shape.width, self.tile.size, self.tile.overlap)
     }
 
+    /// The runs of snapshots that are reconstructed together; an error only if the spec was changed by
+    /// hand.
+    pub fn sequence_plan(&self) -> Result<SequencePlan, ReconError> {
+        let SnapshotRange { first, count } = self.snapshots;
+        self.run.plan(first as usize..first as usize + count as usize)
+    }
+
+    /// Snapshots that are computed, those that two runs share counted twice.
+    pub(super) fn snapshots_computed(&self) -> u64 {
+        // A spec is checked before it is stored: its runs can be planned.
+        let of = |plan: SequencePlan| plan.runs().iter().map(|run| run.len() as u64).sum();
+        self.sequence_plan().map_or(u64::from(self.snapshots.count), of)
+    }
+
     /// An upper bound of the bytes that the job writes to the disk. Tiles are kept until it has
     /// succeeded, so both count.
     pub fn disk_bytes(&self) -> u64 {
@@ -235,14 +278,14 @@ impl JobSpec {
         };
         // A spec is checked before it is stored: its tiles can be planned.
         let tiles = self.tile_plan().map_or(0, area) * frames;
-        let snapshot = voxels * RESULT_BYTES + tiles * TILE_BYTES + SNAPSHOT_BYTES;
-        u64::from(self.snapshots.count) * snapshot
+        let results = voxels * RESULT_BYTES + SNAPSHOT_BYTES;
+        u64::from(self.snapshots.count) * results + self.snapshots_computed() * tiles * TILE_BYTES
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{JobRequest, SceneShape, SnapshotRange};
+    use super::{JobRequest, SceneShape, Sequence, SnapshotRange};
     use crate::job::{Algorithm, CalibrationId, MeasurementId};
     use serde_json::{Value, json};
 
@@ -255,15 +298,20 @@ mod tests {
     }
 
     fn pointers(fields: Value) -> Vec<String> {
-        let errors =
-            request(fields).unwrap().resolve(CalibrationId::new(), SHAPE, None).unwrap_err();
+        let errors = request(fields)
+            .unwrap()
+            .resolve(CalibrationId::new(), SHAPE, Sequence::Separate, None)
+            .unwrap_err();
         errors.into_iter().map(|error| error.pointer).collect()
     }
 
     #[test]
     fn defaults_are_filled_in() {
         let calibration = CalibrationId::new();
-        let spec = request(json!({})).unwrap().resolve(calibration, SHAPE, None).unwrap();
+        let spec = request(json!({}))
+            .unwrap()
+            .resolve(calibration, SHAPE, Sequence::Separate, None)
+            .unwrap();
         assert_eq!(spec.snapshots, SnapshotRange { first: 0, count: 6 });
         assert_eq!(spec.calibration, calibration);
         assert_eq!(
@@ -278,11 +326,51 @@ mod tests {
         for (json, first, count) in [(json!(2), 2, 1), (json!([1, 3]), 1, 3), (json!("all"), 0, 6)]
         {
             let request = request(json!({ "snapshots": json })).unwrap();
-            let spec = request.resolve(CalibrationId::new(), SHAPE, None).unwrap();
+            let spec =
+                request.resolve(CalibrationId::new(), SHAPE, Sequence::Separate, None).unwrap();
             assert_eq!(spec.snapshots, SnapshotRange { first, count });
         }
         assert!(request(json!({"snapshots": "some"})).is_err());
         assert!(request(json!({"snapshots": -1})).is_err());
+    }
+
+    #[test]
+    fn a_job_may_override_what_the_measurement_says() {
+        let run = |fields: Value, measured| {
+            let request = request(fields).unwrap();
+            let spec = request.resolve(CalibrationId::new(), SHAPE, measured, None).unwrap();
+            (spec.sequence, spec.run.length)
+        };
+        let deep = json!({"algorithm": "pnp-tv-fastdvdnet"});
+        assert_eq!(run(deep.clone(), Sequence::Contiguous), (Sequence::Contiguous, 5));
+        assert_eq!(run(deep, Sequence::Separate), (Sequence::Separate, 1));
+        let mut asked = json!({"algorithm": "pnp-tv-fastdvdnet", "sequence": "separate"});
+        assert_eq!(run(asked.clone(), Sequence::Contiguous), (Sequence::Separate, 1));
+        asked["sequence"] = json!("contiguous");
+        assert_eq!(run(asked, Sequence::Separate), (Sequence::Contiguous, 5));
+        // Total variation of each frame alone gains nothing.
+        assert_eq!(run(json!({}), Sequence::Contiguous), (Sequence::Contiguous, 1));
+    }
+
+    #[test]
+    fn runs_that_overlap_count_twice_on_the_disk() {
+        let spec = |sequence: &str| {
+            let fields = json!({"algorithm": "pnp-tv-fastdvdnet", "sequence": sequence,
+                "tile": {"size": 304, "overlap": 0}});
+            let request = request(fields).unwrap();
+            request.resolve(CalibrationId::new(), SHAPE, Sequence::Separate, None).unwrap()
+        };
+        let (separate, together) = (spec("separate"), spec("contiguous"));
+        let frames = (8 * 256 * 300 * 4) as u64;
+        // Six snapshots in two runs of four.
+        assert_eq!(together.sequence_plan().unwrap().runs(), [0..4, 2..6]);
+        assert_eq!(together.disk_bytes() - separate.disk_bytes(), 2 * frames);
+        let tiles = |spec: &super::JobSpec| {
+            let tasks = spec.tasks().unwrap();
+            tasks.into_iter().filter(|(kind, _)| kind.tile().is_some()).collect::<Vec<_>>()
+        };
+        assert_eq!((tiles(&separate).len(), tiles(&together).len()), (6, 2));
+        assert!((tiles(&together)[0].1 / tiles(&separate)[0].1 - 4.0).abs() < 1e-9, "the cost");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
 
 use super::request::JobSpec;
 use super::text::Sha256;
-use crate::recon::{ReconError, pilot, preview};
+use crate::recon::{ReconError, joints, pilot, preview};
 
 /// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
 const READ_S: f64 = 12e-9;
@@ -16,9 +16,9 @@ const PREVIEW_WHOLE_S: f64 = 120e-9;
 
 /// What a task does. Snapshots are counted from 0 within the measurement, tiles within the tile plan.
 ///
-/// The order of work is prepare, then previews, the pilot of an adaptive schedule, and all tiles; a
-/// snapshot is assembled when its tiles are done, and the manifest is written when all snapshots
-/// are assembled.
+/// The order of work is prepare, then previews, the pilot of an adaptive schedule or a sequence, and all
+/// tiles, run by run; a snapshot is assembled when the tiles of the runs that hold it are done, and the
+/// manifest is written when all snapshots are assembled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantNames)]
 #[strum(serialize_all = "snake_case", const_into_str)]
 pub enum TaskKind {
@@ -28,10 +28,15 @@ pub enum TaskKind {
     Preview {
         snapshot: u32,
     },
-    /// Find out how many iterations of an adaptive schedule pay. Tiles wait for it.
+    /// Find out how many iterations of an adaptive schedule pay, and which snapshots belong together. Tiles
+    /// wait for it.
     Pilot,
+    /// Reconstruct one tile of a run of snapshots.
     Tile {
+        /// The run's first snapshot.
         snapshot: u32,
+        /// How many there are in the run.
+        snapshots: u32,
         tile: u32,
     },
     /// Blend the tiles of one snapshot and write its frames.
@@ -44,13 +49,21 @@ pub enum TaskKind {
 }
 
 impl TaskKind {
-    /// The snapshot that the task belongs to, if it belongs to one.
+    /// The snapshot that the task belongs to, or the first of its run, if it belongs to one.
     pub fn snapshot(self) -> Option<u32> {
         match self {
             Self::Preview { snapshot }
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
             Self::Prepare | Self::Pilot | Self::Manifest | Self::Calibration => None,
+        }
+    }
+
+    /// How many snapshots the task does at once.
+    pub fn snapshots(self) -> u32 {
+        match self {
+            Self::Tile { snapshots, .. } => snapshots,
+            _ => 1,
         }
     }
 
@@ -63,12 +76,16 @@ impl TaskKind {
     }
 
     /// The kind with this name and these indices: the inverse of the functions above and `into_str`.
-    pub fn from_parts(name: &str, snapshot: Option<u32>, tile: Option<u32>) -> Option<Self> {
+    pub fn from_parts(
+        name: &str,
+        (snapshot, snapshots): (Option<u32>, u32),
+        tile: Option<u32>,
+    ) -> Option<Self> {
         match (name, snapshot, tile) {
             ("prepare", None, None) => Some(Self::Prepare),
             ("preview", Some(snapshot), None) => Some(Self::Preview { snapshot }),
             ("pilot", None, None) => Some(Self::Pilot),
-            ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, tile }),
+            ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, snapshots, tile }),
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),
             ("calibration", None, None) => Some(Self::Calibration),
@@ -81,7 +98,7 @@ impl JobSpec {
     /// The tasks of the job with their planned CPU-seconds, in the order in which they are handed out.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn tasks(&self) -> Result<Vec<(TaskKind, f64)>, ReconError> {
-        let tiles = self.tile_plan()?;
+        let (tiles, runs) = (self.tile_plan()?, self.sequence_plan()?);
         let pixels = (self.shape.height * self.shape.width) as f64;
         let frames = self.shape.frames as f64;
         let per_voxel = self.planned_ns_per_voxel() * 1e-9;
@@ -90,19 +107,30 @@ impl JobSpec {
         let preview = pixels * frames * if whole { PREVIEW_WHOLE_S } else { PREVIEW_BLOCKS_S };
         let snapshots = self.snapshots.indices();
         tasks.extend(snapshots.map(|snapshot| (TaskKind::Preview { snapshot }, preview)));
-        if self.schedule.adaptive {
+        let joints = runs.joints().len() as f64;
+        if self.schedule.adaptive || joints > 0.0 {
             let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
+            let decided = if self.schedule.adaptive { 1.0 } else { 0.0 };
+            // Of each joint both snapshots together, and the second one alone.
+            let compared =
+                if joints > 0.0 { (3.0 * joints + 1.0) / joints::SHORTER as f64 } else { 0.0 };
             // The preview of the first snapshot is there at once; the others may wait.
-            tasks.insert(2, (TaskKind::Pilot, voxels * per_voxel));
+            tasks.insert(2, (TaskKind::Pilot, voxels * per_voxel * (decided + compared)));
         }
-        for snapshot in self.snapshots.indices() {
+        let mut assembled = self.snapshots.first;
+        for (index, run) in runs.runs().iter().enumerate() {
+            let (snapshot, snapshots) = (run.start as u32, run.len() as u32);
             let mut areas: Vec<_> = (0..).zip(tiles.tiles()).collect();
             areas.sort_by(|(a, _), (b, _)| place(*a).total_cmp(&place(*b)));
             for (tile, area) in areas {
-                let voxels = (area.height * area.width) as f64 * frames;
-                tasks.push((TaskKind::Tile { snapshot, tile }, voxels * per_voxel));
+                let voxels = (area.height * area.width * run.len()) as f64 * frames;
+                tasks.push((TaskKind::Tile { snapshot, snapshots, tile }, voxels * per_voxel));
             }
-            tasks.push((TaskKind::Assemble { snapshot }, pixels * frames * WRITE_S));
+            // What no later run holds is complete.
+            let complete = runs.runs().get(index + 1).map_or(run.end, |next| next.start) as u32;
+            let snapshots = std::mem::replace(&mut assembled, complete)..complete;
+            let assemble = |snapshot| (TaskKind::Assemble { snapshot }, pixels * frames * WRITE_S);
+            tasks.extend(snapshots.map(assemble));
         }
         tasks.push((TaskKind::Manifest, 0.01));
         Ok(tasks)

@@ -80,8 +80,8 @@ mod tests {
             Array3::from_shape_simple_fn((4, 12, 9), || rand::Rng::random::<f32>(&mut rng));
         let y = Array2::from_shape_simple_fn((12, 9), || rand::Rng::random::<f32>(&mut rng) - 0.5);
         let forward = measure(masks.view(), frames.view()).unwrap();
-        let adjoint =
-            crate::recon::sensing::SensingOperator::new(masks).unwrap().adjoint(y.view()).unwrap();
+        let op = crate::recon::sensing::SensingOperator::new(masks).unwrap();
+        let adjoint = op.adjoint(y.view().insert_axis(ndarray::Axis(0))).unwrap();
         let (left, right) = ((&forward * &y).sum(), (&frames * &adjoint).sum());
         assert!((left - right).abs() < 1e-4 * left.abs().max(1.0), "{left} {right}");
     }

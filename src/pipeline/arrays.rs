@@ -43,7 +43,7 @@ impl Arrays {
         plane(&reader, index as usize)
     }
 
-    /// A piece of some snapshots with its masks.
+    /// A piece of a run of snapshots with its masks, to be solved as one clip.
     pub fn window(
         &self,
         snapshots: Range<u32>,
@@ -55,7 +55,8 @@ impl Arrays {
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
         let y = snapshots.read_window(which, rows.clone(), columns.clone())?;
         let masks = masks.read_window(0..masks.info().frames, rows, columns)?;
-        Ok(TileInput { masks, y, plane: 0, white })
+        let whole = 0..y.dim().0;
+        Ok(TileInput { masks, y, plane: 0, white, pieces: vec![whole] })
     }
 }
 

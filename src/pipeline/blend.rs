@@ -1,5 +1,6 @@
-//! Frames of the whole picture, blended from those of its tiles.
+//! Frames of the whole picture, blended from those of its tiles, and of the runs that have a part in them.
 
+use std::convert::Infallible;
 use std::path::PathBuf;
 
 use ndarray::{Array2, ArrayView2, Axis, CowArray, Ix2};
@@ -11,19 +12,22 @@ use super::records::TileTaskRecord;
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
 use crate::job::Sha256;
+use crate::recon::sequence::RunShare;
 use crate::recon::solver::Outcome;
 use crate::recon::tile::{Tile, TilePlan};
 
-/// The stored frames \[B,h,w\] of a tile.
+/// The stored frames \[S B,h,w\] of a tile of a run of snapshots.
 #[derive(Debug, Clone)]
 pub struct StoredTile {
+    /// The index of the run's first snapshot in the measurement.
+    pub run: u32,
     pub tile: u32,
     pub path: PathBuf,
     pub sha256: Sha256,
     pub record: TileTaskRecord,
 }
 
-/// Refuses tiles of which one is missing, or whose bytes are not those that were stored.
+/// Refuses tiles of a run of which one is missing, or whose bytes are not those that were stored.
 /// Errors: [`PipelineError::Damaged`] with the tiles that should be done again.
 pub fn verify(plan: &TilePlan, tiles: &[StoredTile], monitor: &Monitor) -> Result<()> {
     let expected = (0..plan.len() as u64).eq(tiles.iter().map(|tile| u64::from(tile.tile)));
@@ -35,32 +39,63 @@ pub fn verify(plan: &TilePlan, tiles: &[StoredTile], monitor: &Monitor) -> Resul
     for tile in tiles {
         monitor.check()?;
         if !is_intact(&tile.path, tile.sha256)? {
-            damaged.push(tile.tile);
+            damaged.push((tile.run, tile.tile));
         }
     }
     if damaged.is_empty() { Ok(()) } else { Err(PipelineError::Damaged(damaged)) }
 }
 
-/// Frame `k` \[H,W\], of which each stored tile's part is read when it is needed.
+/// Frame `k` \[H,W\] of a snapshot, of which each stored tile's part is read when it is needed. Of each
+/// run that has a share in the snapshot `tiles` tells the tiles, in the plan's order.
 pub fn stored_frame(
     plan: &TilePlan,
-    tiles: &[StoredTile],
+    shares: &[(RunShare, Vec<StoredTile>)],
     k: usize,
 ) -> Result<Array2<f32>, FormatError> {
-    blended(plan, |tile| {
-        // Opened anew for each frame: a large picture has more tiles than a process may have files.
-        let reader = Reader::open(&tiles[tile.index].path, &Limits::default())?;
-        let window = reader.read_window(k..k + 1, 0..tile.height, 0..tile.width)?;
-        Ok(window.index_axis_move(Axis(0), 0).into())
-    })
+    let of_run = |(share, tiles): &(RunShare, Vec<StoredTile>)| {
+        let index = share.frame(k);
+        let frame = blended(plan, |tile| {
+            // Opened anew for each frame: a large picture has more tiles than a process may have files.
+            let reader = Reader::open(&tiles[tile.index].path, &Limits::default())?;
+            let window = reader.read_window(index..index + 1, 0..tile.height, 0..tile.width)?;
+            Ok(window.index_axis_move(Axis(0), 0).into())
+        })?;
+        Ok((share.weights[k], frame))
+    };
+    in_time(plan, shares.iter().map(of_run))
 }
 
-/// Frame `k` \[H,W\] of tiles in memory.
-pub fn frame(plan: &TilePlan, tiles: &[Outcome], k: usize) -> Array2<f32> {
-    let part =
-        |tile: &Tile| -> ArrayView2<'_, f32> { tiles[tile.index].frames.index_axis(Axis(0), k) };
-    let Ok(frame) = blended(plan, |tile| Ok::<_, std::convert::Infallible>(part(tile).into()));
+/// Frame `k` \[H,W\] of a snapshot from the tiles of all runs in memory.
+pub fn frame(plan: &TilePlan, shares: &[RunShare], runs: &[Vec<Outcome>], k: usize) -> Array2<f32> {
+    let of_run = |share: &RunShare| {
+        let part = |tile: &Tile| -> ArrayView2<'_, f32> {
+            runs[share.run][tile.index].frames.index_axis(Axis(0), share.frame(k))
+        };
+        blended(plan, |tile| Ok::<_, Infallible>(part(tile).into()))
+            .map(|frame| (share.weights[k], frame))
+    };
+    let Ok(frame) = in_time(plan, shares.iter().map(of_run));
     frame
+}
+
+/// A frame \[H,W\] from those of the runs, with their weights.
+fn in_time<E>(
+    plan: &TilePlan,
+    parts: impl Iterator<Item = Result<(f32, Array2<f32>), E>>,
+) -> Result<Array2<f32>, E> {
+    let mut whole: Option<Array2<f32>> = None;
+    for part in parts {
+        let (weight, mut frame) = part?;
+        // A run alone is taken as it is.
+        if weight != 1.0 {
+            frame *= weight;
+        }
+        whole = Some(match whole {
+            None => frame,
+            Some(sum) => sum + frame,
+        });
+    }
+    Ok(whole.unwrap_or_else(|| Array2::zeros(plan.dim())))
 }
 
 /// A frame \[H,W\] from the parts of its tiles, in the plan's order.

@@ -32,8 +32,9 @@ pub enum PipelineError {
          there: name a new folder"
     )]
     Foreign { name: String },
-    #[error("the stored results of tiles {0:?} are damaged")]
-    Damaged(Vec<u32>),
+    /// Of runs, given by their first snapshot, these tiles.
+    #[error("the stored results of tiles are damaged (first snapshot of the run, tile): {0:?}")]
+    Damaged(Vec<(u32, u32)>),
     /// A prepared array is not what was stored.
     #[error(
         "the stored {what} (blob {sha256}) are damaged: send the files again, and make the \

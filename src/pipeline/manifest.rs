@@ -15,6 +15,7 @@ use crate::job::{
     Algorithm, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, ResultFile,
     SceneShape, Schedule, Sha256, TaskKind,
 };
+use crate::recon::sequence::{RunShare, SequencePlan};
 use crate::recon::tile::TilePlan;
 
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -41,6 +42,9 @@ pub struct Recipe {
     pub scale: ScaleRecord,
     #[serde(serialize_with = "tile_plan")]
     pub tile_plan: TilePlan,
+    /// The snapshots that were reconstructed together, before joints were taken apart.
+    #[serde(serialize_with = "runs")]
+    pub runs: SequencePlan,
     /// What the check of the measurement against its calibration found.
     pub warnings: Vec<Finding>,
     #[serde(skip)]
@@ -62,7 +66,19 @@ fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::
     Record { size: plan.size(), overlap: plan.overlap(), tiles }.serialize(serializer)
 }
 
+/// The first and the last snapshot of each run.
+fn runs<S: Serializer>(plan: &SequencePlan, serializer: S) -> Result<S::Ok, S::Error> {
+    let runs = plan.runs().iter().map(|run| [run.start, run.end - 1]);
+    runs.collect::<Vec<_>>().serialize(serializer)
+}
+
 impl Recipe {
+    /// What the frames of a snapshot take from the runs that hold it.
+    pub fn shares(&self, snapshot: usize) -> Vec<RunShare> {
+        let cuts = self.pilot.as_ref().map(PilotRecord::cuts).unwrap_or_default();
+        self.runs.shares(snapshot, &cuts, self.shape.frames)
+    }
+
     /// The manifest of a snapshot, by its index in the measurement, but for its files.
     pub fn snapshot(&self, snapshot: usize, tiles: Vec<TileRecord>, run: RunRecord) -> Manifest {
         let SceneShape { frames, height, width, .. } = self.shape;
@@ -140,7 +156,7 @@ pub struct Content {
     pub width: usize,
     /// The snapshot's index in the measurement, from 0.
     snapshot: usize,
-    /// What came of each tile, in the plan's order.
+    /// What came of each tile that has a part in the snapshot: run by run, in the plan's order.
     tiles: Vec<TileRecord>,
     pub summary: Summary,
     camera: Option<CameraRecord>,
@@ -289,6 +305,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         models: ModelRecord::of(&Algorithm::PnpTvFastdvdnet.default_schedule()),
         scale: ScaleRecord { masks_full_scale: 1.0, measurement_full_scale: 255.0, white: 0.9 },
         tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),
+        runs: SequencePlan::separate(0..2),
         warnings: Vec::new(),
         camera: (Some(50.0), Some(0.012)),
     };

@@ -1,4 +1,4 @@
-//! From a snapshot to its frames: white level, pilot, tiles, blending, and the files of a result.
+//! From snapshots to their frames: white level, pilot, tiles, blending, and the files of a result.
 //!
 //! The command line and the workers share these steps, so that a job gives the same frames
 //! whichever way it came. They know arrays and files, not the store or the queue.
@@ -14,7 +14,7 @@ pub(crate) mod progress;
 pub mod quality;
 pub mod records;
 pub mod scale;
-pub mod snapshot;
+pub mod sequence;
 pub(crate) mod tile;
 pub mod usage;
 pub(crate) mod write;

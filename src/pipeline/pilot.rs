@@ -1,32 +1,61 @@
-//! The pilot of a job: which of its planned iterations pay, decided once for all its tiles.
+//! The pilot of a job: which of its planned iterations pay, and which of its snapshots belong together,
+//! decided once for all its tiles.
 
-use ndarray::Axis;
+use ndarray::s;
 
-use super::records::{PilotRecord, StageRecord};
+use super::records::{JointRecord, PilotRecord, StageRecord};
 use super::tile::TileInput;
 use crate::recon::ReconError;
+use crate::recon::joints::{self, JointFinding};
 use crate::recon::pilot::{self, StageFinding};
 use crate::recon::prior::Networks;
 use crate::recon::schedule::{Schedule, Stage};
+use crate::recon::sequence::SequencePlan;
 use crate::recon::solver::Observer;
 
-/// Runs the pilot of an adaptive schedule on a piece of a snapshot; none for a schedule that is
-/// fixed, or a piece that no light reaches.
+/// What is to be found out, and on which piece of the snapshots.
+#[derive(Debug, Clone, Copy)]
+pub struct Pilot<'a> {
+    /// The index of the first snapshot in the measurement.
+    pub first: usize,
+    pub row: usize,
+    pub column: usize,
+    pub schedule: &'a Schedule,
+    pub runs: &'a SequencePlan,
+}
+
+/// Runs the pilot on a piece of all snapshots: how long the stages of an adaptive schedule should be, on the
+/// first of them, and then, by the schedule so decided, whether those that runs hold together are better
+/// apart. None where there is nothing to be decided, or no light reaches the piece.
 pub fn decide(
     input: TileInput,
-    (snapshot, row, column): (usize, usize, usize),
-    schedule: &Schedule,
+    task: &Pilot<'_>,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Option<PilotRecord>, ReconError> {
-    if !schedule.adaptive {
+    let &Pilot { first, row, column, schedule, runs } = task;
+    let candidates = runs.joints();
+    if !schedule.adaptive && candidates.is_empty() {
         return Ok(None);
     }
-    let (height, width) = input.y.index_axis(Axis(0), 0).dim();
+    let (_, height, width) = input.y.dim();
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
     let op = op.with_gamma(schedule.gamma)?;
-    let findings = pilot::run(op, y.view(), schedule, networks, observer)?;
-    let record = |(stage, finding): (&Stage, StageFinding)| StageRecord {
+    let mut record =
+        PilotRecord { snapshot: first, row, column, height, width, stages: vec![], joints: vec![] };
+    if schedule.adaptive {
+        let y = y.slice(s![..1, .., ..]);
+        let findings = pilot::run(op.clone(), y, schedule, networks, observer)?;
+        record.stages = schedule.stages.iter().zip(findings).map(stage).collect();
+    }
+    let decided = record.decide(schedule);
+    let found = joints::compare(&op, (first, y.view()), &candidates, &decided, networks, observer)?;
+    record.joints = found.into_iter().map(joint).collect();
+    Ok(Some(record))
+}
+
+fn stage((stage, finding): (&Stage, StageFinding)) -> StageRecord {
+    StageRecord {
         prior: stage.prior,
         planned: stage.iterations,
         iterations: finding.iterations,
@@ -35,9 +64,17 @@ pub fn decide(
         end: finding.end.to_string(),
         error_before: finding.before,
         error_after: finding.after,
-    };
-    let stages = schedule.stages.iter().zip(findings).map(record).collect();
-    Ok(Some(PilotRecord { snapshot, row, column, height, width, stages }))
+    }
+}
+
+fn joint(finding: JointFinding) -> JointRecord {
+    let finite = |error: f64| error.is_finite().then_some(error);
+    JointRecord {
+        after: finding.after,
+        together: finding.belong_together(),
+        error_alone: finite(finding.alone),
+        error_together: finite(finding.together),
+    }
 }
 
 /// A schedule as the tiles run it: with all defaults filled in, and ended where the pilot found that

@@ -1,5 +1,6 @@
 //! How far a computation is, and how it is stopped.
 
+use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -77,13 +78,20 @@ impl Monitor {
 
     /// An observer of one run of a schedule, which reports here.
     pub fn observe(&self, schedule: Schedule) -> impl Observer {
-        MonitorObserver { monitor: self, share: ShareDone::new(schedule), passes: 0 }
+        MonitorObserver {
+            monitor: self,
+            share: ShareDone::new(schedule),
+            part: 0.0..1.0,
+            passes: 0,
+        }
     }
 }
 
 struct MonitorObserver<'a> {
     monitor: &'a Monitor,
     share: ShareDone,
+    /// The share of the task that the solver's run is.
+    part: Range<f64>,
     passes: u32,
 }
 
@@ -100,9 +108,17 @@ impl Observer for MonitorObserver<'_> {
             stage: stage(progress),
             iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),
             passes: self.passes,
-            fraction: self.share.after(progress),
+            fraction: self.part.start
+                + (self.part.end - self.part.start) * self.share.after(progress),
         });
         if self.monitor.stopped() { Control::Cancel } else { Control::Continue }
+    }
+
+    fn part(&mut self, share: Range<f64>) {
+        self.share.restart();
+        self.part = share;
+        // A plot shows one run of the solver: the last.
+        *self.monitor.history.lock().unwrap_or_else(PoisonError::into_inner) = Default::default();
     }
 }
 
@@ -125,6 +141,11 @@ pub(super) struct ShareDone {
 impl ShareDone {
     pub(super) fn new(schedule: Schedule) -> Self {
         Self { schedule, stage: 0, iterations: 0 }
+    }
+
+    /// To be called where another run of the schedule begins.
+    pub(super) fn restart(&mut self) {
+        (self.stage, self.iterations) = (0, 0);
     }
 
     /// The share on \[0,1\] after the iteration that `progress` tells of; to be called for

@@ -1,12 +1,9 @@
 //! How good frames are where the truth is known: PSNR and SSIM, frame by frame, so that memory holds
 //! one of each.
 
-use ndarray::{ArrayView2, ArrayView3, Axis};
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use serde::Serialize;
 
-use super::blend;
-use crate::recon::solver::Outcome;
-use crate::recon::tile::TilePlan;
 use crate::recon::{ReconError, metrics};
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -44,14 +41,13 @@ pub struct Quality {
 }
 
 impl Quality {
-    /// Of tiles in memory, against the frames \[B,H,W\].
-    pub fn of_tiles(
-        plan: &TilePlan,
-        tiles: &[Outcome],
+    /// Of frames \[H,W\] by their index, against true ones \[frames,H,W\].
+    pub fn of_frames(
+        frame: impl Fn(usize) -> Array2<f32>,
         truth: ArrayView3<'_, f32>,
     ) -> Result<Self, ReconError> {
-        let frame = |(k, truth)| FrameQuality::of(k, blend::frame(plan, tiles, k).view(), truth);
-        let frames = truth.outer_iter().enumerate().map(frame);
+        let frames = truth.outer_iter().enumerate();
+        let frames = frames.map(|(k, truth)| FrameQuality::of(k, frame(k).view(), truth));
         Ok(frames.collect::<Result<Vec<_>, _>>()?.into())
     }
 }

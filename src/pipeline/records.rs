@@ -14,6 +14,7 @@ pub struct PreparedRecord {
     pub white: f32,
 }
 
+/// What the pilot of a job found out.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PilotRecord {
     pub snapshot: usize,
@@ -21,15 +22,41 @@ pub struct PilotRecord {
     pub column: usize,
     pub height: usize,
     pub width: usize,
-    /// The stages of the schedule that was asked for.
+    /// The stages of the schedule that was asked for; none if it is fixed.
     pub stages: Vec<StageRecord>,
+    /// Whether snapshots that follow one another belong together, joint by joint.
+    #[serde(default)]
+    pub joints: Vec<JointRecord>,
 }
 
 impl PilotRecord {
     pub fn decide(&self, schedule: &Schedule) -> Schedule {
+        if self.stages.is_empty() {
+            return schedule.clone();
+        }
         let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
         schedule.decided(&found.collect::<Vec<_>>())
     }
+
+    /// The joints that are taken apart, each given by the snapshot before it.
+    pub fn cuts(&self) -> Vec<usize> {
+        let apart = self.joints.iter().filter(|joint| !joint.together);
+        apart.map(|joint| joint.after).collect()
+    }
+}
+
+/// What the pilot found out about a joint.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct JointRecord {
+    /// The index of the snapshot before it; that behind it is the next.
+    pub after: usize,
+    /// Whether both snapshots are reconstructed together.
+    pub together: bool,
+    /// Error at the held-out pixels of both snapshots, each alone, relative to the measurement; null where
+    /// the solver diverged.
+    pub error_alone: Option<f64>,
+    /// The same of both together.
+    pub error_together: Option<f64>,
 }
 
 /// What the pilot found out about a stage.
@@ -88,9 +115,17 @@ impl From<&Outcome> for TileRecord {
 pub struct TileTaskRecord {
     #[serde(flatten)]
     pub tile: TileRecord,
+    /// The snapshots that have frames here, by their place in the run; the others are left to another run.
+    #[serde(default = "the_only_one")]
+    pub solved: Vec<usize>,
     /// From reading its window to its frames.
     #[serde(flatten)]
     pub cost: CostRecord,
+}
+
+/// Of before there were runs.
+fn the_only_one() -> Vec<usize> {
+    vec![0]
 }
 
 /// What computing took, and on what.

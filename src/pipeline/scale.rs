@@ -1,6 +1,6 @@
 //! The white level that all tiles of a job share.
 
-use ndarray::{ArrayView2, ArrayView3};
+use ndarray::ArrayView3;
 
 use super::arrays::{Arrays, plane};
 use super::error::{PipelineError, Result};
@@ -9,12 +9,18 @@ use crate::job::SnapshotRange;
 use crate::recon::ReconError;
 use crate::recon::scale::ScaleEstimator;
 
-/// The white level of a scene in memory: masks \[B,H,W\] and one snapshot \[H,W\].
-pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Result<f32, ReconError> {
+/// The typical white level of snapshots in memory: masks \[B,H,W\] and snapshots \[S,H,W\].
+pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
     let (_, height, width) = masks.dim();
     let mut estimator = ScaleEstimator::new(height, width);
     masks.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
-    estimator.white(y)
+    let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
+    let none = || ReconError::Shape {
+        what: "the measurement",
+        found: "no snapshots".into(),
+        expected: "at least one".into(),
+    };
+    typical_white(whites.collect::<Result<_, _>>()?).ok_or_else(none)
 }
 
 /// The typical white level of the snapshots of a job; memory holds a few planes, whatever the number

@@ -1,6 +1,8 @@
 //! One tile: the unit of work.
 
-use ndarray::{Array2, Array3, ArrayView2, Axis};
+use std::ops::Range;
+
+use ndarray::{Array3, ArrayView3, Axis, s};
 
 use crate::recon::ReconError;
 use crate::recon::learned::SnapshotNetwork;
@@ -14,21 +16,24 @@ use crate::recon::solver::{self, Observer, Outcome, StopReason};
 pub struct TileInput {
     /// The masks' window \[B,h,w\] on \[0,1\].
     pub masks: Array3<f32>,
-    /// The measurement's window \[S,h,w\]; one snapshot is solved at a time, so S is 1.
+    /// The measurement's window \[S,h,w\] of a run of snapshots.
     pub y: Array3<f32>,
     /// The colour plane of the sensor that both were cut from; grey pictures have plane 0 alone.
     pub plane: usize,
     /// White level of the scene, above 0: the same for all tiles of a job, or seams would show.
     pub white: f32,
+    /// Which snapshots of the run are solved together, by their place in it. The frames of those that are in
+    /// no piece are 0.
+    pub pieces: Vec<Range<usize>>,
 }
 
 impl TileInput {
     /// The tile with the measurement divided by the white level, so that it is `sum_k C_k x_k` with
-    /// frames on \[0,1\]; none if no light reaches it through any mask (a corner outside a round
-    /// aperture, say).
+    /// frames on \[0,1\], and the operator of one snapshot; none if no light reaches it through any mask (a
+    /// corner outside a round aperture, say).
     pub(super) fn on_unit_scale(
         self,
-    ) -> Result<Option<(SensingOperator, Array2<f32>)>, ReconError> {
+    ) -> Result<Option<(SensingOperator, Array3<f32>)>, ReconError> {
         if !(self.white.is_finite() && self.white > 0.0) {
             return Err(ReconError::Parameter {
                 name: "white level",
@@ -36,43 +41,70 @@ impl TileInput {
                 range: "a finite number above 0",
             });
         }
-        if (self.y.dim().0, self.plane) != (1, 0) {
+        let snapshots = self.y.dim().0;
+        let within = |piece: &Range<usize>| !piece.is_empty() && piece.end <= snapshots;
+        if self.plane != 0 || !self.pieces.iter().all(within) {
             return Err(ReconError::Shape {
                 what: "a tile",
-                found: format!("{} snapshots of colour plane {}", self.y.dim().0, self.plane),
-                expected: "one snapshot of plane 0".into(),
+                found: format!(
+                    "{snapshots} snapshots of colour plane {}, to be solved as {:?}",
+                    self.plane, self.pieces
+                ),
+                expected: "plane 0, and pieces of these snapshots".into(),
             });
         }
         let op = match SensingOperator::new(self.masks) {
             Err(ReconError::DarkMasks { .. }) => return Ok(None),
             other => other?,
         };
-        Ok(Some((op, self.y.index_axis_move(Axis(0), 0) / self.white)))
+        Ok(Some((op, self.y / self.white)))
     }
 
-    /// Has the tile solved on the unit scale, and multiplies the frames by the white level again. A
-    /// tile without light has frames of 0 and no iterations.
-    fn solved(
-        self,
-        solve: impl FnOnce(SensingOperator, ArrayView2<'_, f32>) -> Result<Outcome, ReconError>,
-    ) -> Result<Outcome, ReconError> {
-        let (size, white) = (self.masks.raw_dim(), self.white);
-        let Some((op, y)) = self.on_unit_scale()? else {
-            return Ok(Outcome {
-                frames: Array3::zeros(size),
-                tv_iterations: 0,
-                denoiser_passes: 0,
-                residual: 0.0,
-                stop_reason: StopReason::Converged,
-            });
+    /// Has the pieces of the tile solved on the unit scale, one after the other, and multiplies the frames
+    /// by the white level again. `solve` is told which share of all the work a piece is. A tile without
+    /// light has frames of 0 and no iterations.
+    fn solved<F>(self, gamma: f32, mut solve: F) -> Result<Outcome, ReconError>
+    where
+        F: FnMut(&SensingOperator, ArrayView3<'_, f32>, Range<f64>) -> Result<Outcome, ReconError>,
+    {
+        let ((frames, height, width), white) = (self.masks.dim(), self.white);
+        let pieces = self.pieces.clone();
+        let mut whole = Outcome {
+            frames: Array3::zeros((self.y.dim().0 * frames, height, width)),
+            tv_iterations: 0,
+            denoiser_passes: 0,
+            residual: 0.0,
+            stop_reason: StopReason::Converged,
         };
-        let mut outcome = solve(op, y.view())?;
-        outcome.frames *= white;
-        Ok(outcome)
+        let Some((op, y)) = self.on_unit_scale()? else { return Ok(whole) };
+        let mut op = op.with_gamma(gamma)?;
+        let all: usize = pieces.iter().map(Range::len).sum();
+        let share = |snapshots: usize| snapshots as f64 / all as f64;
+        let mut done = 0;
+        for piece in pieces {
+            op = op.over(piece.len())?;
+            let part = share(done)..share(done + piece.len());
+            done += piece.len();
+            let outcome = solve(&op, y.slice(s![piece.clone(), .., ..]), part)?;
+            if piece.len() == y.dim().0 {
+                whole = outcome;
+                continue;
+            }
+            let place = s![piece.start * frames..piece.end * frames, .., ..];
+            whole.frames.slice_mut(place).assign(&outcome.frames);
+            whole.tv_iterations = whole.tv_iterations.max(outcome.tv_iterations);
+            whole.denoiser_passes = whole.denoiser_passes.max(outcome.denoiser_passes);
+            whole.residual = whole.residual.max(outcome.residual);
+            if outcome.stop_reason == StopReason::MaxIterations {
+                whole.stop_reason = StopReason::MaxIterations;
+            }
+        }
+        whole.frames *= white;
+        Ok(whole)
     }
 }
 
-/// Reconstructs one tile by the iterations of a schedule. The frames \[B,h,w\] are on the scale of
+/// Reconstructs one tile by the iterations of a schedule. The frames \[S B,h,w\] are on the scale of
 /// the measurement.
 /// Errors: as [`solver::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct_tile(
@@ -81,19 +113,20 @@ pub fn reconstruct_tile(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome, ReconError> {
-    input.solved(|op, y| {
-        let op = op.with_gamma(schedule.gamma)?;
-        solver::reconstruct(&op, y, schedule, networks, observer)
+    input.solved(schedule.gamma, |op, y, part| {
+        observer.part(part);
+        solver::reconstruct(op, y, schedule, networks, observer)
     })
 }
 
-/// Reconstructs one tile in one run of an end-to-end network.
+/// Reconstructs one tile by an end-to-end network, snapshot by snapshot.
 pub fn run_network(
     input: TileInput,
     network: &mut dyn SnapshotNetwork,
 ) -> Result<Outcome, ReconError> {
-    input.solved(|op, y| {
-        let frames = network.frames(y, op.masks())?;
+    let pieces = (0..input.y.dim().0).map(|snapshot| snapshot..snapshot + 1).collect();
+    TileInput { pieces, ..input }.solved(0.0, |op, y, _| {
+        let frames = network.frames(y.index_axis(Axis(0), 0), op.masks())?;
         let rest = &y - &op.forward(frames.view())?;
         let norm = squares(y).max(f64::MIN_POSITIVE);
         Ok(Outcome {
@@ -106,22 +139,23 @@ pub fn run_network(
     })
 }
 
-fn squares(values: ArrayView2<'_, f32>) -> f64 {
+fn squares(values: ArrayView3<'_, f32>) -> f64 {
     values.iter().map(|&value| f64::from(value) * f64::from(value)).sum()
 }
 
 #[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)] // lists of ranges, some of one
 mod tests {
     use super::{TileInput, reconstruct_tile, run_network};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
     use crate::recon::learned::SnapshotNetwork;
     use crate::recon::schedule::Schedule;
-    use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
+    use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate, s};
 
     /// One snapshot of plane 0.
     fn input(masks: Array3<f32>, y: Array2<f32>, white: f32) -> TileInput {
-        TileInput { masks, y: y.insert_axis(Axis(0)), plane: 0, white }
+        TileInput { masks, y: y.insert_axis(Axis(0)), plane: 0, white, pieces: vec![0..1] }
     }
 
     fn scene() -> (Array3<f32>, Array3<f32>) {
@@ -194,13 +228,34 @@ mod tests {
     }
 
     #[test]
-    fn sequences_and_colours_are_refused_until_they_can_be_solved() {
+    fn a_run_is_solved_in_its_pieces() {
+        let (masks, frames) = scene();
+        let y = measure(masks.view(), frames.view()).unwrap().insert_axis(Axis(0));
+        let y = concatenate(Axis(0), &[y.view(), (0.5 * &y).view(), (0.8 * &y).view()]).unwrap();
+        let solve = |y: Array3<f32>, pieces| {
+            let input = TileInput { masks: masks.clone(), y, plane: 0, white: 0.9, pieces };
+            reconstruct_tile(input, &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().frames
+        };
+        let part = |snapshots: std::ops::Range<usize>| {
+            let alone = y.slice(s![snapshots, .., ..]).to_owned();
+            let whole = 0..alone.dim().0;
+            solve(alone, vec![whole])
+        };
+        let taken_apart = solve(y.clone(), vec![0..2, 2..3]);
+        assert_eq!(taken_apart, concatenate![Axis(0), part(0..2), part(2..3)]);
+        let left_out = solve(y.clone(), vec![1..3]);
+        assert!(left_out.slice(s![..4, .., ..]).iter().all(|&value| value == 0.0));
+        assert_eq!(left_out.slice(s![4.., .., ..]), part(1..3));
+    }
+
+    #[test]
+    fn colours_and_pieces_of_other_snapshots_are_refused() {
         let (masks, _) = scene();
-        for (snapshots, plane) in [(2, 0), (1, 1)] {
-            let y = Array3::ones((snapshots, 32, 32));
-            let input = TileInput { masks: masks.clone(), y, plane, white: 1.0 };
+        for (pieces, plane) in [(vec![0..1], 1), (vec![0..2], 0), (vec![1..1], 0)] {
+            let y = Array3::ones((1, 32, 32));
+            let input = TileInput { masks: masks.clone(), y, plane, white: 1.0, pieces };
             let error = reconstruct_tile(input, &Schedule::gap_tv(), &mut (), &mut ()).unwrap_err();
-            assert!(error.to_string().contains("one snapshot of plane 0"), "{error}");
+            assert!(error.to_string().contains("plane 0"), "{error}");
         }
     }
 }

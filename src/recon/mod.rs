@@ -1,6 +1,7 @@
 //! The reconstruction core: arrays in, arrays out.
 //!
-//! A snapshot `y = sum_k C_k x_k` of `B` frames goes through a [`sensing::SensingOperator`];
+//! A snapshot `y = sum_k C_k x_k` of `B` frames, or a run of them (see [`sequence`]), goes through a
+//! [`sensing::SensingOperator`];
 //! [`solver::reconstruct`] alternates its projection with the priors that a
 //! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes (frame, row, column); frames
 //! and masks live on \[0,1\].
@@ -9,6 +10,7 @@
 
 mod defaults;
 pub mod error;
+pub mod joints;
 pub mod learned;
 pub mod metrics;
 pub mod pilot;
@@ -17,6 +19,7 @@ pub mod prior;
 pub mod scale;
 pub mod schedule;
 pub mod sensing;
+pub mod sequence;
 pub mod solver;
 pub mod tile;
 

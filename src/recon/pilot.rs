@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use ndarray::{ArrayView2, ArrayView3, s};
+use ndarray::{ArrayView2, ArrayView3, Axis, s};
 use rand::{Rng, SeedableRng};
 
 use super::error::{ReconError, Result};
@@ -86,13 +86,13 @@ pub enum StageEnd {
 /// Errors: as [`super::solver::reconstruct`].
 pub fn run(
     op: SensingOperator,
-    y: ArrayView2<'_, f32>,
+    y: ArrayView3<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Vec<StageFinding>> {
     schedule.validate()?;
-    let held_out = HeldOut::of(&op, y);
+    let held_out = HeldOut::of(&op, 0);
     let op = op.without(&held_out.pixels);
     let mut run = Run::new(&op, y, schedule, networks);
     let mut findings = Vec::with_capacity(schedule.stages.len());
@@ -139,7 +139,7 @@ impl Schedule {
 
 struct Watch<'a, 'b> {
     op: &'a SensingOperator,
-    y: ArrayView2<'a, f32>,
+    y: ArrayView3<'a, f32>,
     held_out: &'a HeldOut,
     index: usize,
     observer: &'b mut dyn Observer,
@@ -197,31 +197,50 @@ impl Watch<'_, '_> {
 }
 
 /// Pixels that the solver does not see.
-struct HeldOut {
-    /// Rows and columns.
-    pixels: Vec<(usize, usize)>,
+pub(super) struct HeldOut {
+    /// Snapshots, rows and columns.
+    pub(super) pixels: Vec<(usize, usize, usize)>,
 }
 
 impl HeldOut {
-    /// Drawn from those that a mask reaches; always the same for the same masks.
-    fn of(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Self {
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(0);
-        let mut draw = |&(pixel, _): &((usize, usize), &f32)| {
-            random.random_bool(HELD_OUT) && op.gram()[pixel] > 0.0
-        };
-        let pixels = y.indexed_iter().filter(|entry| draw(entry)).map(|(pixel, _)| pixel).collect();
+    /// Drawn from those that a mask reaches; always the same for the same masks and the same snapshot, of
+    /// which the operator's first has the index `first`.
+    pub(super) fn of(op: &SensingOperator, first: usize) -> Self {
+        let gram = op.gram();
+        let mut pixels = Vec::new();
+        for snapshot in 0..op.snapshots() {
+            let mut random = rand_chacha::ChaCha8Rng::seed_from_u64((first + snapshot) as u64);
+            for ((row, column), &gram) in gram.indexed_iter() {
+                if random.random_bool(HELD_OUT) && gram > 0.0 {
+                    pixels.push((snapshot, row, column));
+                }
+            }
+        }
         Self { pixels }
     }
 
     /// `||y - Hv|| / ||y||` over the pixels.
-    fn error(&self, op: &SensingOperator, y: ArrayView2<'_, f32>, v: ArrayView3<'_, f32>) -> f64 {
-        let (mut rest, mut norm) = (0.0, f64::MIN_POSITIVE);
-        for &(i, j) in &self.pixels {
-            let seen = (0..v.dim().0).map(|k| op.masks()[[k, i, j]] * v[[k, i, j]]).sum::<f32>();
-            rest += f64::from(y[[i, j]] - seen).powi(2);
-            norm += f64::from(y[[i, j]]).powi(2);
-        }
+    fn error(&self, op: &SensingOperator, y: ArrayView3<'_, f32>, v: ArrayView3<'_, f32>) -> f64 {
+        let (rest, norm) = self.squares(op, y, v);
         (rest / norm).sqrt()
+    }
+
+    /// `||y - Hv||^2` and `||y||^2` over the pixels.
+    pub(super) fn squares(
+        &self,
+        op: &SensingOperator,
+        y: ArrayView3<'_, f32>,
+        v: ArrayView3<'_, f32>,
+    ) -> (f64, f64) {
+        let frames = op.masks().len_of(Axis(0));
+        let (mut rest, mut norm) = (0.0, f64::MIN_POSITIVE);
+        for &(s, i, j) in &self.pixels {
+            let seen = |k| op.masks()[[k, i, j]] * v[[s * frames + k, i, j]];
+            let seen = (0..frames).map(seen).sum::<f32>();
+            rest += f64::from(y[[s, i, j]] - seen).powi(2);
+            norm += f64::from(y[[s, i, j]]).powi(2);
+        }
+        (rest, norm)
     }
 }
 
@@ -233,7 +252,7 @@ mod tests {
     use crate::recon::prior::{Denoiser, Network, Networks};
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
-    use ndarray::{Array2, Array3, s};
+    use ndarray::{Array2, Array3, Axis, s};
 
     /// Goes to the truth for some passes, and away from it afterwards.
     struct Tiring {
@@ -266,7 +285,7 @@ mod tests {
         let truth = Array3::from_shape_fn((4, 48, 48), |(k, i, j)| {
             0.5 + 0.4 * ((i + 3 * k) as f32 * 0.4).sin() * (j as f32 * 0.3).cos()
         });
-        let y = measure(masks.view(), truth.view()).unwrap();
+        let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
         let op = SensingOperator::new(masks).unwrap();
         let mut schedule = Schedule::pnp_ffdnet();
         schedule.stages[1].iterations = planned;
@@ -306,7 +325,7 @@ mod tests {
                 let wave = 0.4 * (i as f32 * 0.2).sin() * (j as f32 * 0.15).sin();
                 0.5 + if flicker && k % 2 == 1 { -wave } else { wave }
             });
-            let y = measure(masks.view(), truth.view()).unwrap();
+            let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
             let op = SensingOperator::new(masks.clone()).unwrap();
             run(op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap()[0].temporal_weight
         };

@@ -36,10 +36,10 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
     enough.max(height.max(width).div_ceil(LONGER_SIDE))
 }
 
-/// Frames \[B,H,W\] of a small picture, by a few iterations of GAP-TV. `y` is on the scale on which
+/// Frames of a small picture, by a few iterations of GAP-TV. `y` \[S,H,W\] is on the scale on which
 /// the scene is on \[0,1\].
 /// Errors: as [`solver::reconstruct`].
-pub fn whole(op: &SensingOperator, y: ArrayView2<'_, f32>) -> Result<Array3<f32>> {
+pub fn whole(op: &SensingOperator, y: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
     Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
 }

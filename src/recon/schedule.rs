@@ -230,6 +230,12 @@ impl Schedule {
         self.stages.iter().any(|stage| stage.prior.network().is_some())
     }
 
+    /// Whether frames depend on those before and after them: only then snapshots that follow one another
+    /// are better together.
+    pub fn looks_along_time(&self) -> bool {
+        self.stages.iter().any(|stage| stage.prior.looks_along_time(&stage.settings(0)))
+    }
+
     /// Fixes the total number of iterations and switches the convergence tests off: earlier
     /// stages keep their length as far as it goes, the last one takes the rest.
     pub fn with_iterations(mut self, total: usize) -> Self {

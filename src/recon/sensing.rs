@@ -3,11 +3,13 @@
 use std::ops::Range;
 
 use multiversion::multiversion;
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 
 use super::error::{ReconError, Result, shape_text};
 
-/// `H` of `y = Hx = sum_k C_k x_k`, for one set of masks `C` \[B,H,W\] on \[0,1\].
+/// `H` of `y_s = (Hx)_s = sum_k C_k x_(sB+k)`, for one set of masks `C` \[B,H,W\] on \[0,1\] and a
+/// run of `S` snapshots, one after the other, whose frames `x` \[S B,H,W\] are joined: block by block it is
+/// the operator of one snapshot.
 ///
 /// `H H^T` is diagonal with `sum_k C_k^2` on it (the sum of *squares*: the sum of the masks
 /// is the same only if they are binary). Where it is 0 the pixel is dead: no frame reaches
@@ -16,12 +18,13 @@ use super::error::{ReconError, Result, shape_text};
 pub struct SensingOperator {
     masks: Array3<f32>,
     gram: Array2<f32>,
-    inverse_gram: Array2<f32>,
+    /// Of each snapshot \[S,H,W\]: they differ where pixels are kept from the projection.
+    inverse_gram: Array3<f32>,
     gamma: f32,
 }
 
 impl SensingOperator {
-    /// Takes masks \[B,H,W\], all finite and not all 0.
+    /// Of one snapshot. Takes masks \[B,H,W\], all finite and not all 0.
     pub fn new(masks: Array3<f32>) -> Result<Self> {
         let (frames, height, width) = masks.dim();
         if frames == 0 || height == 0 || width == 0 {
@@ -46,8 +49,21 @@ impl SensingOperator {
         if gram.iter().all(|&g| g == 0.0) {
             return Err(ReconError::DarkMasks { frames });
         }
-        let inverse_gram = invert(&gram, 0.0);
+        let inverse_gram = invert(&gram, 0.0, 1);
         Ok(Self { masks, gram, inverse_gram, gamma: 0.0 })
+    }
+
+    /// The same for a run of so many snapshots, at least 1, behind these masks.
+    pub fn over(self, snapshots: usize) -> Result<Self> {
+        if snapshots == 0 {
+            return Err(ReconError::Parameter {
+                name: "the number of snapshots",
+                value: snapshots.to_string(),
+                range: "at least 1",
+            });
+        }
+        let inverse_gram = invert(&self.gram, self.gamma, snapshots);
+        Ok(Self { inverse_gram, ..self })
     }
 
     /// Replaces `(H H^T)^-1` by `(H H^T + gamma)^-1`, for measurements with noise: plain GAP
@@ -60,14 +76,14 @@ impl SensingOperator {
                 range: "a finite number of at least 0",
             });
         }
-        self.inverse_gram = invert(&self.gram, gamma);
+        self.inverse_gram = invert(&self.gram, gamma, self.snapshots());
         self.gamma = gamma;
         Ok(self)
     }
 
-    /// Keeps some pixels of the measurement, given by row and column, from the projection, as if no
-    /// mask reached them.
-    pub(super) fn without(mut self, pixels: &[(usize, usize)]) -> Self {
+    /// Keeps some pixels of the measurement, given by snapshot, row and column, from the projection, as if
+    /// no mask reached them.
+    pub(super) fn without(mut self, pixels: &[(usize, usize, usize)]) -> Self {
         for &pixel in pixels {
             self.inverse_gram[pixel] = 0.0;
         }
@@ -84,12 +100,23 @@ impl SensingOperator {
         self.masks.view()
     }
 
-    /// (frames, height, width).
-    pub fn dim(&self) -> (usize, usize, usize) {
-        self.masks.dim()
+    /// Snapshots of the run.
+    pub fn snapshots(&self) -> usize {
+        self.inverse_gram.dim().0
     }
 
-    /// The diagonal of `H H^T` \[H,W\]: `sum_k C_k^2`.
+    /// (frames of all snapshots, height, width).
+    pub fn dim(&self) -> (usize, usize, usize) {
+        let (frames, height, width) = self.masks.dim();
+        (self.snapshots() * frames, height, width)
+    }
+
+    /// The size of the measurement: (snapshots, height, width).
+    pub(super) fn measurement_dim(&self) -> (usize, usize, usize) {
+        self.inverse_gram.dim()
+    }
+
+    /// The diagonal of `H H^T` \[H,W\], the same for each snapshot: `sum_k C_k^2`.
     pub fn gram(&self) -> ArrayView2<'_, f32> {
         self.gram.view()
     }
@@ -99,22 +126,30 @@ impl SensingOperator {
         self.gram.iter().filter(|&&g| g == 0.0).count()
     }
 
-    /// `Hx` \[H,W\] of frames `x` \[B,H,W\].
-    pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array2<f32>> {
-        self.check("the frame stack", frames.shape(), self.masks.shape())?;
-        let mut y = Array2::zeros(self.gram.raw_dim());
-        for (mask, frame) in self.masks.outer_iter().zip(frames.outer_iter()) {
-            ndarray::azip!((sum in &mut y, &c in &mask, &x in &frame) *sum += c * x);
+    /// `Hx` \[S,H,W\] of frames `x` \[S B,H,W\].
+    pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
+        let (count, height, width) = self.dim();
+        self.check("the frame stack", frames.shape(), &[count, height, width])?;
+        let mut y = Array3::zeros(self.inverse_gram.raw_dim());
+        let blocks = frames.axis_chunks_iter(Axis(0), self.masks.dim().0);
+        for (mut y, block) in y.outer_iter_mut().zip(blocks) {
+            for (mask, frame) in self.masks.outer_iter().zip(block.outer_iter()) {
+                ndarray::azip!((sum in &mut y, &c in &mask, &x in &frame) *sum += c * x);
+            }
         }
         Ok(y)
     }
 
-    /// `H^T y` \[B,H,W\] of a measurement `y` \[H,W\].
-    pub fn adjoint(&self, y: ArrayView2<'_, f32>) -> Result<Array3<f32>> {
-        self.check("the measurement", y.shape(), self.gram.shape())?;
-        let mut frames = self.masks.clone();
-        for mut frame in frames.outer_iter_mut() {
-            frame *= &y;
+    /// `H^T y` \[S B,H,W\] of a measurement `y` \[S,H,W\].
+    pub fn adjoint(&self, y: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
+        self.check("the measurement", y.shape(), self.inverse_gram.shape())?;
+        let mut frames = Array3::zeros(self.dim());
+        for (mut block, y) in
+            frames.axis_chunks_iter_mut(Axis(0), self.masks.dim().0).zip(y.outer_iter())
+        {
+            for (mut frame, mask) in block.outer_iter_mut().zip(self.masks.outer_iter()) {
+                ndarray::azip!((x in &mut frame, &c in &mask, &y in &y) *x = c * y);
+            }
         }
         Ok(frames)
     }
@@ -123,13 +158,13 @@ impl SensingOperator {
     /// `t = y`, or, accelerated, `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that
     /// is the published `y1 += y - H v` (Liao et al. 2014), with 0 it is plain GAP.
     ///
-    /// Only `rows` are done; they need no other. `y` and `y1` are \[H,W\], `v` and `x` \[B,H,W\],
-    /// all of the operator's size and in standard layout. Returns `||y - H v||^2` of the rows.
+    /// Only `rows` of each snapshot are done; they need no other. `y` and `y1` are \[S,H,W\], `v` and `x`
+    /// \[S B,H,W\], all of the operator's size and in standard layout. Returns `||y - H v||^2` of the rows.
     pub(super) fn project(
         &self,
         rows: Range<usize>,
-        y: &Array2<f32>,
-        y1: Option<(&mut Array2<f32>, f32)>,
+        y: &Array3<f32>,
+        y1: Option<(&mut Array3<f32>, f32)>,
         v: &Array3<f32>,
         x: &mut Array3<f32>,
     ) -> f64 {
@@ -147,14 +182,19 @@ impl SensingOperator {
         let mut accelerated = y1.and_then(|(y1, memory)| Some((y1.as_slice_mut()?, memory)));
         let mut sum = vec![0.0f32; width];
         let mut squares = 0.0f64;
-        // Row by row over all frames: a row of v and of the masks is still in cache when the
-        // correction is added.
-        for start in rows.map(|row| row * width) {
-            let row = start..start + width;
-            let stack = Stack { plane, start, width, frames };
-            let target = accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
-            squares +=
-                project_row(stack, masks, v, x, &y[row.clone()], target, &inverse[row], &mut sum);
+        for snapshot in 0..self.snapshots() {
+            let block = snapshot * frames * plane..(snapshot + 1) * frames * plane;
+            let (v, x) = (&v[block.clone()], &mut x[block]);
+            // Row by row over all frames: a row of v and of the masks is still in cache when the
+            // correction is added.
+            for start in rows.clone().map(|row| row * width) {
+                let stack = Stack { plane, start, width, frames };
+                let row = snapshot * plane + start..snapshot * plane + start + width;
+                let target =
+                    accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
+                let (y, inverse) = (&y[row.clone()], &inverse[row]);
+                squares += project_row(stack, masks, v, x, y, target, inverse, &mut sum);
+            }
         }
         squares
     }
@@ -167,8 +207,12 @@ impl SensingOperator {
     }
 }
 
-fn invert(gram: &Array2<f32>, gamma: f32) -> Array2<f32> {
-    gram.mapv(|g| if g > 0.0 { 1.0 / (g + gamma) } else { 0.0 })
+/// `(H H^T + gamma)^-1` \[S,H,W\].
+fn invert(gram: &Array2<f32>, gamma: f32, snapshots: usize) -> Array3<f32> {
+    let inverse = gram.mapv(|g| if g > 0.0 { 1.0 / (g + gamma) } else { 0.0 });
+    let mut all = Array3::zeros((snapshots, gram.nrows(), gram.ncols()));
+    all.outer_iter_mut().for_each(|mut of_one| of_one.assign(&inverse));
+    all
 }
 
 /// One row through all frames of a stack in standard layout.
@@ -240,7 +284,7 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::SensingOperator;
-    use ndarray::{Array2, Array3};
+    use ndarray::Array3;
     use proptest::prelude::{any, proptest};
 
     fn random(seed: u64, dim: (usize, usize, usize)) -> Array3<f32> {
@@ -253,11 +297,12 @@ mod tests {
         #[test]
         fn adjoint_is_the_adjoint(
             seed in any::<u64>(),
+            snapshots in 1usize..4,
             dim in (1usize..5, 1usize..9, 1usize..9),
         ) {
-            let op = SensingOperator::new(random(seed, dim)).unwrap();
-            let x = random(seed ^ 1, dim);
-            let y = random(seed ^ 2, (1, dim.1, dim.2)).remove_axis_first();
+            let op = SensingOperator::new(random(seed, dim)).unwrap().over(snapshots).unwrap();
+            let x = random(seed ^ 1, op.dim());
+            let y = random(seed ^ 2, (snapshots, dim.1, dim.2));
             let left: f32 = (&op.forward(x.view()).unwrap() * &y).sum();
             let right: f32 = (&op.adjoint(y.view()).unwrap() * &x).sum();
             assert!((left - right).abs() <= 1e-4 * left.abs().max(1.0), "{left} {right}");
@@ -266,31 +311,24 @@ mod tests {
         #[test]
         fn plain_projection_meets_the_measurement(
             seed in any::<u64>(),
+            snapshots in 1usize..4,
             dim in (1usize..5, 1usize..9, 1usize..20),
         ) {
-            let op = SensingOperator::new(random(seed, dim)).unwrap();
-            let truth = random(seed ^ 1, dim);
+            let op = SensingOperator::new(random(seed, dim)).unwrap().over(snapshots).unwrap();
+            let truth = random(seed ^ 1, op.dim());
             let y = op.forward(truth.view()).unwrap();
-            let v = random(seed ^ 2, dim);
-            let mut x = Array3::zeros(dim);
-            let squares = op.project(0..y.nrows(), &y, None, &v, &mut x);
+            let v = random(seed ^ 2, op.dim());
+            let mut x = Array3::zeros(op.dim());
+            let squares = op.project(0..dim.1, &y, None, &v, &mut x);
             let before = &y - &op.forward(v.view()).unwrap();
             let after = &y - &op.forward(x.view()).unwrap();
             let expected: f64 = before.iter().map(|&r| f64::from(r * r)).sum();
             assert!((squares - expected).abs() <= 1e-4 * expected.max(1e-3));
-            for (residual, gram) in after.iter().zip(op.gram()) {
-                assert!(residual.abs() < 1e-4 || *gram < 1e-4, "{residual} {gram}");
+            for after in after.outer_iter() {
+                for (residual, gram) in after.iter().zip(op.gram()) {
+                    assert!(residual.abs() < 1e-4 || *gram < 1e-4, "{residual} {gram}");
+                }
             }
-        }
-    }
-
-    trait FirstFrame {
-        fn remove_axis_first(self) -> Array2<f32>;
-    }
-
-    impl FirstFrame for Array3<f32> {
-        fn remove_axis_first(self) -> Array2<f32> {
-            self.index_axis_move(ndarray::Axis(0), 0)
         }
     }
 
@@ -302,10 +340,11 @@ mod tests {
         assert_eq!(op.dead_pixels(), 1);
         let v = random(4, (2, 3, 3));
         let mut x = Array3::zeros((2, 3, 3));
-        let mut y1 = Array2::from_elem((3, 3), 5.0);
-        op.project(0..3, &Array2::from_elem((3, 3), 1.0), Some((&mut y1, 1.0)), &v, &mut x);
+        let mut y1 = Array3::from_elem((1, 3, 3), 5.0);
+        op.project(0..3, &Array3::from_elem((1, 3, 3), 1.0), Some((&mut y1, 1.0)), &v, &mut x);
         assert_eq!(x[[0, 1, 1]], v[[0, 1, 1]]);
         assert!(x.iter().all(|value| value.is_finite()));
+        assert!(op.over(0).is_err());
     }
 
     #[test]

@@ -111,6 +111,11 @@ impl TilePlan {
         false
     }
 
+    /// Pixels of its largest tile.
+    pub fn largest(&self) -> usize {
+        self.tiles().map(|tile| tile.height * tile.width).max().unwrap_or(0)
+    }
+
     /// The tile at `index`, row by row; none past the end.
     pub fn tile(&self, index: usize) -> Option<Tile> {
         let row = self.rows.get(index / self.columns.len())?;
@@ -150,27 +155,49 @@ impl TilePlan {
 /// Cuts an axis into as few spans as possible, as even as possible, and gives each its weights.
 fn spans(length: usize, size: usize, overlap: usize) -> Vec<Span> {
     let size = size.min(length);
-    let count = 1 + (length - size).div_ceil((size - overlap.min(size / 2)).max(1));
+    let parts = parts(length, size, overlap.min(size / 2), MULTIPLE);
+    let weights = weights(&parts, length);
+    let spans = parts.into_iter().zip(weights);
+    spans.map(|(part, weights)| Span { start: part.start, weights }).collect()
+}
+
+/// As few parts of 0 to `length` as possible of at most `size`, which share at least `overlap`, less than
+/// `size`, with their neighbours, as even as possible, and as short as that allows, in multiples of
+/// `multiple` where `size` is none.
+pub(super) fn parts(
+    length: usize,
+    size: usize,
+    overlap: usize,
+    multiple: usize,
+) -> Vec<Range<usize>> {
+    let count = 1 + length.saturating_sub(size).div_ceil((size - overlap).max(1));
     // No more is shared than was asked for: what is shared is computed twice.
     let least = (length + (count - 1) * overlap).div_ceil(count);
-    let size = least.next_multiple_of(MULTIPLE).min(size);
+    let size = least.next_multiple_of(multiple).min(size);
     let start = |k: usize| if k == 0 { 0 } else { k * (length - size) / (count - 1) };
-    let mut spans: Vec<Span> = (0..count)
+    (0..count).map(|k| start(k)..start(k) + size).collect()
+}
+
+/// The weights of parts that cover 0 to `length`, in order of their starts: they rise as a squared sine over
+/// what a part shares with its neighbour, and add up to 1 everywhere.
+pub(super) fn weights(parts: &[Range<usize>], length: usize) -> Vec<Vec<f32>> {
+    let mut weights: Vec<Vec<f32>> = (0..parts.len())
         .map(|k| {
-            let before = if k == 0 { 0 } else { start(k - 1) + size - start(k) };
-            let after = if k + 1 == count { 0 } else { start(k) + size - start(k + 1) };
-            Span { start: start(k), weights: tapered(size, before, after) }
+            let part = &parts[k];
+            let before = k.checked_sub(1).map_or(0, |k| parts[k].end.saturating_sub(part.start));
+            let after = parts.get(k + 1).map_or(0, |next| part.end.saturating_sub(next.start));
+            tapered(part.len(), before, after)
         })
         .collect();
-    // Even spacing can make three spans meet, so the ramps alone need not add up to 1.
+    // Even spacing can make three parts meet, so the ramps alone need not add up to 1.
     let mut sums = vec![0.0f32; length];
-    for span in &spans {
-        sums[span.start..].iter_mut().zip(&span.weights).for_each(|(sum, weight)| *sum += weight);
+    for (part, weights) in parts.iter().zip(&weights) {
+        sums[part.clone()].iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
     }
-    for span in &mut spans {
-        span.weights.iter_mut().zip(&sums[span.start..]).for_each(|(weight, sum)| *weight /= sum);
+    for (part, weights) in parts.iter().zip(&mut weights) {
+        weights.iter_mut().zip(&sums[part.clone()]).for_each(|(weight, sum)| *weight /= sum);
     }
-    spans
+    weights
 }
 
 /// 1 inside, and a squared sine over the `before` first and `after` last of `length` pixels.

@@ -9,8 +9,8 @@ use sqlx::{Decode, Encode, Row, SqliteConnection, Type};
 
 use super::error::{Result, StoreError};
 use crate::job::{
-    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sha256,
-    TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
+    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sequence,
+    Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
 };
 
 /// One page of a list, and whether to go on after it.
@@ -117,7 +117,8 @@ column!(
     WorkerId,
     JobState,
     TaskState,
-    TaskStage as String,
+    TaskStage,
+    Sequence as String,
     ToString::to_string,
     |text| Ok(text.parse()?)
 );

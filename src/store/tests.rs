@@ -4,6 +4,7 @@ mod calibrations;
 mod failures;
 mod keeping;
 mod migration;
+mod sequences;
 mod turns;
 
 use std::io::Write;
@@ -17,8 +18,8 @@ use super::{
     Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd, WorkerPlace,
 };
 use crate::job::{
-    Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sha256, SnapshotSelection,
-    TaskKind, TaskProgress, TileSpec, WorkerId,
+    Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sequence, Sha256,
+    SnapshotSelection, TaskKind, TaskProgress, TileSpec, WorkerId,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -86,6 +87,7 @@ impl Lab {
             full_scale: 1.0,
             camera_fps: Some(30.0),
             exposure_s: None,
+            sequence: Sequence::Separate,
             dark: Vec::new(),
             warnings: Vec::new(),
         };
@@ -146,6 +148,7 @@ impl Lab {
             measurement: self.measurement,
             calibration: None,
             snapshots: SnapshotSelection::All,
+            sequence: None,
             algorithm,
             model: None,
             schedule: None,
@@ -153,7 +156,8 @@ impl Lab {
             priority,
             label: None,
         };
-        let spec = job.resolve(measurement.calibration, shape, None).unwrap();
+        let sequence = measurement.sequence;
+        let spec = job.resolve(measurement.calibration, shape, sequence, None).unwrap();
         let new = NewJob {
             most_jobs: 1000,
             lab: lab.clone(),
@@ -180,7 +184,7 @@ impl Lab {
             TaskKind::Prepare => Product::Record,
             TaskKind::Pilot => Product::TileCost(0.5),
             TaskKind::Preview { snapshot } => self.blob(&format!("preview {snapshot}")),
-            TaskKind::Tile { snapshot, tile } => self.blob(&format!("{snapshot} {tile}")),
+            TaskKind::Tile { snapshot, tile, .. } => self.blob(&format!("{snapshot} {tile}")),
             TaskKind::Assemble { .. } => {
                 let folder = self.store.staged_dir().unwrap();
                 std::fs::create_dir(folder.path().join("frames")).unwrap();
@@ -243,7 +247,7 @@ fn id(inserted: Inserted) -> JobId {
 }
 
 fn tile(snapshot: u32, tile: u32) -> TaskKind {
-    TaskKind::Tile { snapshot, tile }
+    TaskKind::Tile { snapshot, snapshots: 1, tile }
 }
 
 #[tokio::test]

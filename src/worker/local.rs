@@ -1,5 +1,7 @@
 //! The store of the same machine, as a worker sees it.
 
+use std::ops::Range;
+
 use ndarray::ArrayView3;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -71,11 +73,12 @@ impl Local {
             }
             TaskKind::Pilot => TaskInput::Pilot {
                 arrays,
-                snapshot: spec.snapshots.first,
+                snapshots: spec.snapshots,
                 white: white(task)?,
                 schedule: spec.schedule.clone(),
+                runs: spec.sequence_plan().map_err(PipelineError::from)?,
             },
-            TaskKind::Tile { snapshot, tile } => {
+            TaskKind::Tile { snapshot, tile, .. } => {
                 TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
             }
             TaskKind::Assemble { snapshot } => TaskInput::Assemble {
@@ -120,9 +123,9 @@ impl Local {
     }
 
     fn stored_tile(&self, stored: &TileResult) -> Result<StoredTile, PipelineError> {
-        let TileResult { tile, sha256, record } = stored;
+        let TileResult { run, tile, sha256, record } = stored;
         let record = parsed("tile", record)?;
-        Ok(StoredTile { tile: *tile, path: self.path(*sha256), sha256: *sha256, record })
+        Ok(StoredTile { run: *run, tile: *tile, path: self.path(*sha256), sha256: *sha256, record })
     }
 
     fn path(&self, sha256: Sha256) -> std::path::PathBuf {
@@ -189,7 +192,7 @@ impl Transport for Local {
         Ok(self.store.give_back(lease).await?)
     }
 
-    async fn redo(&self, lease: &Lease, tiles: &[u32]) -> Result<(), TransportError> {
+    async fn redo(&self, lease: &Lease, tiles: &[(u32, u32)]) -> Result<(), TransportError> {
         Ok(self.store.redo_tiles(lease, tiles).await?)
     }
 
@@ -197,7 +200,7 @@ impl Transport for Local {
         let arrays = self.arrays(task.masks, task.measurement);
         let place = (task.tile.rows(), task.tile.columns());
         let input = arrays.window(task.snapshots.clone(), place, task.white)?;
-        Ok(TileInput { plane: task.plane, ..input })
+        Ok(TileInput { plane: task.plane, pieces: task.pieces.clone(), ..input })
     }
 
     fn model(&self, sha256: Sha256) -> ModelFile {
@@ -230,21 +233,33 @@ fn pilot(task: &JobTask) -> Result<Option<PilotRecord>, PipelineError> {
     parsed("pilot", task.pilot.as_ref().unwrap_or(&Value::Null))
 }
 
-/// A tile of a job, from the plan and the records of the tasks before it.
-pub fn tile_task(task: &JobTask, snapshot: u32, index: u32) -> Result<TileTask, PipelineError> {
+/// A tile of the run of a job that begins with this snapshot, from the plans and the records of the tasks
+/// before it.
+pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, PipelineError> {
     let plan = task.spec.tile_plan()?;
     let tile = plan.tile(index as usize).ok_or_else(|| PipelineError::Record {
         what: "task",
         problem: format!("tile {index} of a plan of {}", plan.len()),
     })?;
+    let pilot = pilot(task)?;
+    let runs = task.spec.sequence_plan()?;
+    let begins = |run: &Range<usize>| run.start == first as usize;
+    let run = runs.runs().iter().position(begins).ok_or_else(|| PipelineError::Record {
+        what: "task",
+        problem: format!("no run begins with snapshot {first}"),
+    })?;
+    let start = runs.runs()[run].start;
+    let pieces = runs.pieces(&pilot.as_ref().map(PilotRecord::cuts).unwrap_or_default());
+    let own = pieces.into_iter().filter(|piece| piece.run == run).map(|piece| piece.snapshots);
     Ok(TileTask {
         masks: task.calibration.prepared,
         measurement: task.measurement.prepared,
-        snapshots: snapshot..snapshot + 1,
+        snapshots: first..first + runs.runs()[run].len() as u32,
+        pieces: own.map(|piece| piece.start - start..piece.end - start).collect(),
         plane: 0,
         tile,
         white: white(task)?,
-        schedule: full_schedule(&task.spec.schedule, pilot(task)?.as_ref()),
+        schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),
         model: task.spec.model.as_ref().map(|model| model.sha256),
     })
 }
@@ -267,6 +282,7 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
             white: white(task)?,
         },
         tile_plan: spec.tile_plan()?,
+        runs: spec.sequence_plan()?,
         warnings: spec.warnings.clone(),
         camera: (measurement.camera_fps, measurement.exposure_s),
     })

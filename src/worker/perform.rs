@@ -8,12 +8,13 @@ use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, 
 use crate::formats::planar::{self, Reader};
 use crate::formats::{Limits, StackInfo};
 use crate::intake::{self, Calibrated, IntakeError, Report, calibrate};
-use crate::job::{Label, Schedule, Sha256, TaskProgress, TaskStage};
+use crate::job::{Label, Schedule, Sha256, SnapshotRange, TaskProgress, TaskStage};
 use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
-use crate::pipeline::blend;
+use crate::pipeline::blend::{self, StoredTile};
+use crate::pipeline::manifest::Recipe;
 use crate::pipeline::networks::{ModelFile, WarmNetworks};
-use crate::pipeline::pilot::{self, full_schedule};
+use crate::pipeline::pilot::{self, Pilot, full_schedule};
 use crate::pipeline::progress::Monitor;
 use crate::pipeline::records::{
     CostRecord, PilotRecord, PreparedRecord, RunRecord, SnapshotRecord, TileRecord, TileTaskRecord,
@@ -23,6 +24,7 @@ use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use crate::pipeline::write::{write_manifest, write_result};
 use crate::pipeline::{preview, scale};
 use crate::recon;
+use crate::recon::sequence::{RunShare, SequencePlan};
 use crate::recon::solver::Outcome;
 use crate::store::{CalibrationDone, NewCalibration, StagedBlob};
 
@@ -45,8 +47,9 @@ pub(super) fn perform(
             monitor.reach(TaskStage::Tv, 1.0);
             (Value::Null, Output::Stack(frames))
         }
-        TaskInput::Pilot { arrays, snapshot, white, schedule } => {
-            let record = run_pilot(&arrays, snapshot, white, &schedule, networks, monitor)?;
+        TaskInput::Pilot { arrays, snapshots, white, schedule, runs } => {
+            let task = (snapshots, &schedule, &runs);
+            let record = run_pilot(&arrays, white, task, networks, monitor)?;
             let decided = full_schedule(&schedule, record.as_ref());
             let share = decided.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
             monitor.reach(monitor.progress().stage, 1.0);
@@ -57,7 +60,8 @@ pub(super) fn perform(
             (json(&record)?, Output::Stack(frames))
         }
         TaskInput::Assemble { job, recipe, snapshot, tiles, folder } => {
-            blend::verify(&recipe.tile_plan, &tiles, monitor)?;
+            let shares = of_shares(&recipe, snapshot, &tiles, monitor)?;
+            let tiles: Vec<&StoredTile> = shares.iter().flat_map(|(_, tiles)| tiles).collect();
             let cost = CostRecord::sum(tiles.iter().map(|tile| &tile.record.cost));
             let run = RunRecord::ended(Some(job.to_string()), cost, None);
             let records = tiles.iter().map(|tile| tile.record.tile.clone()).collect();
@@ -66,7 +70,7 @@ pub(super) fn perform(
             let files = write_result(folder.path(), manifest, |k| {
                 monitor.check()?;
                 monitor.reach(TaskStage::Writing, k as f64 / recipe.shape.frames as f64);
-                Ok(blend::stored_frame(&recipe.tile_plan, &tiles, k)?)
+                Ok(blend::stored_frame(&recipe.tile_plan, &shares, k)?)
             })?;
             monitor.reach(TaskStage::Writing, 1.0);
             let record = SnapshotRecord { summary, run, files: files.clone() };
@@ -136,17 +140,33 @@ fn json(record: &impl Serialize) -> Result<Value, PipelineError> {
 
 fn run_pilot(
     arrays: &Arrays,
-    snapshot: u32,
     white: f32,
-    schedule: &Schedule,
+    (snapshots, schedule, runs): (SnapshotRange, &Schedule, &SequencePlan),
     networks: &mut WarmNetworks,
     monitor: &Monitor,
 ) -> Result<Option<PilotRecord>, PipelineError> {
-    let (rows, columns) = recon::pilot::piece(arrays.snapshot(snapshot)?.view());
-    let place = (snapshot as usize, rows.start, columns.start);
-    let input = arrays.window(snapshot..snapshot + 1, (rows, columns), white)?;
-    let mut observer = monitor.observe(schedule.clone());
-    Ok(pilot::decide(input, place, schedule, networks, &mut observer)?)
+    let SnapshotRange { first, count } = snapshots;
+    let place = recon::pilot::piece(arrays.snapshot(first)?.view());
+    let (row, column) = (place.0.start, place.1.start);
+    let input = arrays.window(first..first + count, place, white)?;
+    let task = Pilot { first: first as usize, row, column, schedule, runs };
+    Ok(pilot::decide(input, &task, networks, &mut monitor.observe(schedule.clone()))?)
+}
+
+/// What a snapshot takes from the runs that hold it, with the tiles of each. All tiles must be there.
+fn of_shares(
+    recipe: &Recipe,
+    snapshot: u32,
+    tiles: &[StoredTile],
+    monitor: &Monitor,
+) -> Result<Vec<(RunShare, Vec<StoredTile>)>, PipelineError> {
+    let shares = recipe.shares(snapshot as usize).into_iter().map(|share| {
+        let run = snapshot - share.place as u32;
+        let tiles: Vec<_> = tiles.iter().filter(|tile| tile.run == run).cloned().collect();
+        blend::verify(&recipe.tile_plan, &tiles, monitor)?;
+        Ok((share, tiles))
+    });
+    shares.collect()
 }
 
 fn tile(
@@ -173,7 +193,8 @@ fn tile(
         cpu_seconds: cpu_seconds() - before,
         peak_rss_bytes: peak_rss_bytes(),
     };
-    Ok((TileTaskRecord { tile: TileRecord::from(&outcome), cost }, outcome.frames))
+    let solved = task.pieces.iter().flat_map(Clone::clone).collect();
+    Ok((TileTaskRecord { tile: TileRecord::from(&outcome), solved, cost }, outcome.frames))
 }
 
 /// One run of an end-to-end network, which can't be stopped on its way.

@@ -21,6 +21,7 @@ use crate::pipeline::blend::StoredTile;
 use crate::pipeline::manifest::{JobTasks, Recipe};
 use crate::pipeline::networks::ModelFile;
 use crate::pipeline::tile::TileInput;
+use crate::recon::sequence::SequencePlan;
 use crate::recon::tile::Tile;
 use crate::store::{
     BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath, StoreError,
@@ -72,8 +73,9 @@ pub trait Transport: Clone + Send + 'static {
     /// Gives a task back unharmed: the worker is to end, or the job was cancelled.
     async fn give_back(&self, lease: &Lease) -> Result<(), TransportError>;
 
-    /// Has tiles done again that an assembly, which is given back, found damaged.
-    async fn redo(&self, lease: &Lease, tiles: &[u32]) -> Result<(), TransportError>;
+    /// Has tiles done again that an assembly, which is given back, found damaged: each is given by the first
+    /// snapshot of its run, and its index.
+    async fn redo(&self, lease: &Lease, tiles: &[(u32, u32)]) -> Result<(), TransportError>;
 
     /// What a tile is made of. Blocks.
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError>;
@@ -107,15 +109,16 @@ pub enum TaskInput {
         snapshot: u32,
         white: f32,
     },
-    /// Find out how many iterations of an adaptive schedule pay.
+    /// Find out how many iterations of an adaptive schedule pay, and which snapshots belong together.
     Pilot {
         arrays: Arrays,
-        snapshot: u32,
+        snapshots: SnapshotRange,
         white: f32,
         schedule: Schedule,
+        runs: SequencePlan,
     },
     Tile(Box<TileTask>),
-    /// Blend all tiles of a snapshot, and write its frames to the folder.
+    /// Blend all tiles of the runs that hold a snapshot, and write its frames to the folder.
     Assemble {
         job: JobId,
         recipe: Box<Recipe>,
@@ -147,8 +150,10 @@ pub enum TaskInput {
 pub struct TileTask {
     pub masks: Sha256,
     pub measurement: Sha256,
-    /// The snapshots that are solved together; one today.
+    /// The run of snapshots that it belongs to, by their indices in the measurement.
     pub snapshots: Range<u32>,
+    /// Those of them that are solved together, by their place in the run.
+    pub pieces: Vec<Range<usize>>,
     /// The colour plane of the sensor, from 0; one today.
     pub plane: usize,
     pub tile: Tile,
@@ -172,7 +177,7 @@ pub enum Output {
     Record,
     /// The share of their planned cost that the tiles still have, on \[0,1\].
     TileCost(f64),
-    /// The frames \[B,h,w\] of a tile, or of a preview.
+    /// The frames \[S B,h,w\] of a tile, or \[B,h,w\] of a preview.
     Stack(Array3<f32>),
     /// Files of a result, which are on the disk, and their folder.
     Files(StagedDir, Vec<ResultFile>),

@@ -41,7 +41,7 @@ async fn run(
     schedule: &Value,
 ) -> (std::collections::BTreeMap<String, String>, Value) {
     let body = json!({"measurement": measurement, "algorithm": "pnp-nonlocal",
-        "schedule": schedule, "tile": {"size": 32, "overlap": 8}});
+        "schedule": schedule, "tile": {"size": 32, "overlap": 8}, "sequence": "separate"});
     let job = app.submit(&body).await;
     let ended = app.ended(&job).await;
     assert_eq!(ended["state"], "succeeded", "{ended:#}");

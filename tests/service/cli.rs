@@ -85,10 +85,13 @@ fn a_simulated_snapshot_is_reconstructed() {
         let fields: Vec<&str> = report.as_object().unwrap().keys().map(String::as_str).collect();
         let mut expected = vec![
             "algorithm",
+            "snapshots",
+            "runs",
             "frames",
             "height",
             "width",
             "psnr_db",
+            "psnr_db_by_snapshot",
             "ssim",
             "seconds",
             "denoiser_passes",

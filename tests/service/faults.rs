@@ -23,8 +23,13 @@ fn job(measurement: &str) -> Value {
 
 /// The hashes of all result files but the manifests, which tell times and attempts.
 pub async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
+    results_of(app, job, Scene::SMALL.snapshots).await
+}
+
+/// The same of a job of so many snapshots.
+pub async fn results_of(app: &TestApp, job: &str, snapshots: usize) -> BTreeMap<String, String> {
     let mut hashes = BTreeMap::new();
-    for snapshot in 0..Scene::SMALL.snapshots {
+    for snapshot in 0..snapshots {
         let listed =
             app.get(&format!("/v1/jobs/{job}/snapshots/{snapshot}")).await.expect(200).json();
         for file in listed["files"].as_array().unwrap() {
@@ -53,7 +58,7 @@ impl TestApp {
     }
 
     /// SIGKILL for one worker.
-    fn kill_worker(&self, choice: usize) {
+    pub fn kill_worker(&self, choice: usize) {
         let workers = self.workers();
         if let Some(pid) = workers.get(choice % workers.len().max(1)) {
             // It may have ended meanwhile.

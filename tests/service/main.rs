@@ -7,6 +7,7 @@ mod adaptive;
 mod app;
 mod calibration;
 mod cli;
+mod client_libraries;
 mod clients;
 #[cfg(feature = "nats")]
 mod cluster;
@@ -30,6 +31,7 @@ mod pictures;
 mod pipeline;
 mod resumable;
 mod samples;
+mod sequences;
 mod storm;
 mod upgrade;
 mod uploads;

@@ -38,9 +38,17 @@ impl Scene {
 
     /// The snapshots as .npy, float32 [S, H, W].
     pub fn snapshots(self) -> Vec<u8> {
-        let value = move |s, i, j| {
-            (0..self.frames).map(|k| self.mask(k, i, j) * self.pixel(s, k, i, j)).sum()
+        self.with_a_cut(self.snapshots)
+    }
+
+    /// The same, but the snapshots from this one on show the negative of the scene.
+    pub fn with_a_cut(self, before: usize) -> Vec<u8> {
+        let pixel = move |s, k, i, j| {
+            let value = self.pixel(s, k, i, j);
+            if s < before { value } else { 1.0 - value }
         };
+        let value =
+            move |s, i, j| (0..self.frames).map(|k| self.mask(k, i, j) * pixel(s, k, i, j)).sum();
         let values = (0..self.snapshots)
             .flat_map(|s| (0..self.height).map(move |i| (s, i)))
             .flat_map(|(s, i)| (0..self.width).map(move |j| value(s, i, j)));

@@ -1,8 +1,8 @@
 //! `tables.md`: one table for each compression ratio, laid out as the paper's.
 
-use sci_recon::job::Algorithm;
+use sci_recon::job::{Algorithm, RunSpec};
 
-use super::record::Row;
+use super::record::{Key, Row};
 
 pub struct Layout {
     pub clips: Vec<String>,
@@ -12,10 +12,9 @@ pub struct Layout {
     pub by_zone: bool,
 }
 
-/// Rows of one algorithm at one scale and compression ratio, in the order of the clips; none for
-/// clips that are still to come.
+/// Rows of one algorithm and one kind of runs at one scale and compression ratio, in the order of the
+/// clips; none for clips that are still to come.
 struct Group<'a> {
-    algorithm: Algorithm,
     scale: usize,
     rows: Vec<Option<&'a Row>>,
 }
@@ -37,12 +36,23 @@ pub fn line(row: &Row) -> String {
         "{}, Cr {}, {scale}x{scale}, {}: {} dB, SSIM {:.4}, {:.1} CPU-seconds",
         key.clip,
         key.compression_ratio,
-        key.algorithm.into_str(),
+        name(key),
         decibels(row.psnr_db),
         row.ssim,
         row.cpu_seconds,
         scale = key.scale,
     )
+}
+
+/// The algorithm, and which snapshots are together.
+fn name(key: &Key) -> String {
+    let algorithm = key.algorithm.into_str();
+    let RunSpec { length, overlap } = key.run;
+    match (key.snapshots, length) {
+        (1, _) => algorithm.to_owned(),
+        (_, 1) => format!("{algorithm}, separate"),
+        _ => format!("{algorithm}, runs of {length} sharing {overlap}"),
+    }
 }
 
 impl Layout {
@@ -54,7 +64,8 @@ impl Layout {
             text += &heading(&rows[0]);
             text += &self.quality(&groups);
             if self.by_frame {
-                let frames = (1..=rows[0].key.compression_ratio).map(|k| format!("frame {k}"));
+                let frames = 1..=rows[0].key.compression_ratio * rows[0].key.snapshots;
+                let frames = frames.map(|k| format!("frame {k}"));
                 text += "\nPSNR in dB by frame, mean over the clips:\n\n";
                 text += &detail(&groups, frames.collect(), |row| row.psnr_db_by_frame.clone());
             }
@@ -74,12 +85,23 @@ impl Layout {
     fn groups<'a>(&self, rows: &'a [Row]) -> Vec<Group<'a>> {
         let mut groups = Vec::new();
         for rows in rows.chunk_by(|a, b| a.key.scale == b.key.scale) {
+            let mut runs: Vec<RunSpec> = Vec::new();
+            for row in rows {
+                if !runs.contains(&row.key.run) {
+                    runs.push(row.key.run);
+                }
+            }
             for &algorithm in &self.algorithms {
-                let row = |clip: &String| {
-                    rows.iter().find(|row| row.key.algorithm == algorithm && row.key.clip == *clip)
-                };
-                let (scale, rows) = (rows[0].key.scale, self.clips.iter().map(row).collect());
-                groups.push(Group { algorithm, scale, rows });
+                for &run in &runs {
+                    let of = |row: &&Row| row.key.algorithm == algorithm && row.key.run == run;
+                    let row =
+                        |clip: &String| rows.iter().filter(of).find(|row| row.key.clip == *clip);
+                    let (scale, found) =
+                        (rows[0].key.scale, self.clips.iter().map(row).collect::<Vec<_>>());
+                    if found.iter().any(Option::is_some) {
+                        groups.push(Group { scale, rows: found });
+                    }
+                }
             }
         }
         groups
@@ -149,7 +171,8 @@ fn table_of(
 ) -> String {
     let head = ["Scale", "Algorithm"].map(String::from).into_iter().chain(columns).collect();
     let row = |group: &Group<'_>| {
-        let names = [format!("{0}x{0}", group.scale), group.algorithm.into_str().to_owned()];
+        let key = group.rows.iter().flatten().next().map(|row| name(&row.key));
+        let names = [format!("{0}x{0}", group.scale), key.unwrap_or_default()];
         names.into_iter().chain(cells(group)).collect()
     };
     table(head, groups.iter().map(row))

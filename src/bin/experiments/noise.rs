@@ -6,17 +6,18 @@ use std::path::PathBuf;
 
 use clap::Args;
 use maud::{Markup, html};
-use ndarray::Array3;
-use sci_recon::cli::{CliError, NetworkArguments, algorithms, plan};
-use sci_recon::job::Algorithm;
+use ndarray::{Array3, Axis};
+use sci_recon::cli::{CliError, NetworkArguments, algorithms, cut};
+use sci_recon::job::{Algorithm, Sequence};
 use sci_recon::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, generator, measure, noisy,
     single_apertures,
 };
 use sci_recon::pipeline::NetworkSource;
 use sci_recon::pipeline::quality::Quality;
-use sci_recon::pipeline::snapshot::{SnapshotInput, Solver};
+use sci_recon::pipeline::sequence::{SequenceInput, Solver};
 use sci_recon::recon::schedule::Schedule;
+use sci_recon::recon::sequence::SequencePlan;
 use serde::Serialize;
 
 use super::clips::{Clip, read_clips};
@@ -165,21 +166,27 @@ impl Bench<'_> {
         name: &str,
     ) -> Result<Vec<f64>, CliError> {
         let clean = measure(masks.view(), clip.frames.view())?;
-        let plan = plan(Algorithm::GapTv, (None, None), None, masks.dim())?;
+        let alone = (Sequence::Separate, 1);
+        let gap_tv = (Algorithm::GapTv, &self.schedule);
+        let cut = cut(gap_tv, (None, None), None, alone, masks.dim())?;
+        let plan = cut.tiles(masks.dim().1, masks.dim().2)?;
         let mut by_sigma = Vec::with_capacity(self.sigmas.len());
         for &sigma in self.sigmas {
             let y = noisy(clean.clone(), sigma / 255.0, self.seed)?;
-            let input = SnapshotInput {
-                snapshot: 0,
+            let y = y.insert_axis(Axis(0));
+            let input = SequenceInput {
                 masks: masks.view(),
                 measurement: y.view(),
+                first: 0,
                 // The scene's own: its level is known here, so noise does not disturb it.
                 white: 1.0,
                 solver: Solver::Schedule(&self.schedule),
                 plan: &plan,
+                runs: &SequencePlan::separate(0..1),
             };
-            let tiles = solve_on_all_cores(&input, &self.network)?;
-            let value = Quality::of_tiles(&plan, &tiles, clip.frames.view())?.psnr;
+            let solved = solve_on_all_cores(&input, &self.network)?;
+            let frame = |k| solved.frame(&input, 0, k);
+            let value = Quality::of_frames(frame, clip.frames.view())?.psnr;
             eprintln!("{}, {name}, sigma {sigma}: {value:.2} dB", clip.name);
             by_sigma.push(value);
         }

@@ -5,8 +5,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use sci_recon::cli::CliError;
-use sci_recon::job::{Algorithm, Schedule, TileSpec};
+use sci_recon::job::{Algorithm, RunSpec, Schedule, TileSpec};
 use sci_recon::pipeline::networks::ModelRecord;
+use sci_recon::pipeline::records::JointRecord;
 use serde::{Deserialize, Serialize};
 
 /// Name and version of this form of record.
@@ -28,6 +29,12 @@ pub struct Setting {
 pub struct Key {
     pub program_version: String,
     pub clip: String,
+    /// How many snapshots of the clip there are.
+    #[serde(default = "one")]
+    pub snapshots: usize,
+    /// How they are reconstructed together.
+    #[serde(default)]
+    pub run: RunSpec,
     pub algorithm: Algorithm,
     pub scale: usize,
     pub compression_ratio: usize,
@@ -60,6 +67,14 @@ pub struct Row {
     /// White level of the scene, as it was estimated.
     pub white: f32,
     pub stop_reason: String,
+    /// Whether snapshots were found to belong together.
+    #[serde(default)]
+    pub joints: Vec<JointRecord>,
+}
+
+/// Rows of before there were sequences.
+fn one() -> usize {
+    1
 }
 
 /// A ring around the centre.

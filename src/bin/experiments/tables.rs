@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use clap::Args;
 
 use sci_recon::cli::{CliError, MaskArguments, Model, NetworkArguments, algorithms};
-use sci_recon::job::Algorithm;
+use sci_recon::job::{Algorithm, RunSpec};
 
 use super::clips::read_clips;
 use super::markdown::{Layout, line};
 use super::record::{Records, Setting};
-use super::trial::Bench;
+use super::trial::{Bench, Choice};
 
 /// Compare algorithms as the paper's Tables 1 and 2 do: PSNR and SSIM of each clip at each scale
 /// and compression ratio, with processor seconds and deep passes. Each clip is measured through
@@ -25,10 +25,18 @@ pub struct Arguments {
     #[arg(long, value_name = "PIXELS,...", value_delimiter = ',', default_values_t = [256],
           value_parser = clap::value_parser!(u16).range(16..))]
     scales: Vec<u16>,
-    /// Compression ratios: the first N frames of each clip make one snapshot.
+    /// Compression ratios: the first N frames of each clip make one snapshot, the next N the next.
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [10, 20],
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     cr: Vec<u16>,
+    /// Snapshots of each clip, one after the other.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
+    snapshots: u16,
+    /// How they are reconstructed together, a row each: separate, contiguous (as a job does it), or runs of
+    /// at most LENGTH snapshots that share at least OVERLAP.
+    #[arg(long, value_name = "separate|contiguous|LENGTH:OVERLAP,...", value_delimiter = ',',
+          default_value = "contiguous", value_parser = choice)]
+    sequence: Vec<Choice>,
     /// The algorithms, in the order of the tables' rows.
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = algorithms(),
           default_values = PAPER.map(|algorithm| algorithm.into_str()))]
@@ -66,7 +74,9 @@ const PAPER: [Algorithm; 3] = [Algorithm::GapTv, Algorithm::PnpFfdnet, Algorithm
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let (ratios, scales) = (distinct(&arguments.cr), distinct(&arguments.scales));
     let most = |values: &[u16]| values.iter().copied().max().map(usize::from);
-    let clips = read_clips(&arguments.clips, most(&ratios).unwrap_or(1), most(&scales))?;
+    let snapshots = usize::from(arguments.snapshots);
+    let frames = most(&ratios).unwrap_or(1) * snapshots;
+    let clips = read_clips(&arguments.clips, frames, most(&scales))?;
     let mut algorithms = distinct(&arguments.algorithms);
     algorithms.extend(arguments.learned.is_some().then_some(Algorithm::Learned));
     let layout = Layout {
@@ -94,26 +104,40 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         for &scale in &scales {
             let masks = bench.masks(&arguments.masks, ratio.into(), scale.into())?;
             for clip in &clips {
-                let snapshot = bench.snapshot(&masks, clip)?;
+                let measured = bench.measure(&masks, clip, snapshots)?;
                 for &algorithm in &layout.algorithms {
                     if let Some(why) = bench.obstacle(algorithm, ratio.into(), scale.into()) {
                         eprintln!("{}, no {}: {why}", clip.name, algorithm.into_str());
                         continue;
                     }
-                    let key = bench.key(&snapshot, algorithm)?;
-                    let row = match records.find(&key) {
-                        Some(row) => row.clone(),
-                        None => records.add(bench.run(&snapshot, key)?)?,
-                    };
-                    eprintln!("{}", line(&row));
-                    rows.push(row);
-                    records.write("tables.md", &layout.markdown(&rows))?;
+                    for &sequence in &arguments.sequence {
+                        let key = bench.key(&measured, algorithm, sequence)?;
+                        let row = match records.find(&key) {
+                            Some(row) => row.clone(),
+                            None => records.add(bench.run(&measured, key)?)?,
+                        };
+                        eprintln!("{}", line(&row));
+                        rows.push(row);
+                        records.write("tables.md", &layout.markdown(&rows))?;
+                    }
                 }
             }
         }
     }
     print!("{}", layout.markdown(&rows));
     Ok(())
+}
+
+fn choice(text: &str) -> Result<Choice, String> {
+    if let Ok(sequence) = text.parse() {
+        return Ok(Choice::Default(sequence));
+    }
+    let runs = text.split_once(':').and_then(|(length, overlap)| {
+        let (length, overlap) = (length.parse().ok()?, overlap.parse().ok()?);
+        (overlap < length).then_some(RunSpec { length, overlap })
+    });
+    let wrong = "separate, contiguous or LENGTH:OVERLAP, where the overlap is below the length";
+    runs.map(Choice::Runs).ok_or_else(|| format!("name {wrong}"))
 }
 
 /// The values without repetitions, in their order.

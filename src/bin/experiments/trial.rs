@@ -3,18 +3,16 @@
 use std::thread;
 use std::time::Instant;
 
-use ndarray::{Array2, Array3, ArrayView, ArrayView2, Dimension, s};
-use sci_recon::cli::{CliError, MaskArguments, Model, plan};
-use sci_recon::job::{Algorithm, TileSpec};
+use ndarray::{Array2, Array3, ArrayView, ArrayView2, Axis, Dimension, s};
+use sci_recon::cli::{CliError, MaskArguments, Model, cut};
+use sci_recon::job::{Algorithm, RunSpec, Sequence};
 use sci_recon::optics::{illumination, measure, noisy};
-use sci_recon::pipeline::blend;
 use sci_recon::pipeline::networks::{ModelRecord, NetworkSource};
 use sci_recon::pipeline::quality::FrameQuality;
 use sci_recon::pipeline::records::{Summary, TileRecord};
 use sci_recon::pipeline::scale::white;
-use sci_recon::pipeline::snapshot::{SnapshotInput, Solver, solve};
+use sci_recon::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use sci_recon::pipeline::usage::cpu_seconds;
-use sci_recon::recon::solver::Outcome;
 use sci_recon::recon::tile::TilePlan;
 use sha2::{Digest, Sha256};
 
@@ -23,11 +21,19 @@ use super::markdown::mean;
 use super::record::{Key, Row, Setting, ZoneRecord};
 
 pub fn solve_on_all_cores(
-    input: &SnapshotInput<'_>,
+    input: &SequenceInput<'_>,
     network: &NetworkSource,
-) -> Result<Vec<Outcome>, CliError> {
+) -> Result<Solved, CliError> {
     let cores = thread::available_parallelism().map_or(1, usize::from);
-    Ok(solve(input, network, cores, &|_, _| ())?.tiles)
+    Ok(solve(input, network, cores, &|_, _| ())?)
+}
+
+/// Which snapshots are reconstructed together.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Choice {
+    /// Those that a job would, of this kind of sequence.
+    Default(Sequence),
+    Runs(RunSpec),
 }
 
 /// Makes rows.
@@ -45,12 +51,13 @@ pub struct Masks {
     light: Array2<f32>,
 }
 
-pub struct Snapshot<'a> {
+/// A clip, measured.
+pub struct Measured<'a> {
     clip: &'a str,
     masks: &'a Array3<f32>,
-    /// \[H,W\].
-    measurement: Array2<f32>,
-    /// \[B,H,W\].
+    /// \[S,H,W\].
+    measurement: Array3<f32>,
+    /// \[S B,H,W\].
     truth: Array3<f32>,
     sha256: String,
 }
@@ -80,75 +87,106 @@ impl Bench {
         Ok(Masks { masks: made.masks, light })
     }
 
-    /// Measures the first frames of a clip, of which the middle is taken.
-    pub fn snapshot<'a>(
+    /// Measures the first frames of a clip, of which the middle is taken, in so many snapshots.
+    pub fn measure<'a>(
         &self,
         Masks { masks, light }: &'a Masks,
         clip: &'a Clip,
-    ) -> Result<Snapshot<'a>, CliError> {
+        snapshots: usize,
+    ) -> Result<Measured<'a>, CliError> {
         let (frames, height, width) = masks.dim();
         let (_, rows, columns) = clip.frames.dim();
         let (top, left) = ((rows - height) / 2, (columns - width) / 2);
-        let window = s![..frames, top..top + height, left..left + width];
+        let window = s![..snapshots * frames, top..top + height, left..left + width];
         let truth = &clip.frames.slice(window) * light;
-        let clean = measure(masks.view(), truth.view())?;
-        let measurement = noisy(clean, self.setting.noise_sigma / 255.0, self.setting.seed)?;
+        let mut measurement = Array3::zeros((snapshots, height, width));
+        let blocks = truth.axis_chunks_iter(Axis(0), frames);
+        for ((seed, block), mut y) in
+            (self.setting.seed..).zip(blocks).zip(measurement.outer_iter_mut())
+        {
+            let clean = measure(masks.view(), block)?;
+            y.assign(&noisy(clean, self.setting.noise_sigma / 255.0, seed)?);
+        }
         let mut hash = Sha256::new();
         feed(&mut hash, masks.view());
         feed(&mut hash, measurement.view());
         feed(&mut hash, truth.view());
         let sha256 = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-        Ok(Snapshot { clip: &clip.name, masks, measurement, truth, sha256 })
+        Ok(Measured { clip: &clip.name, masks, measurement, truth, sha256 })
     }
 
-    /// All that the row of this algorithm depends on.
-    pub fn key(&self, snapshot: &Snapshot<'_>, algorithm: Algorithm) -> Result<Key, CliError> {
-        let (compression_ratio, scale, _) = snapshot.masks.dim();
+    /// All that the row of this algorithm depends on, with runs of at most `length` snapshots, or as they
+    /// are by default.
+    pub fn key(
+        &self,
+        measured: &Measured<'_>,
+        algorithm: Algorithm,
+        sequence: Choice,
+    ) -> Result<Key, CliError> {
+        let (compression_ratio, scale, _) = measured.masks.dim();
         let schedule = algorithm.default_schedule();
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned);
-        let plan = plan(algorithm, (None, None), learned, snapshot.masks.dim())?;
+        let snapshots = measured.measurement.dim().0;
+        let kind = match sequence {
+            Choice::Default(kind) => kind,
+            Choice::Runs(_) => Sequence::Separate,
+        };
+        let count = (kind, snapshots as u32);
+        let mut cut =
+            cut((algorithm, &schedule), (None, None), learned, count, measured.masks.dim())?;
+        if let Choice::Runs(run) = sequence {
+            cut.run = run;
+        }
         let deep = learned.is_some() || schedule.needs_network();
         let mut models = ModelRecord::of(&schedule);
         models.extend(learned.map(Model::record));
         Ok(Key {
             program_version: env!("CARGO_PKG_VERSION").into(),
-            clip: snapshot.clip.into(),
+            clip: measured.clip.into(),
+            snapshots,
+            run: cut.run,
             algorithm,
             scale,
             compression_ratio,
             setting: self.setting.clone(),
-            inputs_sha256: snapshot.sha256.clone(),
-            tile: TileSpec { size: plan.size(), overlap: plan.overlap() },
+            inputs_sha256: measured.sha256.clone(),
+            tile: cut.tile,
             models,
             provider: deep.then(|| self.network.provider().into()),
             schedule,
         })
     }
 
-    /// Reconstructs the snapshot as `key` says.
-    pub fn run(&self, snapshot: &Snapshot<'_>, key: Key) -> Result<Row, CliError> {
-        let Snapshot { masks, measurement, .. } = snapshot;
+    /// Reconstructs the clip as `key` says.
+    pub fn run(&self, measured: &Measured<'_>, key: Key) -> Result<Row, CliError> {
+        let Measured { masks, measurement, .. } = measured;
         let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
+        let runs = key.run.plan(0..key.snapshots)?;
         let white = white(masks.view(), measurement.view())
-            .map_err(|error| CliError::Input(format!("clip {}: {error}", snapshot.clip)))?;
+            .map_err(|error| CliError::Input(format!("clip {}: {error}", measured.clip)))?;
         let solver = match &self.learned {
             Some(learned) if key.algorithm == Algorithm::Learned => Solver::Network(&learned.file),
             _ => Solver::Schedule(&key.schedule),
         };
-        let input = SnapshotInput {
-            snapshot: 0,
+        let input = SequenceInput {
             masks: masks.view(),
             measurement: measurement.view(),
+            first: 0,
             white,
             solver,
             plan: &plan,
+            runs: &runs,
         };
         let (started, before) = (Instant::now(), cpu_seconds());
-        let tiles = solve_on_all_cores(&input, &self.network)?;
+        let solved = solve_on_all_cores(&input, &self.network)?;
         let cpu_seconds = cpu_seconds() - before;
         let seconds = started.elapsed().as_secs_f64();
-        let quality = Quality::of(&plan, &tiles, &snapshot.truth)?;
-        let summary = Summary::of(&tiles.iter().map(TileRecord::from).collect::<Vec<_>>());
+        let frames = masks.dim().0;
+        let frame = |k| solved.frame(&input, k / frames, k % frames);
+        let quality = Quality::of(&plan, frame, &measured.truth)?;
+        let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
+        let summary = Summary::of(&tiles);
+        let joints = solved.pilot.map(|pilot| pilot.joints).unwrap_or_default();
         Ok(Row {
             key,
             psnr_db: mean(quality.by_frame.iter().copied()),
@@ -160,6 +198,7 @@ impl Bench {
             denoiser_passes: summary.denoiser_passes,
             white,
             stop_reason: summary.stop_reason,
+            joints,
         })
     }
 }
@@ -171,12 +210,16 @@ struct Quality {
 }
 
 impl Quality {
-    fn of(plan: &TilePlan, tiles: &[Outcome], truth: &Array3<f32>) -> Result<Self, CliError> {
+    fn of(
+        plan: &TilePlan,
+        frame: impl Fn(usize) -> Array2<f32>,
+        truth: &Array3<f32>,
+    ) -> Result<Self, CliError> {
         let finite = |value: f64| value.is_finite().then_some(value);
         let (mut by_frame, mut ssim) = (Vec::new(), 0.0);
         let mut by_zone: [Vec<Option<f64>>; ZONES] = Default::default();
         for (k, truth) in truth.outer_iter().enumerate() {
-            let frame = blend::frame(plan, tiles, k);
+            let frame = frame(k);
             let quality = FrameQuality::of(k, frame.view(), truth)?;
             by_frame.push(finite(quality.psnr));
             ssim += quality.ssim.unwrap_or_default();

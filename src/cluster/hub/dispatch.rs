@@ -151,7 +151,9 @@ impl Core {
     async fn prepare(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<TaskMessage, SendError> {
         let wrong = || PipelineError::Record { what: "task", problem: "it is no tile".into() };
         let Work::Job(job) = &claimed.work else { return Err(wrong().into()) };
-        let TaskKind::Tile { snapshot, tile } = claimed.kind else { return Err(wrong().into()) };
+        let TaskKind::Tile { snapshot, tile, .. } = claimed.kind else {
+            return Err(wrong().into());
+        };
         let tile = tile_task(job, snapshot, tile)?;
         let masks = match self.window(tile.masks, tile.tile) {
             Some(known) if self.is_put(pool, known.sha256) => known,

@@ -22,6 +22,7 @@ export async function job(root, [id], signal) {
   const files = card("Files", h("p", { class: "muted" }, "…"));
   const manifest = card("Manifest");
   const viewer = new Viewer(found, signal);
+  viewer.next = () => snapshot.next();
   const tiles = new TileMap(found, signal);
   const cards = h("div", { class: "cards" }, tiles.plotCard, tiles.tilesCard, files, manifest, details(found), repeat(found));
   root.append(h("div", { class: "row head" }, h("h1", null, nameOf(found)), state, snapshot.element, h("span", { class: "grow" }), buttons), progress, problem, warned ?? "", viewer.element, cards);
@@ -71,7 +72,11 @@ function snapshotChoice(found) {
   const input = h("input", { type: "number", id: "snapshot", min: first, max: first + count - 1, value: first });
   const element = count > 1 && h("label", { class: "row", for: "snapshot" }, "Snapshot", input, `of ${first} to ${first + count - 1}`);
   const value = () => Math.min(first + count - 1, Math.max(first, Number(input.value) || first));
-  return { element, value, listen: (call) => input.addEventListener("change", call) };
+  const next = () => {
+    input.value = value() < first + count - 1 ? value() + 1 : first;
+    input.dispatchEvent(new Event("change"));
+  };
+  return { element, value, next, listen: (call) => input.addEventListener("change", call) };
 }
 
 function line(now) {
@@ -90,6 +95,7 @@ function line(now) {
 function details(found) {
   return card("Job", facts([
     ["Frames", shapeOf(found)],
+    ...(found.snapshots.count > 1 ? [["Snapshots", found.run.length > 1 ? `together in runs of up to ${found.run.length}` : "each alone"]] : []),
     ["Algorithm", found.algorithm],
     ["Schedule", schedule(found.schedule)],
     ["Tiles", `${found.tile.size} pixels, ${found.tile.overlap} shared`],
@@ -130,6 +136,7 @@ async function showManifest(element, now, snapshot, signal) {
     ["White level", figure(content.scale.white)],
     ["Networks", content.models.map((model) => `${model.name}, ${model.sha256.slice(0, 12)}…`).join("; ") || "none"],
     ...pilot(content),
+    ...joints(content),
     ["Provider", run.provider ? `${run.provider}, ONNX Runtime ${run.onnxruntime}` : "none"],
     ["Computing", duration(run.cpu_seconds)],
     ["Memory", bytes(run.peak_rss_bytes)],
@@ -150,6 +157,17 @@ function pilot(content) {
   return (content.pilot?.stages ?? []).map(row).filter(Boolean);
 }
 
+/** Which snapshots were reconstructed together, and why not others. */
+function joints(content) {
+  const held = (content.runs ?? []).filter(([first, last]) => last > first && first <= content.snapshot && content.snapshot <= last);
+  const near = (content.pilot?.joints ?? []).filter((joint) => joint.after === content.snapshot || joint.after + 1 === content.snapshot);
+  const row = (joint) => {
+    const error = `error at held-out pixels ${figure(joint.error_alone)} alone, ${figure(joint.error_together)} together`;
+    return [`Snapshots ${joint.after}, ${joint.after + 1}`, `${joint.together ? "together" : "apart"}, ${error}`];
+  };
+  return [...(held.length ? [["Runs", held.map(([first, last]) => `${first} to ${last}`).join("; ")]] : []), ...near.map(row)];
+}
+
 function warnings(manifest) {
   const found = manifest.content.warnings ?? manifest.warnings ?? [];
   return found.map((warning) => h("p", { class: "warn" }, typeof warning === "string" ? warning : warning.detail ?? JSON.stringify(warning)));
@@ -162,6 +180,7 @@ function repeat(found) {
     measurement: found.measurement,
     algorithm: found.algorithm,
     snapshots: [found.snapshots.first, last],
+    ...(last > found.snapshots.first ? { sequence: found.sequence } : {}),
     ...(found.model ? { model: found.model } : { schedule: found.schedule }),
     tile: found.tile,
     priority: found.priority,

@@ -5,7 +5,7 @@ import { h, put, say } from "./dom.js";
 /** A player of `count` frames; `show(frame)` is called with 1 to `count`. */
 export class Player {
   constructor(count, signal, show) {
-    Object.assign(this, { count, show, frame: 1, playing: false, ahead: () => true });
+    Object.assign(this, { count, show, frame: 1, playing: false, ahead: () => true, onward: () => false });
     this.slider = h("input", { type: "range", id: "frame", min: 1, max: count, value: 1, "aria-label": "Frame" });
     this.slider.addEventListener("input", () => this.go(Number(this.slider.value)));
     this.button = h("button", { type: "button", id: "play", "aria-pressed": "false", onclick: () => this.toggle() }, "Play");
@@ -52,7 +52,9 @@ export class Player {
       if (steps >= 1) {
         // What is asked for faster than the screen is skipped; what has not come yet is waited for.
         const next = ((this.frame - 1 + steps) % this.count) + 1;
-        if (this.ahead(next)) {
+        if (this.frame - 1 + steps >= this.count && this.onward()) {
+          before = now;
+        } else if (this.ahead(next)) {
           before += steps * period;
           this.go(next);
           shown += 1;

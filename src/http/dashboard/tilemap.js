@@ -21,8 +21,11 @@ export class TileMap {
   async renew(snapshot) {
     this.snapshot = snapshot;
     const found = await get(`/v1/jobs/${this.job.id}/snapshots/${snapshot}/tiles`, this.signal);
-    if (found.items !== this.tiles) {
-      this.tiles = found.items;
+    if (found.items !== this.found) {
+      this.found = found.items;
+      // Of the runs that hold the snapshot the one that begins last, whose history is told, too.
+      const first = Math.max(...found.items.map((tile) => tile.snapshots.first));
+      this.tiles = found.items.filter((tile) => tile.snapshots.first === first);
       this.draw();
       this.options();
     }
@@ -58,7 +61,9 @@ export class TileMap {
     const { height, width } = this.job.shape;
     const done = this.tiles.filter((tile) => tile.state === "done");
     const worst = Math.max(...done.map((tile) => tile.residual ?? 0));
-    const text = `${done.length} of ${this.tiles.length} tiles are done`;
+    const run = this.tiles[0]?.snapshots;
+    const together = run?.count > 1 ? ` of snapshots ${run.first} to ${run.first + run.count - 1} together` : "";
+    const text = `${done.length} of ${this.tiles.length} tiles${together} are done`;
     const unit = Math.max(width, height) / 100;
     const rectangle = (tile) => s("rect", {
       x: tile.column + unit / 2, y: tile.row + unit / 2, width: tile.width - unit, height: tile.height - unit, rx: unit,

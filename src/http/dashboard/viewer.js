@@ -21,6 +21,10 @@ export class Viewer {
     this.rightContrast = new Contrast("frames", () => this.showRight());
     this.player = new Player(frames, signal, () => this.showRight());
     this.player.ahead = (frame) => this.mode() === "residual" || this.right.prepare(this.source(frame), ...this.rightContrast.window());
+    // Of a sequence playing goes on from snapshot to snapshot, if asked to.
+    this.through = h("input", { type: "checkbox", id: "through" });
+    this.player.onward = () => this.through.checked && this.goOn();
+    if (job.snapshots.count > 1) this.player.element.append(h("label", { for: "through", class: "row muted" }, this.through, "through all snapshots"));
     this.choice = h("select", { id: "mode", "aria-label": "What is shown" }, MODES.map(([value, text]) => h("option", { value }, text)));
     this.choice.addEventListener("change", () => {
       this.rightContrast.touched = false;
@@ -81,8 +85,20 @@ export class Viewer {
     return { base: `${this.base()}/${name}`, levels: this.levels, tile: this.tile, label };
   }
 
+  /** Has the next snapshot opened, by whoever chooses them; true, as the player then waits for it. */
+  goOn() {
+    if (!this.waiting) {
+      this.waiting = true;
+      this.next();
+    }
+    return true;
+  }
+
   async open(snapshot) {
     this.snapshot = snapshot;
+    if (this.waiting) this.player.frame = 1;
+    this.waiting = false;
+    this.player.tell();
     const base = `/v1/measurements/${this.job.measurement}/pictures/snapshot-${snapshot}`;
     const spread = await get(`${base}/spread`, this.signal);
     Object.assign(this, { levels: spread.levels, tile: spread.tile });

@@ -11,6 +11,7 @@ use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::jobs::with_snapshot;
 use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
+use crate::pipeline::records::TileTaskRecord;
 use crate::store::{Calibration, Job, Measurement, StoreError, TileResult};
 
 /// What can be seen of a job's snapshot.
@@ -215,9 +216,16 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let plan = spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
     let place = |done: TileResult| {
         let tile = plan.tile(done.tile as usize)?;
+        let place = (snapshot - done.run) as usize;
+        // What the pilot has left to another run is not here.
+        let record: TileTaskRecord = serde_json::from_value(done.record).ok()?;
+        if !record.solved.contains(&place) {
+            return None;
+        }
         let (rows, columns) =
             (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
-        Some(DoneTile { rows, columns, path: app.store.dir().blob(&done.sha256) })
+        let first = place * spec.shape.frames;
+        Some(DoneTile { rows, columns, first, path: app.store.dir().blob(&done.sha256) })
     };
     let tiles = done.into_iter().filter_map(place).collect();
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };

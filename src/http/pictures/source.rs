@@ -34,11 +34,13 @@ pub(super) struct Unfinished {
     pub(super) tiles: Vec<DoneTile>,
 }
 
-/// A tile that is done, as a prepared array, and the window that it covers.
+/// A tile that is done, as a prepared array, the window that it covers, and which of its frames is the
+/// snapshot's first.
 #[derive(Debug)]
 pub(super) struct DoneTile {
     pub(super) rows: Range<usize>,
     pub(super) columns: Range<usize>,
+    pub(super) first: usize,
     pub(super) path: PathBuf,
 }
 
@@ -195,7 +197,7 @@ fn lay(
             continue;
         }
         let part = planar::Reader::open(&tile.path, &Limits::default())?.read_window(
-            frames.clone(),
+            tile.first + frames.start..tile.first + frames.end,
             within(&down, &tile.rows),
             within(&across, &tile.columns),
         )?;
@@ -263,7 +265,8 @@ mod tests {
         let coarse_path = prepared(folder.path(), "preview", &coarse);
         for preview in [None, Some(coarse_path)] {
             let below = |i: usize, j: usize| preview.as_ref().map(|_| coarse[[1, i / 8, j / 8]]);
-            let tiles = vec![DoneTile { rows: 16..40, columns: 20..40, path: path.clone() }];
+            let tiles =
+                vec![DoneTile { rows: 16..40, columns: 20..40, first: 0, path: path.clone() }];
             let unfinished = Unfinished { preview: preview.clone(), tiles };
             let picture = stack((2, 40, 40), Files::Tiles(Arc::new(unfinished))).frame(1);
             assert!(!picture.settled);

@@ -37,6 +37,11 @@ pub trait Prior: Sync {
     /// a machine really takes is learned from the tasks it has done.
     fn cost(&self, settings: &Settings) -> f64;
 
+    /// Whether what it makes of a frame depends on other frames.
+    fn looks_along_time(&self, _: &Settings) -> bool {
+        true
+    }
+
     /// Memory that it needs beside the solver's arrays.
     fn memory(&self) -> Memory {
         Memory::default()

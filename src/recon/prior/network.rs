@@ -69,6 +69,10 @@ impl Prior for NetworkPrior {
         self.pass_ns
     }
 
+    fn looks_along_time(&self, _: &Settings) -> bool {
+        self.network != Network::FfdNet
+    }
+
     fn memory(&self) -> Memory {
         self.memory
     }

@@ -57,6 +57,10 @@ impl Prior for Series {
         self.first.cost(settings) + self.second.cost(settings)
     }
 
+    fn looks_along_time(&self, settings: &Settings) -> bool {
+        self.first.looks_along_time(settings) || self.second.looks_along_time(settings)
+    }
+
     fn memory(&self) -> Memory {
         let (first, second) = (self.first.memory(), self.second.memory());
         Memory {

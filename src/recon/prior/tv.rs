@@ -40,6 +40,10 @@ impl Prior for Tv {
         update_ns * settings.tv_updates as f64
     }
 
+    fn looks_along_time(&self, settings: &Settings) -> bool {
+        settings.temporal_weight > 0.0
+    }
+
     fn by_strips(&self) -> bool {
         true
     }

@@ -4,7 +4,9 @@ mod admm;
 mod gap;
 mod state;
 
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
+use std::ops::Range;
+
+use ndarray::{Array3, ArrayView3};
 
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
@@ -51,6 +53,10 @@ pub enum Control {
 pub trait Observer {
     /// Looks at the progress and says whether to go on.
     fn iteration(&mut self, progress: &Progress) -> Control;
+
+    /// Is told that a run of the solver begins that is this share of the whole, on \[0,1\], where there are
+    /// several.
+    fn part(&mut self, _share: Range<f64>) {}
 }
 
 /// An observer that never stops anything.
@@ -70,10 +76,10 @@ pub enum StopReason {
     MaxIterations,
 }
 
-/// A reconstructed snapshot.
+/// A reconstructed run of snapshots.
 #[derive(Debug, Clone)]
 pub struct Outcome {
-    /// The frames \[B,H,W\].
+    /// The frames of all snapshots \[S B,H,W\].
     pub frames: Array3<f32>,
     /// Iterations whose prior had a total-variation part.
     pub tv_iterations: usize,
@@ -85,8 +91,9 @@ pub struct Outcome {
     pub stop_reason: StopReason,
 }
 
-/// Reconstructs `B` frames from one measurement `y` \[H,W\], both on the scale on which the
-/// scene is on \[0,1\].
+/// Reconstructs the `S B` frames of a run of snapshots `y` \[S,H,W\], both on the scale on which the
+/// scene is on \[0,1\]. The priors see the frames of all snapshots as one clip; each measured pixel
+/// stays tied to its own `B`.
 ///
 /// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
 /// variation and the learned denoiser costs what the acceleration gained. With `gamma` > 0 the
@@ -95,17 +102,18 @@ pub struct Outcome {
 /// [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct(
     op: &SensingOperator,
-    y: ArrayView2<'_, f32>,
+    y: ArrayView3<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome> {
     schedule.validate()?;
-    if y.shape() != op.gram().shape() {
+    if y.dim() != op.measurement_dim() {
+        let (snapshots, height, width) = op.measurement_dim();
         return Err(ReconError::Shape {
             what: "the measurement",
             found: shape_text(y.shape()),
-            expected: format!("{} (the masks' size)", shape_text(op.gram().shape())),
+            expected: format!("{} (the masks' size)", shape_text(&[snapshots, height, width])),
         });
     }
     // Before anything is computed, so that a missing network is told at once.
@@ -134,7 +142,7 @@ pub(super) struct Step {
 /// A reconstruction on its way.
 pub(super) struct Run<'a> {
     op: &'a SensingOperator,
-    y: Array2<f32>,
+    y: Array3<f32>,
     y_norm: f64,
     state: State,
     x: Array3<f32>,
@@ -150,7 +158,7 @@ pub(super) struct Run<'a> {
 impl<'a> Run<'a> {
     pub(super) fn new(
         op: &'a SensingOperator,
-        y: ArrayView2<'_, f32>,
+        y: ArrayView3<'_, f32>,
         schedule: &Schedule,
         networks: &'a mut dyn Networks,
     ) -> Self {
@@ -160,7 +168,7 @@ impl<'a> Run<'a> {
             op,
             y_norm: squares.sqrt().max(f64::MIN_POSITIVE),
             y,
-            state: State::new(op.dim(), schedule),
+            state: State::new(op, schedule),
             x: Array3::zeros(op.dim()),
             pass: None,
             networks,
@@ -209,7 +217,7 @@ impl<'a> Run<'a> {
         self.state = state;
     }
 
-    /// The frames as they stand \[B,H,W\].
+    /// The frames as they stand \[S B,H,W\].
     pub(super) fn frames(&self) -> ArrayView3<'_, f32> {
         self.state.v.view()
     }
@@ -269,8 +277,8 @@ impl<'a> Run<'a> {
         let Self { op, y, state, x, networks, .. } = self;
         let pass = self.pass.get_or_insert_with(|| stage.prior.begin(op.dim()));
         let (mut squares, mut change) = (0.0, Change::default());
-        for first in (0..y.nrows()).step_by(rows) {
-            let strip = first..y.nrows().min(first + rows);
+        for first in (0..y.dim().1).step_by(rows) {
+            let strip = first..y.dim().1.min(first + rows);
             squares += state.project(op, strip.clone(), y, stage.memory, x);
             admm::shift(state, x);
             pass.apply(x, strip, settings, &mut **networks, &mut |x, k, done| {
@@ -281,7 +289,7 @@ impl<'a> Run<'a> {
     }
 
     fn residual(&mut self) -> f32 {
-        let rows = 0..self.y.nrows();
+        let rows = 0..self.y.dim().1;
         let squares = self.op.project(rows, &self.y, None, &self.state.v, &mut self.x);
         (squares.sqrt() / self.y_norm) as f32
     }
@@ -295,7 +303,7 @@ mod reference {
     use crate::recon::prior::{Denoiser, Network, Networks};
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
-    use ndarray::{Array2, Array3, ArrayView2};
+    use ndarray::{Array3, ArrayView3};
     use rand::{Rng, SeedableRng};
     use serde_json::json;
 
@@ -303,7 +311,8 @@ mod reference {
     pub(super) struct Problem {
         pub(super) schedule: Schedule,
         masks: Array3<f32>,
-        y: Array2<f32>,
+        /// [S,H,W].
+        y: Array3<f32>,
     }
 
     const GREY: f64 = 0.4;
@@ -326,7 +335,7 @@ mod reference {
 
     type Solver = fn(
         &SensingOperator,
-        ArrayView2<'_, f32>,
+        ArrayView3<'_, f32>,
         &Schedule,
         &mut dyn Networks,
         &mut dyn Observer,
@@ -337,7 +346,9 @@ mod reference {
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
             let size = (rng.random_range(1..5), rng.random_range(1..8), rng.random_range(1..40));
             let masks = Array3::from_shape_simple_fn(size, || 0.2 + 0.8 * rng.random::<f32>());
-            let y = Array2::from_shape_simple_fn((size.1, size.2), || 2.0 * rng.random::<f32>());
+            let snapshots = rng.random_range(1..4);
+            let y = (snapshots, size.1, size.2);
+            let y = Array3::from_shape_simple_fn(y, || 2.0 * rng.random::<f32>());
             let memory: f32 = rng.random();
             let stage = json!({"prior": "ffdnet", "iterations": 7, "sigma": [0.1, 0.1],
                 "memory": memory, "momentum": 0.5 * rng.random::<f32>()});
@@ -348,7 +359,7 @@ mod reference {
 
         pub(super) fn solve(&self, solver: Solver) -> Outcome {
             let op = SensingOperator::new(self.masks.clone()).unwrap();
-            let op = op.with_gamma(self.schedule.gamma).unwrap();
+            let op = op.over(self.y.dim().0).unwrap().with_gamma(self.schedule.gamma).unwrap();
             solver(&op, self.y.view(), &self.schedule, &mut Pull, &mut ()).unwrap()
         }
 
@@ -357,7 +368,7 @@ mod reference {
         }
 
         pub(super) fn zeros(&self) -> Vec<f64> {
-            vec![0.0; self.masks.len()]
+            vec![0.0; self.y.dim().0 * self.masks.len()]
         }
 
         pub(super) fn denoise(&self, x: &mut [f64]) {
@@ -366,13 +377,15 @@ mod reference {
 
         /// `P(w)`, with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
         pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
-            let pixels = self.pixels();
+            let plane = self.masks.dim().1 * self.masks.dim().2;
             let (gamma, memory) = (self.schedule.gamma, self.schedule.stages[0].memory);
             let mask: Vec<f64> = self.masks.iter().map(|&c| f64::from(c)).collect();
             let mut x = w.to_vec();
             for (p, &y) in self.y.iter().enumerate() {
-                let voxels = || (p..w.len()).step_by(pixels);
-                let seen: f64 = voxels().map(|voxel| mask[voxel] * w[voxel]).sum();
+                // The snapshot's own frames at this pixel, and the masks there.
+                let (first, pixel) = (p / plane * mask.len(), p % plane);
+                let voxels = || (pixel..mask.len()).step_by(plane);
+                let seen: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
                 let gram: f64 = voxels().map(|voxel| mask[voxel].powi(2)).sum();
                 let mut target = f64::from(y);
                 if self.schedule.accelerated {
@@ -380,7 +393,7 @@ mod reference {
                     target = y1[p];
                 }
                 for voxel in voxels() {
-                    x[voxel] += mask[voxel] * (target - seen) / (gram + f64::from(gamma));
+                    x[first + voxel] += mask[voxel] * (target - seen) / (gram + f64::from(gamma));
                 }
             }
             x
@@ -396,12 +409,12 @@ mod reference {
 
 #[cfg(test)]
 mod tests {
-    use super::Run;
+    use super::{Run, reconstruct};
     use crate::recon::prior::temporal::TemporalVariation;
     use crate::recon::prior::tv::TotalVariation;
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
-    use ndarray::{Array2, Array3};
+    use ndarray::{Array3, ArrayView3, s};
     use rand::{Rng, SeedableRng};
 
     /// Strip by strip is what projection, total variation along time and that of each frame do one after
@@ -418,7 +431,7 @@ mod tests {
         let stage = &schedule.stages[0];
         let settings = stage.settings(0);
 
-        let (mut expected, mut y1) = (Array3::zeros(size), Array2::zeros(y.raw_dim()));
+        let (mut expected, mut y1) = (Array3::zeros(size), Array3::zeros(y.raw_dim()));
         op.project(0..size.1, &y, Some((&mut y1, stage.memory)), &v, &mut expected);
         let (weight, updates) = (settings.temporal_weight, settings.tv_updates);
         let mut temporal = TemporalVariation::new(size.0);
@@ -436,5 +449,25 @@ mod tests {
             assert!((squares / f64::from(residual) - 1.0).abs() < 1e-4, "{rows} rows: {squares}");
             assert!((change.relative() / difference.sqrt() - 1.0).abs() < 1e-4, "{rows} rows");
         }
+    }
+    /// Where no prior looks along time, a run of snapshots is what they are alone, bit by bit.
+    #[test]
+    fn snapshots_together_are_those_alone_where_nothing_looks_along_time() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+        let masks = Array3::from_shape_simple_fn((4, 40, 24), || rng.random::<f32>());
+        let y = Array3::from_shape_simple_fn((3, 40, 24), || 2.0 * rng.random::<f32>());
+        let solve = |y: ArrayView3<'_, f32>, schedule: &Schedule| {
+            let op = SensingOperator::new(masks.clone()).unwrap().over(y.dim().0).unwrap();
+            reconstruct(&op, y, schedule, &mut (), &mut ()).unwrap().frames
+        };
+        let schedule = Schedule::gap_tv().with_iterations(20);
+        let together = solve(y.view(), &schedule);
+        for snapshot in 0..3 {
+            let alone = solve(y.slice(s![snapshot..=snapshot, .., ..]), &schedule);
+            assert_eq!(alone, together.slice(s![4 * snapshot..4 * snapshot + 4, .., ..]));
+        }
+        let along_time = Schedule::gap_tv3d().with_iterations(20);
+        let alone = solve(y.slice(s![1..2, .., ..]), &along_time);
+        assert_ne!(alone, solve(y.view(), &along_time).slice(s![4..8, .., ..]));
     }
 }

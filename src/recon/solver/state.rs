@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, Array3, Axis};
+use ndarray::{Array3, Axis};
 
 use crate::recon::schedule::{Method, Schedule};
 use crate::recon::sensing::SensingOperator;
@@ -10,10 +10,10 @@ use crate::recon::sensing::SensingOperator;
 /// What an iteration starts from.
 #[derive(Clone)]
 pub(in crate::recon) struct State {
-    /// The iterate \[B,H,W\].
+    /// The iterate \[S B,H,W\].
     pub(super) v: Array3<f32>,
-    /// The target of accelerated GAP \[H,W\].
-    pub(super) y1: Option<Array2<f32>>,
+    /// The target of accelerated GAP \[S,H,W\].
+    pub(super) y1: Option<Array3<f32>>,
     /// What is projected, where it is not `v`: extrapolated, or with ADMM's multiplier.
     pub(super) start: Option<Array3<f32>>,
     /// ADMM's multiplier `u`.
@@ -22,11 +22,11 @@ pub(in crate::recon) struct State {
 
 impl State {
     /// All zero.
-    pub(super) fn new(size: (usize, usize, usize), schedule: &Schedule) -> Self {
-        let zeros = || Array3::zeros(size);
+    pub(super) fn new(op: &SensingOperator, schedule: &Schedule) -> Self {
+        let zeros = || Array3::zeros(op.dim());
         Self {
             v: zeros(),
-            y1: schedule.accelerated.then(|| Array2::zeros((size.1, size.2))),
+            y1: schedule.accelerated.then(|| Array3::zeros(op.measurement_dim())),
             start: schedule.has_own_start().then(zeros),
             multiplier: (schedule.method == Method::Admm).then(zeros),
         }
@@ -37,7 +37,7 @@ impl State {
         &mut self,
         op: &SensingOperator,
         rows: Range<usize>,
-        y: &Array2<f32>,
+        y: &Array3<f32>,
         memory: f32,
         x: &mut Array3<f32>,
     ) -> f64 {

@@ -52,7 +52,7 @@ pub struct JobTask {
     pub prepared: Option<Value>,
     /// What its pilot recorded, if it has one that is done.
     pub pilot: Option<Value>,
-    /// For an assembly: all tiles of its snapshot, in the order of the plan.
+    /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan.
     pub tiles: Vec<TileResult>,
     /// For the manifest: all other tasks of the job, in order.
     pub records: Vec<TaskRecord>,
@@ -257,7 +257,7 @@ async fn take(
              ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
                  jobs.state = 'running' DESC, job, ordinal, tasks.id
              LIMIT 1)
-         RETURNING id, job, calibration, lab, kind, snapshot, tile, attempt, cost",
+         RETURNING id, job, calibration, lab, kind, snapshot, snapshots, tile, attempt, cost",
         [
             TaskState::Running,
             worker,

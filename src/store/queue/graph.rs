@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 
-use crate::job::{CalibrationId, JobId, JobSpec, Lab, TaskId, TaskKind, TaskState};
+use crate::job::{CalibrationId, JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
 use crate::store::tables::{labs, results, sums, tasks};
@@ -27,13 +27,23 @@ pub async fn insert(
         .map(|(ordinal, (kind, cost))| {
             let id = TaskId::new().to_string();
             let state = first_state(kind).into_str();
-            json!([id, ordinal, kind.into_str(), kind.snapshot(), kind.tile(), state, cost])
+            json!([
+                id,
+                ordinal,
+                kind.into_str(),
+                kind.snapshot(),
+                kind.tile(),
+                state,
+                cost,
+                kind.snapshots()
+            ])
         })
         .collect();
     sql!(
-        "INSERT INTO tasks (id, job, lab, ordinal, kind, snapshot, tile, state, priority, cost)
+        "INSERT INTO tasks (id, job, lab, ordinal, kind, snapshot, tile, state, priority, cost,
+             snapshots)
          SELECT value ->> 0, ?1, ?4, value ->> 1, value ->> 2, value ->> 3, value ->> 4, value ->> 5,
-             ?2, value ->> 6
+             ?2, value ->> 6, value ->> 7
          FROM json_each(?3)",
         [job, spec.priority, Value::from(rows).to_string(), lab]
     )
@@ -96,7 +106,7 @@ pub(super) async fn unblock(
     job: JobId,
     done: TaskKind,
 ) -> Result<()> {
-    // ?1 job, ?2 snapshot, ?3 to ?5 states: blocked, ready, done.
+    // ?1 job, ?2 snapshot, ?3 to ?5 states: blocked, ready, done; ?6 snapshots, ?7 the longest run.
     let query = match done {
         TaskKind::Prepare => {
             "UPDATE tasks SET state = ?4
@@ -109,10 +119,13 @@ pub(super) async fn unblock(
             "UPDATE tasks SET state = ?4 WHERE job = ?1 AND kind = 'tile' AND state = ?3"
         }
         TaskKind::Tile { .. } => {
-            "UPDATE tasks SET state = ?4
-             WHERE job = ?1 AND kind = 'assemble' AND snapshot = ?2 AND state = ?3
+            // A snapshot waits for the tiles of all runs that hold it.
+            "UPDATE tasks AS waits SET state = ?4
+             WHERE job = ?1 AND kind = 'assemble' AND snapshot BETWEEN ?2 AND ?2 + ?6 - 1
+               AND state = ?3
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'tile'
-                                   AND snapshot = ?2 AND state <> ?5)"
+                                   AND snapshot BETWEEN waits.snapshot - ?7 + 1 AND waits.snapshot
+                                   AND waits.snapshot < snapshot + snapshots AND state <> ?5)"
         }
         TaskKind::Assemble { .. } | TaskKind::Preview { .. } => {
             "UPDATE tasks SET state = ?4
@@ -122,9 +135,20 @@ pub(super) async fn unblock(
         }
         TaskKind::Manifest | TaskKind::Calibration => return Ok(()),
     };
-    sql!(query, [job, done.snapshot(), TaskState::Blocked, TaskState::Ready, TaskState::Done])
-        .execute(connection)
-        .await?;
+    sql!(
+        query,
+        [
+            job,
+            done.snapshot(),
+            TaskState::Blocked,
+            TaskState::Ready,
+            TaskState::Done,
+            done.snapshots(),
+            RunSpec::LONGEST
+        ]
+    )
+    .execute(connection)
+    .await?;
     Ok(())
 }
 
@@ -174,8 +198,8 @@ pub(super) async fn restart(connection: &mut SqliteConnection, job: JobId) -> Re
     .execute(&mut *connection)
     .await?;
     let done = sql!(
-        "SELECT kind, snapshot, min(tile) AS tile FROM tasks WHERE job = ? AND state = ?
-         GROUP BY kind, snapshot",
+        "SELECT kind, snapshot, snapshots, min(tile) AS tile FROM tasks
+         WHERE job = ? AND state = ? GROUP BY kind, snapshot",
         [job, TaskState::Done]
     )
     .fetch_all(&mut *connection)

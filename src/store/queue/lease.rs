@@ -12,7 +12,9 @@ use sqlx::{Row, SqliteConnection};
 use strum::Display;
 
 use super::job;
-use crate::job::{JobState, TaskId, TaskKind, TaskProgress, TaskState, Timestamp, WorkerId};
+use crate::job::{
+    JobState, RunSpec, TaskId, TaskKind, TaskProgress, TaskState, Timestamp, WorkerId,
+};
 use crate::store::Store;
 use crate::store::error::Result;
 use crate::store::rows::{sql, sql_scalar};
@@ -165,16 +167,18 @@ impl Store {
     }
 
     /// Has tiles done again whose stored results turned out to be damaged, and gives the assembly,
-    /// which found it, back to wait for them. The damage counts as a failure of each tile.
-    pub async fn redo_tiles(&self, lease: &Lease, damaged: &[u32]) -> Result<()> {
+    /// which found it, back to wait for them; each is given by the first snapshot of its run, and its index.
+    /// The damage counts as a failure of each tile.
+    pub async fn redo_tiles(&self, lease: &Lease, damaged: &[(u32, u32)]) -> Result<()> {
         let mut transaction = self.write().await?;
         let Some((Owner::Job(job), kind)) = held(&mut transaction, lease).await? else {
             return Ok(());
         };
         let worst: u32 = sql_scalar!(
             "SELECT coalesce(max(failures), 0) FROM tasks
-             WHERE job = ? AND kind = 'tile' AND snapshot = ?",
-            [job, kind.snapshot()]
+             WHERE job = ?1 AND kind = 'tile' AND snapshot BETWEEN ?2 - ?3 + 1 AND ?2
+               AND ?2 < snapshot + snapshots",
+            [job, kind.snapshot(), RunSpec::LONGEST]
         )
         .fetch_one(&mut *transaction)
         .await?;
@@ -184,11 +188,11 @@ impl Store {
             return Ok(transaction.commit().await?);
         }
         lose(&mut transaction, lease.task, &Loss::Released).await?;
-        for tile in damaged {
+        for (run, tile) in damaged {
             sql!(
                 "UPDATE tasks SET state = ?, result = NULL, failures = failures + 1
                  WHERE job = ? AND kind = 'tile' AND snapshot = ? AND tile = ? AND state = ?",
-                [TaskState::Ready, job, kind.snapshot(), tile, TaskState::Done]
+                [TaskState::Ready, job, run, tile, TaskState::Done]
             )
             .execute(&mut *transaction)
             .await?;
@@ -231,7 +235,7 @@ pub(super) async fn held(
     lease: &Lease,
 ) -> Result<Option<(Owner, TaskKind)>> {
     let row = sql!(
-        "SELECT job, calibration, kind, snapshot, tile FROM tasks
+        "SELECT job, calibration, kind, snapshot, snapshots, tile FROM tasks
          WHERE id = ? AND attempt = ? AND state = ?",
         [lease.task, lease.attempt, TaskState::Running]
     )
@@ -276,7 +280,8 @@ pub(super) async fn lose(
     loss: &Loss,
 ) -> Result<()> {
     let row = sql!(
-        "SELECT job, calibration, kind, snapshot, tile, failures, losses, starved FROM tasks WHERE id = ?",
+        "SELECT job, calibration, kind, snapshot, snapshots, tile, failures, losses, starved FROM tasks
+          WHERE id = ?",
         [task]
     )
     .fetch_one(&mut *connection)
@@ -339,7 +344,13 @@ pub(super) async fn lose(
 
 fn failure_text(kind: TaskKind, attempts: u32, reason: &str) -> String {
     let place = match kind {
-        TaskKind::Tile { snapshot, tile } => format!("tile {tile} of snapshot {snapshot}"),
+        TaskKind::Tile { snapshot, snapshots: 1, tile } => {
+            format!("tile {tile} of snapshot {snapshot}")
+        }
+        TaskKind::Tile { snapshot, snapshots, tile } => {
+            let last = snapshot + snapshots.saturating_sub(1);
+            format!("tile {tile} of snapshots {snapshot} to {last}")
+        }
         TaskKind::Assemble { snapshot } => format!("assembling snapshot {snapshot}"),
         TaskKind::Prepare => "preparing".into(),
         TaskKind::Preview { snapshot } => format!("the preview of snapshot {snapshot}"),

@@ -5,7 +5,9 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
 use sqlx::{Row, SqliteConnection};
 
-use crate::job::{CalibrationId, Finding, Lab, Label, MeasurementId, Sha256, Timestamp, TokenId};
+use crate::job::{
+    CalibrationId, Finding, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp, TokenId,
+};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Filter, Page, integer, list, number, refuse_if_used, sql, sql_scalar};
@@ -27,6 +29,8 @@ pub struct NewMeasurement {
     pub camera_fps: Option<f64>,
     /// Exposure of one snapshot in seconds.
     pub exposure_s: Option<f64>,
+    /// Whether the snapshots follow one another without a gap.
+    pub sequence: Sequence,
     /// The uploads whose average was subtracted.
     pub dark: Vec<Sha256>,
     /// What the check against the calibration found.
@@ -131,8 +135,8 @@ pub async fn insert(
     sql!(
         "INSERT INTO measurements (lab, token, id, name, calibration, data, prepared, format, sample,
              snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings,
-             created_at)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             created_at, sequence)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -151,7 +155,8 @@ pub async fn insert(
             facts.exposure_s,
             Json(&facts.dark),
             Json(&facts.warnings),
-            measurement.created_at
+            measurement.created_at,
+            facts.sequence
         ]
     )
     .execute(connection)
@@ -176,6 +181,7 @@ fn measurement(row: &SqliteRow) -> Result<Measurement> {
             full_scale: row.try_get("full_scale")?,
             camera_fps: row.try_get("camera_fps")?,
             exposure_s: row.try_get("exposure_s")?,
+            sequence: row.try_get("sequence")?,
             dark: list(row, "dark")?,
             warnings: list(row, "warnings")?,
         },

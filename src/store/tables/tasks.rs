@@ -10,7 +10,7 @@ use sqlx::types::Json;
 use sqlx::{FromRow, Row};
 use strum::{VariantArray, VariantNames};
 
-use crate::job::{CalibrationId, JobId, Sha256, TaskKind, TaskState};
+use crate::job::{CalibrationId, JobId, RunSpec, Sha256, TaskKind, TaskState};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_as, sql_scalar};
@@ -24,6 +24,9 @@ pub enum Owner {
 
 #[derive(Debug, Clone, FromRow)]
 pub struct TileResult {
+    /// The first snapshot of its run.
+    #[sqlx(rename = "snapshot")]
+    pub run: u32,
     pub tile: u32,
     /// The hash that its file should have.
     #[sqlx(rename = "result")]
@@ -45,6 +48,13 @@ pub struct TaskRecord {
 
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
 pub struct TileState {
+    /// The first snapshot of its run.
+    #[serde(skip)]
+    #[sqlx(rename = "snapshot")]
+    pub run: u32,
+    /// The number of snapshots in its run.
+    #[serde(skip)]
+    pub snapshots: u32,
     pub tile: u32,
     pub state: TaskState,
     pub stage: Option<String>,
@@ -97,13 +107,14 @@ impl Store {
         Ok(sha256.map(|sha256| (sha256, self.dir().blob(&sha256))))
     }
 
-    /// The stored tiles of a snapshot, in the order of the plan. The job's assembly has the right to
-    /// count on all of them being there.
+    /// The stored tiles of the runs that hold a snapshot, run by run in the order of the plan. The job's
+    /// assembly has the right to count on all of them being there.
     pub async fn tile_results(&self, job: JobId, snapshot: u32) -> Result<Vec<TileResult>> {
         let tiles = sql_as!(
-            "SELECT tile, result, record FROM tasks
-             WHERE job = ? AND kind = 'tile' AND snapshot = ? AND state = ? ORDER BY tile",
-            [job, snapshot, TaskState::Done]
+            "SELECT snapshot, tile, result, record FROM tasks
+             WHERE job = ?1 AND kind = 'tile' AND snapshot BETWEEN ?2 - ?4 + 1 AND ?2
+               AND ?2 < snapshot + snapshots AND state = ?3 ORDER BY snapshot, tile",
+            [job, snapshot, TaskState::Done, RunSpec::LONGEST]
         )
         .fetch_all(&self.readers)
         .await?;
@@ -113,7 +124,7 @@ impl Store {
     /// What is known of all tasks of a job that are done, in order.
     pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>> {
         let rows = sql!(
-            "SELECT kind, snapshot, tile, record, seconds, attempt FROM tasks
+            "SELECT kind, snapshot, snapshots, tile, record, seconds, attempt FROM tasks
              WHERE job = ? AND state = ? ORDER BY ordinal",
             [job, TaskState::Done]
         )
@@ -130,20 +141,22 @@ impl Store {
         rows.iter().map(read).collect()
     }
 
-    /// The tiles of a snapshot, in the order of the plan.
+    /// The tiles of the runs that hold a snapshot, run by run in the order of the plan.
     pub async fn tile_states(&self, job: JobId, snapshot: u32) -> Result<Vec<TileState>> {
         let tiles = sql_as!(
-            "SELECT tile, state, stage, iterations, passes, fraction, attempt,
-                 CASE state WHEN ? THEN record ->> 'residual' END AS residual
-             FROM tasks WHERE job = ? AND kind = 'tile' AND snapshot = ? ORDER BY tile",
-            [TaskState::Done, job, snapshot]
+            "SELECT snapshot, snapshots, tile, state, stage, iterations, passes,
+                 fraction, attempt, CASE state WHEN ?3 THEN record ->> 'residual' END AS residual
+             FROM tasks WHERE job = ?1 AND kind = 'tile' AND snapshot BETWEEN ?2 - ?4 + 1 AND ?2
+               AND ?2 < snapshot + snapshots ORDER BY snapshot, tile",
+            [job, snapshot, TaskState::Done, RunSpec::LONGEST]
         )
         .fetch_all(&self.readers)
         .await?;
         Ok(tiles)
     }
 
-    /// How the solver went on a tile; none if there is no such tile.
+    /// How the solver went on a tile of the last run that holds a snapshot (that which begins with it, if
+    /// one does); none if there is no such tile.
     pub async fn tile_history(
         &self,
         job: JobId,
@@ -152,8 +165,10 @@ impl Store {
     ) -> Result<Option<TileHistory>> {
         let history = sql_as!(
             "SELECT tile, state, coalesce(history, '[]') AS history
-             FROM tasks WHERE job = ? AND kind = 'tile' AND snapshot = ? AND tile = ?",
-            [job, snapshot, tile]
+             FROM tasks WHERE job = ?1 AND kind = 'tile' AND tile = ?3
+               AND snapshot BETWEEN ?2 - ?4 + 1 AND ?2 AND ?2 < snapshot + snapshots
+             ORDER BY snapshot DESC LIMIT 1",
+            [job, snapshot, tile, RunSpec::LONGEST]
         )
         .fetch_optional(&self.readers)
         .await?;
@@ -196,7 +211,8 @@ impl Store {
 
 pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
     let name: String = row.try_get("kind")?;
-    TaskKind::from_parts(&name, row.try_get("snapshot")?, row.try_get("tile")?)
+    let snapshots = (row.try_get("snapshot")?, row.try_get("snapshots")?);
+    TaskKind::from_parts(&name, snapshots, row.try_get("tile")?)
         .ok_or(StoreError::Corrupt { column: "kind", value: name })
 }
 

@@ -82,7 +82,7 @@ async fn damaged_tiles_are_done_again() {
     let assemble = lab.claim().await.unwrap();
     assert_eq!(assemble.kind, TaskKind::Assemble { snapshot: 0 });
     assert_eq!(lab.store.tile_results(job, 0).await.unwrap().len(), 2);
-    lab.store.redo_tiles(&assemble.lease, &[1]).await.unwrap();
+    lab.store.redo_tiles(&assemble.lease, &[(0, 1)]).await.unwrap();
     let done = lab.work_off().await;
     assert_eq!(done[..2], [tile(0, 1), TaskKind::Assemble { snapshot: 0 }]);
     assert_eq!(lab.state(job).await, JobState::Succeeded);

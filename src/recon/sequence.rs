@@ -1,0 +1,237 @@
+//! Snapshots of a sequence together: cut into runs that overlap in time as tiles do in space. Pure
+//! arithmetic.
+//!
+//! The frames of a run are solved as one clip. What follows a cut or a jump of the scene does not belong
+//! to the same clip: a joint between two snapshots may be taken apart, and the runs that hold it are then
+//! solved in pieces.
+
+use std::ops::Range;
+
+use super::error::{ReconError, Result};
+use super::tile::{parts, weights};
+
+/// How the snapshots of a sequence are cut into runs. It depends on their number and the parameters alone,
+/// never on the number of workers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SequencePlan {
+    runs: Vec<Range<usize>>,
+}
+
+/// Snapshots of a run that are solved as one clip.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Piece {
+    /// The index of its run.
+    pub run: usize,
+    /// Its snapshots, by their index in the measurement.
+    pub snapshots: Range<usize>,
+}
+
+/// What the frames of a snapshot take from one run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunShare {
+    /// The index of the run.
+    pub run: usize,
+    /// The place of the snapshot in the run.
+    pub place: usize,
+    /// The weight of each of its frames \[B\]; over all runs they add up to 1.
+    pub weights: Vec<f32>,
+}
+
+impl RunShare {
+    /// The index, among the frames of the run, of frame `k` of the snapshot.
+    pub fn frame(&self, k: usize) -> usize {
+        self.place * self.weights.len() + k
+    }
+}
+
+impl SequencePlan {
+    /// Cuts snapshots, given by their indices in the measurement, into as few runs of at most `length` as
+    /// share at least `overlap` snapshots with each neighbour, and makes them as short as that allows.
+    /// Errors: a length of 0, or an overlap that is not below it.
+    pub fn new(snapshots: Range<usize>, length: usize, overlap: usize) -> Result<Self> {
+        if snapshots.is_empty() || length == 0 {
+            return Err(ReconError::Parameter {
+                name: "the length of a run",
+                value: length.min(snapshots.len()).to_string(),
+                range: "at least 1 snapshot",
+            });
+        }
+        if overlap >= length {
+            return Err(ReconError::Parameter {
+                name: "the overlap of runs",
+                value: overlap.to_string(),
+                range: "less than the length of a run",
+            });
+        }
+        let first = snapshots.start;
+        let length = length.min(snapshots.len());
+        let runs = parts(snapshots.len(), length, overlap.min(length - 1), 1);
+        Ok(Self { runs: runs.into_iter().map(|run| first + run.start..first + run.end).collect() })
+    }
+
+    /// Each snapshot alone.
+    pub fn separate(snapshots: Range<usize>) -> Self {
+        Self { runs: snapshots.map(|snapshot| snapshot..snapshot + 1).collect() }
+    }
+
+    /// The snapshots of each run, by their indices in the measurement.
+    pub fn runs(&self) -> &[Range<usize>] {
+        &self.runs
+    }
+
+    /// The joints that runs hold: `j` is the one between the snapshots `j` and `j + 1`.
+    pub fn joints(&self) -> Vec<usize> {
+        let mut joints: Vec<usize> =
+            self.runs.iter().flat_map(|run| run.start..run.end - 1).collect();
+        joints.sort_unstable();
+        joints.dedup();
+        joints
+    }
+
+    /// What is solved where the joints in `cuts` are taken apart, in the order of the runs. A piece that is
+    /// part of another run's piece is left to that run: it has nothing to add.
+    pub fn pieces(&self, cuts: &[usize]) -> Vec<Piece> {
+        let mut pieces = Vec::with_capacity(self.runs.len());
+        for run in 0..self.runs.len() {
+            for snapshots in self.split(run, cuts) {
+                // Runs stand in order: those that meet this one are its neighbours.
+                let meets = |other: &usize| {
+                    let other = &self.runs[*other];
+                    other.start < snapshots.end && snapshots.start < other.end
+                };
+                let before = (0..run).rev().take_while(meets);
+                let after = (run + 1..self.runs.len()).take_while(meets);
+                let left_to = |other: usize| {
+                    self.split(other, cuts).into_iter().any(|larger| {
+                        let within = larger.start <= snapshots.start && snapshots.end <= larger.end;
+                        within && (larger != snapshots || other < run)
+                    })
+                };
+                if !before.chain(after).any(left_to) {
+                    pieces.push(Piece { run, snapshots });
+                }
+            }
+        }
+        pieces
+    }
+
+    /// A run, taken apart.
+    fn split(&self, run: usize, cuts: &[usize]) -> Vec<Range<usize>> {
+        let run = &self.runs[run];
+        let mut split = Vec::new();
+        let mut start = run.start;
+        for last in run.clone() {
+            if last + 1 == run.end || cuts.contains(&last) {
+                split.push(start..last + 1);
+                start = last + 1;
+            }
+        }
+        split
+    }
+
+    /// What the `frames` frames of a snapshot take from each run, where the joints in `cuts` are taken apart.
+    /// Over the frames that two runs share the weights change as a squared sine.
+    pub fn shares(&self, snapshot: usize, cuts: &[usize], frames: usize) -> Vec<RunShare> {
+        // The snapshots that are not cut off from this one.
+        let (Some(first), Some(last)) = (self.runs.first(), self.runs.last()) else {
+            return Vec::new();
+        };
+        let start = (first.start..snapshot).rev().find(|joint| cuts.contains(joint));
+        let end = (snapshot..last.end).find(|joint| cuts.contains(joint));
+        let (start, end) = (start.map_or(first.start, |j| j + 1), end.map_or(last.end, |j| j + 1));
+        let mut pieces = self.pieces(cuts);
+        pieces.retain(|piece| start <= piece.snapshots.start && piece.snapshots.end <= end);
+        let frame = |snapshot: usize| (snapshot - start) * frames;
+        let parts: Vec<Range<usize>> = pieces
+            .iter()
+            .map(|Piece { snapshots, .. }| frame(snapshots.start)..frame(snapshots.end))
+            .collect();
+        let weights = weights(&parts, frame(end));
+        let own = |(piece, weights): (Piece, Vec<f32>)| {
+            piece.snapshots.contains(&snapshot).then(|| {
+                let at = frame(snapshot) - frame(piece.snapshots.start);
+                RunShare {
+                    run: piece.run,
+                    place: snapshot - self.runs[piece.run].start,
+                    weights: weights[at..at + frames].to_vec(),
+                }
+            })
+        };
+        pieces.into_iter().zip(weights).filter_map(own).collect()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)] // lists of ranges, some of one
+mod tests {
+    use super::{Piece, SequencePlan};
+    use proptest::prelude::{any, proptest};
+
+    #[test]
+    fn runs_are_few_and_even() {
+        for (count, length, overlap, runs) in [
+            (1, 5, 1, vec![0..1]),
+            (5, 5, 1, vec![0..5]),
+            (6, 5, 1, vec![0..4, 2..6]),
+            (7, 4, 1, vec![0..4, 3..7]),
+            (3, 1, 0, vec![0..1, 1..2, 2..3]),
+        ] {
+            let plan = SequencePlan::new(0..count, length, overlap).unwrap();
+            assert_eq!(plan.runs(), runs, "{count} snapshots");
+        }
+        let plan = SequencePlan::new(3..10, 4, 1).unwrap();
+        assert_eq!(plan.runs(), [3..7, 6..10]);
+        assert_eq!(plan.joints(), (3..9).collect::<Vec<_>>());
+        assert_eq!(SequencePlan::separate(2..4), SequencePlan::new(2..4, 1, 0).unwrap());
+        assert!(SequencePlan::new(0..3, 0, 0).is_err());
+        assert!(SequencePlan::new(0..3, 2, 2).is_err());
+    }
+
+    #[test]
+    fn what_a_cut_leaves_of_an_overlap_is_done_once() {
+        let plan = SequencePlan::new(0..7, 4, 1).unwrap();
+        let pieces = |cuts: &[usize]| -> Vec<_> {
+            plan.pieces(cuts).into_iter().map(|Piece { run, snapshots }| (run, snapshots)).collect()
+        };
+        assert_eq!(pieces(&[]), [(0, 0..4), (1, 3..7)]);
+        assert_eq!(pieces(&[1]), [(0, 0..2), (0, 2..4), (1, 3..7)]);
+        // Before the shared snapshot, and behind it.
+        assert_eq!(pieces(&[2]), [(0, 0..3), (1, 3..7)]);
+        assert_eq!(pieces(&[3]), [(0, 0..4), (1, 4..7)]);
+        let all: Vec<usize> = (0..6).collect();
+        let alone = pieces(&all);
+        assert_eq!(alone.len(), 7, "each once: {alone:?}");
+        for snapshot in 0..7 {
+            let shares = plan.shares(snapshot, &all, 3);
+            assert_eq!((shares.len(), &shares[0].weights[..]), (1, &[1.0; 3][..]));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn weights_add_up_to_one(
+            first in 0usize..4,
+            count in 1usize..20,
+            length in 1usize..6,
+            overlap in 0usize..5,
+            frames in 1usize..6,
+            cuts in any::<u32>(),
+        ) {
+            let plan = SequencePlan::new(first..first + count, length, overlap.min(length - 1)).unwrap();
+            let cuts: Vec<usize> = (0..24).filter(|joint| cuts >> joint & 1 == 1).collect();
+            let pieces = plan.pieces(&cuts);
+            for snapshot in first..first + count {
+                let shares = plan.shares(snapshot, &cuts, frames);
+                for frame in 0..frames {
+                    let sum: f32 = shares.iter().map(|share| share.weights[frame]).sum();
+                    assert!((sum - 1.0).abs() < 1e-5, "{snapshot} {frame}: {sum}");
+                }
+                for share in shares {
+                    let piece = |piece: &&Piece| piece.run == share.run && piece.snapshots.contains(&snapshot);
+                    assert_eq!(pieces.iter().filter(piece).count(), 1);
+                    assert_eq!(plan.runs()[share.run].start + share.place, snapshot);
+                }
+            }
+        }
+    }
+}
