@@ -87,9 +87,10 @@ fn nonlocal(criterion: &mut Criterion) {
         group
             .bench_function(&name, |bencher| bencher.iter(|| prior.work(black_box(&[part]), 0.05)));
     }
-    let groups = DIM.0 * 64 * 64;
+    // Every five pixels, the ends among them.
+    let groups = DIM.0 * 51 * 51;
     // 44 pairs of frames that are at most 3 apart, of 8 x 8; a difference and a square for each pixel.
-    let candidates = 44 * 64 * 64 * 16 * 16;
+    let candidates = 44 * 51 * 51 * 16 * 16;
     let triangle = |size: usize| size * (size + 1) / 2;
     let square = PIXELS * PIXELS;
     for (part, count) in [

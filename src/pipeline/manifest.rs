@@ -327,7 +327,7 @@ mod tests {
         };
         assert_eq!(text("frame"), Some("3 of 3"));
         assert_eq!(text("algorithm"), Some("gap-tv"));
-        assert_eq!(text("model fastdvdnet-gray").map(str::len), Some(64));
+        assert_eq!(text("model fastdvdnet-gray-int8").map(str::len), Some(64));
         assert!((attributes[2].frame_time_s.unwrap() - 0.028).abs() < 1e-12);
         assert!((attributes[2].frames_per_second.unwrap() - 250.0).abs() < 1e-9);
         // They must be names that OpenEXR takes.

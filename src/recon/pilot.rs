@@ -1,10 +1,11 @@
-//! How many iterations of each stage pay for a scene, found out on a piece of its measurement.
+//! How far along its schedule a reconstruction should go, found out on a piece of the measurement.
 //!
 //! Without the truth, only the measurement can judge. One in fourteen of the piece's pixels is
 //! kept from the solver, and after each iteration what the frames say about these pixels is compared
 //! with what was measured there (cross-validation). That error falls as long as the frames get
-//! better and rises when the solver begins to fit noise or the network to invent: on the clips that
-//! were tried its least value lies within a few passes of the best PSNR.
+//! better and rises when the solver begins to fit noise or the network to invent. It also rises where
+//! a prior takes over at a level far above the error that is left, and falls again with the level: so
+//! the whole stage is run, and judged by its end.
 
 use std::ops::Range;
 
@@ -23,12 +24,9 @@ pub const SIDE: usize = 96;
 
 /// The share of pixels that are kept from the solver.
 const HELD_OUT: f64 = 0.07;
-/// A stage goes on as long as its error comes this near to its least: about there the frames still
-/// get better.
+/// The last iteration whose error comes this near to the least is the end. Where the error hardly changes any
+/// more, the frames often still get better: in doubt the schedule goes on.
 const SLACK: f64 = 0.005;
-/// So many iterations that don't come near end the stage. Where the prior changes, the error may
-/// rise for ten iterations while the frames get better.
-const PATIENCE: usize = 20;
 
 /// The rows and columns of the piece: of all that lie side by side in a measurement \[H,W\], the one
 /// with the greatest variance. Flat sky would tell nothing.
@@ -52,7 +50,7 @@ pub fn piece(y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
 /// What was found out about a stage.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StageFinding {
-    /// Iterations that pay; 0 if the first one diverges.
+    /// Iterations that pay; 0 for a stage that is better left out.
     pub iterations: usize,
     /// Weight of the total variation along time, if it pays; else 0.
     pub temporal_weight: f32,
@@ -73,16 +71,15 @@ pub enum StageEnd {
     /// All that may be were done, and paid.
     #[strum(serialize = "max-iterations")]
     Planned,
-    /// Those that followed raised the error.
+    /// What followed, to the end of the schedule, raised the error.
     Converged,
     /// The iteration left the finite numbers soon after.
     Diverged,
 }
 
 /// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],
-/// and tells for every stage how many of its iterations pay. Stages of total variation alone, which
-/// cost next to nothing, are taken as they are, but for their part along time: it is left out if the
-/// stage's error is less without.
+/// and tells where it should end. Stages of total variation alone, which cost next to nothing, are taken
+/// as they are, but for their part along time: it is left out if the stage's error is less without.
 /// Errors: as [`super::solver::reconstruct`].
 pub fn run(
     op: SensingOperator,
@@ -95,27 +92,72 @@ pub fn run(
     let held_out = HeldOut::of(&op, 0);
     let op = op.without(&held_out.pixels);
     let mut run = Run::new(&op, y, schedule, networks);
-    let mut findings = Vec::with_capacity(schedule.stages.len());
-    let mut before = 1.0;
+    let mut courses: Vec<Course> = Vec::with_capacity(schedule.stages.len());
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = stage.temporal_weight.filter(|weight| *weight > 0.0).map(|_| run.state());
-        let mut finding = watch.stage(stage, &mut run, before)?;
+        let mut course = watch.stage(stage, &mut run)?;
         if let Some(start) = start {
             let with = run.state();
             run.restore(start);
             let without = Stage { temporal_weight: None, ..stage.clone() };
-            let other = watch.stage(&without, &mut run, before)?;
-            if other.after < finding.after {
-                finding = other;
+            let other = watch.stage(&without, &mut run)?;
+            if other.last() < course.last() {
+                course = other;
             } else {
                 run.restore(with);
             }
         }
-        before = finding.after;
-        findings.push(finding);
+        let diverged = course.diverged;
+        courses.push(course);
+        if diverged {
+            break;
+        }
     }
-    Ok(findings)
+    Ok(judge(schedule, &courses))
+}
+
+/// The errors of a stage on its way.
+struct Course {
+    temporal_weight: f32,
+    /// After each iteration; of a stage without a level after the last one alone.
+    errors: Vec<f64>,
+    /// Whether the next iteration left the finite numbers.
+    diverged: bool,
+}
+
+impl Course {
+    /// At its end.
+    fn last(&self) -> f64 {
+        self.errors.last().copied().unwrap_or(f64::INFINITY)
+    }
+}
+
+/// Ends the last stage with a level where its own error is about least. Those before it run as planned: what
+/// follows builds on them, and their errors on so small a piece can't tell how. Stages that were not reached
+/// are left out.
+fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
+    let last = schedule.stages.iter().rposition(|stage| stage.sigma.is_some());
+    let mut before = 1.0;
+    let finding = |(index, stage): (usize, &Stage)| {
+        let course = courses.get(index);
+        let errors = course.map_or(&[][..], |course| &course.errors);
+        let near = errors.iter().copied().fold(f64::INFINITY, f64::min) * (1.0 + SLACK);
+        let paid = errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1);
+        let done = if last == Some(index) { paid } else { errors.len() };
+        let diverged = course.is_none_or(|course| course.diverged) && done == errors.len();
+        let (iterations, end) = match (stage.sigma.is_none(), diverged) {
+            (true, _) => (stage.iterations, StageEnd::Fixed),
+            (false, true) => (done, StageEnd::Diverged),
+            (false, false) if done < stage.iterations => (done, StageEnd::Converged),
+            (false, false) => (done, StageEnd::Planned),
+        };
+        let after = errors[..done].last().copied().unwrap_or(before);
+        let temporal_weight = course.map_or(0.0, |course| course.temporal_weight);
+        let before = std::mem::replace(&mut before, after);
+        StageFinding { iterations, temporal_weight, before, after, end }
+    };
+    schedule.stages.iter().enumerate().map(finding).collect()
 }
 
 impl Schedule {
@@ -146,53 +188,29 @@ struct Watch<'a, 'b> {
 }
 
 impl Watch<'_, '_> {
-    fn error(&self, run: &Run<'_>) -> f64 {
-        self.held_out.error(self.op, self.y, run.frames())
-    }
-
-    fn stage(&mut self, stage: &Stage, run: &mut Run<'_>, before: f64) -> Result<StageFinding> {
+    fn stage(&mut self, stage: &Stage, run: &mut Run<'_>) -> Result<Course> {
         let fixed = stage.sigma.is_none();
         let temporal_weight = stage.temporal_weight.unwrap_or(0.0);
-        let mut end = if fixed { StageEnd::Fixed } else { StageEnd::Planned };
-        let mut best = (0, before, run.state());
-        let mut least = f64::INFINITY;
+        let mut course = Course { temporal_weight, errors: Vec::new(), diverged: false };
         run.enter();
         for done in 1..=stage.iterations {
             let step = match run.iterate(stage, done - 1) {
                 Err(ReconError::Diverged { .. }) if !fixed => {
-                    end = StageEnd::Diverged;
+                    course.diverged = true;
                     break;
                 }
                 other => other?,
             };
             run.tell((self.index, stage), done - 1, &step, &mut *self.observer)?;
-            if fixed {
-                if done == stage.iterations || step.change < stage.tolerance {
-                    let after = self.error(run);
-                    return Ok(StageFinding {
-                        iterations: stage.iterations,
-                        temporal_weight,
-                        before,
-                        after,
-                        end,
-                    });
-                }
-                continue;
+            let last = done == stage.iterations || step.change < stage.tolerance;
+            if !fixed || last {
+                course.errors.push(self.held_out.error(self.op, self.y, run.frames()));
             }
-            let error = self.error(run);
-            least = least.min(error);
-            if error <= least * (1.0 + SLACK) {
-                best = (done, error, run.state());
-            } else if done - best.0 >= PATIENCE {
+            if fixed && last {
                 break;
             }
         }
-        let (iterations, after, state) = best;
-        if end == StageEnd::Planned && iterations < stage.iterations {
-            end = StageEnd::Converged;
-        }
-        run.restore(state);
-        Ok(StageFinding { iterations, temporal_weight, before, after, end })
+        Ok(course)
     }
 }
 
@@ -253,20 +271,21 @@ mod tests {
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
     use ndarray::{Array2, Array3, Axis, s};
+    use std::ops::Range;
 
-    /// Goes to the truth for some passes, and away from it afterwards.
-    struct Tiring {
+    /// Goes to the truth in some passes, counted from 1, and away from it in the others.
+    struct Moody {
         truth: Array3<f32>,
-        good: usize,
+        good: Range<usize>,
         passes: usize,
-        /// What it does to the frames when it is tired.
+        /// What it does to the frames in the others.
         harm: f32,
     }
 
-    impl Denoiser for Tiring {
+    impl Denoiser for Moody {
         fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
             self.passes += 1;
-            match self.passes <= self.good {
+            match self.good.contains(&self.passes) {
                 true => frames.zip_mut_with(&self.truth, |x, &truth| *x += 0.3 * (truth - *x)),
                 false => frames.mapv_inplace(|x| x * self.harm),
             }
@@ -274,13 +293,13 @@ mod tests {
         }
     }
 
-    impl Networks for Tiring {
+    impl Networks for Moody {
         fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
             Ok(self)
         }
     }
 
-    fn find(planned: usize, good: usize, harm: f32) -> (Schedule, Vec<StageFinding>) {
+    fn find(planned: usize, good: Range<usize>, harm: f32) -> (Schedule, Vec<StageFinding>) {
         let masks = iid_masks(4, 48, 48, 3).unwrap();
         let truth = Array3::from_shape_fn((4, 48, 48), |(k, i, j)| {
             0.5 + 0.4 * ((i + 3 * k) as f32 * 0.4).sin() * (j as f32 * 0.3).cos()
@@ -291,14 +310,14 @@ mod tests {
         schedule.stages[1].iterations = planned;
         // So that each pass helps.
         schedule.stages[1].memory = 0.0;
-        let mut network = Tiring { truth, good, passes: 0, harm };
+        let mut network = Moody { truth, good, passes: 0, harm };
         let found = run(op, y.view(), &schedule, &mut network, &mut ()).unwrap();
         (schedule, found)
     }
 
     #[test]
     fn passes_that_harm_are_left_out() {
-        let (schedule, found) = find(60, 9, 0.7);
+        let (schedule, found) = find(60, 1..10, 0.7);
         assert_eq!((found[0].iterations, found[0].end), (60, StageEnd::Fixed));
         assert_eq!((found[1].iterations, found[1].end), (9, StageEnd::Converged));
         assert!(found[1].after < 0.5 * found[1].before && found[1].before == found[0].after);
@@ -313,8 +332,16 @@ mod tests {
 
     #[test]
     fn all_passes_that_help_are_kept() {
-        let (_, found) = find(6, 6, 1.0);
+        let (_, found) = find(6, 1..7, 1.0);
         assert_eq!((found[1].iterations, found[1].end), (6, StageEnd::Planned));
+    }
+
+    /// A level far above the error that is left harms at first.
+    #[test]
+    fn a_stage_is_judged_by_its_end_not_by_its_first_passes() {
+        let (_, found) = find(60, 30..61, 0.7);
+        assert_eq!((found[1].iterations, found[1].end), (60, StageEnd::Planned));
+        assert!(found[1].after < 0.5 * found[1].before);
     }
 
     #[test]
@@ -335,9 +362,9 @@ mod tests {
 
     #[test]
     fn divergence_ends_the_stage_before_it() {
-        let (schedule, found) = find(60, 5, f32::INFINITY);
+        let (schedule, found) = find(60, 1..6, f32::INFINITY);
         assert_eq!((found[1].iterations, found[1].end), (5, StageEnd::Diverged));
-        let (_, none) = find(60, 0, f32::INFINITY);
+        let (_, none) = find(60, 1..1, f32::INFINITY);
         assert_eq!((none[1].iterations, none[1].end), (0, StageEnd::Diverged));
         assert_eq!(
             schedule.decided(&[(60, 0.0), (0, 0.0)]).stages.len(),

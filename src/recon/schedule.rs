@@ -357,13 +357,14 @@ mod tests {
         }
         assert!(Schedule::pnp_tv_fastdvdnet().planned_passes() <= 24);
         let both = [Network::FastDvdNet, Network::FastDvdNetInt8];
-        assert_eq!(Schedule::pnp_tv_fastdvdnet().networks(), both);
+        assert_eq!(Schedule::pnp_fastdvdnet().networks(), both);
+        assert_eq!(Schedule::pnp_tv_fastdvdnet().networks(), [Network::FastDvdNetInt8]);
         assert_eq!(Schedule::pnp_nonlocal().networks(), []);
     }
 
     #[test]
     fn sigma_falls_geometrically_from_first_to_last() {
-        let schedule = Schedule::pnp_tv_fastdvdnet();
+        let schedule = Schedule::pnp_fastdvdnet();
         let stage = &schedule.stages[1];
         let [first, last] = stage.sigma.unwrap();
         let at = |index| stage.sigma_at(index).unwrap();

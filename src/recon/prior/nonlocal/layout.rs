@@ -9,7 +9,7 @@ pub(super) const PIXELS: usize = SIDE * SIDE;
 /// Patches of a group.
 pub(super) const PATCHES: usize = 40;
 /// Distance of neighbouring reference patches, pixels.
-const STRIDE: usize = 4;
+const STRIDE: usize = 5;
 /// Height and width of the window that is searched in each frame, in positions of patches.
 pub(super) const WINDOW: usize = 16;
 /// Frames before and after the reference that are searched.
@@ -31,10 +31,19 @@ pub(super) fn row_length(width: usize) -> usize {
     width + WINDOW + SIDE
 }
 
-/// Positions of the reference patches along an axis, the last one at its end.
-pub(super) fn positions(length: usize) -> Vec<usize> {
+/// How far the grid of reference patches is shifted down and to the right, for a frame and the searches before: not
+/// the same pixels lie between the patches in every frame and after every search.
+pub(super) fn shift(frame: usize, searches: usize) -> (usize, usize) {
+    let down = 2 * frame + 3 * searches;
+    (down % STRIDE, (down + frame + searches / 2) % STRIDE)
+}
+
+/// Positions of the reference patches along an axis, on a grid that is shifted by so many pixels; one at each
+/// end.
+pub(super) fn positions(length: usize, shift: usize) -> Vec<usize> {
     let last = length - SIDE;
-    let mut all: Vec<usize> = (0..last).step_by(STRIDE).collect();
-    all.push(last);
+    let mut all = vec![0];
+    all.extend((shift..last).step_by(STRIDE).filter(|&at| at > 0));
+    all.extend((last > 0).then_some(last));
     all
 }

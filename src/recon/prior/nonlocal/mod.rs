@@ -41,10 +41,10 @@ impl Prior for NonlocalPrior {
     }
 
     fn cost(&self, _: &Settings) -> f64 {
-        400.0
+        200.0
     }
 
-    /// Four clips with margins, and 40 indices for each 16 pixels.
+    /// Four clips with margins, and 40 indices for each 25 pixels.
     fn memory(&self) -> Memory {
         Memory { per_voxel: 30, per_network_pixel: 0 }
     }
@@ -190,8 +190,10 @@ impl WithSimd for Work<'_> {
         let (parts, sigma) = (self.parts, self.sigma);
         if parts.contains(&Part::Search) {
             {
-                let Nonlocal { guide, groups, cover, frames, height, width, .. } = &mut *self.prior;
-                search::search(simd, guide, (*frames, *height, *width), groups, cover);
+                let Nonlocal { guide, groups, cover, frames, height, width, passes, .. } =
+                    &mut *self.prior;
+                let (size, searches) = ((*frames, *height, *width), *passes / REFRESH);
+                search::search(simd, guide, size, searches, groups, cover);
             }
         }
         let Nonlocal { noisy, sum, groups, filter, width, .. } = self.prior;
@@ -254,7 +256,7 @@ fn span<S: Simd>() -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions};
+    use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions, shift};
     use super::search::window;
     use super::{Nonlocal, REFRESH, STRENGTH};
     use ndarray::Array3;
@@ -304,7 +306,7 @@ mod tests {
                 self.guide = clip.clone();
             }
             if self.passes.is_multiple_of(REFRESH) {
-                self.search();
+                self.search(self.passes / REFRESH);
             }
             self.passes += 1;
             let tau = f64::from(STRENGTH * PATCHES as f32 * sigma * sigma);
@@ -329,12 +331,15 @@ mod tests {
             self.guide.assign(clip);
         }
 
-        fn search(&mut self) {
+        fn search(&mut self, searches: usize) {
             let (frames, height, width) = self.guide.dim();
             self.groups.clear();
-            let places = |length| positions(length).into_iter();
-            let rows = (0..frames).flat_map(|k| places(height).map(move |i| (k, i)));
-            for (k, i, j) in rows.flat_map(|(k, i)| places(width).map(move |j| (k, i, j))) {
+            let places = |k| {
+                let (down, right) = shift(k, searches);
+                let columns = move |i| positions(width, right).into_iter().map(move |j| (k, i, j));
+                positions(height, down).into_iter().flat_map(columns)
+            };
+            for (k, i, j) in (0..frames).flat_map(places) {
                 let distance = |(other, row, column): (usize, usize, usize)| -> f64 {
                     let pixels = (0..PIXELS).map(|p| (p / SIDE, p % SIDE));
                     let differences = pixels.map(|(di, dj)| {
@@ -463,7 +468,8 @@ mod tests {
 
     #[test]
     fn reference_patches_reach_both_ends() {
-        assert_eq!(positions(6), [0]);
-        assert_eq!(positions(17), [0, 4, 8, 11]);
+        assert_eq!(positions(6, 3), [0]);
+        assert_eq!(positions(17, 0), [0, 5, 10, 11]);
+        assert_eq!(positions(17, 3), [0, 3, 8, 11]);
     }
 }

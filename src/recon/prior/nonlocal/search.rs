@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use pulp::{Simd, bytemuck};
 
-use super::layout::{PATCHES, REACH, SIDE, WINDOW, positions, row_length};
+use super::layout::{PATCHES, REACH, SIDE, WINDOW, positions, row_length, shift};
 
 /// Frames, height and width of a clip.
 type Size = (usize, usize, usize);
@@ -15,21 +15,22 @@ pub(super) const ROWS: usize = 8;
 const KEPT: usize = 128;
 
 /// Finds the patches most similar to each reference patch, near it in space and time, and counts how many
-/// cover a pixel. Of patches equally similar those that come first in the clip are taken; of a group they are
+/// cover a pixel; the grid of references depends on the number of searches before. Of patches equally similar those that come first in the clip are taken; of a group they are
 /// in the clip's order, which does not depend on how they were found.
 #[inline(always)]
 pub(super) fn search<S: Simd>(
     simd: S,
     guide: &[f32],
     size: Size,
+    searches: usize,
     groups: &mut Vec<u32>,
     cover: &mut [f32],
 ) {
     match S::F32_LANES {
-        16 => search_with::<S, { WINDOW / 16 }>(simd, guide, size, groups),
-        8 => search_with::<S, { WINDOW / 8 }>(simd, guide, size, groups),
-        4 => search_with::<S, { WINDOW / 4 }>(simd, guide, size, groups),
-        _ => search_with::<S, WINDOW>(simd, guide, size, groups),
+        16 => search_with::<S, { WINDOW / 16 }>(simd, guide, size, searches, groups),
+        8 => search_with::<S, { WINDOW / 8 }>(simd, guide, size, searches, groups),
+        4 => search_with::<S, { WINDOW / 4 }>(simd, guide, size, searches, groups),
+        _ => search_with::<S, WINDOW>(simd, guide, size, searches, groups),
     }
     count_cover(groups, cover, row_length(size.2));
 }
@@ -40,17 +41,19 @@ fn search_with<S: Simd, const V: usize>(
     simd: S,
     guide: &[f32],
     (frames, height, width): Size,
+    searches: usize,
     groups: &mut Vec<u32>,
 ) {
     let row_length = row_length(width);
     let plane = height * row_length;
-    let (rows, columns) = (positions(height), positions(width));
     let mut best = Best::default();
     groups.clear();
     for frame in 0..frames {
         let near = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
         // The own frame first: there the most similar ones are likely, and the bound falls at once.
         let order = || [frame].into_iter().chain(near.clone().filter(|&other| other != frame));
+        let (down, right) = shift(frame, searches);
+        let (rows, columns) = (positions(height, down), positions(width, right));
         for (&row, &column) in rows.iter().flat_map(|row| columns.iter().map(move |c| (row, c))) {
             let (top, left) = (window(row, height), window(column, width));
             let reference = frame * plane + row * row_length + column;
