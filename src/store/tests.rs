@@ -4,6 +4,7 @@ mod calibrations;
 mod failures;
 mod keeping;
 mod migration;
+mod remote;
 mod turns;
 
 use std::io::Write;
