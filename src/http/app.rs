@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use axum::extract::FromRef;
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
@@ -34,15 +34,18 @@ pub struct Services {
     pub(super) metrics: Metrics,
     pub(super) events: Events,
     pub(super) pictures: Pictures,
+    /// Why no tile can leave this machine, where tiles should.
+    pub(super) cluster: Option<watch::Receiver<Option<String>>>,
 }
 
 impl App {
-    /// The app on a store, with these settings. Answers that have no end of their own end with
-    /// `closing`. Needs a runtime of tokio.
+    /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine; none if
+    /// none should. Answers that have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
         settings: &ServeArguments,
         metrics: Metrics,
+        cluster: Option<watch::Receiver<Option<String>>>,
         closing: CancellationToken,
     ) -> Self {
         Self(Arc::new(Services {
@@ -54,6 +57,7 @@ impl App {
             intake: Arc::new(Semaphore::new(1)),
             checker: Checker::new(settings),
             metrics,
+            cluster,
             settings: settings.clone(),
             store,
         }))

@@ -23,8 +23,13 @@ fn job(measurement: &str) -> Value {
 
 /// The hashes of all result files but the manifests, which tell times and attempts.
 pub async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
+    results_of(app, job, Scene::SMALL.snapshots).await
+}
+
+/// The same for a job of so many snapshots.
+pub async fn results_of(app: &TestApp, job: &str, snapshots: usize) -> BTreeMap<String, String> {
     let mut hashes = BTreeMap::new();
-    for snapshot in 0..Scene::SMALL.snapshots {
+    for snapshot in 0..snapshots {
         let listed =
             app.get(&format!("/v1/jobs/{job}/snapshots/{snapshot}")).await.expect(200).json();
         for file in listed["files"].as_array().unwrap() {
