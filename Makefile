@@ -65,9 +65,12 @@ load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once
 	$(PYTHON) scripts/figures.py load \
 		$(CARGO) test --release --test service -- --nocapture --ignored --test-threads 1 load::
 
-cluster: runtime ## workers on other machines, with faults at random moments; needs nats-server; ROUNDS=20
-	SCI_RECON_CLUSTER_ROUNDS=$(ROUNDS) $(PYTHON) scripts/figures.py cluster \
-		$(CARGO) test --release --test service -- --nocapture --include-ignored --test-threads 1 cluster::rounds::
+# ONLY=rounds, scale or deep: a part of it. PASSES: deep passes of the job whose overhead is measured, instead of
+# the default schedule.
+cluster: runtime ## workers on other machines: faults at random moments, overhead, a simulated thousand; needs nats-server; ROUNDS=20 ONLY=rounds PASSES=10
+	SCI_RECON_CLUSTER_ROUNDS=$(ROUNDS) $(if $(PASSES),SCI_RECON_CLUSTER_PASSES=$(PASSES)) \
+		$(PYTHON) scripts/figures.py cluster \
+		$(CARGO) test --release --test service -- --nocapture --include-ignored --test-threads 1 cluster::$(ONLY)
 ROUNDS ?= 20
 
 fuzz: ## every decoder for SECONDS seconds of CPU; needs cargo install cargo-fuzz

@@ -35,9 +35,9 @@ struct Init {
     #[arg(long = "node", value_name = "HOST[:PORT]", default_value = "127.0.0.1:4222")]
     nodes: Vec<Node>,
 
-    /// Folder for messages on the machine of a node.
-    #[arg(long, value_name = "DIR", default_value = "/var/lib/sci-recon-nats")]
-    store: PathBuf,
+    /// Folder for messages on the machine of a node [default: `store` in the folder of the keys].
+    #[arg(long, value_name = "DIR")]
+    store: Option<PathBuf>,
 
     /// The most bytes in it.
     #[arg(long, value_name = "N", default_value_t = 20 << 30)]
@@ -123,19 +123,14 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
 fn make(init: &Init) -> Result<(), CliError> {
     let Init { folder, nodes, store, store_bytes, no_tls } = init;
     let tls = !no_tls;
+    let store = store.clone().unwrap_or_else(|| folder.path.join("store"));
     let url = configuration::url(nodes, tls);
     let authority = Authority::create(&folder.path, &url)?;
     if tls {
         configuration::make_certificates(&folder.path, nodes)?;
     }
     authority.write_own_credentials()?;
-    let made = configuration::write(
-        &authority,
-        &folder.path,
-        nodes,
-        (store.as_path(), *store_bytes),
-        tls,
-    )?;
+    let made = configuration::write(&authority, &folder.path, nodes, (&store, *store_bytes), tls)?;
     for file in made.files {
         println!("nats-server -c {}", file.display());
     }

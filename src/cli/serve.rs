@@ -14,7 +14,7 @@ use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 #[cfg(feature = "nats")]
-use crate::cluster::{ClusterError, Connection, Credential, Hub, describe_metrics};
+use crate::cluster::{Access, ClusterError, Credential, Hub, describe_metrics};
 #[cfg(feature = "nats")]
 use crate::config::{ClusterArguments, RemoteArguments};
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
@@ -86,6 +86,10 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let hub = cluster(settings, &store).await?;
     #[cfg(not(feature = "nats"))]
     store.disown_remote().await?;
+    #[cfg(feature = "nats")]
+    let trouble = hub.as_ref().map(Hub::trouble);
+    #[cfg(not(feature = "nats"))]
+    let trouble = None;
     let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
     let closing = CancellationToken::new();
     let figures = metrics.clone();
@@ -104,7 +108,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. The API.
-    let service = router(App::new(store.clone(), settings, metrics, closing));
+    let service = router(App::new(store.clone(), settings, metrics, trouble, closing));
     tokio::select! {
         () = listen(listener, service, stopped(stop.clone())) => {}
         () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
@@ -167,10 +171,9 @@ async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>
     }
     describe_metrics();
     let credential = nats.nats_creds.as_deref().map(Credential::read).transpose()?;
-    let connection =
-        Connection::open(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")
-            .await?;
-    Ok(Some(Hub::start(store.clone(), connection, Duration::from_secs(*ack_wait))))
+    let access =
+        Access::new(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")?;
+    Ok(Some(Hub::start(store.clone(), access, Duration::from_secs(*ack_wait))))
 }
 
 /// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.

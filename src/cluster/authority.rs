@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha512_256};
 
-use super::connection::{ClusterError, Connection, Credential};
+use super::connection::{Access, ClusterError, Credential};
 use super::names;
 use crate::job::{Pool, Timestamp};
 
@@ -247,7 +247,7 @@ impl Authority {
     /// If it can't be reached, or does not take the token.
     pub async fn publish(&self) -> Result<(), ClusterError> {
         let credential = Credential::read(&self.folder.join(SYSTEM))?;
-        let connection = Connection::open(None, &credential, "sci-recon cluster").await?;
+        let connection = Access::new(None, &credential, "sci-recon cluster")?.connect().await?;
         let (_, token) = self.account()?;
         let asked = connection.client.request("$SYS.REQ.CLAIMS.UPDATE", token.into()).await;
         let answer = asked.map_err(ClusterError::nats("tell what is revoked"))?;

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 
-use super::connection::{ClusterError, Connection, Credential};
+use super::connection::{Access, ClusterError, Connection, Credential};
 use super::message::{Hello, HelloAnswer, Input, Program};
 use super::names;
 use crate::job::{Pool, Sha256, TaskId, WorkerId};
@@ -57,7 +57,8 @@ impl Check {
         credential: Option<&Path>,
     ) -> Result<Vec<Self>, ClusterError> {
         let credential = credential.map(Credential::read).transpose()?.unwrap_or_default();
-        let connection = Connection::open(urls, &credential, "sci-recon cluster check").await?;
+        let connection =
+            Access::new(urls, &credential, "sci-recon cluster check")?.connect().await?;
         let mut checks =
             vec![version(&connection), payload(&connection), round_trip(&connection).await];
         match credential.pool() {

@@ -95,6 +95,7 @@ pub fn write(
     tls: bool,
 ) -> Result<Configured, ClusterError> {
     let folder = std::path::absolute(folder).map_err(at(folder))?;
+    let store = &std::path::absolute(store).map_err(at(store))?;
     let secret = hex::encode(rand::random::<[u8; 16]>());
     let (mut files, mut warnings) = (Vec::new(), Vec::new());
     let server = find_server();

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
+use async_nats::connection::State;
 use async_nats::jetstream::Context;
 use async_nats::jetstream::context::ContextBuilder;
 use async_nats::{Client, ConnectOptions, Event, ServerAddr};
@@ -93,22 +94,24 @@ impl Credential {
     }
 }
 
-/// A connection, which is made anew whenever it breaks.
+/// Where the message server is, and as whom one comes.
 #[derive(Debug, Clone)]
-pub struct Connection {
-    pub(super) client: Client,
-    pub(super) context: Context,
+pub struct Access {
+    /// As they were given, separated by commas.
+    urls: String,
+    servers: Vec<ServerAddr>,
+    options: ConnectOptions,
     /// The file from which NATS reads the authority's certificate, at each new connection.
-    _authority: Option<Arc<NamedTempFile>>,
+    authority: Option<Arc<NamedTempFile>>,
 }
 
-impl Connection {
-    /// Connects to one of the servers in `urls`, which are separated by commas; where there are none,
-    /// to those that the credential names.
+impl Access {
+    /// To the servers in `urls`, which are separated by commas; where there are none, to those that the
+    /// credential names. Nothing is connected yet.
     ///
     /// # Errors
-    /// Addresses or a credential that can't be; no server that answers.
-    pub async fn open(
+    /// Addresses or a credential that can't be.
+    pub fn new(
         urls: Option<&str>,
         credential: &Credential,
         name: &str,
@@ -157,7 +160,16 @@ impl Connection {
         if let Some(file) = &authority {
             options = options.add_root_certificates(file.path().to_owned());
         }
-        let client = options.connect(servers?).await.map_err(|error| {
+        Ok(Self { urls: urls.to_owned(), servers: servers?, options, authority })
+    }
+
+    /// Connects to one of the servers.
+    ///
+    /// # Errors
+    /// If none answers, or takes the credential.
+    pub async fn connect(&self) -> Result<Connection, ClusterError> {
+        let connected = self.options.clone().connect(self.servers.as_slice()).await;
+        let client = connected.map_err(|error| {
             let mut reason = error.to_string();
             let mut source = std::error::Error::source(&error);
             while let Some(error) = source {
@@ -167,11 +179,27 @@ impl Connection {
                 }
                 source = error.source();
             }
-            ClusterError::Unreachable { url: urls.to_owned(), reason }
+            ClusterError::Unreachable { url: self.urls.clone(), reason }
         })?;
         let context =
             ContextBuilder::new().timeout(ANSWER).ack_timeout(ANSWER).build(client.clone());
-        Ok(Self { client, context, _authority: authority })
+        Ok(Connection { client, context, _authority: self.authority.clone() })
+    }
+}
+
+/// A connection, which is made anew whenever it breaks.
+#[derive(Debug, Clone)]
+pub struct Connection {
+    pub(super) client: Client,
+    pub(super) context: Context,
+    /// See [`Access`].
+    _authority: Option<Arc<NamedTempFile>>,
+}
+
+impl Connection {
+    /// Whether it is there at the moment.
+    pub(super) fn is_up(&self) -> bool {
+        self.client.connection_state() == State::Connected
     }
 
     /// Says something to whoever listens, without a stream.

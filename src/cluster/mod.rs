@@ -28,6 +28,6 @@ mod setup;
 pub use authority::{Authority, HUB as HUB_CREDENTIAL, Issued};
 pub use check::Check;
 pub use configuration::Node;
-pub use connection::{ClusterError, Connection, Credential};
+pub use connection::{Access, ClusterError, Credential};
 pub use hub::{Hub, describe_metrics};
 pub use remote::{Remote, RemoteSettings};

@@ -21,7 +21,7 @@ use tokio_util::sync::CancellationToken;
 use super::arrays;
 use super::blobs::BlobError;
 use super::cache::Cache;
-use super::connection::{ClusterError, Connection, Credential};
+use super::connection::{Access, ClusterError, Connection, Credential};
 use super::message::{
     Beat, Begin, BeginAnswer, End, Event, Hello, HelloAnswer, Input, Program, TaskMessage, Tell,
     TileBeat, Want,
@@ -158,13 +158,14 @@ impl Remote {
         let cache = Cache::open(&settings.cache.0, settings.cache.1)?;
         let host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         let name = format!("sci-recon worker {host}");
-        let connection = Connection::open(settings.urls.as_deref(), &credential, &name).await?;
+        let connection =
+            Access::new(settings.urls.as_deref(), &credential, &name)?.connect().await?;
         let told = connection.client.subscribe(names::tell(&pool, worker)).await;
         let told = told.map_err(ClusterError::nats("listen to the server"))?;
         let device = settings.device;
         let hello =
             Hello { worker, host, pid: std::process::id(), device, program: Program::this() };
-        let start = Instant::now();
+        let (start, mut pause) = (Instant::now(), LOOK);
         let ack_wait = loop {
             if let Some(ack_wait) = introduce(&connection, &pool, &hello).await? {
                 break ack_wait;
@@ -175,7 +176,7 @@ impl Remote {
             }
             tokio::select! {
                 () = stop.cancelled() => return Ok(None),
-                () = tokio::time::sleep(SIGN) => {}
+                () = tokio::time::sleep(pause) => pause = SIGN.min(2 * pause),
             }
         };
         let consumer = connection.pool(&pool).await?;
@@ -205,8 +206,13 @@ impl Remote {
     /// Says goodbye.
     pub async fn leave(&self) {
         let beat = Beat { worker: self.0.hello.worker, tile: None, leaves: true };
-        let said = self.say("beat", &beat).await;
-        if said.is_err() || self.0.connection.client.flush().await.is_err() {
+        let said = async {
+            self.say("beat", &beat).await?;
+            let flushed = self.0.connection.client.flush().await;
+            flushed.map_err(ClusterError::nats("say goodbye"))
+        };
+        // Without a connection it is not sent, and waits for one.
+        if !tokio::time::timeout(BEGIN, said).await.is_ok_and(|said| said.is_ok()) {
             tracing::debug!("the goodbye was not heard: the worker is forgotten after a while");
         }
     }

@@ -123,6 +123,14 @@ impl Connection {
         found.map_err(ClusterError::nats("find the consumer of the pool"))
     }
 
+    /// Removes a consumer, which is made anew by the next sweep at the latest; who pulls of it sees none for
+    /// that long.
+    pub(super) async fn drop_consumer(&self, stream: &str, consumer: &str) {
+        if let Err(error) = self.context.delete_consumer_from_stream(consumer, stream).await {
+            tracing::warn!(%error, stream, consumer, "a consumer can't be removed");
+        }
+    }
+
     /// The consumer of events.
     pub(super) async fn events(&self) -> Result<PullConsumer, ClusterError> {
         let found = self.context.get_consumer_from_stream(names::HUB, names::EVENTS).await;

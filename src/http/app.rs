@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::extract::FromRef;
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
@@ -41,15 +41,18 @@ pub struct Services {
     pub(super) metrics: Metrics,
     pub(super) events: Events,
     pub(super) pictures: Pictures,
+    /// Why no tile can leave this machine, where tiles should.
+    pub(super) cluster: Option<watch::Receiver<Option<String>>>,
 }
 
 impl App {
-    /// The app on a store, with these settings. Answers that have no end of their own end with
-    /// `closing`. Needs a runtime of tokio.
+    /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine; none if
+    /// none should. Answers that have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
         settings: &ServeArguments,
         metrics: Metrics,
+        cluster: Option<watch::Receiver<Option<String>>>,
         closing: CancellationToken,
     ) -> Self {
         Self(Arc::new(Services {
@@ -62,6 +65,7 @@ impl App {
             disk_tried: Mutex::default(),
             checker: Checker::new(settings),
             metrics,
+            cluster,
             settings: settings.clone(),
             store,
         }))

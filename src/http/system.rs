@@ -123,6 +123,9 @@ struct Readiness {
     database: String,
     disk: String,
     workers: String,
+    /// Only with `serve --nats`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    cluster: Option<String>,
     /// What jobs with networks need.
     networks: String,
 }
@@ -132,18 +135,22 @@ pub(super) async fn live() -> Json<serde_json::Value> {
     Json(serde_json::json!({"live": true}))
 }
 
-/// `GET /readyz`: database, disk and workers are there. A long queue is no fault.
+/// `GET /readyz`: database, disk and workers are there. A long queue is no fault. Nor is a message server
+/// that does not answer, as long as the workers of this machine take tiles; but it is said.
 pub(super) async fn ready(State(app): State<App>) -> Response {
     let checks =
         [database_answers(&app).await, disk_takes_files(&app).await, workers_live(&app).await];
-    let ready = checks.iter().all(Result::is_ok);
+    let cluster = app.cluster.as_ref().map(|trouble| trouble.borrow().clone());
+    let tiles_go_on = matches!(cluster, None | Some(None)) || !app.settings.without_tiles();
+    let ready = checks.iter().all(Result::is_ok) && tiles_go_on;
     let [database, disk, workers] =
         checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
     let status = if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     let networks = app.networks();
-    let degraded = networks.is_err();
+    let degraded = networks.is_err() || matches!(cluster, Some(Some(_)));
     let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
-    let body = Readiness { ready, degraded, database, disk, workers, networks };
+    let cluster = cluster.map(|trouble| trouble.unwrap_or_else(|| "ok".to_owned()));
+    let body = Readiness { ready, degraded, database, disk, workers, cluster, networks };
     (status, Json(body)).into_response()
 }
 

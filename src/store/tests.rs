@@ -4,6 +4,7 @@ mod calibrations;
 mod failures;
 mod keeping;
 mod migration;
+mod remote;
 mod sequences;
 mod turns;
 

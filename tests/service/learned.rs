@@ -10,7 +10,7 @@ use crate::pipeline::{psnr, values};
 use crate::samples::Scene;
 
 /// Python with the packages of the tests, where libonnxruntime is there as well.
-fn python() -> Option<String> {
+pub fn python() -> Option<String> {
     let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
     let python = std::env::var("SCI_RECON_JUDGES").ok();
     if python.is_none() || !Path::new(&library).exists() {
@@ -21,7 +21,7 @@ fn python() -> Option<String> {
 }
 
 /// A network for the scene's masks, of fixed or free size.
-fn train(python: &str, folder: &Path, scene: Scene, size: &str) -> PathBuf {
+pub fn train(python: &str, folder: &Path, scene: Scene, size: &str) -> PathBuf {
     let (masks, network) = (folder.join("masks.npy"), folder.join(format!("{size}.onnx")));
     std::fs::write(&masks, scene.masks()).unwrap();
     let mut command = Command::new(python);
@@ -40,7 +40,7 @@ fn trivial(scene: Scene) -> f64 {
     psnr(scene, 0, &frame.repeat(scene.frames))
 }
 
-async fn register(app: &TestApp, calibration: &str, file: &Path) -> crate::app::Answer {
+pub async fn register(app: &TestApp, calibration: &str, file: &Path) -> crate::app::Answer {
     let file = app.upload(std::fs::read(file).unwrap()).await;
     app.post("/v1/models", &json!({"calibration": calibration, "file": file, "name": "tiny"})).await
 }

@@ -19,6 +19,16 @@ const WINDOWS: usize = 65_536;
 /// An input that was put longer ago may have grown too old for the stream.
 const FRESH: Duration = Duration::from_secs(12 * 3600);
 
+/// A message that is there and is not delivered.
+#[derive(Debug, Clone, Copy)]
+pub struct Undelivered {
+    /// Its number.
+    pub seq: i64,
+    pub since: Instant,
+    /// Whether the consumer was made anew since.
+    pub again: bool,
+}
+
 /// What the parts of the hub share.
 pub struct Core {
     pub store: Store,
@@ -39,6 +49,8 @@ pub struct Core {
     put: Mutex<HashMap<(Pool, Sha256), Instant>>,
     /// What windows of prepared masks are as files.
     windows: Mutex<HashMap<(Sha256, Tile), Input>>,
+    /// Tiles that wait though workers of their pool wait, too; see `sweep.rs`.
+    pub undelivered: Mutex<HashMap<TaskId, Undelivered>>,
     /// The snapshots' window of a tile that is out, which no other tile needs.
     snapshots: Mutex<HashMap<TaskId, (Pool, Sha256)>>,
 }
@@ -58,6 +70,7 @@ impl Core {
             stream: Mutex::default(),
             put: Mutex::default(),
             windows: Mutex::default(),
+            undelivered: Mutex::default(),
             snapshots: Mutex::default(),
         }
     }

@@ -24,6 +24,8 @@ struct Sign {
     at: Instant,
     /// Not yet on record.
     fresh: bool,
+    /// Whether it had a tile then.
+    busy: bool,
     tile: Option<TileBeat>,
 }
 
@@ -34,7 +36,8 @@ impl Presence {
         if self.workers.get(&worker).is_some_and(|sign| sign.pool != *pool) {
             return;
         }
-        let sign = Sign { pool: pool.clone(), at: Instant::now(), fresh: true, tile: None };
+        let sign =
+            Sign { pool: pool.clone(), at: Instant::now(), fresh: true, busy: false, tile: None };
         self.workers.insert(worker, sign);
         self.pools.insert(pool.clone(), Instant::now());
     }
@@ -43,7 +46,7 @@ impl Presence {
     pub fn sign(&mut self, worker: WorkerId, pool: &Pool, tile: Option<TileBeat>) -> bool {
         let known = self.workers.get_mut(&worker).filter(|sign| sign.pool == *pool);
         let Some(sign) = known else { return false };
-        (sign.at, sign.fresh) = (Instant::now(), true);
+        (sign.at, sign.fresh, sign.busy) = (Instant::now(), true, tile.is_some());
         self.pools.insert(sign.pool.clone(), sign.at);
         if let Some(mut tile) = tile {
             // News that are not on record yet stay news.
@@ -66,6 +69,12 @@ impl Presence {
     /// Whether a worker lives, as far as is known.
     pub fn lives(&self, worker: WorkerId) -> bool {
         self.workers.get(&worker).is_some_and(|sign| sign.at.elapsed() < SILENCE)
+    }
+
+    /// Whether a living worker of a pool waits for a tile.
+    pub fn waits(&self, pool: &Pool) -> bool {
+        let waits = |sign: &Sign| sign.pool == *pool && !sign.busy && sign.at.elapsed() < SILENCE;
+        self.workers.values().any(waits)
     }
 
     /// The number of living workers of each pool that ever had one, and since when a pool has none.

@@ -3,51 +3,98 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::core::Core;
-use crate::cluster::connection::{ClusterError, Connection};
+use crate::cluster::connection::{Access, ClusterError, Connection};
 use crate::store::Store;
 
-/// Pause before the streams are tried to be made again.
-const TROUBLE: Duration = Duration::from_secs(2);
+/// The shortest and the longest pause before the message server is tried again.
+const PAUSES: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(10));
+/// Time between looks at the connection.
+const LOOK: Duration = Duration::from_secs(1);
 
 /// The hub, which runs until this is dropped. Tiles that are out stay out, and are known to the next
 /// server by the store.
 #[derive(Debug)]
 pub struct Hub {
     _running: JoinSet<()>,
+    trouble: watch::Receiver<Option<String>>,
 }
 
 impl Hub {
-    /// Starts to hand tiles out. A message is delivered again when its worker was silent for `ack_wait`.
+    /// Starts to hand tiles out, as soon as the message server answers. A message is delivered again when
+    /// its worker was silent for `ack_wait`.
     #[must_use]
-    pub fn start(store: Store, connection: Connection, ack_wait: Duration) -> Self {
+    pub fn start(store: Store, access: Access, ack_wait: Duration) -> Self {
         let mut running = JoinSet::new();
-        running.spawn(run(Arc::new(Core::new(store, connection, ack_wait))));
-        Self { _running: running }
+        let (tell, trouble) = watch::channel(Some("there is no connection to NATS yet".to_owned()));
+        running.spawn(run(store, access, ack_wait, tell));
+        Self { _running: running, trouble }
+    }
+
+    /// Why no tiles can be handed out at the moment; none if they can.
+    #[must_use]
+    pub fn trouble(&self) -> watch::Receiver<Option<String>> {
+        self.trouble.clone()
     }
 }
 
-async fn run(core: Arc<Core>) {
-    while let Err(error) = core.find_streams().await {
-        tracing::error!(%error, "the cluster can't begin to work");
-        tokio::time::sleep(TROUBLE).await;
-    }
-    let mut parts = loop {
-        match parts(&core).await {
-            Ok(parts) => break parts,
-            Err(error) => tracing::error!(%error, "the cluster can't begin to work"),
-        }
-        tokio::time::sleep(TROUBLE).await;
-    };
+async fn run(
+    store: Store,
+    access: Access,
+    ack_wait: Duration,
+    tell: watch::Sender<Option<String>>,
+) {
+    let connection = persist(&tell, || access.connect()).await;
+    let core = Arc::new(Core::new(store, connection.clone(), ack_wait));
+    persist(&tell, || core.find_streams()).await;
+    let mut parts = persist(&tell, || parts(&core)).await;
     tracing::info!("handing tiles out to other machines");
+    parts.spawn(watch_over(connection, tell));
     while let Some(ended) = parts.join_next().await {
         if let Err(error) = ended
             && error.is_panic()
         {
             tracing::error!(%error, "a part of the hub has died");
         }
+    }
+}
+
+/// Does something again and again until it succeeds, and tells why it does not.
+async fn persist<T, F>(tell: &watch::Sender<Option<String>>, what: impl Fn() -> F) -> T
+where
+    F: Future<Output = Result<T, ClusterError>>,
+{
+    let mut pause = PAUSES.0;
+    loop {
+        match what().await {
+            Ok(done) => return done,
+            Err(error) => {
+                tracing::error!(
+                    %error,
+                    "no tile leaves this machine: the cluster can't begin to work, and is tried again"
+                );
+                tell.send_replace(Some(error.to_string()));
+            }
+        }
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(PAUSES.1);
+    }
+}
+
+/// Tells whether the connection is there.
+async fn watch_over(connection: Connection, tell: watch::Sender<Option<String>>) {
+    loop {
+        let lost = (!connection.is_up()).then(|| "the connection to NATS is lost".to_owned());
+        tell.send_if_modified(|told| {
+            *told != lost && {
+                *told = lost;
+                true
+            }
+        });
+        tokio::time::sleep(LOOK).await;
     }
 }
 

@@ -1,19 +1,24 @@
 //! Compares what is out by the store's account with what the message server has, and mends the
 //! difference. It is the answer to every message that is lost, and to a lost disk of the message server.
 
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::core::{Core, lock};
+use super::core::{Core, Undelivered, lock};
 use super::figures;
 use crate::cluster::connection::ClusterError;
 use crate::cluster::names;
 use crate::job::Pool;
 use crate::store::{MessagePlace, RemoteTask, StoreError};
 
-/// Time between sweeps.
+/// The longest time between sweeps. Where workers may be silent for less, sweeps come as often: what was
+/// lost is found as soon as who was lost.
 const TICK: Duration = Duration::from_secs(30);
+/// Time between looks whether events are dealt with.
+const LOOK: Duration = Duration::from_millis(200);
+/// A message is held to be stuck after twice the time of a delivery to somebody who is gone, and this.
+const PATIENCE: Duration = Duration::from_secs(10);
 /// A pool without a worker for so long gives its tiles back.
 const EMPTY: Duration = Duration::from_secs(60);
 
@@ -40,7 +45,7 @@ impl Core {
                 let count = out.get(pool.as_str()).map_or(0, |count| *count as usize);
                 figures::pool(&pool, workers, count);
             }
-            tokio::time::sleep(TICK).await;
+            tokio::time::sleep(TICK.min(self.ack_wait)).await;
         }
     }
 
@@ -68,10 +73,11 @@ impl Core {
         // 2. What should be out; before the streams are looked at.
         let out = self.store.remote_tasks().await?;
         lock(&self.jobs).extend(out.iter().map(|remote| remote.job));
-        // 3. What is there. A worker reports before it lets its message go: what is missing here and
-        // has no event after this, and is still out after that, is lost.
+        // 3. What is there. A worker reports before it lets its message go: what is missing here and is
+        // still out when all that was reported before is dealt with, is lost.
         let messages = self.messages().await?;
-        let quiet = self.events_are_dealt_with().await?;
+        let reported = self.reported().await?;
+        let mut missing = Vec::new();
         for remote in &out {
             let Ok(pool) = remote.pool.parse::<Pool>() else { continue };
             let worker_lives = remote.delivery > 0 && lock(&self.presence).lives(remote.worker);
@@ -91,9 +97,7 @@ impl Core {
                     let (hub, pool) = (self.clone(), pool);
                     tokio::spawn(async move { hub.send(&pool, claimed).await });
                 }
-                Some(place) if quiet && !there(place) && !worker_lives => {
-                    self.mend(remote, "its message was lost").await?;
-                }
+                Some(place) if !there(place) && !worker_lives => missing.push(remote),
                 Some(place) if empty && !worker_lives => {
                     self.connection.drop_task(place.seq).await;
                     self.mend(remote, "its pool has no worker any more").await?;
@@ -101,9 +105,57 @@ impl Core {
                 Some(_) => {}
             }
         }
+        if !missing.is_empty() && self.is_dealt_with(reported).await? {
+            for remote in missing {
+                self.mend(remote, "its message was lost").await?;
+            }
+        }
+        self.deliver(&out).await?;
         // 4. When nothing is out, nothing needs the files.
         if out.is_empty() && lock(&self.sending).is_empty() {
             self.empty_files().await?;
+        }
+        Ok(())
+    }
+
+    /// Looks for messages that are not delivered though workers wait for them: a consumer that is moved from
+    /// node to node may forget some, or stand still (nats-server 6905, 7680). It is made anew first; if that
+    /// does not help, the tile is handed out again.
+    async fn deliver(&self, out: &[RemoteTask]) -> Result<(), SweepError> {
+        let (mut late, mut lost) = (BTreeSet::new(), Vec::new());
+        {
+            let mut undelivered = lock(&self.undelivered);
+            let before = std::mem::take(&mut *undelivered);
+            for remote in out.iter().filter(|remote| remote.delivery == 0) {
+                let (Some(place), Ok(pool)) = (&remote.place, remote.pool.parse::<Pool>()) else {
+                    continue;
+                };
+                if !lock(&self.presence).waits(&pool) {
+                    continue;
+                }
+                let seq = place.seq;
+                let known = before.get(&remote.task).filter(|known| known.seq == seq);
+                let now = Undelivered { seq, since: Instant::now(), again: false };
+                let mut found = known.copied().unwrap_or(now);
+                if found.since.elapsed() > 2 * self.ack_wait + PATIENCE {
+                    if found.again {
+                        lost.push((remote, seq));
+                        continue;
+                    }
+                    late.insert(pool);
+                    found = Undelivered { again: true, ..now };
+                }
+                undelivered.insert(remote.task, found);
+            }
+        }
+        for (remote, seq) in lost {
+            self.connection.drop_task(seq).await;
+            self.mend(remote, "its message was not delivered").await?;
+        }
+        for pool in late {
+            tracing::warn!(%pool, "messages are not delivered: their consumer is made anew");
+            self.connection.drop_consumer(names::TASKS, pool.as_str()).await;
+            self.connection.make_pool(&pool, self.ack_wait).await?;
         }
         Ok(())
     }
@@ -134,11 +186,34 @@ impl Core {
         Ok(all.filter(|seq| !deleted.contains(seq)).map(u64::cast_signed).collect())
     }
 
-    /// Whether no event waits or is being dealt with.
-    async fn events_are_dealt_with(&self) -> Result<bool, ClusterError> {
-        let consumer = self.connection.events().await?;
-        let info = consumer.cached_info();
-        Ok(info.num_pending == 0 && info.num_ack_pending == 0)
+    /// The number of the last event.
+    async fn reported(&self) -> Result<u64, ClusterError> {
+        let stream = self.connection.context.get_stream(names::EVENTS).await;
+        let stream = stream.map_err(ClusterError::nats("find the stream of events"))?;
+        Ok(stream.cached_info().state.last_sequence)
+    }
+
+    /// Waits until all events up to this number are dealt with; false if that takes long.
+    async fn is_dealt_with(&self, last: u64) -> Result<bool, ClusterError> {
+        let (start, mut first) = (Instant::now(), None);
+        loop {
+            let consumer = self.connection.events().await?;
+            let info = consumer.cached_info();
+            let none_left = info.num_pending == 0 && info.num_ack_pending == 0;
+            let floor = info.ack_floor.stream_sequence;
+            if none_left || floor >= last {
+                return Ok(true);
+            }
+            if start.elapsed() > TICK {
+                if floor == *first.get_or_insert(floor) {
+                    tracing::warn!("events are not delivered: their consumer is made anew");
+                    self.connection.drop_consumer(names::EVENTS, names::HUB).await;
+                }
+                return Ok(false);
+            }
+            first.get_or_insert(floor);
+            tokio::time::sleep(LOOK).await;
+        }
     }
 
     async fn empty_files(&self) -> Result<(), ClusterError> {

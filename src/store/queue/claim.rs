@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
-use sqlx::{FromRow, Row, SqliteConnection};
+use sqlx::{AssertSqlSafe, FromRow, Row, SqliteConnection};
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
 use crate::job::{
@@ -82,10 +82,71 @@ pub enum Claimant<'a> {
 }
 
 impl Claimant<'_> {
-    /// Whether it takes tiles, and whether it takes others.
-    fn takes(self) -> (bool, bool) {
-        (self != Self::WithoutTiles, !matches!(self, Self::Pool(_)))
+    /// The statement that tells whether there may be work: a task that is ready, or a lease that has run
+    /// out. Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
+    fn look(self) -> String {
+        let Choice { kinds, by_lab, .. } = self.choice();
+        format!(
+            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks {by_lab} WHERE state = 'ready' {kinds}
+                                        AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
+                 OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
+                                AND lease_until NOT BETWEEN ?1 AND ?1 + ?3)"
+        )
     }
+
+    /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of
+    /// the lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see
+    /// [`take`].
+    fn take(self) -> String {
+        let Choice { kinds, by_lab, by_job } = self.choice();
+        let ready = format!("state = 'ready' {kinds} AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6");
+        format!(
+            "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
+                 stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
+             WHERE id = (
+                 SELECT tasks.id FROM (
+                     -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
+                     SELECT finish, (SELECT id FROM tasks {by_lab}
+                                     WHERE {ready} AND tasks.lab = labs.lab
+                                     ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
+                     FROM labs
+                     UNION ALL
+                     SELECT finish, (SELECT id FROM tasks {by_job}
+                                     WHERE {ready}
+                                       AND job = (SELECT id FROM jobs
+                                                  WHERE jobs.state = 'running' AND jobs.lab = labs.lab
+                                                    AND EXISTS (SELECT 1 FROM tasks {by_job}
+                                                                WHERE job = jobs.id AND {ready})
+                                                  ORDER BY priority DESC, id LIMIT 1)
+                                     ORDER BY ordinal LIMIT 1)
+                     FROM labs)
+                 JOIN tasks ON tasks.id = task
+                 LEFT JOIN jobs ON jobs.id = job
+                 ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
+                     jobs.state = 'running' DESC, job, ordinal, tasks.id
+                 LIMIT 1)
+             RETURNING id, job, calibration, lab, kind, snapshot, snapshots, tile, attempt, cost"
+        )
+    }
+
+    fn choice(self) -> Choice {
+        match self {
+            Self::Local => Choice { kinds: "", by_lab: "", by_job: "" },
+            Self::WithoutTiles => Choice {
+                kinds: "AND kind <> 'tile'",
+                by_lab: "INDEXED BY tasks_others",
+                by_job: "INDEXED BY tasks_others_of_job",
+            },
+            Self::Pool(_) => Choice { kinds: "AND kind = 'tile'", by_lab: "", by_job: "" },
+        }
+    }
+}
+
+/// Which tasks a claimant may have, and the indexes that lead past those that it may not.
+struct Choice {
+    kinds: &'static str,
+    by_lab: &'static str,
+    by_job: &'static str,
 }
 
 impl Store {
@@ -150,25 +211,9 @@ impl Store {
 
     /// Looks without the lock: most of the time there is nothing to do.
     async fn may_have_work(&self, claimant: Claimant<'_>, now: i64) -> Result<bool> {
-        let (tiles, others) = claimant.takes();
-        let found = sql!(
-            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks WHERE state = ?1
-                                        AND ready_at NOT BETWEEN ?3 + 1 AND ?3 + ?4
-                                        AND CASE kind WHEN 'tile' THEN ?6 ELSE ?7 END)
-                 OR EXISTS (SELECT 1 FROM tasks WHERE state = ?2
-                                AND lease_until NOT BETWEEN ?3 AND ?3 + ?5)",
-            [
-                TaskState::Ready,
-                TaskState::Running,
-                now,
-                LONGEST_PAUSE,
-                LONGEST_LEASE,
-                tiles,
-                others
-            ]
-        )
-        .fetch_optional(&self.readers)
-        .await?;
+        let found = sql!(AssertSqlSafe(claimant.look()), [now, LONGEST_PAUSE, LONGEST_LEASE])
+            .fetch_optional(&self.readers)
+            .await?;
         Ok(found.is_some())
     }
 
@@ -217,8 +262,7 @@ impl Store {
     }
 }
 
-/// One statement finds the next task, marks it and counts the attempt: of the highest priority, of the lab
-/// whose turn it is, of the jobs that have begun before others, of the oldest one.
+/// Takes the next task, and advances its lab's tag.
 async fn take(
     connection: &mut SqliteConnection,
     claimant: Claimant<'_>,
@@ -226,47 +270,15 @@ async fn take(
     length: Duration,
     now: i64,
 ) -> Result<Option<SqliteRow>> {
-    let (tiles, others) = claimant.takes();
     let row = sql!(
-        "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
-             stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
-         WHERE id = (
-             SELECT tasks.id FROM (
-                 -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
-                 SELECT finish, (SELECT id FROM tasks
-                                 WHERE state = 'ready' AND tasks.lab = labs.lab
-                                   AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
-                                   AND CASE kind WHEN 'tile' THEN ?7 ELSE ?8 END
-                                 ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
-                 FROM labs
-                 UNION ALL
-                 SELECT finish, (SELECT id FROM tasks
-                                 WHERE state = 'ready' AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
-                                   AND CASE kind WHEN 'tile' THEN ?7 ELSE ?8 END
-                                   AND job = (SELECT id FROM jobs
-                                              WHERE jobs.state = 'running' AND jobs.lab = labs.lab
-                                                AND EXISTS (SELECT 1 FROM tasks WHERE job = jobs.id
-                                                    AND state = 'ready'
-                                                    AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6
-                                                    AND CASE kind WHEN 'tile' THEN ?7 ELSE ?8 END)
-                                              ORDER BY priority DESC, id LIMIT 1)
-                                 ORDER BY ordinal LIMIT 1)
-                 FROM labs)
-             JOIN tasks ON tasks.id = task
-             LEFT JOIN jobs ON jobs.id = job
-             ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
-                 jobs.state = 'running' DESC, job, ordinal, tasks.id
-             LIMIT 1)
-         RETURNING id, job, calibration, lab, kind, snapshot, snapshots, tile, attempt, cost",
+        AssertSqlSafe(claimant.take()),
         [
             TaskState::Running,
             worker,
             Lease::until(length, now),
             TaskStage::Reading,
             now,
-            LONGEST_PAUSE,
-            tiles,
-            others
+            LONGEST_PAUSE
         ]
     )
     .fetch_optional(&mut *connection)
@@ -299,4 +311,37 @@ async fn hand_over(
         .execute(connection)
         .await?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::{AssertSqlSafe, Row};
+
+    use super::Claimant;
+    use crate::store::{Purpose, Store};
+
+    /// What SQLite reads of `tasks` for a statement, line by line.
+    async fn plan(store: &Store, text: &str) -> Vec<String> {
+        let explained = sqlx::query(AssertSqlSafe(format!("EXPLAIN QUERY PLAN {text}")));
+        let rows = explained.fetch_all(&store.readers).await.unwrap();
+        let lines = rows.iter().map(|row| row.get::<String, _>("detail"));
+        lines.filter(|line| line.contains(" tasks")).collect()
+    }
+
+    #[tokio::test]
+    async fn who_takes_no_tiles_reads_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let purpose = Purpose::Serve { accept_database: false };
+        let store = Store::open(folder.path(), purpose).await.unwrap();
+        let claimant = Claimant::WithoutTiles;
+        // The look for leases that have run out reads what runs.
+        for (text, others) in [(claimant.look(), 1), (claimant.take(), 0)] {
+            let plan = plan(&store, &text).await;
+            let good = ["INDEX tasks_others", "PRIMARY KEY (id=?)"];
+            let bad: Vec<_> =
+                plan.iter().filter(|line| !good.iter().any(|good| line.contains(good))).collect();
+            assert!(plan.iter().any(|line| line.contains(good[0])), "{plan:#?}");
+            assert_eq!(bad.len(), others, "{bad:#?} of {plan:#?}");
+        }
+    }
 }

@@ -54,7 +54,7 @@ pub struct JobProgress {
     pub queue_position: Option<usize>,
     pub tiles_done: u64,
     pub tiles_total: u64,
-    /// Tiles that a worker has in hand.
+    /// Tiles that a worker has in hand; one that is out with other machines and waits for a worker is none.
     pub tiles_running: u64,
     /// Snapshots that can be downloaded.
     pub snapshots_done: u64,
@@ -98,10 +98,11 @@ impl Store {
             "WITH running AS (
                  SELECT job, sum(cost * fraction) AS spent,
                      sum(iif(kind = 'tile', cost * fraction, 0.0)) AS tiles_spent,
-                     sum(kind = 'tile') AS tiles_running,
+                     sum(kind = 'tile' AND delivery IS NOT 0) AS tiles_running,
                      sum(stage = ?3) AS deep, sum(stage = ?4) AS nonlocal,
                      sum(iterations) AS iterations, sum(passes) AS passes
-                 FROM tasks WHERE state = ?2 AND job IS NOT NULL GROUP BY job)
+                 FROM tasks LEFT JOIN remote_tasks ON task = id
+                 WHERE state = ?2 AND job IS NOT NULL GROUP BY job)
              SELECT sums.*, coalesce(spent, 0.0) AS spent, coalesce(tiles_spent, 0.0) AS tiles_spent,
                  coalesce(tiles_running, 0) AS tiles_running,
                  coalesce(deep, 0) AS deep, coalesce(nonlocal, 0) AS nonlocal,
@@ -148,15 +149,18 @@ impl Store {
         }
         let rows = sql!(
             "SELECT job, (SELECT lab FROM jobs WHERE id = job) AS lab, count(*) AS tasks,
-                 sum(ordinal) AS ordinals, sum(iterations) AS iterations, sum(fraction) AS fraction
-             FROM tasks WHERE state = ? AND job IS NOT NULL GROUP BY job",
+                 sum(ordinal + iif(delivery = 0, 1 << 24, 0)) AS ordinals,
+                 sum(iterations) AS iterations, sum(fraction) AS fraction
+             FROM tasks LEFT JOIN remote_tasks ON task = id
+             WHERE state = ? AND job IS NOT NULL GROUP BY job",
             [TaskState::Running]
         )
         .fetch_all(&self.readers)
         .await?;
         for row in &rows {
             if let Some(mark) = marks.get_mut(&(row.try_get("lab")?, row.try_get("job")?)) {
-                // Which tasks run, and not only how many: one may have ended and another begun.
+                // Which tasks run, and not only how many: one may have ended and another begun. One that
+                // waits elsewhere differs from one that is in hand.
                 mark.tasks =
                     row.try_get::<i64, _>("tasks")? << 32 ^ row.try_get::<i64, _>("ordinals")?;
                 mark.iterations = row.try_get("iterations")?;

@@ -38,6 +38,10 @@ impl Process {
         Pid::from_raw(self.0.id() as i32).unwrap()
     }
 
+    pub fn id(&self) -> u32 {
+        self.0.id()
+    }
+
     pub fn signal(&self, signal: Signal) {
         // It may have ended.
         let _ = kill_process(self.pid(), signal);
@@ -250,6 +254,12 @@ impl Nats {
         eprintln!("nothing was in {stream} to be corrupted");
     }
 
+    /// Removes all messages of a stream.
+    pub async fn purge(&self, stream: &str) {
+        let context = async_nats::jetstream::new(self.client().await);
+        context.get_stream(stream).await.unwrap().purge().await.unwrap();
+    }
+
     /// Starts a node, on the disk that it had.
     pub fn begin(&mut self, n: usize) {
         let log = std::fs::File::create(self.folder.path().join(format!("n{n}.log"))).unwrap();
@@ -317,6 +327,24 @@ impl Nats {
         found
     }
 
+    /// What it says of the streams of tiles and events and of their consumers.
+    pub async fn state(&self) -> String {
+        let client = self.client().await;
+        let mut said = String::new();
+        for (stream, consumer) in [("SCI_TASKS", "test"), ("SCI_EVENTS", "hub")] {
+            for subject in [
+                format!("$JS.API.STREAM.INFO.{stream}"),
+                format!("$JS.API.CONSUMER.INFO.{stream}.{consumer}"),
+            ] {
+                let answer = client.request(subject.clone(), "".into()).await;
+                let answer =
+                    answer.map(|answer| String::from_utf8_lossy(&answer.payload).into_owned());
+                said += &format!("{subject}: {answer:?}\n");
+            }
+        }
+        said
+    }
+
     /// Waits until all streams are empty.
     pub async fn emptied(&self) {
         let start = Instant::now();
@@ -332,7 +360,7 @@ impl Nats {
 }
 
 /// The program, where others than root may run it.
-fn program() -> &'static Path {
+pub fn program() -> &'static Path {
     static COPY: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
     let (_, path) = COPY.get_or_init(|| {
         let folder = tempfile::tempdir().unwrap();
@@ -346,7 +374,7 @@ fn program() -> &'static Path {
 }
 
 /// Somebody without rights to anything.
-const NOBODY: u32 = 65_534;
+pub const NOBODY: u32 = 65_534;
 
 /// A worker in an empty folder, with a cleared environment, as another user where the test is root.
 pub struct RemoteWorker {

@@ -17,18 +17,25 @@ use super::{figure, workers};
 use crate::app::TestApp;
 use crate::samples::Scene;
 
-/// Seconds of silence after which another worker gets a tile.
-const ACK_WAIT: &str = "5";
 /// Bytes that a worker's cache may hold, and that a worker may have resident.
 const CACHE: u64 = 24 << 20;
 const MEMORY: u64 = 1 << 30;
 
 /// What is to be computed: the schedule `rounds` has tiles of about five seconds (`make cluster`), or
 /// of one (all tests).
+#[derive(Debug, Clone, Copy)]
 struct Plan {
     scene: Scene,
     tile: u32,
     iterations: u32,
+    /// Seconds of silence after which another worker gets a tile.
+    ack_wait: u64,
+    /// How long a worker is suspended or cut off, the quorum is lost, and the stream's leader is down.
+    silence: Duration,
+    no_quorum: Duration,
+    leaderless: Duration,
+    /// The longest pause before a fault, in milliseconds.
+    pause: u64,
     /// The longest that a round may take.
     limit: Duration,
 }
@@ -38,12 +45,22 @@ impl Plan {
         scene: Scene { frames: 8, height: 1280, width: 1280, snapshots: 1 },
         tile: 288,
         iterations: 60,
+        ack_wait: 5,
+        silence: Duration::from_secs(9),
+        no_quorum: Duration::from_secs(12),
+        leaderless: Duration::from_secs(2),
+        pause: 2500,
         limit: Duration::from_secs(900),
     };
     const SHORT: Self = Self {
         scene: Scene { frames: 8, height: 320, width: 320, snapshots: 1 },
         tile: 96,
         iterations: 100,
+        ack_wait: 2,
+        silence: Duration::from_secs(4),
+        no_quorum: Duration::from_secs(7),
+        leaderless: Duration::from_secs(1),
+        pause: 800,
         limit: Duration::from_secs(300),
     };
 
@@ -88,6 +105,7 @@ impl Fault {
 
 /// A cluster at work, and what it has been through.
 struct Ground {
+    plan: Plan,
     app: TestApp,
     nats: Nats,
     workers: Vec<RemoteWorker>,
@@ -100,7 +118,7 @@ struct Ground {
 }
 
 impl Ground {
-    async fn start(nodes: usize, delay: Duration, seed: u64) -> Option<(Self, Plan)> {
+    async fn start(plan: Plan, nodes: usize, delay: Duration, seed: u64) -> Option<Self> {
         let nats = Nats::secured(nodes, &["--no-tls"])?;
         let app = TestApp::with(&[
             "--workers",
@@ -110,21 +128,20 @@ impl Ground {
             "--nats",
             &nats.url(),
             "--ack-wait",
-            ACK_WAIT,
+            &plan.ack_wait.to_string(),
         ])
         .await;
         let credential = nats.credential("test");
         let proxy = Proxy::start(nats.ports[0], delay);
         let random = ChaCha8Rng::seed_from_u64(seed);
         let (workers, counts, peak) = (Vec::new(), BTreeMap::new(), 0);
-        let mut ground = Self { app, nats, workers, proxy, credential, random, counts, peak };
+        let mut ground = Self { plan, app, nats, workers, proxy, credential, random, counts, peak };
         let slow = !delay.is_zero();
         for n in 0..4 {
             let worker = ground.worker(n == 0 || slow);
             ground.workers.push(worker);
         }
-        let plan = if rounds().is_some() { Plan::LONG } else { Plan::SHORT };
-        Some((ground, plan))
+        Some(ground)
     }
 
     fn worker(&self, by_proxy: bool) -> RemoteWorker {
@@ -166,7 +183,7 @@ impl Ground {
             Fault::LeaderKilled => {
                 let leader = self.nats.leader().await;
                 self.nats.end(leader);
-                tokio::time::sleep(Duration::from_secs(2)).await;
+                tokio::time::sleep(self.plan.leaderless).await;
                 self.nats.begin(leader);
             }
             Fault::ServerKilled => {
@@ -175,19 +192,19 @@ impl Ground {
             }
             Fault::WorkerSuspended => {
                 self.workers[pick].signal(Signal::STOP);
-                tokio::time::sleep(Duration::from_secs(9)).await;
+                tokio::time::sleep(self.plan.silence).await;
                 self.workers[pick].signal(Signal::CONT);
             }
             Fault::QuorumLost => {
                 let first = self.random.random_range(0..nodes);
                 let lost: Vec<usize> = (0..nodes.min(2)).map(|n| (first + n) % nodes).collect();
                 lost.iter().for_each(|n| self.nats.signal(*n, Signal::STOP));
-                tokio::time::sleep(Duration::from_secs(12)).await;
+                tokio::time::sleep(self.plan.no_quorum).await;
                 lost.iter().for_each(|n| self.nats.signal(*n, Signal::CONT));
             }
             Fault::ConnectionFrozen => {
                 self.proxy.freeze(true);
-                tokio::time::sleep(Duration::from_secs(9)).await;
+                tokio::time::sleep(self.plan.silence).await;
                 self.proxy.freeze(false);
             }
             Fault::DiskWiped => {
@@ -204,13 +221,13 @@ impl Ground {
     }
 
     /// One job with all faults at random moments.
-    async fn round(&mut self, plan: &Plan, measurement: &str, faults: &[Fault]) -> String {
+    async fn round(&mut self, measurement: &str, faults: &[Fault]) -> String {
         let start = Instant::now();
-        let id = self.app.submit(&plan.job(measurement)).await;
+        let id = self.app.submit(&self.plan.job(measurement)).await;
         let mut order = faults.to_vec();
         order.shuffle(&mut self.random);
         for fault in order {
-            let pause = self.random.random_range(200..2500);
+            let pause = self.random.random_range(200..self.plan.pause);
             tokio::time::sleep(Duration::from_millis(pause)).await;
             let state = self.app.get(&format!("/v1/jobs/{id}")).await.expect(200).json();
             if state["state"] == "succeeded" {
@@ -227,9 +244,10 @@ impl Ground {
                 "succeeded" => break,
                 "failed" | "cancelled" => panic!("{job:#}"),
                 _ => assert!(
-                    start.elapsed() < plan.limit,
-                    "{job:#}\n{:#?}",
-                    workers(&self.app).await
+                    start.elapsed() < self.plan.limit,
+                    "{job:#}\n{:#?}\n{}",
+                    workers(&self.app).await,
+                    self.nats.state().await
                 ),
             }
             self.look();
@@ -240,7 +258,7 @@ impl Ground {
 }
 
 /// As `make cluster` says; none for the short version.
-fn rounds() -> Option<u32> {
+pub fn rounds() -> Option<u32> {
     std::env::var("SCI_RECON_CLUSTER_ROUNDS").ok().map(|text| text.parse().unwrap())
 }
 
@@ -285,12 +303,13 @@ async fn not_once(data: &Path, job: &str) -> i64 {
 async fn rounds_of(name: &str, nodes: usize, delay: Duration, count: u32, faults: &[Fault]) {
     let seed: u64 = rand::random();
     eprintln!("{name}: seed {seed}");
-    let Some((mut ground, plan)) = Ground::start(nodes, delay, seed).await else { return };
+    let plan = if rounds().is_some() { Plan::LONG } else { Plan::SHORT };
+    let Some(mut ground) = Ground::start(plan, nodes, delay, seed).await else { return };
     let expected = local(&plan).await;
     let (_, measurement) = ground.app.scene(&plan.scene).await;
     let (start, mut wrong, mut twice) = (Instant::now(), 0, 0);
     for round in 1..=count {
-        let job = ground.round(&plan, &measurement, faults).await;
+        let job = ground.round(&measurement, faults).await;
         wrong += u32::from(frames(&ground.app, &job).await != expected);
         twice += not_once(ground.app.data(), &job).await;
         ground.nats.emptied().await;

@@ -1,0 +1,66 @@
+//! Networks over the network: those that the program carries, and a lab's own, which travels by its hash.
+
+use serde_json::json;
+
+use super::nodes::Nats;
+use super::rounds::rounds;
+use super::{worker, workers};
+use crate::app::TestApp;
+use crate::faults::results_of;
+use crate::learned;
+use crate::samples::Scene;
+
+#[tokio::test]
+async fn networks_give_the_same_bytes_on_other_machines() {
+    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
+    if !std::path::Path::new(&library).exists() {
+        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+        return;
+    }
+    let Some(nats) = Nats::start(1) else { return };
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let (calibration, measurement) = app.scene(&Scene::SMALL).await;
+    // Two tiles: a few passes in all tests, the default schedule with its pilot in `make cluster`.
+    let mut deep = json!({
+        "measurement": measurement, "algorithm": "pnp-tv-fastdvdnet", "snapshots": 0,
+        "tile": {"size": 48, "overlap": 16},
+    });
+    if rounds().is_none() {
+        deep["schedule"] = json!({"stages": [
+            {"prior": "tv", "iterations": 20, "tv_weight": 0.1},
+            {"prior": "tv+fastdvdnet", "iterations": 3, "sigma": [0.2, 0.05], "tv_weight": 0.02}]});
+    }
+    let mut bodies = vec![deep];
+    let mut own = None;
+    if let Some(python) = learned::python() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = learned::train(&python, folder.path(), Scene::SMALL, "free");
+        let model = learned::register(&app, &calibration, &file).await.expect(201).json();
+        bodies.push(json!({
+            "measurement": measurement, "algorithm": "learned", "model": model["id"], "snapshots": 0,
+            "tile": {"size": 32, "overlap": 16},
+        }));
+        own = Some(model["file"].as_str().unwrap().to_owned());
+    }
+    let run = async |app: &TestApp| {
+        let mut found = Vec::new();
+        for body in &bodies {
+            let job = app.submit(body).await;
+            let done = app.ended(&job).await;
+            assert_eq!(done["state"], "succeeded", "{done:#}");
+            found.push(results_of(app, &job, 1).await);
+        }
+        found
+    };
+    let expected = run(&app).await;
+    let url = nats.url();
+    let app = app.again(&["--workers", "0", "--nats", &url, "--ack-wait", "5"]).await;
+    let both = [worker(&nats, &[]), worker(&nats, &[])];
+    assert_eq!(run(&app).await, expected);
+    assert_eq!(workers(&app).await.len(), 2);
+    if let Some(sha256) = own {
+        let cached = |folder: &std::path::Path| folder.join("cache").join(&sha256).exists();
+        assert!(both.iter().any(|worker| cached(worker.folder.path())), "it travels by its hash");
+    }
+    nats.emptied().await;
+}

@@ -1,0 +1,452 @@
+//! What the hand-over costs, and how far it carries. Where workers are simulated, they speak the whole
+//! protocol over a connection of their own each, sleep instead of computing, and send a tile's masks for its
+//! frames: what is measured is hub, store and message server, never a solver.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use async_nats::Client;
+use async_nats::jetstream::{AckKind, Context, Message};
+use futures_util::StreamExt;
+use serde_json::{Value, json};
+
+use super::nodes::{Nats, RemoteWorker};
+use super::rounds::rounds;
+use super::{served, until, with_iterations, worker};
+use crate::app::TestApp;
+use crate::samples::Scene;
+
+/// How long a simulated worker waits for an answer.
+const ANSWER: Duration = Duration::from_secs(5);
+
+/// CPU seconds of a process, and of those of its children that have ended.
+fn cpu(pid: u32) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    let (_, fields) = stat.rsplit_once(')').unwrap_or_default();
+    // utime, stime, cutime, cstime: proc(5).
+    let ticks = fields.split_whitespace().skip(11).take(4);
+    let ticks: f64 = ticks.map(|field| field.parse::<f64>().unwrap_or(0.0)).sum();
+    ticks / rustix::param::clock_ticks_per_second() as f64
+}
+
+/// CPU seconds of what hands tiles over: the server, and the message server.
+fn handing_over(app: &TestApp, nats: &Nats) -> (f64, f64) {
+    (cpu(app.pid()), nats.nodes.iter().flatten().map(|node| cpu(node.id())).sum())
+}
+
+/// What all simulated workers share.
+#[derive(Default)]
+struct Crowd {
+    url: String,
+    /// What a real worker says of its program, and of a tile that it has done.
+    program: Value,
+    end: Value,
+    /// How long a tile takes.
+    length: Mutex<Duration>,
+    stop: AtomicBool,
+    /// Requests that were not answered in time.
+    late: AtomicU64,
+    done: AtomicU64,
+    /// From the end of a tile to the beginning of the next.
+    pauses: Mutex<Vec<Duration>>,
+}
+
+struct Simulated {
+    crowd: Arc<Crowd>,
+    client: Client,
+    context: Context,
+    id: String,
+}
+
+impl Crowd {
+    /// Learns from a real worker what the others are to say.
+    async fn learn(nats: &Nats, app: &TestApp) -> Self {
+        let client = nats.client().await;
+        let mut hellos = client.subscribe("sci.v1.hello.test").await.unwrap();
+        let mut events = client.subscribe("sci.v1.event.test").await.unwrap();
+        client.flush().await.unwrap();
+        let mut model = worker(nats, &[]);
+        let (_, measurement) = app.scene(&Scene::SMALL).await;
+        let job = app.submit(&with_iterations(&measurement, 1)).await;
+        let read = |message: async_nats::Message| -> Value {
+            serde_json::from_slice(&message.payload).unwrap()
+        };
+        let program = read(hellos.next().await.unwrap())["program"].clone();
+        let end = read(events.next().await.unwrap())["end"]["done"].clone();
+        assert_eq!(app.ended(&job).await["state"], "succeeded");
+        model.process.signal(rustix::process::Signal::TERM);
+        model.process.ended(Duration::from_secs(10));
+        Self { url: nats.url(), program, end, ..Self::default() }
+    }
+
+    async fn enter(self: Arc<Self>) {
+        let client = async_nats::connect(&self.url).await.unwrap();
+        let context = async_nats::jetstream::new(client.clone());
+        let id = uuid::Uuid::now_v7().to_string();
+        let worker = Simulated { crowd: self, client, context, id };
+        worker.work().await;
+    }
+}
+
+impl Simulated {
+    fn stopped(&self) -> bool {
+        self.crowd.stop.load(Ordering::Relaxed)
+    }
+
+    async fn say(&self, what: &str, message: Value) {
+        self.client
+            .publish(format!("sci.v1.{what}.test"), message.to_string().into())
+            .await
+            .unwrap();
+    }
+
+    /// Does something until it is answered in time, and counts how often it was not.
+    async fn in_time<T, E, F>(&self, mut what: impl FnMut() -> F) -> T
+    where
+        F: Future<Output = Result<T, E>>,
+    {
+        loop {
+            if let Ok(Ok(answer)) = tokio::time::timeout(ANSWER, what()).await {
+                return answer;
+            }
+            self.crowd.late.fetch_add(1, Ordering::Relaxed);
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    }
+
+    async fn ask(&self, what: &str, message: &Value) -> Value {
+        let subject = format!("sci.v1.{what}.test");
+        let answer =
+            self.in_time(|| self.client.request(subject.clone(), message.to_string().into())).await;
+        serde_json::from_slice(&answer.payload).unwrap()
+    }
+
+    async fn work(self) {
+        let _told = self.client.subscribe(format!("sci.v1.tell.test.{}", self.id)).await.unwrap();
+        let hello = json!({"worker": self.id, "host": "simulated", "pid": 1, "device": "none",
+            "program": self.crowd.program});
+        let welcome = self.ask("hello", &hello).await;
+        let ack_wait = Duration::from_millis(welcome["welcome"]["ack_wait_ms"].as_u64().unwrap());
+        let idle = json!({"worker": self.id, "tile": null, "leaves": false});
+        let (mut signed, mut free) = (Instant::now(), None);
+        while !self.stopped() {
+            // As a worker does: one tile, asked for in rounds of five seconds.
+            let consumer = self
+                .in_time(|| {
+                    self.context.get_consumer_from_stream::<
+                        async_nats::jetstream::consumer::pull::Config, _, _>("test", "SCI_TASKS")
+                })
+                .await;
+            let pulled = async {
+                let batch = consumer.batch().max_messages(1).expires(Duration::from_secs(5));
+                batch.messages().await.ok()?.next().await?.ok()
+            };
+            let found = tokio::time::timeout(Duration::from_secs(6), pulled).await.ok().flatten();
+            if signed.elapsed() > Duration::from_secs(5) {
+                self.say("beat", idle.clone()).await;
+                signed = Instant::now();
+            }
+            let Some(message) = found else { continue };
+            if self.tile(&message, ack_wait, free).await {
+                free = Some(Instant::now());
+                self.crowd.done.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        self.say("beat", json!({"worker": self.id, "tile": null, "leaves": true})).await;
+        self.client.flush().await.unwrap();
+    }
+
+    /// Does a tile; false if the message was of no use.
+    async fn tile(&self, message: &Message, ack_wait: Duration, free: Option<Instant>) -> bool {
+        let task: Value = serde_json::from_slice(&message.payload).unwrap();
+        let (seq, delivery) = {
+            let info = message.info().unwrap();
+            (info.stream_sequence, info.delivered)
+        };
+        let begin = json!({"task": task["task"], "attempt": task["attempt"], "seq": seq,
+            "delivery": delivery, "worker": self.id});
+        let answer = self.ask("begin", &begin).await;
+        let Some(attempt) = answer["go"].as_u64() else {
+            if answer == "over" {
+                let _ = message.double_ack().await;
+            }
+            return false;
+        };
+        if let Some(free) = free {
+            self.crowd.pauses.lock().unwrap().push(free.elapsed());
+        }
+        let masks = self.input(&task["masks"]).await;
+        self.input(&task["snapshots"]).await;
+        let start = Instant::now();
+        let (mut told, mut kept) = (start, start);
+        let length = *self.crowd.length.lock().unwrap();
+        while start.elapsed() < length {
+            let left = length.saturating_sub(start.elapsed());
+            tokio::time::sleep(left.min(Duration::from_millis(500))).await;
+            if told.elapsed() > Duration::from_secs(1) {
+                let tile = json!({"task": task["task"], "attempt": attempt,
+                    "progress": self.crowd.end["progress"], "history": null});
+                self.say("beat", json!({"worker": self.id, "tile": tile, "leaves": false})).await;
+                told = Instant::now();
+            }
+            if kept.elapsed() > ack_wait / 6 {
+                self.in_time(|| message.double_ack_with(AckKind::Progress)).await;
+                kept = Instant::now();
+            }
+        }
+        let (id, worker) = (task["task"].as_str().unwrap(), &self.id);
+        let subject = format!("sci.v1.out.test.{id}.{attempt}.{worker}.0");
+        self.stored(subject, masks).await;
+        let mut end = self.crowd.end.clone();
+        end["frames"] = task["masks"].clone();
+        end["history"] = Value::Null;
+        let event = json!({"task": id, "attempt": attempt, "worker": worker, "end": {"done": end}});
+        self.stored("sci.v1.event.test".into(), event.to_string().into()).await;
+        self.in_time(|| message.double_ack()).await;
+        true
+    }
+
+    /// Publishes into a stream.
+    async fn stored(&self, subject: String, bytes: bytes::Bytes) {
+        self.in_time(|| async {
+            let sent = self.context.publish(subject.clone(), bytes.clone()).await;
+            sent.map_err(|_| ())?.await.map_err(|_| ())
+        })
+        .await;
+    }
+
+    /// A small input, which is one chunk.
+    async fn input(&self, input: &Value) -> bytes::Bytes {
+        let subject = format!("sci.v1.in.test.{}.0", input["sha256"].as_str().unwrap());
+        let stream = self.context.get_stream_no_info("SCI_IN").await.unwrap();
+        self.in_time(|| stream.direct_get_last_for_subject(subject.clone())).await.payload
+    }
+}
+
+/// A scene with at least so many tiles of 24 pixels.
+fn scene(tiles: usize) -> Scene {
+    let side = (1..).find(|side| side * side >= tiles).unwrap();
+    Scene { frames: 2, height: 16 * side + 8, width: 16 * side + 8, snapshots: 1 }
+}
+
+fn percentile(times: &[Duration], of_hundred: usize) -> f64 {
+    let at = (times.len() * of_hundred).div_ceil(100).clamp(1, times.len());
+    times.get(at - 1).map_or(0.0, Duration::as_secs_f64) * 1e3
+}
+
+/// One job of simulated tiles, and what its hand-over took.
+async fn simulate(
+    app: &TestApp,
+    nats: &Nats,
+    crowd: &Crowd,
+    workers: usize,
+    (tiles, length): (usize, Duration),
+) -> Value {
+    *crowd.length.lock().unwrap() = length;
+    crowd.pauses.lock().unwrap().clear();
+    let (done, late) = (crowd.done.load(Ordering::Relaxed), crowd.late.load(Ordering::Relaxed));
+    let (_, measurement) = app.scene(&scene(tiles)).await;
+    let before = handing_over(app, nats);
+    let job = app.submit(&with_iterations(&measurement, 1)).await;
+    let state = || async { app.get(&format!("/v1/jobs/{job}")).await.expect(200).json() };
+    while state().await["progress"]["tiles_done"] == 0 {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let start = Instant::now();
+    let total = loop {
+        let job = state().await;
+        let (done, total) = (&job["progress"]["tiles_done"], &job["progress"]["tiles_total"]);
+        if done == total {
+            break total.as_u64().unwrap();
+        }
+        assert!(job["state"] != "failed" && start.elapsed() < Duration::from_secs(600), "{job:#}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    };
+    let seconds = start.elapsed().as_secs_f64();
+    let after = handing_over(app, nats);
+    let mut pauses = crowd.pauses.lock().unwrap().clone();
+    pauses.sort();
+    let per_tile = |spent: f64| (spent / total as f64 * 1e6).round() / 1e3;
+    let round = |value: f64| (value * 10.0).round() / 10.0;
+    // So many a second there would be, if the hand-over took no time.
+    let wanted = workers as f64 / length.as_secs_f64();
+    app.ended(&job).await;
+    json!({
+        "workers": workers, "tiles": total, "tile_seconds": length.as_secs_f64(),
+        "tiles_per_second": round(total as f64 / seconds),
+        "wanted_per_second": if wanted.is_finite() { json!(round(wanted)) } else { Value::Null },
+        "pause_ms": {"median": round(percentile(&pauses, 50)), "p99": round(percentile(&pauses, 99))},
+        "hub_cpu_ms_per_tile": per_tile(after.0 - before.0),
+        "nats_cpu_ms_per_tile": per_tile(after.1 - before.1),
+        "late": crowd.late.load(Ordering::Relaxed) - late,
+        "twice": crowd.done.load(Ordering::Relaxed) - done - total,
+    })
+}
+
+async fn crowd_of(
+    app: &TestApp,
+    crowd: &Arc<Crowd>,
+    (from, to): (usize, usize),
+) -> Vec<tokio::task::JoinHandle<()>> {
+    let mut all = Vec::new();
+    for n in from..to {
+        all.push(tokio::spawn(crowd.clone().enter()));
+        if n % 50 == 49 {
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    }
+    until("all are there", || async { super::workers(app).await.len() >= to }).await;
+    all
+}
+
+/// The soft limit on open files: each simulated worker has a connection.
+fn open_many_files() {
+    use rustix::process::{Resource, getrlimit, setrlimit};
+    let mut limit = getrlimit(Resource::Nofile);
+    limit.current = limit.maximum;
+    setrlimit(Resource::Nofile, limit).unwrap();
+}
+
+/// Fewer in the short version, which all tests have.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn idle_workers_by_the_hundred_take_tiny_tiles_without_a_late_answer() {
+    let Some(nats) = Nats::start(1) else { return };
+    open_many_files();
+    let (workers, tiles) = if rounds().is_some() { (500, 2000) } else { (60, 200) };
+    let app = served(&nats, "30").await;
+    let crowd = Arc::new(Crowd::learn(&nats, &app).await);
+    let all = crowd_of(&app, &crowd, (0, workers)).await;
+    let idle = if rounds().is_some() { 30 } else { 1 };
+    let before = handing_over(&app, &nats);
+    tokio::time::sleep(Duration::from_secs(idle)).await;
+    let after = handing_over(&app, &nats);
+    let share = |spent: f64| (spent / idle as f64 * 1e4).round() / 1e4;
+    let mut line = simulate(&app, &nats, &crowd, workers, (tiles, Duration::ZERO)).await;
+    let ok = line["late"] == 0 && line["twice"] == 0;
+    line["target"] = json!("cluster_idle_workers");
+    line["ok"] = json!(ok);
+    line["idle_hub_cores"] = json!(share(after.0 - before.0));
+    line["idle_nats_cores"] = json!(share(after.1 - before.1));
+    println!("{line}");
+    assert!(ok, "{line}");
+    crowd.stop.store(true, Ordering::Relaxed);
+    futures_util::future::join_all(all).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "part of `make cluster`"]
+async fn a_simulation_of_a_thousand_workers_shows_where_the_limit_is() {
+    let Some(nats) = Nats::start(1) else { return };
+    open_many_files();
+    let app = served(&nats, "30").await;
+    let crowd = Arc::new(Crowd::learn(&nats, &app).await);
+    let (mut all, mut lines, mut there) = (Vec::new(), Vec::new(), 0);
+    for workers in [10, 100, 300, 1000] {
+        all.extend(crowd_of(&app, &crowd, (there, workers)).await);
+        there = workers;
+        // Four tiles for each, of so many seconds.
+        for length in [10, 2] {
+            let plan = (4 * workers, Duration::from_secs(length));
+            let line = simulate(&app, &nats, &crowd, workers, plan).await;
+            eprintln!("{line}");
+            lines.push(line);
+        }
+    }
+    println!("{}", json!({"target": "cluster_simulation", "ok": true, "simulated": lines}));
+    crowd.stop.store(true, Ordering::Relaxed);
+    futures_util::future::join_all(all).await;
+}
+
+/// CPU seconds of a worker: of the process that computes, and of the one that watches over it.
+fn cpu_of_worker(worker: &RemoteWorker) -> f64 {
+    let inner = worker.inner().map_or(0, |pid| pid.as_raw_nonzero().get().unsigned_abs());
+    cpu(worker.process.id()) + cpu(inner)
+}
+
+/// What a job costs in CPU seconds: (server and its own process, message server, workers, of which tiles).
+async fn cost(
+    app: &TestApp,
+    nats: &Nats,
+    workers: &[RemoteWorker],
+    body: &Value,
+) -> (f64, f64, f64, f64) {
+    let local = |app: &TestApp| -> f64 {
+        app.workers().iter().map(|pid| cpu(pid.as_raw_nonzero().get().unsigned_abs())).sum()
+    };
+    let spent = || {
+        let (server, nats) = handing_over(app, nats);
+        let workers: f64 = workers.iter().map(cpu_of_worker).sum();
+        (server + local(app), nats, workers)
+    };
+    let before = spent();
+    let job = app.submit(body).await;
+    let start = Instant::now();
+    loop {
+        let job = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
+        if job["state"] == "succeeded" {
+            break;
+        }
+        assert!(job["state"] != "failed" && start.elapsed().as_secs() < 7200, "{job:#}");
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    }
+    let after = spent();
+    let manifest = app.get(&format!("/v1/jobs/{job}/snapshots/0/manifest.json")).await.json();
+    let tiles = manifest["run"]["cpu_seconds"].as_f64().unwrap_or_else(|| panic!("{manifest:#}"));
+    (after.0 - before.0, after.1 - before.1, after.2 - before.2, tiles)
+}
+
+/// A deep job over the network, and what of it is not the solver's. The part of a tile that is spent on its
+/// inputs is known from a job whose tiles do next to nothing.
+#[tokio::test]
+#[ignore = "part of `make cluster`"]
+async fn little_of_a_deep_job_is_not_the_solvers() {
+    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
+    if !std::path::Path::new(&library).exists() {
+        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+        return;
+    }
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "30").await;
+    let workers = [worker(&nats, &[]), worker(&nats, &[])];
+    until("both are there", || async { super::workers(&app).await.len() == 2 }).await;
+    // 1. Nothing to do.
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    const IDLE: u64 = 60;
+    let before = workers.each_ref().map(cpu_of_worker);
+    tokio::time::sleep(Duration::from_secs(IDLE)).await;
+    let after = workers.each_ref().map(cpu_of_worker);
+    let idle = after.iter().zip(before).map(|(after, before)| (after - before) / IDLE as f64);
+    let idle = idle.fold(0.0, f64::max);
+    // 2. Next to nothing, and the default schedule, or one of fewer deep passes.
+    let scene = Scene { frames: 10, height: 1024, width: 1024, snapshots: 1 };
+    let (_, measurement) = app.scene(&scene).await;
+    let nothing = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
+        {"prior": "tv", "iterations": 1, "tv_weight": 0.05, "tv_updates": 1}]}});
+    let mut deep = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
+    if let Ok(passes) = std::env::var("SCI_RECON_CLUSTER_PASSES") {
+        let passes: u32 = passes.parse().unwrap();
+        deep["schedule"] = json!({"stages": [
+            {"prior": "tv", "iterations": 20, "tv_weight": 0.1},
+            {"prior": "tv+fastdvdnet", "iterations": passes, "sigma": [0.2, 0.05], "tv_weight": 0.02}]});
+    }
+    let (base_server, base_nats, base_workers, base_tiles) =
+        cost(&app, &nats, &workers, &nothing).await;
+    let (server, nats_cpu, all, tiles) = cost(&app, &nats, &workers, &deep).await;
+    let whole = server + nats_cpu + all;
+    // Of the workers what no tile has on its account, and the inputs, which are.
+    let outside = server + nats_cpu + (all - tiles) + base_tiles;
+    let share = outside / whole;
+    let ok = share <= 0.02 && idle < 0.002;
+    let round = |value: f64| (value * 1e4).round() / 1e4;
+    let line = json!({
+        "target": "cluster_overhead", "ok": ok, "idle_worker_cores": round(idle),
+        "deep_passes": deep["schedule"]["stages"][1]["iterations"],
+        "job_cpu_seconds": round(whole), "server": round(server), "nats": round(nats_cpu),
+        "workers": round(all), "tiles": round(tiles), "share_outside": round(share),
+        "next_to_nothing": {"server": round(base_server), "nats": round(base_nats),
+            "workers": round(base_workers), "tiles": round(base_tiles)},
+    });
+    println!("{line}");
+    assert!(ok, "{line}");
+}
