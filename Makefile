@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: demo test deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: demo test deploy-check client-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -19,6 +19,10 @@ test: runtime judges $(TRAINING)/.stamp ## all tests
 
 deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
 	$(JUDGES)/bin/python tests/judges/deploy.py .
+
+client-check: judges ## the client for Python: types, lint
+	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
+		$(abspath $(JUDGES))/bin/python -m ruff format --check src
 
 e2e: runtime ## the dashboard in a real browser; ends with one line of JSON; SHORT=1
 	@SHORT=$(SHORT) tests/e2e/run.sh

@@ -32,16 +32,16 @@ use crate::recon::tile::TilePlan;
 /// Reconstruct the frames of one snapshot from files, without a server.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Masks, one frame each: npy, TIFF, PNG, or a .mat scene's `mask`.
+    /// Masks, one frame each: npy, TIFF, PNG, or a scene's `mask`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     masks: Option<PathBuf>,
-    /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a .mat scene's `meas`.
+    /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a scene's `meas`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     measurement: Option<PathBuf>,
     /// True frames, to be compared with: those of the snapshot, or of all snapshots.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// A .mat scene (level 5) with `mask`, `meas` and perhaps `orig`, instead of the three files.
+    /// A scene, .mat or HDF5, with `mask`, `meas` and perhaps `orig`, instead of the three files.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["masks", "measurement", "truth"])]
     scene: Option<PathBuf>,
     /// The snapshot, counted from 0.

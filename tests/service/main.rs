@@ -7,6 +7,7 @@ mod adaptive;
 mod app;
 mod calibration;
 mod cli;
+mod client_libraries;
 mod clients;
 #[cfg(feature = "nats")]
 mod cluster;
