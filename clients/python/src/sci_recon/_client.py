@@ -290,15 +290,18 @@ class Job(Entity):
     def wait(self, timeout: float | None = None) -> Job:
         """Waits until it has ended; `JobFailed` unless it has succeeded, `TimeoutError` after `timeout` seconds."""
         end = None if timeout is None else time.monotonic() + timeout
-        attempt = 0
         with self.client._bar(f"job {self.id[:8]}", "%") as bar:
             while self.state not in ENDED:
                 bar(int(self.record["progress"]["percent"]), 100)
                 if end is not None and time.monotonic() >= end:
                     raise TimeoutError(f"job {self.id} is {self.state} after {timeout} s")
-                transfer.pause(min(attempt, 4))
-                attempt += 1
-                self.refresh()
+                asked = time.monotonic()
+                # Answered when the job has ended; at once where too many of a lab wait.
+                longest = 2.0 if self.client.progress else 20.0
+                wait = longest if end is None else max(0.0, min(longest, end - asked))
+                self.record = self.client._get(f"/v1/jobs/{self.id}", wait=round(wait, 3))
+                if time.monotonic() - asked < 0.2:
+                    transfer.pause(2)
             bar(100, 100)
         if self.state != "succeeded":
             raise JobFailed(self.record)
