@@ -8,16 +8,6 @@ use crate::app::TestApp;
 use crate::resumable::cutting;
 use crate::samples::Scene;
 
-/// A Python that has the packages of tests/judges/requirements.txt.
-fn python() -> Option<tokio::process::Command> {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return None;
-    };
-    let mut command = tokio::process::Command::new(python);
-    command.env("PYTHONPATH", "clients/python/src").env_remove("SCI_RECON_URL");
-    Some(command)
-}
 
 /// What a client makes of a service that is reached over connections that are cut, and how many were.
 async fn over_cuts(app: &TestApp, mut client: tokio::process::Command) -> Value {

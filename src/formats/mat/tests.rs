@@ -156,7 +156,6 @@ fn wrong_arrays_are_refused_by_name() {
     for (class, storage, name) in [
         (2, 2, "a struct"),
         (4, 4, "text"),
-        (16, 2, "unknown class"),
         (6 | 0x800, 9, "complex"),
     ] {
         let message =
