@@ -8,7 +8,6 @@ use crate::app::TestApp;
 use crate::resumable::cutting;
 use crate::samples::Scene;
 
-
 /// What a client makes of a service that is reached over connections that are cut, and how many were.
 async fn over_cuts(app: &TestApp, mut client: tokio::process::Command) -> Value {
     let token = app.token(&["create", "--lab", "a"]);

@@ -153,11 +153,7 @@ fn every_class_and_storage_is_read_with_its_scale() {
 #[test]
 fn wrong_arrays_are_refused_by_name() {
     let numbers = |class, storage| Numbers { class, storage, bytes: vec![0; 32] };
-    for (class, storage, name) in [
-        (2, 2, "a struct"),
-        (4, 4, "text"),
-        (6 | 0x800, 9, "complex"),
-    ] {
+    for (class, storage, name) in [(2, 2, "a struct"), (4, 4, "text"), (6 | 0x800, 9, "complex")] {
         let message =
             refused(&mat(&[matrix("mask", &[2, 2], &numbers(class, storage), false)], false));
         assert_names(&message, &[name, "'mask'", "double"]);
