@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release install dist demo test clients deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release install dist demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -19,6 +19,10 @@ test: runtime judges $(TRAINING)/.stamp ## all tests
 
 deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
 	$(JUDGES)/bin/python tests/judges/deploy.py .
+
+client-check: judges ## the client for Python: types, lint
+	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
+		$(abspath $(JUDGES))/bin/python -m ruff format --check src
 
 clients: ## the contract before Redocly and Spectral, and clients of it by openapi-python-client and openapi-typescript
 	@tests/judges/clients/run.sh $(VENV)/clients

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::CliError;
+use super::wait::wait;
 use crate::cli::error::Result;
 use crate::store::{Backup, Purpose, Store};
 
@@ -27,9 +28,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let text = format!("{} is there already; name a new folder", arguments.out.display());
         return Err(CliError::Input(text));
     }
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
-    let backup = runtime.block_on(async {
+    let backup = wait(async {
         let store = Store::open(&arguments.data, Purpose::Use).await?;
         let backup = store.backup(&arguments.out).await?;
         store.close().await;

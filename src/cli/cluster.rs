@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use super::wait::wait;
 use crate::cluster::{Authority, Check, ClusterError, Node, configuration};
 use crate::config::NatsArguments;
 use crate::job::{Pool, Timestamp};
@@ -191,12 +192,6 @@ fn examine(check: &CheckArguments) -> Result<(), CliError> {
         println!("{} {what}: {found}", if good { "ok     " } else { "missing" });
     }
     if bad == 0 { Ok(()) } else { Err(CliError::Failure(format!("{bad} things are missing"))) }
-}
-
-fn wait<T>(what: impl Future<Output = Result<T, ClusterError>>) -> Result<T, CliError> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
-    Ok(runtime.block_on(what)?)
 }
 
 impl From<ClusterError> for CliError {

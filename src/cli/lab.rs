@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use super::wait::wait;
 use crate::cli::error::Result;
 use crate::job::Lab;
 use crate::store::{Entitlement, LabRow, Purpose, Store};
@@ -64,9 +65,7 @@ fn share(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
-    runtime.block_on(async {
+    wait(async {
         let store = Store::open(&arguments.data, Purpose::Use).await?;
         if let Action::Set { lab, share, bytes, jobs } = &arguments.action {
             let to = Entitlement {

@@ -11,6 +11,7 @@ mod masks;
 mod model;
 mod progress;
 mod supervisor;
+mod wait;
 
 pub mod backup;
 pub mod calibrate;

@@ -34,16 +34,16 @@ use crate::recon::tile::TilePlan;
 /// server.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Masks, one frame each: npy, TIFF, PNG, or a .mat scene's `mask`.
+    /// Masks, one frame each: npy, TIFF, PNG, or a scene's `mask`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     masks: Option<PathBuf>,
-    /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a .mat scene's `meas`.
+    /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a scene's `meas`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     measurement: Option<PathBuf>,
     /// True frames, to be compared with: those of what is reconstructed, or of all snapshots.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// A .mat scene (level 5) with `mask`, `meas` and perhaps `orig`, instead of the three files.
+    /// A scene, .mat or HDF5, with `mask`, `meas` and perhaps `orig`, instead of the three files.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["masks", "measurement", "truth"])]
     scene: Option<PathBuf>,
     /// The snapshots, counted from 0: one, a range with both ends in, or all.

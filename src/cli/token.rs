@@ -7,6 +7,7 @@ use clap::{Args, Subcommand};
 use rand::TryRngCore;
 
 use super::CliError;
+use super::wait::wait;
 use crate::cli::error::Result;
 use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use crate::store::{Purpose, Store, StoreError, Token};
@@ -55,9 +56,7 @@ struct Create {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
-    runtime.block_on(async {
+    wait(async {
         let store = open(arguments).await?;
         let text = act(&store, &arguments.action).await?;
         // A copy of the database from before has other tokens, or none, and is known by this.

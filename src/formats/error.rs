@@ -2,7 +2,7 @@
 
 use std::io;
 
-use super::Format;
+use super::{Format, SampleType};
 
 /// What the functions of this folder give.
 pub type Result<T, E = FormatError> = std::result::Result<T, E>;
@@ -39,9 +39,14 @@ pub enum FormatError {
     /// The content is larger than this installation accepts ([`super::Limits`]).
     #[error("{format} file is too large: {what} is {value}, the limit is {limit}")]
     OverLimit { format: Format, what: &'static str, value: u64, limit: u64 },
-    /// A .mat file without the array that was asked for.
-    #[error(".mat file has no array named '{name}'; it holds {present}")]
-    MissingArray { name: &'static str, present: String },
+    /// A file of several arrays without the one that was asked for.
+    #[error("{format} file has no array named '{name}'; it holds {present}")]
+    MissingArray { format: Format, name: &'static str, present: String },
+    /// Integers of a type that has no scale of its own, and none was stated.
+    #[error(
+        "the samples are {0}, which has no full scale of its own: state full_scale, the stored number that means 1"
+    )]
+    FullScaleNeeded(SampleType),
     /// A full scale that is no finite positive number.
     #[error("full_scale must be a finite number above 0, not {0}")]
     FullScale(f32),
@@ -85,7 +90,7 @@ impl FormatError {
             Self::Malformed { .. } => "malformed",
             Self::OverLimit { .. } => "over_limit",
             Self::MissingArray { .. } => "missing_array",
-            Self::FullScale(_) => "invalid_full_scale",
+            Self::FullScale(_) | Self::FullScaleNeeded(_) => "invalid_full_scale",
             Self::NotFinite { .. } => "not_finite",
             Self::AboveFullScale { .. } => "above_full_scale",
             Self::AllMasksZero { .. } => "all_masks_zero",

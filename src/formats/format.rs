@@ -4,6 +4,8 @@ use strum::Display;
 
 /// The first bytes of every npy file.
 pub(super) const NPY_MAGIC: &[u8] = b"\x93NUMPY";
+/// The first bytes of an HDF5 file that begins without a block of its writer's.
+const HDF5_MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 /// The first bytes of our own prepared arrays.
 pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 
@@ -22,6 +24,9 @@ pub enum Format {
     /// MATLAB's level 5 array file.
     #[strum(serialize = ".mat")]
     Mat,
+    /// HDF5, and MATLAB's level 7.3 array file, which is HDF5.
+    #[strum(serialize = "HDF5")]
+    Hdf5,
     /// OpenEXR.
     #[strum(serialize = "EXR")]
     Exr,
@@ -42,6 +47,8 @@ impl Format {
             Some(Self::Tiff)
         } else if head.starts_with(b"\x89PNG\r\n\x1a\n") {
             Some(Self::Png)
+        } else if head.starts_with(HDF5_MAGIC) || head.starts_with(b"MATLAB 7.3") {
+            Some(Self::Hdf5)
         } else if head.starts_with(&[0x76, 0x2f, 0x31, 0x01]) {
             Some(Self::Exr)
         } else if head.starts_with(PLANAR_MAGIC) {
@@ -59,11 +66,10 @@ impl Format {
 
 /// What a file of an unknown format begins with.
 pub(super) fn describe(head: &[u8]) -> String {
-    if head.starts_with(b"\x89HDF\r\n\x1a\n") || head.starts_with(b"MATLAB 7.3") {
-        return "it is HDF5 or a .mat level 7.3 file (save with -v7 instead)".to_owned();
-    }
     if head.starts_with(b"PK\x03\x04") {
-        return "it is a zip archive, perhaps .npz (save one array as .npy instead)".to_owned();
+        return "it is a zip archive, perhaps .npz (python -c \"import numpy; numpy.save('out.npy', \
+                numpy.load('in.npz')['NAME'])\" saves one array)"
+            .to_owned();
     }
     if head.starts_with(b"\xff\xd8\xff") {
         return "it is a JPEG, which changes the values it stores".to_owned();

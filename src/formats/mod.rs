@@ -11,6 +11,7 @@
 
 mod error;
 mod format;
+mod hdf5;
 mod limits;
 mod open;
 mod samples;

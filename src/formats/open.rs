@@ -10,12 +10,12 @@ use super::format::describe;
 use super::{Format, FormatError, FrameReader, Limits, StackInfo, npy, png, tiff};
 use crate::formats::error::Result;
 
-const ACCEPTED: &str = "npy, TIFF, PNG (8 or 16 bit grey) and .mat level 5";
+const ACCEPTED: &str = "npy, TIFF, PNG (1, 8 or 16 bit grey), .mat and HDF5";
 
 /// Opens a stack of frames. The format is told by the file's first bytes, never by its name.
 ///
-/// npy: (frame, row, column) or (row, column) of uint8, uint16, float32, float64 or bool. TIFF and
-/// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 8
+/// npy: (frame, row, column) or (row, column) of integers, floats or bool. TIFF and
+/// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 1, 8
 /// or 16 bit. Errors say what is wrong with the file; see [`FormatError`].
 pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
@@ -24,10 +24,10 @@ pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + 
         Format::Npy => Ok(Box::new(npy::NpyReader::open(file, length, limits)?)),
         Format::Tiff => Ok(Box::new(tiff::TiffReader::open(file, length, limits)?)),
         Format::Png => Ok(Box::new(png::PngReader::open(file, length, limits)?)),
-        Format::Mat => Err(FormatError::Unsupported {
+        Format::Mat | Format::Hdf5 => Err(FormatError::Unsupported {
             format,
             found: "a scene of several arrays".to_owned(),
-            accepted: "one stack a file here; name the file as a .mat scene",
+            accepted: "one stack a file here; name the file as a scene",
         }),
         Format::Exr | Format::Planar => Err(FormatError::UnknownFormat {
             found: format!("it is a {format} file"),

@@ -38,13 +38,14 @@ impl PngReader {
         let header = decoder.read_header_info().map_err(decoding_error)?;
         let (height, width) = (header.height, header.width);
         let sample = match (header.color_type, header.bit_depth) {
+            (ColorType::Grayscale, BitDepth::One) => SampleType::Bool,
             (ColorType::Grayscale, BitDepth::Eight) => SampleType::U8,
             (ColorType::Grayscale, BitDepth::Sixteen) => SampleType::U16,
             (color, depth) => return Err(unsupported(format!("{color:?}, {depth:?} bit"))),
         };
         limits.check_shape(Format::Png, 1, height.into(), width.into())?;
         let info = StackInfo::new(Format::Png, sample, 1, height as usize, width as usize);
-        let promised = info.voxels() * sample.bytes() as u64;
+        let promised = (row_bytes(&info) * info.height) as u64;
         if length.saturating_mul(MAX_EXPANSION) < promised {
             return Err(FormatError::Truncated {
                 format: Format::Png,
@@ -70,9 +71,23 @@ impl FrameReader for PngReader {
             return Ok(None);
         };
         let StackInfo { height, width, sample, .. } = self.info;
-        let mut bytes = vec![0; height * width * sample.bytes()];
+        let mut bytes = vec![0; row_bytes(&self.info) * height];
         decoder.next_frame(&mut bytes).map_err(decoding_error)?;
+        if sample == SampleType::Bool {
+            let row =
+                |row: &[u8]| (0..width).map(|j| row[j / 8] >> (7 - j % 8) & 1).collect::<Vec<_>>();
+            bytes = bytes.chunks_exact(row_bytes(&self.info)).flat_map(row).collect();
+        }
         samples::frame(height, width, samples::decode(&bytes, sample, ByteOrder::Big)).map(Some)
+    }
+}
+
+/// Bytes of a stored row: of one bit a pixel, rows begin at whole bytes.
+fn row_bytes(info: &StackInfo) -> usize {
+    if info.sample == SampleType::Bool {
+        info.width.div_ceil(8)
+    } else {
+        info.width * info.sample.bytes()
     }
 }
 
@@ -134,7 +149,8 @@ fn unsupported(found: String) -> FormatError {
     FormatError::Unsupported {
         format: Format::Png,
         found,
-        accepted: "Grayscale without alpha, Eight or Sixteen bit, one image",
+        accepted: "Grayscale without alpha, One, Eight or Sixteen bit, one image (grey of a colour picture: \
+                   python -c \"from PIL import Image; Image.open('in.png').convert('L').save('out.png')\")",
     }
 }
 

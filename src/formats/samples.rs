@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 
+use half::f16;
 use ndarray::{Array2, ArrayView2};
 
 use super::{FormatError, SampleType};
@@ -22,6 +23,19 @@ pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<
         (SampleType::U8, _) => bytes.iter().map(|&b| f32::from(b)).collect(),
         (SampleType::U16, Little) => each(bytes, |b| f32::from(u16::from_le_bytes(b))),
         (SampleType::U16, Big) => each(bytes, |b| f32::from(u16::from_be_bytes(b))),
+        (SampleType::I8, _) => each(bytes, |b| f32::from(i8::from_le_bytes(b))),
+        (SampleType::I16, Little) => each(bytes, |b| f32::from(i16::from_le_bytes(b))),
+        (SampleType::I16, Big) => each(bytes, |b| f32::from(i16::from_be_bytes(b))),
+        (SampleType::I32, Little) => each(bytes, |b| i32::from_le_bytes(b) as f32),
+        (SampleType::I32, Big) => each(bytes, |b| i32::from_be_bytes(b) as f32),
+        (SampleType::I64, Little) => each(bytes, |b| i64::from_le_bytes(b) as f32),
+        (SampleType::I64, Big) => each(bytes, |b| i64::from_be_bytes(b) as f32),
+        (SampleType::U32, Little) => each(bytes, |b| u32::from_le_bytes(b) as f32),
+        (SampleType::U32, Big) => each(bytes, |b| u32::from_be_bytes(b) as f32),
+        (SampleType::U64, Little) => each(bytes, |b| u64::from_le_bytes(b) as f32),
+        (SampleType::U64, Big) => each(bytes, |b| u64::from_be_bytes(b) as f32),
+        (SampleType::F16, Little) => each(bytes, |b| f16::from_le_bytes(b).to_f32()),
+        (SampleType::F16, Big) => each(bytes, |b| f16::from_be_bytes(b).to_f32()),
         (SampleType::F32, Little) => each(bytes, f32::from_le_bytes),
         (SampleType::F32, Big) => each(bytes, f32::from_be_bytes),
         (SampleType::F64, Little) => each(bytes, |b| f64::from_le_bytes(b) as f32),

@@ -18,6 +18,27 @@ pub enum SampleType {
     /// Unsigned 16 bit.
     #[strum(serialize = "uint16")]
     U16,
+    /// Unsigned 32 bit; this and wider integers are rounded to 24 binary digits when read.
+    #[strum(serialize = "uint32")]
+    U32,
+    /// Unsigned 64 bit.
+    #[strum(serialize = "uint64")]
+    U64,
+    /// Signed 8 bit.
+    #[strum(serialize = "int8")]
+    I8,
+    /// Signed 16 bit.
+    #[strum(serialize = "int16")]
+    I16,
+    /// Signed 32 bit.
+    #[strum(serialize = "int32")]
+    I32,
+    /// Signed 64 bit.
+    #[strum(serialize = "int64")]
+    I64,
+    /// 16-bit float.
+    #[strum(serialize = "float16")]
+    F16,
     /// 32-bit float.
     #[strum(serialize = "float32")]
     F32,
@@ -30,20 +51,22 @@ impl SampleType {
     /// Bytes a sample.
     pub fn bytes(self) -> usize {
         match self {
-            Self::Bool | Self::U8 => 1,
-            Self::U16 => 2,
-            Self::F32 => 4,
-            Self::F64 => 8,
+            Self::Bool | Self::U8 | Self::I8 => 1,
+            Self::U16 | Self::I16 | Self::F16 => 2,
+            Self::U32 | Self::I32 | Self::F32 => 4,
+            Self::U64 | Self::I64 | Self::F64 => 8,
         }
     }
 
-    /// What means 1.0 where nobody states a full scale: the type's maximum for integers, 1 for
-    /// floats and truth values.
-    pub fn default_full_scale(self) -> FullScale {
+    /// What means 1.0 where nobody states a full scale: the type's maximum for unsigned integers of 8
+    /// and 16 bits, in which cameras and pictures count, and 1 for floats and truth values. Other integers
+    /// have none: what programs store in them has no common scale.
+    pub fn default_full_scale(self) -> Option<FullScale> {
         match self {
-            Self::U8 => FullScale(255.0),
-            Self::U16 => FullScale(65535.0),
-            Self::Bool | Self::F32 | Self::F64 => FullScale(1.0),
+            Self::U8 => Some(FullScale(255.0)),
+            Self::U16 => Some(FullScale(65535.0)),
+            Self::Bool | Self::F16 | Self::F32 | Self::F64 => Some(FullScale(1.0)),
+            Self::U32 | Self::U64 | Self::I8 | Self::I16 | Self::I32 | Self::I64 => None,
         }
     }
 }
@@ -89,7 +112,7 @@ pub struct StackInfo {
     pub format: Format,
     /// What means 1.0 unless stated: [`SampleType::default_full_scale`], but 255 for the meas and
     /// orig arrays of a .mat scene, whatever their type.
-    pub default_full_scale: FullScale,
+    pub default_full_scale: Option<FullScale>,
 }
 
 impl StackInfo {

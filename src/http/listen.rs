@@ -97,11 +97,13 @@ impl Places {
 
     fn take(&self, address: IpAddr) -> Option<Place> {
         let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        let (all, own) = (taken.values().sum::<usize>(), taken.entry(address).or_default());
-        if all >= self.most || *own >= MOST_OF_AN_ADDRESS {
+        let all: usize = taken.values().sum();
+        // Who is refused leaves no entry behind.
+        let own = taken.get(&address).copied().unwrap_or(0);
+        if all >= self.most || own >= MOST_OF_AN_ADDRESS {
             return None;
         }
-        *own += 1;
+        taken.insert(address, own + 1);
         Some(Place { places: self.clone(), address })
     }
 }
@@ -139,5 +141,8 @@ mod tests {
         let address = "10.0.0.1".parse().unwrap();
         let held = (places.take(address), places.take(address));
         assert!(held.0.is_some() && held.1.is_some() && places.take(address).is_none());
+        assert!(places.take("10.0.0.2".parse().unwrap()).is_none());
+        drop(held);
+        assert!(places.taken.lock().unwrap().is_empty());
     }
 }

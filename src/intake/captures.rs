@@ -201,8 +201,8 @@ pub(super) fn average(
 /// Floats have none: there it must be stated.
 #[allow(clippy::cast_precision_loss)] // cameras' numbers are small
 pub(super) fn full_number(sample: SampleType, stated: Option<u32>) -> Option<f32> {
-    let largest = sample.default_full_scale();
-    let largest = (largest != FullScale::ONE).then(|| largest.value());
+    let largest = sample.default_full_scale().filter(|largest| *largest != FullScale::ONE);
+    let largest = largest.map(FullScale::value);
     stated.map(|value| value as f32).or(largest)
 }
 
@@ -275,7 +275,7 @@ fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<Mask
 fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<f32>>> {
     let Some(path) = &files.patterns else { return Ok(None) };
     let (info, patterns) = read_stack(path, limits).map_err(IntakeError::format("patterns"))?;
-    let patterns = patterns / info.default_full_scale.value();
+    let patterns = patterns / info.default_full_scale.unwrap_or(FullScale::ONE).value();
     check_patterns(patterns.view(), files.masks.len())
         .map_err(|error| IntakeError::content("patterns", &error))?;
     Ok(Some(patterns))

@@ -6,10 +6,10 @@ use ndarray::Array2;
 
 use super::IntakeError;
 use crate::formats::mat::{self, SceneArray};
-use crate::formats::{self, FrameReader, FullScale, Limits, StackInfo};
+use crate::formats::{self, FormatError, FrameReader, FullScale, Limits, StackInfo};
 use crate::intake::error::Result;
 
-/// A file, and which array of it is meant if it is a .mat scene.
+/// A file, and which array of it is meant if it has several.
 #[derive(Debug, Clone)]
 pub struct Source<'a> {
     pub path: &'a Path,
@@ -55,17 +55,21 @@ impl<'a> Source<'a> {
     /// Errors: no file, or none of a format that is read; larger than the limits; no such array; no
     /// full scale.
     pub fn open(&self) -> Result<Opened> {
-        let opened = match mat::is_mat(self.path) {
+        let opened = match mat::is_scene(self.path) {
             Ok(true) => mat::open_array(self.path, self.array, &self.limits),
             Ok(false) => formats::open_stack(self.path, &self.limits),
             Err(error) => Err(error),
         };
         let reader = opened.map_err(IntakeError::format(&self.name))?;
         let info = *reader.info();
-        let full_scale = match self.full_scale {
-            Some(value) => FullScale::new(value).map_err(IntakeError::format(&self.name))?,
-            None => info.default_full_scale,
+        let full_scale = match (self.full_scale, info.default_full_scale) {
+            (Some(value), _) => FullScale::new(value),
+            (None, Some(own)) => Ok(own),
+            // Of 0 and 1; a larger value is refused with the question for the scale.
+            (None, None) if self.array == SceneArray::Masks => Ok(FullScale::ONE),
+            (None, None) => Err(FormatError::FullScaleNeeded(info.sample)),
         };
+        let full_scale = full_scale.map_err(IntakeError::format(&self.name))?;
         Ok(Opened { info, full_scale, reader, name: self.name.clone() })
     }
 }

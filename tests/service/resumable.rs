@@ -8,7 +8,7 @@ use rand::{Rng, RngCore, SeedableRng};
 use reqwest::{Method, RequestBuilder};
 use sci_recon::store::{Purpose, Store};
 use serde_json::{Value, json};
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::app::{Answer, TestApp};
@@ -169,8 +169,8 @@ async fn the_disk_is_promised_once_and_the_queue_has_an_end() {
     assert_eq!((&ready["database"], &ready["disk"]), (&json!("ok"), &json!("ok")));
 }
 
-/// Hands connections on to the service and cuts each of them after some bytes, ever later.
-async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
+/// Hands connections on to the service and cuts each of them after some bytes that went either way.
+pub async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let cuts = Arc::new(AtomicU64::new(0));
@@ -179,34 +179,36 @@ async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
         for number in 0u64.. {
             let (mut client, _) = listener.accept().await.unwrap();
             let (service, cuts) = (service.clone(), counter.clone());
-            let mut left = 1_000 + (number * 7_919_000) % 900_000;
+            let left = AtomicU64::new(1_000 + (number * 7_919_000) % 900_000);
             tokio::spawn(async move {
                 let mut server = TcpStream::connect(&service).await.unwrap();
-                let (mut from_client, mut to_client) = client.split();
-                let (mut from_server, mut to_server) = server.split();
-                let up = async {
-                    let mut buffer = vec![0; 16 * 1024];
-                    while let Ok(count @ 1..) = from_client.read(&mut buffer).await {
-                        let count = (count as u64).min(left) as usize;
-                        if to_server.write_all(&buffer[..count]).await.is_err() {
-                            return;
-                        }
-                        left -= count as u64;
-                        if left == 0 {
-                            cuts.fetch_add(1, Ordering::Relaxed);
-                            return;
-                        }
-                    }
-                };
-                let down = tokio::io::copy(&mut from_server, &mut to_client);
+                let (from_client, to_client) = client.split();
+                let (from_server, to_server) = server.split();
                 tokio::select! {
-                    () = up => {}
-                    _ = down => {}
+                    () = pump(from_client, to_server, &left) => {}
+                    () = pump(from_server, to_client, &left) => {}
                 }
+                cuts.fetch_add(u64::from(left.into_inner() == 0), Ordering::Relaxed);
             });
         }
     });
     (address, cuts)
+}
+
+/// Hands bytes on until the end, or until no more are left to go.
+async fn pump(mut from: impl AsyncRead + Unpin, mut to: impl AsyncWrite + Unpin, left: &AtomicU64) {
+    let mut buffer = vec![0; 16 * 1024];
+    while let Ok(count @ 1..) = from.read(&mut buffer).await {
+        let before = left.load(Ordering::Relaxed);
+        let count = (count as u64).min(before);
+        if to.write_all(&buffer[..count as usize]).await.is_err() {
+            return;
+        }
+        left.store(before - count, Ordering::Relaxed);
+        if before == count {
+            return;
+        }
+    }
 }
 
 #[tokio::test]

@@ -4,7 +4,7 @@ use std::io::BufRead;
 
 use super::element::{Content, malformed};
 use crate::formats::error::Result;
-use crate::formats::samples::{ByteOrder, each};
+use crate::formats::samples::ByteOrder;
 use crate::formats::{Format, FormatError, SampleType};
 
 const INT8: u32 = 1;
@@ -64,23 +64,23 @@ impl ArrayHeader {
             9 if self.flags & LOGICAL != 0 => return Ok(SampleType::Bool),
             9 => return Ok(SampleType::U8),
             11 => return Ok(SampleType::U16),
+            8 => return Ok(SampleType::I8),
+            10 => return Ok(SampleType::I16),
+            12 => return Ok(SampleType::I32),
+            13 => return Ok(SampleType::U32),
+            14 => return Ok(SampleType::I64),
+            15 => return Ok(SampleType::U64),
             1 => "a cell array",
             2 => "a struct",
             3 => "an object",
             4 => "text",
             5 => "a sparse matrix",
-            8 => "int8",
-            10 => "int16",
-            12 => "int32",
-            13 => "uint32",
-            14 => "int64",
-            15 => "uint64",
             _ => "an array of an unknown class",
         };
         Err(FormatError::Unsupported {
             format: Format::Mat,
             found: format!("{refused} in '{}'", self.name),
-            accepted: "double, single, uint8, uint16, logical",
+            accepted: "double, single, logical and integers",
         })
     }
 }
@@ -90,7 +90,7 @@ impl ArrayHeader {
 pub(super) fn read_data_tag<R: BufRead>(
     content: &mut Content<R>,
     header: &ArrayHeader,
-) -> Result<(Storage, u64)> {
+) -> Result<(SampleType, u64)> {
     let (kind, bytes) = content.tag()?;
     let name = &header.name;
     if kind > 0xffff {
@@ -100,7 +100,7 @@ pub(super) fn read_data_tag<R: BufRead>(
             accepted: "frames of some size",
         });
     }
-    let storage = Storage::from_type(kind)
+    let storage = storage(kind)
         .ok_or_else(|| malformed(format!("'{name}' stores numbers as type {kind}")))?;
     let count = header.dimensions.iter().fold(1u64, |product, axis| product.saturating_mul(*axis));
     let promised = count.saturating_mul(storage.bytes() as u64);
@@ -163,61 +163,19 @@ impl Part {
     }
 }
 
-/// How numbers are stored; MATLAB stores small whole doubles as integers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Storage {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
-}
-
-impl Storage {
-    fn from_type(kind: u32) -> Option<Self> {
-        Some(match kind {
-            INT8 => Self::I8,
-            2 => Self::U8,
-            3 => Self::I16,
-            4 => Self::U16,
-            INT32 => Self::I32,
-            UINT32 => Self::U32,
-            7 => Self::F32,
-            9 => Self::F64,
-            _ => return None,
-        })
-    }
-
-    pub(super) fn bytes(self) -> usize {
-        match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::I32 | Self::U32 | Self::F32 => 4,
-            Self::F64 => 8,
-        }
-    }
-
-    /// Whole numbers to f32; what f32 cannot hold exactly is rounded.
-    pub(super) fn decode(self, bytes: &[u8], order: ByteOrder) -> Vec<f32> {
-        use ByteOrder::{Big, Little};
-        match (self, order) {
-            (Self::I8, _) => each(bytes, |b| f32::from(i8::from_le_bytes(b))),
-            (Self::U8, _) => each(bytes, |b| f32::from(u8::from_le_bytes(b))),
-            (Self::I16, Little) => each(bytes, |b| f32::from(i16::from_le_bytes(b))),
-            (Self::I16, Big) => each(bytes, |b| f32::from(i16::from_be_bytes(b))),
-            (Self::U16, Little) => each(bytes, |b| f32::from(u16::from_le_bytes(b))),
-            (Self::U16, Big) => each(bytes, |b| f32::from(u16::from_be_bytes(b))),
-            (Self::I32, Little) => each(bytes, |b| i32::from_le_bytes(b) as f32),
-            (Self::I32, Big) => each(bytes, |b| i32::from_be_bytes(b) as f32),
-            (Self::U32, Little) => each(bytes, |b| u32::from_le_bytes(b) as f32),
-            (Self::U32, Big) => each(bytes, |b| u32::from_be_bytes(b) as f32),
-            (Self::F32, Little) => each(bytes, f32::from_le_bytes),
-            (Self::F32, Big) => each(bytes, f32::from_be_bytes),
-            (Self::F64, Little) => each(bytes, |b| f64::from_le_bytes(b) as f32),
-            (Self::F64, Big) => each(bytes, |b| f64::from_be_bytes(b) as f32),
-        }
-    }
+/// How numbers are stored, by the code of their type; MATLAB stores small whole doubles as integers.
+fn storage(kind: u32) -> Option<SampleType> {
+    Some(match kind {
+        INT8 => SampleType::I8,
+        2 => SampleType::U8,
+        3 => SampleType::I16,
+        4 => SampleType::U16,
+        INT32 => SampleType::I32,
+        UINT32 => SampleType::U32,
+        7 => SampleType::F32,
+        9 => SampleType::F64,
+        12 => SampleType::I64,
+        13 => SampleType::U64,
+        _ => return None,
+    })
 }

@@ -1,4 +1,5 @@
-//! The community's benchmark scenes: MATLAB level 5 files with the arrays `mask`, `meas`, `orig`.
+//! The community's benchmark scenes: files with the arrays `mask`, `meas`, `orig`, as MATLAB saves them
+//! (level 5; level 7.3 is HDF5, [`super::hdf5`]).
 //!
 //! The frame axis is the last one in MATLAB and the first one here; rows and columns stay what they
 //! are. MATLAB stores columns one after another, so a frame is contiguous and is read alone.
@@ -16,11 +17,14 @@ use std::path::Path;
 
 use ndarray::{Array2, Array3};
 
-use array::{ArrayHeader, Storage};
+use array::ArrayHeader;
 use element::{Content, Elements};
 
 use super::open::open;
-use super::{Format, FormatError, FrameReader, FullScale, Limits, StackInfo, collect, samples};
+use super::{
+    Format, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo, collect, hdf5,
+    samples,
+};
 use crate::formats::error::Result;
 
 /// An array of a scene.
@@ -64,10 +68,10 @@ pub struct MatScene {
     pub truth: Option<Array3<f32>>,
 }
 
-/// True for a MATLAB level 5 file, told by its first bytes. Errors: I/O.
-pub fn is_mat(path: &Path) -> Result<bool> {
+/// True for a file of named arrays, .mat or HDF5, told by its first bytes. Errors: I/O.
+pub fn is_scene(path: &Path) -> Result<bool> {
     match open(path) {
-        Ok((_, _, format)) => Ok(format == Format::Mat),
+        Ok((_, _, format)) => Ok(matches!(format, Format::Mat | Format::Hdf5)),
         Err(FormatError::UnknownFormat { .. }) => Ok(false),
         Err(error) => Err(error),
     }
@@ -86,10 +90,13 @@ pub fn open_array(
 ) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
+    if format == Format::Hdf5 {
+        return Ok(Box::new(hdf5::Hdf5Reader::open(file, array, limits)?));
+    }
     if format != Format::Mat {
         return Err(FormatError::UnknownFormat {
             found: format!("it is a {format} file"),
-            accepted: "a .mat level 5 scene",
+            accepted: "a .mat or HDF5 scene",
         });
     }
     let mut elements = Elements::new(BufReader::new(file), length)?;
@@ -102,7 +109,7 @@ pub fn open_array(
         }
         present.push(header.name);
     }
-    Err(FormatError::MissingArray { name: array.name(), present: list(&present) })
+    Err(FormatError::MissingArray { format, name: array.name(), present: list(&present) })
 }
 
 /// Reads a scene: `mask` and `meas`, and `orig` where it is there.
@@ -122,7 +129,7 @@ pub fn read_scene_mat(path: &Path, limits: &Limits) -> Result<MatScene> {
 }
 
 /// Names for a message, bounded in number.
-fn list(names: &[String]) -> String {
+pub(super) fn list(names: &[String]) -> String {
     const SHOWN: usize = 20;
     let quoted: Vec<String> = names.iter().take(SHOWN).map(|name| format!("'{name}'")).collect();
     match (quoted.is_empty(), names.len().saturating_sub(SHOWN)) {
@@ -136,7 +143,7 @@ fn list(names: &[String]) -> String {
 struct MatReader {
     content: Content<BufReader<File>>,
     info: StackInfo,
-    storage: Storage,
+    storage: SampleType,
     next: usize,
     bytes: Vec<u8>,
 }
@@ -166,7 +173,7 @@ impl MatReader {
         let [frames, height, width] =
             [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
         let info = StackInfo {
-            default_full_scale: array.default_full_scale(),
+            default_full_scale: Some(array.default_full_scale()),
             ..StackInfo::new(Format::Mat, sample, frames, height, width)
         };
         Ok(Self {
@@ -193,7 +200,7 @@ impl FrameReader for MatReader {
         if self.next == self.info.frames {
             self.content.finish()?;
         }
-        let values = self.storage.decode(&self.bytes, self.content.order());
+        let values = samples::decode(&self.bytes, self.storage, self.content.order());
         let columns = samples::frame(self.info.width, self.info.height, values)?;
         Ok(Some(columns.t().as_standard_layout().into_owned()))
     }

@@ -11,8 +11,7 @@ use crate::formats::{Format, FormatError, SampleType};
 /// NumPy itself refuses to parse headers above 10,000 bytes from strangers.
 pub(super) const MAX_HEADER_BYTES: u64 = 10_000;
 
-const ACCEPTED_TYPES: &str =
-    "uint8, uint16, float32, float64 (little or big endian) and bool, in 2 or 3 dimensions";
+const ACCEPTED_TYPES: &str = "integers and floats of 8 to 64 bits and bool, in 2 or 3 dimensions";
 
 /// The three facts of an npy header.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -146,6 +145,13 @@ impl<'a> Cursor<'a> {
             b"b1" => SampleType::Bool,
             b"u1" => SampleType::U8,
             b"u2" => SampleType::U16,
+            b"u4" => SampleType::U32,
+            b"u8" => SampleType::U64,
+            b"i1" => SampleType::I8,
+            b"i2" => SampleType::I16,
+            b"i4" => SampleType::I32,
+            b"i8" => SampleType::I64,
+            b"f2" => SampleType::F16,
             b"f4" => SampleType::F32,
             b"f8" => SampleType::F64,
             _ => {
@@ -166,14 +172,7 @@ fn dtype_name(code: &[u8], descr: &[u8]) -> String {
         b"O" => "object (a pickle)",
         b"c8" => "complex64",
         b"c16" => "complex128",
-        b"f2" => "float16",
         b"f16" => "float128",
-        b"i1" => "int8",
-        b"i2" => "int16",
-        b"i4" => "int32",
-        b"i8" => "int64",
-        b"u4" => "uint32",
-        b"u8" => "uint64",
         _ => {
             let shown: String = String::from_utf8_lossy(descr).chars().take(24).collect();
             return format!("'{}'", shown.escape_default());

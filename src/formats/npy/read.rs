@@ -66,7 +66,8 @@ impl NpyReader {
             return Err(FormatError::Unsupported {
                 format: Format::Npy,
                 found: "a three-dimensional array in Fortran order".to_owned(),
-                accepted: "C order (save numpy.ascontiguousarray(stack))",
+                accepted: "C order: python -c \"import numpy; numpy.save('out.npy', \
+                           numpy.ascontiguousarray(numpy.load('in.npy')))\"",
             });
         }
         // The limits bound each axis below 2^32 only where they are sane; they are settings.

@@ -64,7 +64,7 @@ fn every_accepted_dtype_is_read_in_both_byte_orders() {
         }
     }
     let (info, stack) = read(&array_file("'|b1'", "False", "(1, 3)", &[0, 1, 1])).unwrap();
-    assert_eq!(info.default_full_scale.value(), 1.0);
+    assert_eq!(info.default_full_scale.unwrap().value(), 1.0);
     assert_eq!(stack, array![[[0.0, 1.0, 1.0]]]);
 }
 
@@ -95,14 +95,11 @@ fn other_dtypes_are_refused_by_name() {
     for (descr, name) in [
         ("'<c16'", "complex128"),
         ("'|O'", "object (a pickle)"),
-        ("'<i4'", "int32"),
-        ("'<u4'", "uint32"),
-        ("'<f2'", "float16"),
         ("[('a', '<f4'), ('b', '<f4')]", "structured"),
         ("'<U7'", "'<U7'"),
     ] {
         let message = refusal(&array_file(descr, "False", "(2, 2)", &[0; 64]));
-        assert_names(&message, &[name, "uint8", "uint16", "float32", "float64"]);
+        assert_names(&message, &[name, "integers and floats of 8 to 64 bits", "bool"]);
     }
 }
 

@@ -67,7 +67,7 @@ fn other_kinds_are_refused_by_name() {
         (ColorType::Rgba, BitDepth::Sixteen, 32, "Rgba"),
         (ColorType::GrayscaleAlpha, BitDepth::Eight, 8, "GrayscaleAlpha"),
         (ColorType::Indexed, BitDepth::Eight, 4, "Indexed"),
-        (ColorType::Grayscale, BitDepth::One, 2, "One bit"),
+        (ColorType::Grayscale, BitDepth::Two, 2, "Two bit"),
         (ColorType::Grayscale, BitDepth::Four, 2, "Four bit"),
     ] {
         let message = refusal(&png(color, depth, 2, 2, &vec![0; bytes]));

@@ -104,7 +104,10 @@ fn pages_of_every_type_and_compression_are_read() {
         let (info, read16) =
             read(&pages!(new, colortype::Gray16, u16, stack, compression)).unwrap();
         assert_eq!((info.frames, info.height, info.width), (3, 5, 7));
-        assert_eq!((info.sample, info.default_full_scale.value()), (SampleType::U16, 65535.0));
+        assert_eq!(
+            (info.sample, info.default_full_scale.unwrap().value()),
+            (SampleType::U16, 65535.0)
+        );
         assert_eq!(read16, stack);
         let (_, big) = read(&pages!(new_big, colortype::Gray16, u16, stack, compression)).unwrap();
         assert_eq!(big, stack);

@@ -5,7 +5,7 @@ import { bytes, figure, moment, nameOf } from "./format.js";
 import { findings } from "./report.js";
 import { gaveUp, get, send, upload } from "./api.js";
 
-const HINT = "npy, TIFF, PNG (16 bit) or .mat";
+const HINT = "npy, TIFF, PNG, .mat or HDF5";
 
 export async function submit(root, [query], signal) {
   const form = { calibration: null, measurement: null };

@@ -1,0 +1,334 @@
+function [frames, job] = sci_recon(masks, measurement, varargin)
+%SCI_RECON  Reconstructs video from a snapshot compressive measurement with a sci-recon service.
+%
+%   FRAMES = SCI_RECON(MASKS, MEASUREMENT) sends MASKS [H,W,B] on [0,1] and MEASUREMENT [H,W], or [H,W,S] for a
+%   sequence of snapshots, waits for the job, and gives FRAMES [H,W,B], or [H,W,B,S], single. The measurement is the
+%   sum of the masked frames: where all masks are open it goes up to B.
+%
+%   [FRAMES, JOB] = ... also gives the job as the service describes it.
+%
+%   SCI_RECON(..., NAME, VALUE, ...):
+%     'url'         address of the service   (default: environment SCI_RECON_URL, or http://127.0.0.1:8080)
+%     'token'       access token             (default: environment SCI_RECON_TOKEN)
+%     'algorithm'   'pnp-tv-fastdvdnet' (default), 'gap-tv', 'gap-tv3d', ...
+%     'full_scale'  the number in MEASUREMENT that means 1 (default 1; never guessed)
+%     'masks_full_scale'  the same of MASKS
+%     'camera_fps', 'exposure_s', 'label'   kept with the measurement and the job
+%     'schedule'    a struct, instead of the algorithm's own schedule
+%     'quiet'       true: no lines of progress
+%
+%   Uploads go on where they were after a cut, downloads too. Errors have the service's code as identifier, such as
+%   sci_recon:invalid_content. Needs curl on the path, as Windows 10, macOS and Linux have it; MATLAB R2016b or
+%   Octave 7.
+%
+%   Example:
+%     masks = single(rand(256, 256, 8) > 0.5);
+%     frames = sci_recon(masks, sum(masks .* video, 3), 'url', 'http://server.lab:8080', 'algorithm', 'gap-tv');
+
+  o = options(varargin);
+  if ndims(masks) > 3 || ndims(measurement) > 3
+    error('sci_recon:size', 'masks are [H,W,B] and the measurement is [H,W] or [H,W,S]');
+  end
+  if size(masks, 1) ~= size(measurement, 1) || size(masks, 2) ~= size(measurement, 2)
+    error('sci_recon:size', 'masks are %dx%d, the measurement is %dx%d', ...
+          size(masks, 1), size(masks, 2), size(measurement, 1), size(measurement, 2));
+  end
+
+  calibration = request(o, 'POST', '/v1/calibrations', ...
+                        given(struct('masks', upload(o, masks), 'full_scale', o.masks_full_scale)));
+  calibration = ready(o, '/v1/calibrations/', calibration);
+  taken = request(o, 'POST', '/v1/measurements', ...
+                  given(struct('calibration', calibration.id, 'data', upload(o, measurement), ...
+                               'full_scale', o.full_scale, 'camera_fps', o.camera_fps, 'exposure_s', o.exposure_s)));
+  taken = ready(o, '/v1/measurements/', taken);
+  for k = 1:numel(taken.warnings)
+    found = element(taken.warnings, k);
+    warning(['sci_recon:' found.code], '%s %s', found.detail, found.remedy);
+  end
+
+  job = request(o, 'POST', '/v1/jobs', ...
+                given(struct('measurement', taken.id, 'algorithm', o.algorithm, 'schedule', o.schedule, ...
+                             'label', o.label)));
+  shown = -1;
+  delay = 0.2;
+  while any(strcmp(job.state, {'queued', 'running', 'cancelling'}))
+    pause(delay);
+    delay = min(2 * delay, 5);
+    job = request(o, 'GET', ['/v1/jobs/' job.id], []);
+    if ~o.quiet && floor(job.progress.percent) > shown
+      shown = floor(job.progress.percent);
+      fprintf('%s: %d %%\n', job.state, shown);
+    end
+  end
+  if ~strcmp(job.state, 'succeeded')
+    error(['sci_recon:' job.state], 'job %s (%s): %s', job.id, job.state, char(job.error));
+  end
+
+  frames = [];
+  for s = job.snapshots.first + (0:job.snapshots.count - 1)
+    frames = cat(4, frames, download(o, sprintf('/v1/jobs/%s/snapshots/%d', job.id, s)));
+  end
+end
+
+function o = options(flags)
+  o = struct('url', getenv('SCI_RECON_URL'), 'token', getenv('SCI_RECON_TOKEN'), ...
+             'algorithm', 'pnp-tv-fastdvdnet', 'full_scale', 1, 'masks_full_scale', 1, 'camera_fps', [], ...
+             'exposure_s', [], 'label', [], 'schedule', [], 'quiet', false);
+  for k = 1:2:numel(flags)
+    if k == numel(flags) || ~ischar(flags{k}) || ~isfield(o, flags{k})
+      error('sci_recon:option', 'options are pairs of a name and a value; the names are %s', ...
+            strjoin(fieldnames(o)', ', '));
+    end
+    o.(flags{k}) = flags{k + 1};
+  end
+  if isempty(o.url)
+    o.url = 'http://127.0.0.1:8080';
+  end
+  o.url = regexprep(o.url, '/+$', '');
+end
+
+function body = given(body)
+  % Leaves out what was not stated.
+  for name = fieldnames(body)'
+    if isempty(body.(name{1}))
+      body = rmfield(body, name{1});
+    end
+  end
+end
+
+function record = ready(o, path, record)
+  % Waits while the service prepares what it was sent.
+  while isfield(record, 'state') && strcmp(record.state, 'preparing')
+    pause(0.5);
+    record = request(o, 'GET', [path record.id], []);
+  end
+  if isfield(record, 'state') && strcmp(record.state, 'failed')
+    error('sci_recon:failed', '%s', char(record.error));
+  end
+end
+
+function one = element(list, k)
+  % JSON lists of objects are arrays of structs, or cells where their fields differ.
+  if iscell(list)
+    one = list{k};
+  else
+    one = list(k);
+  end
+end
+
+function record = request(o, method, path, body)
+  % One request with a body of JSON; again after a cut or while the service is busy. The key makes the second
+  % sending of a request harmless.
+  files = {tempname(), tempname()};
+  clean = onCleanup(@() remove(files));
+  extra = '';
+  if ~isempty(body)
+    write(files{1}, uint8(unicode2native(jsonencode(body), 'UTF-8')));
+    extra = sprintf(' -H "Content-Type: application/json" -H "Idempotency-Key: %s" --data-binary "@%s"', ...
+                    key(), files{1});
+  end
+  for attempt = 1:12
+    status = curl(o, sprintf('-X %s%s -o "%s"', method, extra, files{2}), path);
+    if status >= 200 && status < 300
+      record = jsondecode(native2unicode(read(files{2}), 'UTF-8'));
+      return
+    end
+    if ~any(status == [0 408 423 429 502 503 504])
+      break
+    end
+    pause(min(0.1 * 2 ^ attempt, 30));
+  end
+  refuse(o, status, files{2}, [method ' ' path]);
+end
+
+function refuse(o, status, file, what)
+  if status == 0
+    error('sci_recon:unreachable', '%s%s does not answer', o.url, what);
+  end
+  try
+    problem = jsondecode(native2unicode(read(file), 'UTF-8'));
+    code = problem.code;
+    detail = problem.detail;
+  catch
+    code = sprintf('status_%d', status);
+    detail = native2unicode(read(file), 'UTF-8');
+  end
+  error(['sci_recon:' code], '%s: %d %s', what, status, detail);
+end
+
+function hash = upload(o, values)
+  % Sends an array by tus 1.0, in pieces, going on where it was after a cut.
+  file = tempname();
+  answer = tempname();
+  clean = onCleanup(@() remove({file, answer, [file '.piece'], [file '.head']}));
+  write_npy(file, values);
+  listed = dir(file);
+  total = listed.bytes;
+  piece = 8 * 2 ^ 20;
+  location = '';
+  failures = 0;
+  offset = 0;
+  hash = '';
+  while isempty(hash)
+    if isempty(location)
+      status = curl(o, sprintf('-X POST -H "Tus-Resumable: 1.0.0" -H "Upload-Length: %d" -D "%s.head" -o "%s"', ...
+                               total, file, answer), '/v1/uploads');
+      location = regexprep(header([file '.head'], 'Location'), '^https?://[^/]+', '');
+    elseif failures > 0 || offset >= total
+      status = curl(o, sprintf('-I -H "Tus-Resumable: 1.0.0" -D "%s.head" -o "%s"', file, answer), location);
+      if any(status == [404 410])
+        location = '';
+        offset = 0;
+      elseif status == 200
+        before = offset;
+        offset = str2double(header([file '.head'], 'Upload-Offset'));
+        hash = regexprep(header([file '.head'], 'Content-Location'), '^.*/', '');
+        if offset > before
+          failures = 0;
+        end
+        if offset == total && isempty(hash)
+          status = 503;
+        elseif offset < total
+          status = append(o, file, offset, piece, location, answer);
+        end
+      end
+    else
+      status = append(o, file, offset, piece, location, answer);
+    end
+    if status >= 200 && status < 300
+      if status == 204
+        offset = str2double(header([file '.head'], 'Upload-Offset'));
+        failures = 0;
+      end
+    elseif failures == 12 || ~any(status == [0 404 408 409 410 423 429 502 503 504])
+      refuse(o, status, answer, 'upload');
+    else
+      failures = failures + 1;
+      pause(min(0.1 * 2 ^ failures, 30));
+    end
+  end
+end
+
+function status = append(o, file, offset, piece, location, answer)
+  id = fopen(file, 'r');
+  fseek(id, offset, 'bof');
+  bytes = fread(id, piece, '*uint8');
+  fclose(id);
+  write([file '.piece'], bytes);
+  status = curl(o, sprintf(['-X PATCH -H "Tus-Resumable: 1.0.0" -H "Upload-Offset: %d" -D "%s.head" -o "%s" ' ...
+                            '-H "Content-Type: application/offset+octet-stream" --data-binary "@%s.piece"'], ...
+                           offset, file, answer, file), location);
+end
+
+function frames = download(o, path)
+  % The frames of a snapshot, [H,W,B]; the download goes on where it was after a cut.
+  file = tempname();
+  clean = onCleanup(@() remove({file}));
+  for attempt = 1:12
+    status = curl(o, sprintf('-C - -o "%s"', file), [path '/frames.npy']);
+    if any(status == [200 206])
+      break
+    end
+    if attempt == 12 || ~any(status == [0 408 429 502 503 504])
+      refuse(o, status, file, [path '/frames.npy']);
+    end
+    pause(min(0.1 * 2 ^ attempt, 30));
+  end
+  frames = read_npy(file);
+end
+
+function status = curl(o, flags, path)
+  % The status of HTTP, or 0 where the answer did not come to its end. The token goes by a file, because other
+  % users of the machine can see command lines.
+  config = tempname();
+  clean = onCleanup(@() remove({config}));
+  lines = '';
+  if ~isempty(o.token)
+    lines = sprintf('header = "Authorization: Bearer %s"\n', o.token);
+  end
+  write(config, uint8(lines));
+  code = '%{http_code}';
+  if ispc
+    code = '%%{http_code}';
+  end
+  command = ['curl -sS -K "' config '" --connect-timeout 10 -w "' code '" ' flags ' "' o.url path '"'];
+  [failed, text] = system([command ' 2>&1']);
+  status = str2double(regexprep(strtrim(text), '^.*?(\d{3})$', '$1'));
+  if failed ~= 0 || isnan(status)
+    status = 0;
+  end
+end
+
+function value = header(file, name)
+  value = '';
+  if exist(file, 'file')
+    found = regexpi(char(read(file)), ['^' name ':[ \t]*([^\r\n]*)'], 'tokens', 'lineanchors');
+    if ~isempty(found)
+      value = strtrim(found{end}{1});
+    end
+  end
+end
+
+function write_npy(file, values)
+  % [H,W,B] becomes [B,H,W] in C order, which has the same order of bytes as [W,H,B] in MATLAB.
+  if islogical(values)
+    type = '|b1'; class_name = 'uint8';
+  else
+    types = struct('single', '<f4', 'double', '<f8', 'uint8', '|u1', 'uint16', '<u2');
+    if ~isfield(types, class(values))
+      error('sci_recon:class', 'arrays are single, double, uint8, uint16 or logical, not %s', class(values));
+    end
+    type = types.(class(values)); class_name = class(values);
+  end
+  shape = sprintf('(%d, %d, %d)', size(values, 3), size(values, 1), size(values, 2));
+  text = sprintf('{''descr'': ''%s'', ''fortran_order'': False, ''shape'': %s, }', type, shape);
+  text = [text repmat(' ', 1, mod(-(numel(text) + 11), 64)) sprintf('\n')];
+  id = fopen(file, 'w', 'ieee-le');
+  fwrite(id, [uint8(147) uint8('NUMPY') 1 0], 'uint8');
+  fwrite(id, numel(text), 'uint16');
+  fwrite(id, text, 'char*1');
+  fwrite(id, permute(values, [2 1 3]), class_name);
+  fclose(id);
+end
+
+function values = read_npy(file)
+  % float32 [B,H,W] in C order, as the service writes it.
+  id = fopen(file, 'r', 'ieee-le');
+  start = fread(id, 8, '*uint8');
+  if numel(start) < 8 || start(1) ~= 147
+    fclose(id);
+    error('sci_recon:answer', 'the frames are no npy file');
+  end
+  text = fread(id, fread(id, 1, 'uint16'), '*char')';
+  sides = regexp(text, '\(([^)]*)\)', 'tokens', 'once');
+  shape = str2double(regexp(sides{1}, '\d+', 'match'));
+  values = permute(reshape(fread(id, prod(shape), '*single'), shape(3), shape(2), shape(1)), [2 1 3]);
+  fclose(id);
+end
+
+function text = key()
+  text = sprintf('%s-%s', datestr(now, 'yyyymmddHHMMSSFFF'), char('a' + floor(26 * rand(1, 16))));
+end
+
+function write(file, bytes)
+  id = fopen(file, 'w');
+  fwrite(id, bytes, 'uint8');
+  fclose(id);
+end
+
+function bytes = read(file)
+  bytes = uint8([]);
+  if exist(file, 'file')
+    id = fopen(file, 'r');
+    bytes = fread(id, Inf, '*uint8')';
+    fclose(id);
+  end
+end
+
+function remove(files)
+  for k = 1:numel(files)
+    if exist(files{k}, 'file')
+      delete(files{k});
+    end
+  end
+end

@@ -1,0 +1,400 @@
+"""The client: calibrations, measurements, jobs and their results."""
+
+from __future__ import annotations
+
+import os
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import httpx
+import numpy as np
+import numpy.typing as npt
+
+from . import _transfer as transfer
+from ._errors import CalibrationFailed, JobFailed
+from ._transfer import Source
+
+Record = dict[str, Any]
+Snapshots = Literal["all"] | int | tuple[int, int]
+ENDED = {"succeeded", "failed", "cancelled"}
+
+
+class Client:
+    """A connection to a service.
+
+    `url` and `token` are taken from SCI_RECON_URL and SCI_RECON_TOKEN where they are left out. With `progress` uploads,
+    jobs and downloads show a bar (needs tqdm).
+
+    Methods raise `ApiError` for what the service refuses, and `SciReconError` when it can't be reached for
+    about five minutes.
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        token: str | None = None,
+        *,
+        progress: bool = False,
+    ) -> None:
+        url = url or os.environ.get("SCI_RECON_URL")
+        if not url:
+            raise ValueError("no address of a service: Client('http://server.lab:8080'), or set SCI_RECON_URL")
+        token = token or os.environ.get("SCI_RECON_TOKEN")
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        timeout = httpx.Timeout(60, connect=10)
+        self.http = httpx.Client(base_url=url, headers=headers, timeout=timeout)
+        self.progress = progress
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes all connections."""
+        self.http.close()
+
+    def reconstruct(
+        self,
+        masks: Source | Calibration,
+        measurement: Source,
+        algorithm: str = "pnp-tv-fastdvdnet",
+        *,
+        masks_full_scale: float | None = None,
+        full_scale: float | None = None,
+        folder: str | os.PathLike[str] | None = None,
+        **job: Any,
+    ) -> Result:
+        """Uploads, submits, waits and downloads.
+
+        `masks` are [B, H, W], `measurement` is [H, W] or [S, H, W]; arrays or file names. Their full scale, the stored
+        number that means 1, is by default the maximum of an integer type, and 1 for floats. `job` goes on to `submit`.
+        The frames come into `folder`, by default one that goes away with the result.
+        """
+        calibration = masks if isinstance(masks, Calibration) else self.calibrate(masks, full_scale=masks_full_scale)
+        taken = self.measure(calibration, measurement, full_scale=full_scale)
+        return self.submit(taken, algorithm, **job).wait().result(folder)
+
+    def calibrate(self, masks: Source, *, full_scale: float | None = None, name: str | None = None) -> Calibration:
+        """Makes a calibration of masks [B, H, W]."""
+        record = self._create("calibrations", masks=self.upload(masks), full_scale=full_scale, name=name)
+        return Calibration(self, record).ready()
+
+    def calibrate_captures(
+        self,
+        masks: Sequence[Source | Sequence[Source]],
+        white: Source | Sequence[Source],
+        black: Source | Sequence[Source],
+        *,
+        black_with_mask: Source | Sequence[Source] | None = None,
+        patterns: Source | None = None,
+        saturation: int | None = None,
+        name: str | None = None,
+    ) -> Calibration:
+        """Makes a calibration of raw captures, and waits until its masks are there.
+
+        `masks` has the captures of each aperture pattern in its order; each capture may be several repeats.
+        """
+        captures: Record = {
+            "masks": [self._uploads(repeats) for repeats in masks],
+            "white": self._uploads(white),
+            "black": self._uploads(black),
+            "saturation": saturation,
+            "patterns": None if patterns is None else self.upload(patterns),
+        }
+        if black_with_mask is not None:
+            captures["black_with_mask"] = self._uploads(black_with_mask)
+        return Calibration(self, self._create("calibrations", captures=captures, name=name)).ready()
+
+    def measure(
+        self,
+        calibration: Calibration | str,
+        data: Source,
+        *,
+        dark: Source | Sequence[Source] = (),
+        full_scale: float | None = None,
+        saturation: int | None = None,
+        camera_fps: float | None = None,
+        exposure_s: float | None = None,
+        name: str | None = None,
+    ) -> Measurement:
+        """Makes a measurement of snapshots [H, W] or [S, H, W] that were taken with a calibration."""
+        record = self._create(
+            "measurements",
+            calibration=str(calibration),
+            data=self.upload(data),
+            dark=self._uploads(dark),
+            full_scale=full_scale,
+            saturation=saturation,
+            camera_fps=camera_fps,
+            exposure_s=exposure_s,
+            name=name,
+        )
+        return Measurement(self, record).ready()
+
+    def submit(
+        self,
+        measurement: Measurement | str,
+        algorithm: str = "pnp-tv-fastdvdnet",
+        *,
+        snapshots: Snapshots = "all",
+        schedule: Mapping[str, Any] | None = None,
+        tile: Mapping[str, int] | None = None,
+        model: str | None = None,
+        priority: int = 0,
+        label: str | None = None,
+        key: str | None = None,
+    ) -> Job:
+        """Asks for a reconstruction, and does not wait for it.
+
+        `snapshots` is "all", one by its index from 0, or (first, last) with both ends in. A second request with the same
+        `key` is answered with the first one's job.
+        """
+        return Job(
+            self,
+            self._create(
+                "jobs",
+                key=key,
+                measurement=str(measurement),
+                algorithm=algorithm,
+                snapshots=list(snapshots) if isinstance(snapshots, tuple) else snapshots,
+                schedule=schedule,
+                tile=tile,
+                model=model,
+                priority=priority,
+                label=label,
+            ),
+        )
+
+    def job(self, identifier: str) -> Job:
+        """A job that was submitted before, by this client or another."""
+        return Job(self, self._get(f"/v1/jobs/{identifier}"))
+
+    def jobs(self, **filters: str) -> Iterator[Job]:
+        """All jobs, newest first; `filters` as in the contract, such as `state="running"`."""
+        for record in self._pages("/v1/jobs", filters):
+            yield Job(self, record)
+
+    def upload(self, source: Source) -> str:
+        """Sends an array or a file, in pieces that survive cuts. Gives its SHA-256, by which requests name it."""
+        name = "array" if isinstance(source, np.ndarray) else os.path.basename(source)
+        with transfer.as_file(source) as path, self._bar(f"upload {name}") as bar:
+            return transfer.upload(self.http, path, bar)
+
+    def _uploads(self, sources: Source | Sequence[Source]) -> list[str]:
+        if isinstance(sources, (str, os.PathLike, np.ndarray)):
+            return [self.upload(sources)]
+        return [self.upload(source) for source in sources]
+
+    def _create(self, what: str, *, key: str | None = None, **body: Any) -> Record:
+        given = {name: value for name, value in body.items() if value is not None}
+        headers = {"Idempotency-Key": key or str(uuid.uuid4())}
+        record: Record = transfer.send(self.http, "POST", f"/v1/{what}", json=given, headers=headers).json()
+        return record
+
+    def _get(self, path: str, **parameters: Any) -> Record:
+        record: Record = transfer.send(self.http, "GET", path, params=parameters).json()
+        return record
+
+    def _pages(self, path: str, filters: Mapping[str, str]) -> Iterator[Record]:
+        parameters = dict(filters)
+        while True:
+            page = self._get(path, **parameters)
+            yield from page["items"]
+            if page["next_cursor"] is None:
+                return
+            parameters["cursor"] = page["next_cursor"]
+
+    def _bar(self, text: str, unit: str = "B") -> Bar:
+        return Bar(text, unit, self.progress)
+
+
+@dataclass
+class Entity:
+    """Something that the service keeps. `record` is what it last said of it."""
+
+    client: Client = field(repr=False)
+    record: Record = field(repr=False)
+
+    @property
+    def id(self) -> str:
+        return str(self.record["id"])
+
+    def __str__(self) -> str:
+        return self.id
+
+    @property
+    def warnings(self) -> list[Record]:
+        """What checks have found: each has a `code`, a `detail` and a `remedy`."""
+        return list(self.record.get("warnings", []))
+
+    def _ready(self, collection: str) -> None:
+        attempt = 0
+        with self.client._bar(f"{self.__class__.__name__.lower()} {self.id}", "%") as bar:
+            while self.record.get("state") == "preparing":
+                bar(int(self.record.get("percent", 0)), 100)
+                transfer.pause(min(attempt, 4))
+                attempt += 1
+                self.record = self.client._get(f"/v1/{collection}/{self.id}")
+        if self.record.get("state") == "failed":
+            raise CalibrationFailed(self.record.get("error") or "no reason was given")
+
+
+@dataclass
+class Calibration(Entity):
+    """Masks [B, H, W] of an optical setting."""
+
+    def ready(self) -> Calibration:
+        """Waits until there are masks."""
+        self._ready("calibrations")
+        return self
+
+    def report(self) -> Record:
+        """What is known of the masks: a grade, findings, and what to do."""
+        return self.client._get(f"/v1/calibrations/{self.id}/report.json")
+
+
+@dataclass
+class Measurement(Entity):
+    """Snapshots [S, H, W] taken with a calibration."""
+
+    def ready(self) -> Measurement:
+        """Waits until it is checked."""
+        self._ready("measurements")
+        return self
+
+
+@dataclass
+class Job(Entity):
+    """A reconstruction."""
+
+    @property
+    def state(self) -> str:
+        return str(self.record["state"])
+
+    def refresh(self) -> Job:
+        """Asks for its state."""
+        self.record = self.client._get(f"/v1/jobs/{self.id}")
+        return self
+
+    def wait(self, timeout: float | None = None) -> Job:
+        """Waits until it has ended; `JobFailed` unless it has succeeded, `TimeoutError` after `timeout` seconds."""
+        end = None if timeout is None else time.monotonic() + timeout
+        with self.client._bar(f"job {self.id[:8]}", "%") as bar:
+            while self.state not in ENDED:
+                bar(int(self.record["progress"]["percent"]), 100)
+                if end is not None and time.monotonic() >= end:
+                    raise TimeoutError(f"job {self.id} is {self.state} after {timeout} s")
+                asked = time.monotonic()
+                # Answered when the job has ended; at once where too many of a lab wait.
+                longest = 2.0 if self.client.progress else 20.0
+                wait = longest if end is None else max(0.0, min(longest, end - asked))
+                self.record = self.client._get(f"/v1/jobs/{self.id}", wait=round(wait, 3))
+                if time.monotonic() - asked < 0.2:
+                    transfer.pause(2)
+            bar(100, 100)
+        if self.state != "succeeded":
+            raise JobFailed(self.record)
+        return self
+
+    def cancel(self) -> Job:
+        """Stops it within an iteration."""
+        self.record = transfer.send(self.client.http, "POST", f"/v1/jobs/{self.id}/cancel").json()
+        return self
+
+    def retry(self) -> Job:
+        """Takes it up again after a failure or a cancel; tiles that are done stay so."""
+        self.record = transfer.send(self.client.http, "POST", f"/v1/jobs/{self.id}/retry").json()
+        return self
+
+    def delete(self) -> None:
+        """Removes it and its results."""
+        transfer.send(self.client.http, "DELETE", f"/v1/jobs/{self.id}")
+
+    def result(self, folder: str | os.PathLike[str] | None = None) -> Result:
+        """Its results, downloaded as they are asked for, into `folder` or one that goes away with them."""
+        return Result(self, folder)
+
+
+class Result:
+    """The results of a job that has succeeded."""
+
+    def __init__(self, job: Job, folder: str | os.PathLike[str] | None = None) -> None:
+        self.job = job
+        self._temporary = TemporaryDirectory(prefix="sci-recon-") if folder is None else None
+        self.folder = Path(self._temporary.name if self._temporary else folder or "")
+
+    @property
+    def snapshots(self) -> range:
+        """The snapshots of the measurement that were reconstructed."""
+        chosen = self.job.record["snapshots"]
+        return range(chosen["first"], chosen["first"] + chosen["count"])
+
+    @cached_property
+    def frames(self) -> npt.NDArray[np.float32]:
+        """All frames, those of one snapshot after the other: [B * S, H, W], float32.
+
+        Of one snapshot it is a memory map of the downloaded file; of several an array in memory.
+        """
+        parts = [self.snapshot(index) for index in self.snapshots]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def snapshot(self, index: int) -> npt.NDArray[np.float32]:
+        """The frames of one snapshot, [B, H, W], as a memory map of the downloaded file."""
+        frames: npt.NDArray[np.float32] = np.load(self.download("frames.npy", index), mmap_mode="r")
+        return frames
+
+    def download(self, name: str, snapshot: int | None = None) -> Path:
+        """Fetches a file such as `stack.exr`, `frames.npy` or `frames/frame_0001.exr`, unless it is here already."""
+        index = self.snapshots[0] if snapshot is None else snapshot
+        listed = self.job.client._get(f"/v1/jobs/{self.job.id}/snapshots/{index}")["files"]
+        files = {file["name"]: file for file in listed if file["href"]}
+        if name not in files:
+            raise KeyError(f"no file {name!r} of snapshot {index}; there are {', '.join(files)}")
+        file = files[name]
+        path = self.folder / f"snapshot_{index:04d}" / name
+        if not (path.is_file() and transfer.sha256(path) == file["sha256"]):
+            with self.job.client._bar(f"download {name}") as bar:
+                transfer.download(self.job.client.http, file["href"], path, file["sha256"], bar)
+        return path
+
+    @property
+    def manifest(self) -> Record:
+        """What went into the job and what came of it."""
+        return self.job.client._get(f"/v1/jobs/{self.job.id}/manifest.json")
+
+
+class Bar:
+    """A bar of tqdm from the first progress on, or nothing."""
+
+    def __init__(self, text: str, unit: str, shown: bool) -> None:
+        self._make = None
+        self._bar: Any = None
+        if shown:
+            from tqdm.auto import tqdm
+
+            self._make = lambda: tqdm(desc=text, unit=unit, unit_scale=unit == "B")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, done: int, total: int) -> None:
+        if self._bar is None and self._make is not None:
+            self._bar = self._make()
+        if self._bar is not None:
+            self._bar.total = total
+            self._bar.update(done - self._bar.n)

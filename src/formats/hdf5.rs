@@ -1,0 +1,248 @@
+//! HDF5: MATLAB's level 7.3, h5py and others. One array of a file, frame by frame.
+//!
+//! What is no MATLAB file has the axes (frame, row, column) or (row, column). MATLAB writes its axes (row, column, frame)
+//! in reverse, so there a frame comes as (column, row).
+//!
+//! `hdf5-reader` is pure Rust and reads this file alone: a binding to libhdf5 would follow references to external
+//! files, so that an upload could read the server's. Ranges are read, not mapped: a file that is cut while it is
+//! read is an error, not a signal.
+
+use std::fs::File;
+use std::sync::Arc;
+
+use hdf5_reader::error::Error;
+use hdf5_reader::storage::{DynStorage, FileStorage};
+use hdf5_reader::{
+    ByteOrder as StoredOrder, Dataset, Datatype, H5Type, Hdf5File, OpenOptions, SliceInfo,
+    SliceInfoElem,
+};
+use ndarray::Array2;
+
+use super::mat::{SceneArray, list};
+use super::samples::{self, ByteOrder};
+use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use crate::formats::error::Result;
+
+/// Chunks that a frame touches are decoded once for all frames they hold, and kept so long. A file whose frames need
+/// more would be decoded again for each frame.
+const CHUNK_CACHE_BYTES: usize = 128 << 20;
+
+/// One array of an HDF5 file.
+pub(super) struct Hdf5Reader {
+    dataset: Dataset,
+    info: StackInfo,
+    /// Rows and columns are exchanged, as MATLAB writes them.
+    by_columns: bool,
+    next: usize,
+}
+
+impl Hdf5Reader {
+    /// Opens the array of `file` by its name. Errors: no HDF5; no such array; too large; another type.
+    pub(super) fn open(file: File, array: SceneArray, limits: &Limits) -> Result<Self> {
+        let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
+        let options = OpenOptions {
+            chunk_cache_bytes: CHUNK_CACHE_BYTES,
+            max_chunk_bytes: CHUNK_CACHE_BYTES,
+            ..OpenOptions::default()
+        };
+        let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
+        let (_, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
+        if !names.iter().any(|name| name == array.name()) {
+            let format = Format::Hdf5;
+            return Err(FormatError::MissingArray {
+                format,
+                name: array.name(),
+                present: list(&names),
+            });
+        }
+        let dataset = file.dataset(array.name()).map_err(error)?;
+        let class = dataset.attribute("MATLAB_class").ok();
+        let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
+        let sample = match (stored(dataset.dtype()), class.as_deref()) {
+            (Some((SampleType::U8, _)), Some("logical")) => SampleType::Bool,
+            (Some(_), Some("char")) => return Err(unsupported("text".to_owned())),
+            (Some((sample, _)), _) => sample,
+            (None, _) => return Err(unsupported(describe(dataset.dtype()))),
+        };
+        let by_columns = class.is_some();
+        let (frames, height, width) = match (dataset.shape(), by_columns) {
+            (&[height, width], false) | (&[width, height], true) => (1, height, width),
+            (&[frames, height, width], false) | (&[frames, width, height], true) => {
+                (frames, height, width)
+            }
+            (shape, _) => {
+                return Err(unsupported(format!("an array of {} dimensions", shape.len())));
+            }
+        };
+        limits.check_shape(Format::Hdf5, frames, height, width)?;
+        check_chunks(&dataset, sample)?;
+        let [frames, height, width] =
+            [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
+        let mut info = StackInfo::new(Format::Hdf5, sample, frames, height, width);
+        if by_columns {
+            info.default_full_scale = Some(array.default_full_scale());
+        }
+        Ok(Self { dataset, info, by_columns, next: 0 })
+    }
+}
+
+impl FrameReader for Hdf5Reader {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
+        if self.next == self.info.frames {
+            return Ok(None);
+        }
+        let all = SliceInfoElem::Slice { start: 0, end: u64::MAX, step: 1 };
+        let mut selections = vec![all; self.dataset.ndim()];
+        if let [frame, _, _] = &mut *selections {
+            *frame = SliceInfoElem::Index(self.next as u64);
+        }
+        let values = self.dataset.read_slice::<Value>(&SliceInfo { selections }).map_err(error)?;
+        self.next += 1;
+        let mut values: Vec<f32> = values.into_iter().map(|Value(value)| value).collect();
+        if self.info.sample == SampleType::Bool {
+            values.iter_mut().for_each(|value| *value = f32::from(u8::from(*value != 0.0)));
+        }
+        let (height, width) = (self.info.height, self.info.width);
+        if self.by_columns {
+            let columns = samples::frame(width, height, values)?;
+            return Ok(Some(columns.t().as_standard_layout().into_owned()));
+        }
+        samples::frame(height, width, values).map(Some)
+    }
+}
+
+/// A sample of any type that is accepted, as float32.
+#[derive(Clone)]
+struct Value(f32);
+
+impl H5Type for Value {
+    fn hdf5_type() -> Datatype {
+        f32::hdf5_type()
+    }
+
+    fn from_bytes(bytes: &[u8], dtype: &Datatype) -> hdf5_reader::error::Result<Self> {
+        let decoded = Self::decode_vec(bytes, dtype, 1).and_then(|values| values.ok()?.pop());
+        decoded.ok_or_else(|| Error::InvalidData("a sample is cut short".to_owned()))
+    }
+
+    fn element_size(dtype: &Datatype) -> usize {
+        // A type that is not accepted is refused before anything is read.
+        stored(dtype).map_or(1, |(sample, _)| sample.bytes())
+    }
+
+    fn decode_vec(
+        raw: &[u8],
+        dtype: &Datatype,
+        count: usize,
+    ) -> Option<hdf5_reader::error::Result<Vec<Self>>> {
+        let (sample, order) = stored(dtype)?;
+        let bytes = raw.get(..count.checked_mul(sample.bytes())?)?;
+        Some(Ok(samples::decode(bytes, sample, order).into_iter().map(Value).collect()))
+    }
+}
+
+/// How numbers of a type are stored, if they are accepted.
+fn stored(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
+    let (sample, order) = match dtype {
+        Datatype::FixedPoint { size, signed, byte_order } => {
+            let sample = match (size, signed) {
+                (1, false) => SampleType::U8,
+                (1, true) => SampleType::I8,
+                (2, false) => SampleType::U16,
+                (2, true) => SampleType::I16,
+                (4, false) => SampleType::U32,
+                (4, true) => SampleType::I32,
+                (8, false) => SampleType::U64,
+                (8, true) => SampleType::I64,
+                _ => return None,
+            };
+            (sample, byte_order)
+        }
+        Datatype::FloatingPoint { size, byte_order } => {
+            let sample = match size {
+                2 => SampleType::F16,
+                4 => SampleType::F32,
+                8 => SampleType::F64,
+                _ => return None,
+            };
+            (sample, byte_order)
+        }
+        // h5py's truth values: an enumeration of FALSE and TRUE.
+        Datatype::Enum { base, members } if members.len() == 2 => {
+            return match stored(base)? {
+                (SampleType::I8 | SampleType::U8, order) => Some((SampleType::Bool, order)),
+                _ => None,
+            };
+        }
+        _ => return None,
+    };
+    let order = match order {
+        StoredOrder::LittleEndian => ByteOrder::Little,
+        StoredOrder::BigEndian => ByteOrder::Big,
+    };
+    Some((sample, order))
+}
+
+/// What people call the types that are refused.
+fn describe(dtype: &Datatype) -> String {
+    let name = match dtype {
+        Datatype::String { .. } | Datatype::VarLen { .. } => "text",
+        Datatype::Compound { .. } => "records, perhaps complex numbers",
+        Datatype::Reference { .. } => "references, perhaps a cell array",
+        Datatype::Enum { .. } => "an enumeration",
+        _ => "numbers of an unknown type",
+    };
+    name.to_owned()
+}
+
+/// Refuses chunks of which those that one frame touches don't fit into the cache.
+fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
+    let Some(chunk) = dataset.chunks() else { return Ok(()) };
+    let ([.., height, width], Some(depth)) = (dataset.shape(), chunk.first()) else {
+        return Ok(());
+    };
+    let depth = if chunk.len() == 3 { u64::from(*depth) } else { 1 };
+    let round = |side: u64, chunk: Option<&u32>| {
+        side.next_multiple_of(chunk.map_or(1, |n| u64::from(*n).max(1)))
+    };
+    let plane =
+        round(*height, chunk.iter().rev().nth(1)).saturating_mul(round(*width, chunk.last()));
+    let bytes = plane.saturating_mul(depth).saturating_mul(sample.bytes() as u64);
+    if bytes <= CHUNK_CACHE_BYTES as u64 {
+        return Ok(());
+    }
+    Err(FormatError::OverLimit {
+        format: Format::Hdf5,
+        what: "the size of the chunks that hold one frame (save with chunks of one frame each, in h5py \
+               chunks=(1, height, width))",
+        value: bytes,
+        limit: CHUNK_CACHE_BYTES as u64,
+    })
+}
+
+fn unsupported(found: String) -> FormatError {
+    FormatError::Unsupported {
+        format: Format::Hdf5,
+        found,
+        accepted: "integers and floats of 8 to 64 bits and truth values, in 2 or 3 dimensions",
+    }
+}
+
+fn error(error: Error) -> FormatError {
+    match error {
+        Error::Io(source) => FormatError::Io { action: "read the HDF5 file", source },
+        Error::UnexpectedEof { offset, needed, available } => FormatError::Truncated {
+            format: Format::Hdf5,
+            promised: format!("{needed} bytes at {offset}"),
+            present: format!("{available} bytes"),
+        },
+        other => FormatError::malformed(Format::Hdf5, other.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,47 @@
+"""Makes the files of this folder with the writers that labs use. Needs h5py, numpy, Pillow.
+
+Each holds the same numbers: masks [3, 4, 5] whose value is (frame + 2 row + 3 column) mod 2, or measurements
+[2, 4, 5] whose value is 100 frame + 10 row + column.
+"""
+
+import pathlib
+
+import h5py
+import numpy as np
+from PIL import Image
+
+HERE = pathlib.Path(__file__).parent
+
+
+def main():
+    frame, row, column = np.indices((3, 4, 5))
+    masks = (frame + 2 * row + 3 * column) % 2
+    frame, row, column = np.indices((2, 4, 5))
+    snapshots = 100 * frame + 10 * row + column
+    with h5py.File(HERE / "h5py.h5", "w") as file:
+        file["mask"] = masks.astype(bool)
+        file.create_dataset("meas", data=snapshots.astype("<u2"), chunks=(1, 3, 2), compression="gzip", shuffle=True)
+        file.create_dataset("orig", data=snapshots.astype(">f4"), chunks=(2, 4, 5), fletcher32=True)
+    with h5py.File(HERE / "types.h5", "w", libver="latest") as file:
+        file["mask"] = masks.astype("<i8")
+        file["meas"] = snapshots.astype("<f2")
+        file["orig"] = snapshots.astype(complex)
+    # MATLAB's layout: a block of 512 bytes before the file, axes in reverse, the class as an attribute.
+    path = HERE / "matlab73.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values, matlab in [
+            ("mask", masks.astype("u1"), "logical"),
+            ("meas", snapshots.astype("f8"), "double"),
+            ("orig", snapshots.astype("<i4"), "int32"),
+        ]:
+            written = np.ascontiguousarray(np.moveaxis(values, 0, -1).T)
+            dataset = file.create_dataset(name, data=written, chunks=written.shape, compression="gzip")
+            dataset.attrs["MATLAB_class"] = np.bytes_(matlab)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64, of a test HDF5 schema 1.00 .".ljust(116) + b"\0" * 8 + b"\0\x02IM")
+    for name, type in [("int64", "<i8"), ("int32-big", ">i4"), ("float16", "<f2"), ("int8", "i1")]:
+        np.save(HERE / f"masks-{name}.npy", masks.astype(type))
+    Image.fromarray(masks[0].astype(bool)).save(HERE / "mask-1-bit.png")
+
+
+main()

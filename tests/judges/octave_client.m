@@ -1,0 +1,26 @@
+% A lab's round trip with clients/matlab: arrays to the service and the frames back. Run by tests/service/clients.rs
+% with SCI_RECON_URL and SCI_RECON_TOKEN; prints one JSON line.
+addpath('clients/matlab');
+[column, row, frame] = meshgrid(1:160, 1:144, 1:8);
+video = single(0.5 * column / 160 + 0.4 * (abs(row - 40 - 2 * frame) < 12 & abs(column - 60 - 3 * frame) < 12));
+rand('state', 1);
+masks = rand(144, 160, 8) > 0.5;
+measurement = sum(masks .* video, 3);
+measurement(:, :, 2) = sum(masks .* flipud(video), 3);
+[frames, job] = sci_recon(masks, measurement, 'algorithm', 'gap-tv', 'label', 'octave', 'quiet', true);
+assert(isequal(size(frames), [144 160 8 2]) && isa(frames, 'single'));
+for s = 1:2
+  again = sum(masks .* frames(:, :, :, s), 3);
+  difference = norm(again(:) - measurement(:, :, s)(:)) / norm(measurement(:, :, s)(:));
+  assert(difference < 0.05, 'snapshot %d does not fit its measurement: %g', s, difference);
+end
+error_of = @(frames, truth) sqrt(mean((frames(:) - truth(:)) .^ 2));
+assert(error_of(frames(:, :, :, 1), video) < 0.08 && error_of(frames(:, :, :, 2), flipud(video)) < 0.08);
+refused = '';
+try
+  sci_recon(3 * masks, measurement, 'algorithm', 'gap-tv', 'quiet', true);
+catch problem
+  refused = problem.identifier;
+end
+assert(strcmp(refused, 'sci_recon:invalid_content'), 'masks above 1: %s', refused);
+printf('%s\n', jsonencode(struct('job', job.id)));

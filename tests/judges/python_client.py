@@ -1,0 +1,43 @@
+"""A lab's round trip with clients/python: files of FOLDER to the service and its frames back.
+
+Usage: python_client.py FOLDER, with SCI_RECON_URL and SCI_RECON_TOKEN. Prints one JSON line.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from sci_recon import ApiError, Client
+
+
+def main():
+    folder = Path(sys.argv[1])
+    masks = np.load(folder / "masks.npy")
+    with Client() as client:
+        result = client.reconstruct(masks, folder / "measurement.npy", "gap-tv", folder=folder / "result")
+        frames = result.frames
+        snapshots, count = len(result.snapshots), len(masks)
+        assert frames.shape == (snapshots * count, *masks.shape[1:]) and frames.dtype == np.float32
+        measurement = np.load(folder / "measurement.npy")
+        for snapshot in range(snapshots):
+            again = (masks * frames[snapshot * count :][:count]).sum(axis=0)
+            difference = np.linalg.norm(again - measurement[snapshot]) / np.linalg.norm(measurement[snapshot])
+            assert difference < 0.05, f"snapshot {snapshot} does not fit its measurement: {difference}"
+        stack = result.download("stack.exr", snapshot=1)
+        assert stack.read_bytes()[:4] == bytes([0x76, 0x2F, 0x31, 0x01])
+        assert not list(stack.parent.glob("*.part"))
+        assert result.manifest["content"]["schedule"]
+        # What the service refuses is told in its words, and not tried again.
+        try:
+            client.reconstruct(masks * 3, measurement, "gap-tv")
+            raise AssertionError("masks above their full scale were accepted")
+        except ApiError as error:
+            assert error.code == "invalid_content" and "full_scale" in str(error), error
+        # Another process takes the job up by its identifier.
+        later = client.job(result.job.id).wait(timeout=10)
+        assert later.state == "succeeded" and [job.id for job in client.jobs()] == [later.id]
+        print(json.dumps({"job": later.id, "frames": list(frames.shape)}))
+
+
+main()
