@@ -2,7 +2,7 @@
 
 use std::io;
 
-use super::{Format, SampleType};
+use super::Format;
 
 /// What the functions of this folder give.
 pub type Result<T, E = FormatError> = std::result::Result<T, E>;
@@ -46,7 +46,7 @@ pub enum FormatError {
     #[error(
         "the samples are {0}, which has no full scale of its own: state full_scale, the stored number that means 1"
     )]
-    FullScaleNeeded(SampleType),
+    FullScaleNeeded(String),
     /// A full scale that is no finite positive number.
     #[error("full_scale must be a finite number above 0, not {0}")]
     FullScale(f32),

@@ -18,8 +18,8 @@ use hdf5_reader::{
 };
 use ndarray::Array2;
 
-use super::mat::{SceneArray, list};
 use super::samples::{self, ByteOrder};
+use super::scene::{SceneArray, list};
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::formats::error::Result;
 

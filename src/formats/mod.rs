@@ -15,6 +15,7 @@ mod hdf5;
 mod limits;
 mod open;
 mod samples;
+mod scene;
 mod stack;
 mod window;
 

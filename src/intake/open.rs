@@ -67,7 +67,7 @@ impl<'a> Source<'a> {
             (None, Some(own)) => Ok(own),
             // Of 0 and 1; a larger value is refused with the question for the scale.
             (None, None) if self.array == SceneArray::Masks => Ok(FullScale::ONE),
-            (None, None) => Err(FormatError::FullScaleNeeded(info.sample)),
+            (None, None) => Err(FormatError::FullScaleNeeded(info.sample.to_string())),
         };
         let full_scale = full_scale.map_err(IntakeError::format(&self.name))?;
         Ok(Opened { info, full_scale, reader, name: self.name.clone() })

@@ -21,41 +21,12 @@ use array::ArrayHeader;
 use element::{Content, Elements};
 
 use super::open::open;
+pub use super::scene::SceneArray;
+use super::scene::list;
 use super::{
-    Format, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo, collect, hdf5,
-    samples,
+    Format, FormatError, FrameReader, Limits, SampleType, StackInfo, collect, hdf5, samples,
 };
 use crate::formats::error::Result;
-
-/// An array of a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SceneArray {
-    /// `mask`, (row, column, mask), on `[0,1]`.
-    Masks,
-    /// `meas`, (row, column, snapshot), raw: 255 means 1.
-    Measurements,
-    /// `orig`, (row, column, frame), raw: 255 means 1.
-    Truth,
-}
-
-impl SceneArray {
-    /// The name of the array in the file.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Masks => "mask",
-            Self::Measurements => "meas",
-            Self::Truth => "orig",
-        }
-    }
-
-    /// What means 1.0 in this array unless stated, whatever its type.
-    pub fn default_full_scale(self) -> FullScale {
-        match self {
-            Self::Masks => FullScale::ONE,
-            Self::Measurements | Self::Truth => FullScale::EIGHT_BIT,
-        }
-    }
-}
 
 /// A whole scene in memory, axes (frame, row, column), values as stored.
 #[derive(Debug, Clone, PartialEq)]
@@ -126,17 +97,6 @@ pub fn read_scene_mat(path: &Path, limits: &Limits) -> Result<MatScene> {
             Err(error) => return Err(error),
         },
     })
-}
-
-/// Names for a message, bounded in number.
-pub(super) fn list(names: &[String]) -> String {
-    const SHOWN: usize = 20;
-    let quoted: Vec<String> = names.iter().take(SHOWN).map(|name| format!("'{name}'")).collect();
-    match (quoted.is_empty(), names.len().saturating_sub(SHOWN)) {
-        (true, _) => "no arrays".to_owned(),
-        (false, 0) => quoted.join(", "),
-        (false, more) => format!("{} and {more} more", quoted.join(", ")),
-    }
 }
 
 /// The frames of one array.
