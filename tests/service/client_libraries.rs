@@ -33,7 +33,7 @@ async fn python_makes_the_round_trip_over_connections_that_are_cut() {
         eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
         return;
     };
-    let app = TestApp::start().await;
+    let app = TestApp::with(&["--workers", "1"]).await;
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene { frames: 8, height: 384, width: 384, snapshots: 2 };
     std::fs::write(folder.path().join("masks.npy"), scene.masks()).unwrap();
@@ -53,5 +53,5 @@ async fn octave_makes_the_round_trip_over_connections_that_are_cut() {
         eprintln!("SKIPPED: there is no octave-cli");
         return;
     }
-    over_cuts(&TestApp::start().await, client).await;
+    over_cuts(&TestApp::with(&["--workers", "1"]).await, client).await;
 }
