@@ -36,15 +36,14 @@ async fn a_deep_job_runs_and_records_model_and_provider() {
 }
 
 #[tokio::test]
-async fn without_the_library_a_deep_job_fails_with_the_reason() {
+async fn without_the_library_a_deep_job_is_refused_with_the_reason() {
     let app = TestApp::with(&["--workers", "1", "--onnxruntime", "/nowhere/lib.so"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
-    let done = app.ended(&app.submit(&body).await).await;
-    assert_eq!(done["state"], "failed");
-    let error = done["error"].as_str().unwrap();
-    assert!(error.contains("lib.so") && !error.contains("/nowhere"), "{error}");
-    // The worker lives and does what it can.
+    let detail = app.post("/v1/jobs", &body).await.problem(422, "invalid_request");
+    assert!(detail.contains("lib.so") && !detail.contains("/nowhere"), "{detail}");
+    assert!(detail.contains("scripts/fetch") && detail.contains("gap-tv3d needs none"), "{detail}");
+    // What needs no network is done.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
 }

@@ -79,19 +79,6 @@ async fn a_measurement_without_light_fails_at_once_with_its_reason() {
     assert!(!error.contains("attempts"), "trying again is no use: {error}");
 }
 
-#[tokio::test]
-async fn a_missing_runtime_fails_the_job_with_its_reason() {
-    let library = ["--workers", "1", "--onnxruntime", "/nowhere/libonnxruntime.so"];
-    let app = TestApp::with(&library).await;
-    let (_, measurement) = app.scene(&Scene::SMALL).await;
-    let body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
-    let job = app.submit(&body).await;
-    let ended = app.ended(&job).await;
-    assert_eq!(ended["state"], "failed");
-    let error = ended["error"].as_str().unwrap();
-    assert!(error.contains("libonnxruntime") && error.contains("scripts/fetch"), "{error}");
-}
-
 /// The linter of Prometheus itself, where it is installed (Debian: `prometheus`).
 #[tokio::test]
 async fn figures_please_the_linter_of_prometheus() {

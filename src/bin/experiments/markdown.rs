@@ -15,6 +15,7 @@ pub struct Layout {
 /// Rows of one algorithm and one kind of runs at one scale and compression ratio, in the order of the
 /// clips; none for clips that are still to come.
 struct Group<'a> {
+    name: String,
     scale: usize,
     rows: Vec<Option<&'a Row>>,
 }
@@ -92,15 +93,22 @@ impl Layout {
                 }
             }
             for &algorithm in &self.algorithms {
+                let scale = rows[0].key.scale;
+                let before = groups.len();
                 for &run in &runs {
                     let of = |row: &&Row| row.key.algorithm == algorithm && row.key.run == run;
                     let row =
                         |clip: &String| rows.iter().filter(of).find(|row| row.key.clip == *clip);
-                    let (scale, found) =
-                        (rows[0].key.scale, self.clips.iter().map(row).collect::<Vec<_>>());
-                    if found.iter().any(Option::is_some) {
-                        groups.push(Group { scale, rows: found });
+                    let rows: Vec<Option<&Row>> = self.clips.iter().map(row).collect();
+                    if let Some(first) = rows.iter().flatten().next() {
+                        groups.push(Group { name: name(&first.key), scale, rows });
                     }
+                }
+                // One that fits nothing, or is still to come.
+                if groups.len() == before {
+                    let (name, rows) =
+                        (algorithm.into_str().to_owned(), vec![None; self.clips.len()]);
+                    groups.push(Group { name, scale, rows });
                 }
             }
         }
@@ -171,8 +179,7 @@ fn table_of(
 ) -> String {
     let head = ["Scale", "Algorithm"].map(String::from).into_iter().chain(columns).collect();
     let row = |group: &Group<'_>| {
-        let key = group.rows.iter().flatten().next().map(|row| name(&row.key));
-        let names = [format!("{0}x{0}", group.scale), key.unwrap_or_default()];
+        let names = [format!("{0}x{0}", group.scale), group.name.clone()];
         names.into_iter().chain(cells(group)).collect()
     };
     table(head, groups.iter().map(row))
