@@ -234,7 +234,7 @@ fn sha256(path: &Path) -> Result<Sha256> {
 struct Input<'a> {
     sources: Sources<'a>,
     masks: Scaled<Array3<f32>>,
-    /// [S,H,W].
+    /// \[S,H,W\].
     measurement: Scaled<Array3<f32>>,
     /// The index of the first of them in the file.
     first: usize,

@@ -1,5 +1,5 @@
 //! The community's benchmark scenes: files with the arrays `mask`, `meas`, `orig`, as MATLAB saves them
-//! (level 5; level 7.3 is HDF5, [`super::hdf5`]).
+//! (level 5; level 7.3 is HDF5, `hdf5.rs`).
 //!
 //! The frame axis is the last one in MATLAB and the first one here; rows and columns stay what they
 //! are. MATLAB stores columns one after another, so a frame is contiguous and is read alone.
