@@ -9,6 +9,7 @@ use clap::Args;
 use serde::Deserialize;
 
 use super::CliError;
+use super::wait::wait;
 use crate::cli::error::Result;
 
 /// The longest that an answer may take.
@@ -34,9 +35,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let text = fs::read_to_string(&path).map_err(|error| failed(&error))?;
     let announced: Announcement = serde_json::from_str(&text).map_err(|error| failed(&error))?;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
-    println!("{}", runtime.block_on(ask(announced.address))?);
+    println!("{}", wait(ask(announced.address))?);
     Ok(())
 }
 

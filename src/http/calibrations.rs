@@ -9,14 +9,14 @@ use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
+use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
 use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody, Renaming};
 use crate::formats::validate::MaskStatistics;
 use crate::intake::check_sizes;
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
 use crate::store::{
-    Calibration, Filter, Inserted, NewCalibration, Page, RequestKey, Span, Unready,
+    Calibration, Filter, Inserted, Made, NewCalibration, Page, RequestKey, Span, Unready,
 };
 
 /// The body of `POST /v1/calibrations`: masks, or the captures to make them of.
@@ -147,10 +147,8 @@ pub(super) async fn make(
     request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
-    match app.store.made_with(&access.lab, "calibration", key).await? {
-        Some(id) => Ok(Inserted::Before(id)),
-        None => insert(app, access, request, key).await,
-    }
+    let insert = insert(app, access, request, key);
+    once(app, &access.lab, (Made::Calibration, key), insert).await
 }
 
 /// Makes a calibration of masks, or has one made of captures.

@@ -8,13 +8,13 @@ use serde::{Deserialize, Serialize};
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
+use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
 use super::intake::{self, Prepared};
 use super::page::{ListQuery, PageBody, Renaming};
 use crate::formats::StackInfo;
 use crate::intake::Exposure;
 use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sequence, Sha256};
-use crate::store::{Inserted, Measurement, NewMeasurement, RequestKey};
+use crate::store::{Inserted, Made, Measurement, NewMeasurement, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -73,10 +73,8 @@ pub(super) async fn make(
     request: MeasurementRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<MeasurementId>> {
-    match app.store.made_with(&access.lab, "measurement", key).await? {
-        Some(id) => Ok(Inserted::Before(id)),
-        None => insert(app, access, request, key).await,
-    }
+    let insert = insert(app, access, request, key);
+    once(app, &access.lab, (Made::Measurement, key), insert).await
 }
 
 /// Checks a measurement and puts it on record.

@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
+use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
 use super::intake;
 use super::page::{ListQuery, PageBody, Renaming};
 use crate::job::{CalibrationId, Label, ModelId, Sha256};
-use crate::store::{Inserted, Model, NewModel, RequestKey};
+use crate::store::{Inserted, Made, Model, NewModel, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -41,10 +41,8 @@ async fn make(
     request: ModelRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<ModelId>> {
-    match app.store.made_with(&access.lab, "model", key).await? {
-        Some(id) => Ok(Inserted::Before(id)),
-        None => insert(app, access, request, key).await,
-    }
+    let insert = insert(app, access, request, key);
+    once(app, &access.lab, (Made::Model, key), insert).await
 }
 
 /// Checks a network and registers it.

@@ -288,11 +288,12 @@ mod tests {
         }
         let decibels = 10.0 * (sums[0] / sums[1]).log10();
         assert!(decibels.abs() < 0.3, "{decibels} dB between cut and whole");
-        // From frame to frame no step that the whole has not.
+        // From frame to frame no step that the whole has not. Frames 8 to 11 are blended of two runs.
         for k in 1..20 {
             let step = |frames: &[Array2<f32>]| error(&frames[k - 1], &frames[k]);
             let decibels = 10.0 * (step(&parts) / step(&whole)).log10();
-            assert!(decibels < 0.6, "from frame {k}: {decibels} dB");
+            let limit = if [8, 12].contains(&k) { 0.5 } else { 0.05 };
+            assert!(decibels < limit, "from frame {} to {k}: {decibels} dB", k - 1);
         }
     }
 

@@ -59,10 +59,10 @@ pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::NewJob;
 pub use tables::{
     Blob, BlobRow, Calibration, Entitlement, FIRST_RESERVE, FoundPartial, Inserted, Job,
-    JobChanges, JobFilter, LabRow, LabUse, Measurement, Model, NewCalibration, NewMeasurement,
-    NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey, TaskCounts, TaskRecord,
-    TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow,
-    WorkerTask,
+    JobChanges, JobFilter, LabRow, LabUse, Made, Measurement, Model, NewCalibration,
+    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey, TaskCounts,
+    TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace,
+    WorkerRow, WorkerTask,
 };
 
 /// The store: a handle that is cheap to clone.

@@ -9,7 +9,7 @@ use super::rows::{Reference, require, sql_as};
 use super::staging::StagedBlob;
 use super::tables::blobs::Origin;
 use super::tables::calibrations::{self, Asked, Calibration, NewCalibration};
-use super::tables::keys::{self, CALIBRATION, Inserted, MEASUREMENT, RequestKey};
+use super::tables::keys::{self, Inserted, Made, RequestKey};
 use super::tables::measurements::{self, Measurement, NewMeasurement};
 use super::tables::{jobs, quota};
 use crate::job::{
@@ -82,7 +82,7 @@ impl Store {
         };
         let (id, facts) = (calibration.id, &calibration.facts);
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, CALIBRATION, key).await? {
+        if let Some(before) = keys::found(&mut transaction, lab, Made::Calibration, key).await? {
             return Ok(Inserted::Before(before));
         }
         require(&mut transaction, &[Reference::Blob(facts.masks)]).await?;
@@ -92,7 +92,7 @@ impl Store {
         let asked = Asked { id, token, name: facts.name.as_ref(), captures: None, bytes: 0 };
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
         graph::insert_calibration(&mut transaction, lab, id).await?;
-        keys::insert(&mut transaction, lab, CALIBRATION, key, id).await?;
+        keys::insert(&mut transaction, lab, Made::Calibration, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
@@ -108,14 +108,14 @@ impl Store {
     ) -> Result<Inserted<CalibrationId>> {
         let id = CalibrationId::new();
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, CALIBRATION, key).await? {
+        if let Some(before) = keys::found(&mut transaction, lab, Made::Calibration, key).await? {
             return Ok(Inserted::Before(before));
         }
         quota::check(&mut transaction, lab, token, bytes).await?;
         let asked = Asked { id, token, name, captures: Some(captures), bytes };
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
         graph::insert_calibration(&mut transaction, lab, id).await?;
-        keys::insert(&mut transaction, lab, CALIBRATION, key, id).await?;
+        keys::insert(&mut transaction, lab, Made::Calibration, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
@@ -138,14 +138,14 @@ impl Store {
         let facts = &measurement.facts;
         let references = [Reference::Calibration(facts.calibration), Reference::Blob(facts.data)];
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, MEASUREMENT, key).await? {
+        if let Some(before) = keys::found(&mut transaction, lab, Made::Measurement, key).await? {
             return Ok(Inserted::Before(before));
         }
         require(&mut transaction, &references).await?;
         quota::check(&mut transaction, lab, token, prepared.size()).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         measurements::insert(&mut transaction, (lab, token), &measurement).await?;
-        keys::insert(&mut transaction, lab, MEASUREMENT, key, measurement.id).await?;
+        keys::insert(&mut transaction, lab, Made::Measurement, key, measurement.id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(measurement.id))
     }

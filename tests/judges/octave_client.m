@@ -1,5 +1,7 @@
-% A lab's round trip with clients/matlab: arrays to the service and the frames back. Run by tests/service/clients.rs
+% A lab's round trip with clients/matlab: arrays to the service and the frames back. Run by tests/service/client_libraries.rs
 % with SCI_RECON_URL and SCI_RECON_TOKEN; prints one JSON line.
+% A test that ends it leaves no dump of its variables.
+crash_dumps_octave_core(false); sigterm_dumps_octave_core(false); sighup_dumps_octave_core(false);
 addpath('clients/matlab');
 [column, row, frame] = meshgrid(1:160, 1:144, 1:8);
 video = single(0.5 * column / 160 + 0.4 * (abs(row - 40 - 2 * frame) < 12 & abs(column - 60 - 3 * frame) < 12));

@@ -18,7 +18,7 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, request_key};
 use super::page::{Limit, PageBody};
 use crate::job::{Lab, PartialId, Sha256, Timestamp};
-use crate::store::{FIRST_RESERVE, FoundPartial, Inserted, NewPartial, Partial, PartialFile};
+use crate::store::{FIRST_RESERVE, FoundPartial, Inserted, Made, NewPartial, Partial, PartialFile};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -102,7 +102,7 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
     let metadata = text(&headers, &METADATA)?.unwrap_or_default();
     let expected = expected(metadata).map_err(malformed)?;
     let key = request_key(&headers, &(length, metadata))?;
-    if let Some(id) = app.store.made_with(&access.lab, "upload", key.as_ref()).await? {
+    if let Some(id) = app.store.made_with(&access.lab, Made::Upload, key.as_ref()).await? {
         return begun(&app, &access.lab, Inserted::Before(id)).await;
     }
     app.admission.check_length(&access, length).await?;

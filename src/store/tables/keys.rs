@@ -4,17 +4,22 @@ use std::fmt::Display;
 use std::str::FromStr;
 
 use sqlx::SqliteConnection;
+use strum::IntoStaticStr;
 
 use crate::job::{InvalidId, JobId, Lab, Sha256};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_as};
 
-/// What keys make, as the column `what` has it.
-pub const CALIBRATION: &str = "calibration";
-pub const MEASUREMENT: &str = "measurement";
-pub const MODEL: &str = "model";
-pub const UPLOAD: &str = "upload";
+/// What a key makes; by these names in the column `what`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+#[strum(serialize_all = "lowercase", const_into_str)]
+pub enum Made {
+    Calibration,
+    Measurement,
+    Model,
+    Upload,
+}
 
 /// A user's key against making a thing twice, and the hash of the request that came with it.
 #[derive(Debug, Clone)]
@@ -45,7 +50,7 @@ impl Store {
     pub async fn made_with<Id>(
         &self,
         lab: &Lab,
-        what: &'static str,
+        what: Made,
         key: Option<&RequestKey>,
     ) -> Result<Option<Id>>
     where
@@ -60,7 +65,7 @@ impl Store {
 pub async fn found<Id>(
     connection: &mut SqliteConnection,
     lab: &Lab,
-    what: &'static str,
+    what: Made,
     key: Option<&RequestKey>,
 ) -> Result<Option<Id>>
 where
@@ -69,13 +74,13 @@ where
     let Some(RequestKey { key, request }) = key else { return Ok(None) };
     let row: Option<(String, Sha256)> = sql_as!(
         "SELECT id, request FROM request_keys WHERE lab = ? AND what = ? AND key = ?",
-        [lab, what, key]
+        [lab, what.into_str(), key]
     )
     .fetch_optional(connection)
     .await?;
     let Some((id, asked)) = row else { return Ok(None) };
     if asked != *request {
-        return Err(StoreError::KeyReused { key: key.clone(), what, id });
+        return Err(StoreError::KeyReused { key: key.clone(), what: what.into_str(), id });
     }
     match id.parse() {
         Ok(id) => Ok(Some(id)),
@@ -87,14 +92,14 @@ where
 pub async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
-    what: &'static str,
+    what: Made,
     key: Option<&RequestKey>,
     id: impl Display,
 ) -> Result<()> {
     let Some(RequestKey { key, request }) = key else { return Ok(()) };
     sql!(
         "INSERT INTO request_keys (lab, what, key, request, id) VALUES (?, ?, ?, ?, ?)",
-        [lab, what, key, request, id.to_string()]
+        [lab, what.into_str(), key, request, id.to_string()]
     )
     .execute(connection)
     .await?;

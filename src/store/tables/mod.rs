@@ -19,7 +19,7 @@ pub(super) mod workers;
 pub use blobs::{Blob, BlobRow, Origin};
 pub use calibrations::{Calibration, NewCalibration, Unready};
 pub use jobs::{Job, JobChanges, JobFilter};
-pub use keys::{Inserted, RequestKey};
+pub use keys::{Inserted, Made, RequestKey};
 pub use labs::{Entitlement, LabRow, LabUse};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};

@@ -8,7 +8,7 @@ use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha25
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Filter, Page, Reference, refuse_if_used, require, sql, sql_as};
-use crate::store::tables::keys::{self, Inserted, MODEL, RequestKey};
+use crate::store::tables::keys::{self, Inserted, Made, RequestKey};
 
 /// What is known of an end-to-end network when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
@@ -49,7 +49,7 @@ impl Store {
         let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
         let NewModel { name, calibration, file, facts } = &model.content;
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, MODEL, key).await? {
+        if let Some(before) = keys::found(&mut transaction, lab, Made::Model, key).await? {
             return Ok(Inserted::Before(before));
         }
         let references = [Reference::Calibration(*calibration), Reference::Blob(*file)];
@@ -61,7 +61,7 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
-        keys::insert(&mut transaction, lab, MODEL, key, model.id).await?;
+        keys::insert(&mut transaction, lab, Made::Model, key, model.id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(model.id))
     }

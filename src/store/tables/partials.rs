@@ -11,7 +11,7 @@ use sqlx::FromRow;
 use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
-use crate::store::tables::keys::{self, Inserted, RequestKey, UPLOAD};
+use crate::store::tables::keys::{self, Inserted, Made, RequestKey};
 use crate::store::tables::quota;
 use crate::store::{Store, dir, on_files};
 
@@ -165,7 +165,7 @@ impl Store {
         key: Option<&RequestKey>,
     ) -> Result<Inserted<PartialId>> {
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, &facts.lab, UPLOAD, key).await? {
+        if let Some(before) = keys::found(&mut transaction, &facts.lab, Made::Upload, key).await? {
             return Ok(Inserted::Before(before));
         }
         quota::check_partials(&mut transaction, &facts.lab).await?;
@@ -185,7 +185,7 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
-        keys::insert(&mut transaction, &facts.lab, UPLOAD, key, id).await?;
+        keys::insert(&mut transaction, &facts.lab, Made::Upload, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }

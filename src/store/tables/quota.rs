@@ -1,7 +1,7 @@
 //! What labs and tokens keep here, and how much they may. Asked again in the transaction in which something is
 //! added, so that of many requests at once no two get the last room.
 
-use sqlx::SqliteConnection;
+use sqlx::{AssertSqlSafe, SqliteConnection};
 
 use crate::job::{Lab, TokenId};
 use crate::store::Store;
@@ -57,40 +57,36 @@ fn within(whose: &'static str, kept: u64, needed: u64, limit: u64) -> Result<()>
     Err(StoreError::Quota { whose, kept, needed, limit })
 }
 
-/// Bytes of uploads that a token keeps here or has begun, and of arrays that were prepared for it.
-pub async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Result<u64> {
-    let bytes = sql_scalar!(
-        "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                 WHERE token = ?1)
-              + (SELECT coalesce(sum(length), 0) FROM partials WHERE token = ?1 AND result IS NULL)
-              + (SELECT coalesce(sum(size), 0) FROM blobs
-                 WHERE sha256 IN (SELECT prepared FROM calibrations WHERE token = ?1
-                                  UNION SELECT prepared FROM measurements WHERE token = ?1))
-              + (SELECT coalesce(sum(prepared_bytes), 0) FROM calibration_requests AS asked
-                 WHERE token = ?1
-                   AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = asked.calibration))",
-        [token]
-    );
-    Ok(bytes.fetch_one(connection).await?)
+/// The sum of what an owner, ?1, keeps here of uploads, whole and begun, and of arrays that were prepared.
+/// `owner` is the column that names it: `lab` or `token`.
+fn files_of(owner: &str) -> String {
+    format!(
+        "(SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
+          WHERE {owner} = ?1)
+         + (SELECT coalesce(sum(length), 0) FROM partials WHERE {owner} = ?1 AND result IS NULL)
+         + (SELECT coalesce(sum(size), 0) FROM blobs
+            WHERE sha256 IN (SELECT prepared FROM calibrations WHERE {owner} = ?1
+                             UNION SELECT prepared FROM measurements WHERE {owner} = ?1))
+         + (SELECT coalesce(sum(prepared_bytes), 0) FROM calibration_requests AS asked
+            WHERE {owner} = ?1
+              AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = asked.calibration))"
+    )
+}
+
+async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Result<u64> {
+    let text = format!("SELECT {}", files_of("token"));
+    Ok(sql_scalar!(AssertSqlSafe(text), [token]).fetch_one(connection).await?)
 }
 
 async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> {
-    let bytes = sql_scalar!(
-        "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                 WHERE lab = ?1)
-              + (SELECT coalesce(sum(length), 0) FROM partials WHERE lab = ?1 AND result IS NULL)
-              + (SELECT coalesce(sum(size), 0) FROM blobs
-                 WHERE sha256 IN (SELECT prepared FROM calibrations WHERE lab = ?1
-                                  UNION SELECT prepared FROM measurements WHERE lab = ?1))
-              + (SELECT coalesce(sum(prepared_bytes), 0) FROM calibration_requests AS asked
-                 WHERE lab = ?1
-                   AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = asked.calibration))
+    let text = format!(
+        "SELECT {}
               + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes,
                      (SELECT coalesce(sum(size), 0) FROM result_files WHERE job = jobs.id))), 0)
                  FROM jobs WHERE lab = ?1)",
-        [lab]
+        files_of("lab")
     );
-    Ok(bytes.fetch_one(connection).await?)
+    Ok(sql_scalar!(AssertSqlSafe(text), [lab]).fetch_one(connection).await?)
 }
 
 /// Refuses a job if enough wait and run. A lab has its own limit, if one was set. When all places are taken,

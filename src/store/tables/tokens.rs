@@ -6,7 +6,6 @@ use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql, sql_as};
-use crate::store::tables::quota;
 
 /// A token on record, without the secret.
 #[derive(Debug, Clone, PartialEq, Eq, FromRow)]
@@ -62,7 +61,7 @@ impl Store {
             sqlx::query_as("SELECT * FROM tokens ORDER BY id").fetch_all(&self.readers).await?;
         let mut listed = Vec::with_capacity(tokens.len());
         for token in tokens {
-            let bytes = quota::token_bytes(&mut *self.readers.acquire().await?, token.id).await?;
+            let bytes = self.token_bytes(token.id).await?;
             listed.push((token, bytes));
         }
         Ok(listed)
