@@ -12,7 +12,11 @@ use std::path::{Path, PathBuf};
 
 use syn::visit::Visit;
 
-/// Each folder of `src/`, and the others that it may know.
+/// The sources of both crates. The service hands on the core's modules, so that `crate::recon` is one
+/// path in either.
+const SOURCES: [&str; 2] = ["src", "core/src"];
+
+/// Each folder of the sources, and the others that it may know.
 const LAYERS: &[(&str, &[&str])] = &[
     ("formats", &[]),
     ("optics", &["formats"]),
@@ -28,8 +32,8 @@ const LAYERS: &[(&str, &[&str])] = &[
 
 /// Crates and modules that only these files and folders may name.
 const OWNERS: &[(&str, &[&str])] = &[
-    ("ort", &["src/recon/prior/onnx.rs"]),
-    ("sqlx", &["src/store/"]),
+    ("ort", &["core/src/recon/prior/onnx.rs"]),
+    ("sqlx", &["src/store/", "core/src/job/columns.rs"]),
     ("axum", &["src/http/", "src/cli/serve.rs"]),
     ("tokio", &["src/http/", "src/store/", "src/worker/", "src/cluster/", "src/cli/"]),
     ("async_nats", &["src/cluster/"]),
@@ -39,12 +43,16 @@ const OWNERS: &[(&str, &[&str])] = &[
 
 /// Folders that know arrays and no files.
 const WITHOUT_FILES: (&[&str], &[&str], &[&str]) =
-    (&["src/recon/", "src/optics/"], &["std::fs", "std::path"], &["src/recon/prior/onnx.rs"]);
+    (
+    &["core/src/recon/", "core/src/optics/"],
+    &["std::fs", "std::path"],
+    &["core/src/recon/prior/onnx.rs"],
+);
 
 /// A module's path from the crate's root.
 type Module = Vec<String>;
 
-/// What a file under `src/` says of itself and of others.
+/// What a file of the sources says of itself and of others.
 #[derive(Default)]
 struct File {
     place: String,
@@ -194,15 +202,19 @@ fn read(text: &str, module: Module, place: &str, is_folder: bool) -> File {
 /// All files of the library; those that hold nothing but tests are left out.
 fn read_all() -> BTreeMap<Module, File> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut paths = Vec::new();
-    sources(&root.join("src"), &mut paths);
     let mut files = BTreeMap::new();
-    for path in paths {
-        let within = path.strip_prefix(root.join("src")).unwrap().with_extension("");
+    let paths = SOURCES.into_iter().flat_map(|folder| {
+        let mut paths = Vec::new();
+        sources(&root.join(folder), &mut paths);
+        paths.into_iter().map(move |path| (folder, path))
+    });
+    for (folder, path) in paths {
+        let within = path.strip_prefix(root.join(folder)).unwrap().with_extension("");
         let mut module: Module =
             within.iter().map(|word| word.to_string_lossy().into_owned()).collect();
         let tests = |word: &String| word == "tests" || word == "test_support";
-        if module[0] == "main" || module[0] == "bin" || module.iter().any(tests) {
+        let of_core = folder != "src";
+        if (of_core && module[0] == "lib") || module[0] == "main" || module[0] == "bin" || module.iter().any(tests) {
             continue;
         }
         let listing = module.last().is_some_and(|name| name == "mod" || name == "lib");

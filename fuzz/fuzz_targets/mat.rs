@@ -2,7 +2,7 @@
 
 mod file;
 
-use sci_recon::formats::mat::{SceneArray, open_array};
+use sci_recon_core::formats::mat::{SceneArray, open_array};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     file::with_file(bytes, |path| {

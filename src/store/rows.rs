@@ -1,17 +1,12 @@
-//! Statements, how types lie in columns, pages, and what rows refer to.
+//! Statements, pages, and what rows refer to.
 
 use serde::de::DeserializeOwned;
-use sqlx::encode::IsNull;
-use sqlx::error::BoxDynError;
-use sqlx::sqlite::{Sqlite, SqliteArgumentsBuffer, SqliteRow, SqliteTypeInfo, SqliteValueRef};
+use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
-use sqlx::{Decode, Encode, Row, SqliteConnection, Type};
+use sqlx::{Row, SqliteConnection};
 
 use super::error::{Result, StoreError};
-use crate::job::{
-    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sequence,
-    Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
-};
+use crate::job::{CalibrationId, MeasurementId, ModelId, Sha256, Timestamp};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -71,57 +66,6 @@ macro_rules! sql_scalar {
 }
 
 pub(super) use {sql, sql_as, sql_scalar};
-
-/// How a type lies in a column: as another one, and how it becomes that one and is read of it.
-macro_rules! column {
-    ($($type:ty),* as $other:ty, $write:expr, $read:expr) => {$(
-        impl Type<Sqlite> for $type {
-            fn type_info() -> SqliteTypeInfo {
-                <$other as Type<Sqlite>>::type_info()
-            }
-
-            fn compatible(found: &SqliteTypeInfo) -> bool {
-                <$other as Type<Sqlite>>::compatible(found)
-            }
-        }
-
-        impl Encode<'_, Sqlite> for $type {
-            fn encode_by_ref(&self, to: &mut SqliteArgumentsBuffer) -> Result<IsNull, BoxDynError> {
-                let write: fn(&Self) -> $other = $write;
-                write(self).encode(to)
-            }
-        }
-
-        impl Decode<'_, Sqlite> for $type {
-            fn decode(value: SqliteValueRef<'_>) -> Result<Self, BoxDynError> {
-                let read: fn($other) -> Result<Self, BoxDynError> = $read;
-                read(Decode::<Sqlite>::decode(value)?)
-            }
-        }
-    )*};
-}
-
-column!(Timestamp as i64, |time| time.0, |millis| Ok(Timestamp(millis)));
-column!(
-    Sha256,
-    Lab,
-    Label,
-    Role,
-    CalibrationId,
-    MeasurementId,
-    ModelId,
-    JobId,
-    TaskId,
-    PartialId,
-    TokenId,
-    WorkerId,
-    JobState,
-    TaskState,
-    TaskStage,
-    Sequence as String,
-    ToString::to_string,
-    |text| Ok(text.parse()?)
-);
 
 /// The column as a length.
 pub(super) fn number(row: &SqliteRow, column: &'static str) -> Result<usize> {

@@ -126,7 +126,7 @@ fn nonlocal_stage(iterations: usize, first: f32, last: f32) -> Stage {
 #[cfg(test)]
 impl Schedule {
     /// All of them.
-    pub(crate) fn defaults() -> [Self; 7] {
+    pub fn defaults() -> [Self; 7] {
         [
             Self::gap_tv(),
             Self::gap_tv3d(),

@@ -238,7 +238,7 @@ proptest! {
 fn shared(name: &str) -> Option<PathBuf> {
     let root = match std::env::var_os("SCI_RECON_SHARED") {
         Some(root) => PathBuf::from(root),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
+        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"),
     };
     let path = root.join(name);
     if path.exists() {

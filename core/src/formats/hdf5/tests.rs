@@ -11,7 +11,7 @@ use crate::formats::{
 
 /// A file that another program has written; `make.py` beside it says how.
 fn sample(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/formats").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/formats").join(name)
 }
 
 fn read(name: &str, array: SceneArray) -> Result<(StackInfo, Array3<f32>), FormatError> {

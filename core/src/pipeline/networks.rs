@@ -37,22 +37,22 @@ pub const fn carried(network: Network) -> Model {
 const FASTDVDNET_GRAY: Model = Model {
     name: "fastdvdnet-gray",
     files: &[
-        ("stage1.onnx", include_bytes!("../../models/fastdvdnet-gray/stage1.onnx")),
-        ("stage2.onnx", include_bytes!("../../models/fastdvdnet-gray/stage2.onnx")),
+        ("stage1.onnx", include_bytes!("../../../models/fastdvdnet-gray/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../../../models/fastdvdnet-gray/stage2.onnx")),
     ],
 };
 
 const FASTDVDNET_GRAY_INT8: Model = Model {
     name: "fastdvdnet-gray-int8",
     files: &[
-        ("stage1.onnx", include_bytes!("../../models/fastdvdnet-gray-int8/stage1.onnx")),
-        ("stage2.onnx", include_bytes!("../../models/fastdvdnet-gray-int8/stage2.onnx")),
+        ("stage1.onnx", include_bytes!("../../../models/fastdvdnet-gray-int8/stage1.onnx")),
+        ("stage2.onnx", include_bytes!("../../../models/fastdvdnet-gray-int8/stage2.onnx")),
     ],
 };
 
 const FFDNET_GRAY: Model = Model {
     name: "ffdnet-gray",
-    files: &[("model.onnx", include_bytes!("../../models/ffdnet-gray/model.onnx"))],
+    files: &[("model.onnx", include_bytes!("../../../models/ffdnet-gray/model.onnx"))],
 };
 
 /// A network, as it stands in manifests.
@@ -383,7 +383,7 @@ mod tests {
 
         let file = folder.path().join("ffdnet-gray/model.onnx");
         std::fs::create_dir(file.parent().unwrap()).unwrap();
-        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/models/ffdnet-gray/model.onnx");
+        let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/ffdnet-gray/model.onnx");
         let mut content = std::fs::read(shipped).unwrap();
         std::fs::write(&file, &content).unwrap();
         assert_eq!(own.records(&schedule).unwrap(), carried.records(&schedule).unwrap());

@@ -3,6 +3,8 @@
 mod access;
 mod algorithm;
 mod captures;
+#[cfg(feature = "sqlite")]
+mod columns;
 mod ids;
 mod memory;
 mod model;

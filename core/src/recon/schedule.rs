@@ -453,14 +453,14 @@ mod tests {
     }
 
     fn text(path: &str) -> String {
-        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)).unwrap()
     }
 
     #[test]
     fn the_published_schema_is_that_of_the_type() {
         let schema = format!("{:#}\n", schemars::schema_for!(Schedule).to_value());
         if std::env::var_os("SCI_RECON_WRITE_SCHEMA").is_some() {
-            std::fs::write("docs/schedule.schema.json", &schema).unwrap();
+            std::fs::write("../docs/schedule.schema.json", &schema).unwrap();
         }
         assert!(
             text("docs/schedule.schema.json") == schema,

@@ -115,7 +115,7 @@ impl FormatError {
     }
 
     /// For `map_err` on I/O: `.map_err(FormatError::io("read the frame"))`.
-    pub(crate) fn io(action: &'static str) -> impl FnOnce(io::Error) -> Self {
+    pub fn io(action: &'static str) -> impl FnOnce(io::Error) -> Self {
         move |source| Self::Io { action, source }
     }
 }

@@ -3,21 +3,21 @@
 //! The command line and the workers share these steps, so that a job gives the same frames
 //! whichever way it came. They know arrays and files, not the store or the queue.
 
-pub(crate) mod arrays;
+pub mod arrays;
 pub mod blend;
-pub(crate) mod error;
-pub(crate) mod manifest;
+pub mod error;
+pub mod manifest;
 pub mod networks;
-pub(crate) mod pilot;
-pub(crate) mod preview;
-pub(crate) mod progress;
+pub mod pilot;
+pub mod preview;
+pub mod progress;
 pub mod quality;
 pub mod records;
 pub mod scale;
 pub mod sequence;
-pub(crate) mod tile;
+pub mod tile;
 pub mod usage;
-pub(crate) mod write;
+pub mod write;
 
 pub use error::PipelineError;
 pub use networks::NetworkSource;

@@ -14,14 +14,14 @@ use crate::optics::{measure, random_squares};
 
 /// The first frames of `demo/clip` (its README says where they come from), one snapshot's worth.
 const FRAMES: [&[u8]; 8] = [
-    include_bytes!("../../demo/clip/frame_0001.png"),
-    include_bytes!("../../demo/clip/frame_0002.png"),
-    include_bytes!("../../demo/clip/frame_0003.png"),
-    include_bytes!("../../demo/clip/frame_0004.png"),
-    include_bytes!("../../demo/clip/frame_0005.png"),
-    include_bytes!("../../demo/clip/frame_0006.png"),
-    include_bytes!("../../demo/clip/frame_0007.png"),
-    include_bytes!("../../demo/clip/frame_0008.png"),
+    include_bytes!("../../../demo/clip/frame_0001.png"),
+    include_bytes!("../../../demo/clip/frame_0002.png"),
+    include_bytes!("../../../demo/clip/frame_0003.png"),
+    include_bytes!("../../../demo/clip/frame_0004.png"),
+    include_bytes!("../../../demo/clip/frame_0005.png"),
+    include_bytes!("../../../demo/clip/frame_0006.png"),
+    include_bytes!("../../../demo/clip/frame_0007.png"),
+    include_bytes!("../../../demo/clip/frame_0008.png"),
 ];
 
 const SEED: u64 = 1;
