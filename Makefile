@@ -13,8 +13,10 @@ TRAINING := $(VENV)/training
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
 
+# Most tests wait for services and clocks.
+TEST_THREADS ?= $(shell expr 2 \* $$(nproc))
 test: runtime judges $(TRAINING)/.stamp ## all tests
-	SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test
+	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test
 	$(TRAINING)/bin/python training/test_pipeline.py
 
 deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them

@@ -276,7 +276,7 @@ def ways(program, a, frames, folder):
 # ---------------------------------------------------------------- rows
 def source_hash():
     """Of the code that a row depends on."""
-    files = sorted(f for part in ('recon', 'optics') for f in glob.glob(os.path.join(HERE, '../src', part, '**/*.rs'), recursive=True))
+    files = sorted(f for part in ('recon', 'optics') for f in glob.glob(os.path.join(HERE, '../core/src', part, '**/*.rs'), recursive=True))
     digest = hashlib.sha256()
     for f in files:
         with open(f, 'rb') as content:

@@ -28,7 +28,7 @@ use super::message::{
 };
 use super::names;
 use crate::formats::FormatError;
-use crate::job::{Pool, Sha256, TaskProgress, WorkerId};
+use crate::job::{Pool, Sha256, TaskId, TaskProgress, WorkerId};
 use crate::pipeline::PipelineError;
 use crate::pipeline::networks::ModelFile;
 use crate::pipeline::tile::TileInput;
@@ -282,20 +282,18 @@ impl Remote {
         self.note_hand(None);
     }
 
-    /// Notes what is in hand, for the process after this one.
-    fn note_hand(&self, held: Option<&Held>) {
+    /// Notes what is in hand, a task's attempt and its message, for the process after this one.
+    fn note_hand(&self, held: Option<(TaskId, u32, &Message)>) {
         let Some(path) = &self.0.hand else { return };
         let noted = match held {
             None => match std::fs::remove_file(path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
                 _ => Ok(()),
             },
-            Some(held) => {
+            Some((task, attempt, message)) => {
                 let end = End::Died { how: String::new(), fault: false };
-                let (task, worker) = (held.task.task, self.0.hello.worker);
-                let event = Event { task, attempt: held.attempt, worker, end };
-                let acknowledge =
-                    held.message.reply.as_ref().map_or("", |to| to.as_str()).to_owned();
+                let event = Event { task, attempt, worker: self.0.hello.worker, end };
+                let acknowledge = message.reply.as_ref().map_or("", |to| to.as_str()).to_owned();
                 let text = serde_json::to_vec(&Hand { event, acknowledge });
                 text.map_err(io::Error::other).and_then(|text| std::fs::write(path, text))
             }
@@ -306,7 +304,7 @@ impl Remote {
     }
 
     fn hold(&self, held: Option<Arc<Held>>) {
-        self.note_hand(held.as_deref());
+        self.note_hand(held.as_ref().map(|held| (held.task.task, held.attempt, &held.message)));
         let mut place = lock(&self.0.held);
         if place.0.is_some() || held.is_some() {
             *place = (held, Instant::now());
@@ -349,10 +347,16 @@ impl Remote {
         };
         let worker = self.0.hello.worker;
         let begin = Begin { task: task.task, attempt: task.attempt, seq, delivery, worker };
+        // Before the hub counts on this process: nobody else would know that it died with the message.
+        self.note_hand(Some((task.task, task.attempt, &message)));
         let attempt = match self.ask(&begin).await {
             Some(BeginAnswer::Go(attempt)) => attempt,
-            Some(BeginAnswer::Lost) => return Ok(None),
+            Some(BeginAnswer::Lost) => {
+                self.note_hand(None);
+                return Ok(None);
+            }
             Some(BeginAnswer::Over) => {
+                self.note_hand(None);
                 message.double_ack().await?;
                 return Ok(None);
             }

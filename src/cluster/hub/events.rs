@@ -138,6 +138,10 @@ impl Core {
                 tracing::warn!(%task, attempt, %worker, reason, "a tile has failed");
                 self.store.fail(&lease, &reason, retry).await?;
             }
+            End::Died { .. } if remote.delivery > 0 && remote.worker != worker => {
+                tracing::info!(%task, attempt, %worker, "a worker has died before its tile was its own");
+                return Ok(());
+            }
             End::Died { how, fault } => {
                 tracing::warn!(%task, attempt, %worker, how, "a worker has died in a tile");
                 self.store.remote_died(&remote, &how, fault).await?;

@@ -1,4 +1,7 @@
 //! The filter of groups of patches.
+//!
+//! Its loops are loops, not closures handed to iterators: such a closure is a function without the vector
+//! instructions, a call for each of them unless the compiler happens to inline it (ten times slower without).
 
 #![allow(clippy::needless_range_loop)] // the indices of the algebra
 
@@ -39,8 +42,16 @@ impl Default for Filter {
 #[inline(always)]
 pub(super) fn multiply<S: Simd>(simd: S, filter: &mut Filter) {
     match S::F32_LANES {
-        16 => parts::<S, 4>(simd, filter).for_each(|mut part| part.multiply()),
-        _ => parts::<S, 2>(simd, filter).for_each(|mut part| part.multiply()),
+        16 => {
+            for mut part in parts::<S, 4>(simd, filter) {
+                part.multiply();
+            }
+        }
+        _ => {
+            for mut part in parts::<S, 2>(simd, filter) {
+                part.multiply();
+            }
+        }
     }
 }
 
@@ -48,8 +59,16 @@ pub(super) fn multiply<S: Simd>(simd: S, filter: &mut Filter) {
 #[inline(always)]
 pub(super) fn factorize<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
     match S::F32_LANES {
-        16 => parts::<S, 4>(simd, filter).for_each(|mut part| part.factorize(tau)),
-        _ => parts::<S, 2>(simd, filter).for_each(|mut part| part.factorize(tau)),
+        16 => {
+            for mut part in parts::<S, 4>(simd, filter) {
+                part.factorize(tau);
+            }
+        }
+        _ => {
+            for mut part in parts::<S, 2>(simd, filter) {
+                part.factorize(tau);
+            }
+        }
     }
 }
 
@@ -57,8 +76,16 @@ pub(super) fn factorize<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
 #[inline(always)]
 pub(super) fn solve<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
     match S::F32_LANES {
-        16 => parts::<S, 4>(simd, filter).for_each(|mut part| part.solve(tau)),
-        _ => parts::<S, 2>(simd, filter).for_each(|mut part| part.solve(tau)),
+        16 => {
+            for mut part in parts::<S, 4>(simd, filter) {
+                part.solve(tau);
+            }
+        }
+        _ => {
+            for mut part in parts::<S, 2>(simd, filter) {
+                part.solve(tau);
+            }
+        }
     }
 }
 
@@ -98,7 +125,9 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
     fn square(&self, tau: f32) -> S::f32s {
         let simd = self.simd;
         let mut trace = simd.splat_f32s(0.0);
-        (0..PIXELS).for_each(|i| trace = simd.add_f32s(trace, self.gram[i * PIXELS + i]));
+        for i in 0..PIXELS {
+            trace = simd.add_f32s(trace, self.gram[i * PIXELS + i]);
+        }
         let least = simd.mul_f32s(simd.splat_f32s(4e-6), simd.mul_f32s(trace, trace));
         simd.max_f32s(simd.splat_f32s(tau * tau), least)
     }
@@ -111,10 +140,13 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
         let rows = self.patches.chunks_exact(PATCHES).zip(self.solved.chunks_exact_mut(PATCHES));
         for (row, centred) in rows {
             let mut sum = simd.splat_f32s(0.0);
-            row.iter().for_each(|&value| sum = simd.add_f32s(sum, value));
+            for &value in row {
+                sum = simd.add_f32s(sum, value);
+            }
             let mean = simd.mul_f32s(sum, share);
-            let pairs = centred.iter_mut().zip(row);
-            pairs.for_each(|(centred, &value)| *centred = simd.sub_f32s(value, mean));
+            for (centred, &value) in centred.iter_mut().zip(row) {
+                *centred = simd.sub_f32s(value, mean);
+            }
         }
     }
 
@@ -152,8 +184,9 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
                     store(&tile, self.factor, PIXELS, (i, column));
                 }
                 for row in i..i + ROWS {
-                    (j..(j + ROWS).min(row + 1))
-                        .for_each(|column| self.finish(row, column, j, square));
+                    for column in j..(j + ROWS).min(row + 1) {
+                        self.finish(row, column, j, square);
+                    }
                 }
             }
         }
@@ -183,8 +216,12 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
     fn solve(&mut self, tau: f32) {
         let square = self.square(tau);
         for column in (0..PATCHES).step_by(C) {
-            (0..PIXELS).step_by(ROWS).for_each(|row| self.forward(row, column));
-            (0..PIXELS).step_by(ROWS).rev().for_each(|row| self.backward(row, column, square));
+            for row in (0..PIXELS).step_by(ROWS) {
+                self.forward(row, column);
+            }
+            for row in (0..PIXELS).step_by(ROWS).rev() {
+                self.backward(row, column, square);
+            }
         }
     }
 
