@@ -151,7 +151,7 @@ deny: ## licences, bans and sources of all crates; needs cargo install cargo-den
 	$(CARGO) deny check licenses bans sources
 
 fmt:
-	$(CARGO) fmt --check
+	$(CARGO) fmt --all --check
 
 lint:
 	$(CARGO) clippy --all-targets -- -D warnings

@@ -42,8 +42,7 @@ const OWNERS: &[(&str, &[&str])] = &[
 ];
 
 /// Folders that know arrays and no files.
-const WITHOUT_FILES: (&[&str], &[&str], &[&str]) =
-    (
+const WITHOUT_FILES: (&[&str], &[&str], &[&str]) = (
     &["core/src/recon/", "core/src/optics/"],
     &["std::fs", "std::path"],
     &["core/src/recon/prior/onnx.rs"],
@@ -214,7 +213,11 @@ fn read_all() -> BTreeMap<Module, File> {
             within.iter().map(|word| word.to_string_lossy().into_owned()).collect();
         let tests = |word: &String| word == "tests" || word == "test_support";
         let of_core = folder != "src";
-        if (of_core && module[0] == "lib") || module[0] == "main" || module[0] == "bin" || module.iter().any(tests) {
+        if (of_core && module[0] == "lib")
+            || module[0] == "main"
+            || module[0] == "bin"
+            || module.iter().any(tests)
+        {
             continue;
         }
         let listing = module.last().is_some_and(|name| name == "mod" || name == "lib");
