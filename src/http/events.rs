@@ -6,7 +6,7 @@
 use std::collections::{HashMap, HashSet};
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::extract::State;
 use axum::http::HeaderName;
@@ -24,8 +24,10 @@ use super::shares::{Place, Places};
 use crate::job::{JobId, Lab, TokenId};
 use crate::store::{JobMark, Store};
 
-/// Time between two looks.
+/// The longest time between two looks at all jobs.
 const LOOK: Duration = Duration::from_secs(1);
+/// The shortest. Where looking takes long, a fifth of the time is spent on it at most.
+const SPACING: Duration = Duration::from_millis(40);
 /// Time between two looks at whether a listener may still listen.
 const TOKEN_LOOK: Duration = Duration::from_secs(3);
 /// Listeners at the same time: each holds a connection.
@@ -147,10 +149,19 @@ impl Drop for Waiter {
 
 async fn look(store: Store, sender: broadcast::Sender<Changes>) {
     let mut before: Option<Versions> = None;
-    let mut tick = tokio::time::interval(LOOK);
-    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut watcher = store.watcher().await.ok();
     loop {
-        tick.tick().await;
+        let change = async {
+            match &mut watcher {
+                Some(watcher) => watcher.changed(LOOK).await.is_ok(),
+                None => false,
+            }
+        };
+        if !change.await {
+            watcher = store.watcher().await.ok();
+            tokio::time::sleep(LOOK).await;
+        }
+        let start = Instant::now();
         if sender.receiver_count() == 0 {
             before = None;
             continue;
@@ -167,6 +178,7 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             let _ = sender.send(changes.into());
         }
         before = Some(now);
+        tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;
     }
 }
 

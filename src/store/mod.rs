@@ -31,6 +31,7 @@ mod tables;
 #[cfg(test)]
 mod tests;
 mod upgrade;
+mod watch;
 
 use std::fs::File;
 use std::path::Path;
@@ -64,6 +65,7 @@ pub use tables::{
     TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace,
     WorkerRow, WorkerTask,
 };
+pub use watch::Watcher;
 
 /// The store: a handle that is cheap to clone.
 #[derive(Debug, Clone)]

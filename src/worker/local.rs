@@ -1,10 +1,13 @@
 //! The store of the same machine, as a worker sees it.
 
 use std::ops::Range;
+use std::sync::Arc;
+use std::time::Duration;
 
 use ndarray::ArrayView3;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
+use tokio::sync::Mutex;
 
 use super::transport::{
     Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
@@ -21,7 +24,7 @@ use crate::pipeline::records::{PilotRecord, PreparedRecord};
 use crate::pipeline::tile::TileInput;
 use crate::store::{
     Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, Product, StagedBlob, Store,
-    StoreError, TaskRecord, TileResult, Work, WorkerPlace,
+    StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
 };
 
 /// The store, and who works for it.
@@ -30,13 +33,15 @@ pub struct Local {
     store: Store,
     worker: WorkerId,
     claimant: Claimant<'static>,
+    /// None until it is first needed.
+    watcher: Arc<Mutex<Option<Watcher>>>,
 }
 
 impl Local {
     /// For a worker of this name, which does all there is, or leaves the tiles to other machines.
     pub fn new(store: Store, worker: WorkerId, tiles: bool) -> Self {
         let claimant = if tiles { Claimant::Local } else { Claimant::WithoutTiles };
-        Self { store, worker, claimant }
+        Self { store, worker, claimant, watcher: Arc::default() }
     }
 
     fn arrays(&self, masks: Sha256, snapshots: Sha256) -> Arrays {
@@ -143,6 +148,22 @@ impl Transport for Local {
 
     async fn seen(&self) -> Result<(), TransportError> {
         Ok(self.store.worker_seen(self.worker).await?)
+    }
+
+    async fn idle(&self, time: Duration) {
+        let mut place = self.watcher.lock().await;
+        let changed = async {
+            let watcher = match &mut *place {
+                Some(watcher) => watcher,
+                none => none.insert(self.store.watcher().await?),
+            };
+            watcher.changed(time).await
+        };
+        if let Err(error) = changed.await {
+            tracing::warn!(%error, "changes of the database can't be seen");
+            *place = None;
+            tokio::time::sleep(time).await;
+        }
     }
 
     async fn claim(&self) -> Result<Option<Claim>, TransportError> {

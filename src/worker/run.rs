@@ -7,7 +7,7 @@
 
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -24,10 +24,10 @@ use crate::store::{Heartbeat, Lease};
 
 /// Time between heartbeats, and so the longest time until a cancel is heard of.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Time between looks for a task.
+/// The longest time between looks for a task, such as one whose lease has expired.
 const POLL: Duration = Duration::from_millis(200);
-/// Looks without a task between two signs of life.
-const LOOKS_PER_SIGN: u32 = 25;
+/// Time between two signs of life of a worker without a task.
+const SIGN: Duration = Duration::from_secs(5);
 /// Pause after the database has failed.
 const TROUBLE: Duration = Duration::from_secs(2);
 /// How long a task may take to come to the end of an iteration when the worker is to end. A deep
@@ -91,18 +91,21 @@ impl<T: Transport> Worker<T> {
     pub async fn run(mut self) -> Result<(), WorkerError> {
         self.transport.started().await?;
         tracing::info!("waiting for tasks");
-        let mut looks = 0;
+        let mut seen = Instant::now();
         while !self.stop.is_cancelled() {
             match self.transport.claim().await {
                 Ok(Some(claim)) => self.work(claim).await?,
                 Ok(None) => {
-                    looks += 1;
-                    if looks % LOOKS_PER_SIGN == 0
-                        && let Err(error) = self.transport.seen().await
-                    {
-                        tracing::warn!(%error, "the worker's sign of life is not recorded");
+                    if seen.elapsed() >= SIGN {
+                        seen = Instant::now();
+                        if let Err(error) = self.transport.seen().await {
+                            tracing::warn!(%error, "the worker's sign of life is not recorded");
+                        }
                     }
-                    self.pause(POLL).await;
+                    tokio::select! {
+                        () = self.transport.idle(POLL) => {}
+                        () = self.stop.cancelled() => {}
+                    }
                 }
                 Err(error) => {
                     tracing::error!(%error, "no task can be claimed");

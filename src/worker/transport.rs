@@ -44,6 +44,11 @@ pub trait Transport: Clone + Send + 'static {
 
     async fn claim(&self) -> Result<Option<Claim>, TransportError>;
 
+    /// Waits until there may be a task, at most for `time`.
+    async fn idle(&self, time: Duration) {
+        tokio::time::sleep(time).await;
+    }
+
     /// Renews a lease, notes the progress and how the solver went (JSON), and asks whether to go on.
     async fn heartbeat(
         &self,
