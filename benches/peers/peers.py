@@ -4,8 +4,9 @@
 
 The Python way is GAP in numpy with scikit-image's total variation, and FFDNet and FastDVDNet in PyTorch as they were published: frame by
 frame, so that FastDVDNet runs four blocks a frame. Both sides get the same masks and measurement in float32 and do the same number of
-iterations. The cost of one iteration or pass is the difference of two runs, which leaves out starting, reading and writing. Prints a
-table and ends with its figures as one JSON line. Content does not change the time, so the frames are random.
+iterations. The cost of one iteration or pass is the difference of two runs, which leaves out starting, reading and writing; content does
+not change the time, so these frames are random. Then a whole job, the demo's clip: our default beside the stages of it that the Python way
+has, with the same weights, and a pass of BM4D beside one of our nonlocal prior. Prints tables and ends with all figures as one JSON line.
 """
 import os
 
@@ -21,11 +22,14 @@ import sys
 import tempfile
 import time
 
+import bm4d
+import imageio.v3 as imageio
 import numpy as np
 import torch
 from skimage.restoration import denoise_tv_chambolle
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[2] / 'training'))
+import export
 import model   # the networks' layouts; weights don't change the time
 
 TV_WEIGHT = 0.1
@@ -42,27 +46,43 @@ def snapshot(frames, size):
 
 
 # ---------------------------------------------------------------- the Python way
-def gap_tv(masks, y, iterations):
-    """Accelerated GAP with the total variation of each frame."""
+def gap(masks, y, v, denoise, iterations):
+    """Accelerated GAP from the frames `v` on, with `denoise(v, iteration)` for a prior."""
     gram = (masks * masks).sum(0)
-    v, y1 = np.zeros_like(masks), np.zeros_like(y)
-    for _ in range(iterations):
+    y1 = np.zeros_like(y)
+    for iteration in range(iterations):
         seen = (masks * v).sum(0)
         y1 += y - seen
-        v = v + masks * ((y1 - seen) / gram)
-        for k in range(len(v)):
-            v[k] = denoise_tv_chambolle(v[k], weight=TV_WEIGHT, eps=0, max_num_iter=DUAL_UPDATES + 1)
+        v = denoise(v + masks * ((y1 - seen) / gram), iteration)
+    return v
+
+
+def total_variation(v, _):
+    """Of each frame."""
+    return np.stack([denoise_tv_chambolle(frame, weight=TV_WEIGHT, eps=0, max_num_iter=DUAL_UPDATES + 1) for frame in v])
+
+
+def gap_tv(masks, y, iterations):
+    return gap(masks, y, np.zeros_like(masks), total_variation, iterations)
+
+
+def pnp_tv_fastdvdnet(masks, y, net, stages):
+    """The stages of total variation, then those of the network with levels that fall evenly."""
+    v = np.zeros_like(masks)
+    for stage in stages:
+        levels = np.linspace(*stage['sigma'], stage['iterations'], dtype=np.float32) if stage.get('sigma') else None
+        denoise = total_variation if levels is None else lambda v, i: fastdvdnet_pass(net, torch.from_numpy(v), float(levels[i]))
+        v = gap(masks, y, v, denoise, stage['iterations'])
     return v
 
 
 @torch.no_grad()
-def fastdvdnet_pass(net, x):
+def fastdvdnet_pass(net, x, level=.1):
     """One pass over a clip [B,H,W]; five frames in, one out."""
     last = len(x) - 1
-    sigma = torch.full((1, 1, 1, 1), .1)
-    for k in range(len(x)):
-        window = [abs(i) if i <= last else 2 * last - i for i in range(k - 2, k + 3)]
-        net(x[window][None], sigma)
+    sigma = torch.full((1, 1, 1, 1), level)
+    windows = ([abs(i) if i <= last else 2 * last - i for i in range(k - 2, k + 3)] for k in range(len(x)))
+    return torch.cat([net(x[window][None], sigma)[0] for window in windows]).numpy()
 
 
 @torch.no_grad()
@@ -102,6 +122,55 @@ class Ours:
         return self.cpu_seconds('--algorithm', f'pnp-{network}', '--schedule', path)
 
 
+def psnr(frames, truth):
+    """Mean over the frames, range 1."""
+    error = ((frames.clip(0, 1) - truth) ** 2).mean((1, 2))
+    return float((-10 * np.log10(error)).mean())
+
+
+# ---------------------------------------------------------------- a whole job
+def whole_job(binary, size=256, frames=8):
+    """Rows (what, CPU seconds, PSNR): the default and its parts, ours and the Python way, on the demo's clip behind random squares."""
+    root = pathlib.Path(__file__).resolve().parents[2]
+    clip = np.stack([imageio.imread(path) for path in sorted(root.glob('demo/clip/frame_*.png'))[:frames]])
+    top, left = ((extent - size) // 2 for extent in clip.shape[1:])
+    run = lambda *arguments: json.loads(subprocess.run([binary, *map(str, arguments)], stdout=subprocess.PIPE, check=True).stdout)
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        np.save(folder / 'clip.npy', clip[:, top:top + size, left:left + size])
+        subprocess.run([binary, 'simulate', '--frames', folder / 'clip.npy', '--compression-ratio', str(frames), '--pattern', 'random-squares',
+                        '--seed', '1', '--out', folder], stdout=subprocess.DEVNULL, check=True)
+        masks, y, truth = (np.load(folder / f'{name}.npy').astype(np.float32) for name in ('masks', 'measurement', 'truth'))
+        y = y.reshape(masks.shape[1:])
+        files = [argument for name in ('masks', 'measurement', 'truth') for argument in (f'--{name}', folder / f'{name}.npy')]
+
+        def ours(what, schedule=None):
+            arguments = ['--algorithm', 'pnp-tv-fastdvdnet', '--threads', 1, '--json']
+            if schedule:
+                (folder / 'schedule.json').write_text(json.dumps(schedule))
+                arguments += ['--schedule', folder / 'schedule.json']
+            report = run('reconstruct', *files, *arguments)
+            return {'what': what, 'cpu_s': round(report['cpu_seconds'], 1), 'psnr_db': round(report['psnr_db'], 2)}
+
+        default = run('schedule', '--algorithm', 'pnp-tv-fastdvdnet')
+        parts = [stage for stage in default['stages'] if stage['prior'] == 'tv' or stage['prior'].startswith('fastdvdnet')]
+        exact = [{**stage, 'prior': stage['prior'].removesuffix('-int8')} for stage in parts]
+        yield ours('sci-recon, default')
+        yield ours('sci-recon, its stages of TV and FastDVDNet', {**default, 'adaptive': False, 'stages': parts})
+        yield ours('the same in floating point', {**default, 'adaptive': False, 'stages': exact})
+        net = export.weights_of(root / 'models/fastdvdnet-gray')
+        began = time.process_time()
+        found = pnp_tv_fastdvdnet(masks, y, net, parts)
+        yield {'what': 'Python: scikit-image TV, PyTorch FastDVDNet, these stages', 'cpu_s': round(time.process_time() - began, 1),
+               'psnr_db': round(psnr(found, truth), 2)}
+        volume = np.ascontiguousarray(found.transpose(1, 2, 0))
+        theirs = cpu_seconds(bm4d.bm4d, volume, 10 / 255)
+        stage = lambda count: {'stages': [parts[0], {**default['stages'][-1], 'iterations': count}]}
+        few, many = (ours('', stage(count))['cpu_s'] for count in (4, 24))
+        yield {'what': 'a pass of the nonlocal prior, sci-recon', 'cpu_s': round((many - few) / 20, 3)}
+        yield {'what': 'a pass of BM4D', 'cpu_s': round(theirs, 1)}
+
+
 def least(measure, few, many, repeats):
     """CPU seconds of one iteration: the difference of two runs, each the least of a few (a busy machine only adds)."""
     runs = {n: min(measure(n) for _ in range(repeats)) for n in (few, many)}
@@ -138,8 +207,14 @@ def main():
             for network, work, net in (('ffdnet', ffdnet_pass, model.FFDNet()), ('fastdvdnet', fastdvdnet_pass, model.FastDVDnet())):
                 theirs = min(cpu_seconds(work, net.eval(), clip) for _ in range(2))
                 row(f'{network} pass, 256x256x10', x.size, theirs, least(lambda n: ours.passes(network, n), 1, 3, 2))
+    jobs = []
+    if not a.short:
+        print(f"\n{'a whole job, 256x256x8, one thread':60}{'CPU s':>10}{'PSNR dB':>10}")
+        for job in whole_job(a.binary):
+            jobs.append(job)
+            print(f"{job['what']:60}{job['cpu_s']:10.2f}{job.get('psnr_db', ''):>10}", flush=True)
     cpu = next((line.split(':')[1].strip() for line in open('/proc/cpuinfo') if line.startswith('model name')), platform.processor())
-    print(json.dumps({'target': 'bench-peers', 'cpu': cpu, 'cores': os.cpu_count(), 'rows': rows}))
+    print(json.dumps({'target': 'bench-peers', 'cpu': cpu, 'cores': os.cpu_count(), 'rows': rows, 'jobs': jobs}))
 
 
 main()
