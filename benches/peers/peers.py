@@ -49,6 +49,7 @@ def snapshot(frames, size):
 def gap(masks, y, v, denoise, iterations):
     """Accelerated GAP from the frames `v` on, with `denoise(v, iteration)` for a prior."""
     gram = (masks * masks).sum(0)
+    gram[gram == 0] = 1   # dead pixels
     y1 = np.zeros_like(y)
     for iteration in range(iterations):
         seen = (masks * v).sum(0)
