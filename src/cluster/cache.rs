@@ -19,19 +19,28 @@ pub struct Cache {
     /// Of each file its size and its turn: the higher, the later it was used.
     files: HashMap<Sha256, (u64, u64)>,
     turn: u64,
+    /// Locked as long as this lives.
+    _lock: fs::File,
 }
 
 impl Cache {
     /// Opens a folder, which is made if it is missing. Files in it that are not the cache's stay.
     ///
     /// # Errors
-    /// If it can't be made or read.
+    /// If it can't be made or read, or if another worker has it: that one would remove what this one needs.
     pub fn open(folder: &Path, limit: u64) -> Result<Self, ClusterError> {
         let failed = |error: io::Error| ClusterError::Cache {
             path: folder.display().to_string(),
             reason: error.to_string(),
         };
         fs::create_dir_all(folder).map_err(failed)?;
+        let lock = fs::File::create(folder.join(LOCK)).map_err(failed)?;
+        lock.try_lock().map_err(|error| match error {
+            fs::TryLockError::Error(error) => failed(error),
+            fs::TryLockError::WouldBlock => failed(io::Error::other(
+                "it is another worker's; give each worker a folder of its own (--cache)",
+            )),
+        })?;
         let mut found = Vec::new();
         for entry in fs::read_dir(folder).map_err(failed)? {
             let entry = entry.map_err(failed)?;
@@ -48,7 +57,8 @@ impl Cache {
             }
         }
         found.sort_unstable_by_key(|(used, ..)| *used);
-        let mut cache = Self { folder: folder.to_owned(), limit, files: HashMap::new(), turn: 0 };
+        let folder = folder.to_owned();
+        let mut cache = Self { folder, limit, files: HashMap::new(), turn: 0, _lock: lock };
         for (_, sha256, size) in found {
             cache.note(sha256, size);
         }
@@ -124,6 +134,8 @@ impl Cache {
 
 /// The end of the name of a file that is being written.
 const DRAFT: &str = ".part";
+/// The file whose lock says that a worker has the folder.
+const LOCK: &str = "lock";
 
 #[cfg(test)]
 mod tests {
@@ -153,6 +165,9 @@ mod tests {
         let refused = cache.add(names[1], &files[1], &names).unwrap_err().to_string();
         assert!(refused.contains("--cache-bytes"), "{refused}");
 
+        let taken = Cache::open(folder.path(), 200).unwrap_err().to_string();
+        assert!(taken.contains("another worker's"), "{taken}");
+        drop(cache);
         let mut again = Cache::open(folder.path(), 200).unwrap();
         assert_eq!(sizes(folder.path()), 200, "the bound may have become smaller");
         std::fs::write(again.path(names[4]), "other bytes").unwrap();
