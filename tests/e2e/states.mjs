@@ -58,7 +58,7 @@ export async function faults(browser, checks, program, services) {
   await page.waitForSelector("#offline:not([hidden])", { timeout: 20_000 });
   await checks.look(page, "offline");
   await page.click("#nav >> text=Calibrations");
-  await page.waitForSelector("text=The service does not answer");
+  await page.waitForSelector("h1:has-text('The service does not answer')");
   await checks.look(page, "offline-view");
 }
 

@@ -156,19 +156,26 @@ function measurementStep(form, changed, signal) {
     darks.splice(0, darks.length, ...next);
     say(darkList, darks.length ? `Subtracted is the average of ${darks.map((dark) => dark.name).join(", ")}.` : "");
     forget.hidden = darks.length === 0;
-    if (last) make(last).catch((error) => put(verdict, problem(error)));
+    if (last) make(last, scaled).catch((error) => put(verdict, problem(error)));
   };
-  let last = null;
+  // The file that was dropped last, the full scale that was chosen for it, and which attempt counts.
+  let [last, scaled, turn] = [null, null, 0];
   const make = async (sha256, scale = null) => {
+    turn += 1;
+    const mine = turn;
     form.measurement = null;
     changed();
     put(verdict);
     const body = { name: name.value(), full_scale: scale, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
     const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
-    last = sha256;
+    [last, scaled] = [sha256, scale];
     try {
-      form.measurement = await send("POST", "/v1/measurements", { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) });
+      const made = await send("POST", "/v1/measurements", { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) });
+      // Something else was chosen meanwhile.
+      if (mine !== turn) return;
+      form.measurement = made;
     } catch (error) {
+      if (mine !== turn) return;
       if (!scaleInDoubt(error)) {
         last = null;
         throw error;
@@ -182,7 +189,7 @@ function measurementStep(form, changed, signal) {
   };
   // What is stated later goes with the same file: it need not be dropped again.
   for (const input of [fps.input, exposure.input, sequence]) {
-    input.addEventListener("change", () => last && make(last).catch((error) => put(verdict, problem(error))));
+    input.addEventListener("change", () => last && make(last, scaled).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
   const dark = dropZone("darks", "Dark captures", "Optional: with the LCoS all black, at the same exposure", signal, async (blob, file) => {
@@ -192,12 +199,13 @@ function measurementStep(form, changed, signal) {
     h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Several snapshots are", sequence)),
     h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))));
   const wake = () => {
+    turn += 1;
     inside.hidden = !form.calibration;
     wait.hidden = !inside.hidden;
     form.measurement = null;
     put(verdict);
     // The file that was dropped for another calibration is tried with this one.
-    if (form.calibration && last) make(last).catch((error) => put(verdict, problem(error)));
+    if (form.calibration && last) make(last, scaled).catch((error) => put(verdict, problem(error)));
     changed();
   };
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
