@@ -16,13 +16,19 @@ async function drop(page, selector, name, bytes) {
 }
 
 /** Drops the files of a scene, reads the verdicts, submits; gives the job's identifier. */
-export async function submit(page, checks, scene) {
+export async function submit(page, checks, scene, small) {
   await page.click("#nav >> text=New job");
-  await page.waitForSelector("label.drop");
+  await page.check("input[value=masks]");
   const [masks, data] = ["label.drop:has(#masks)", "label.drop:has(#data)"];
   await drop(page, masks, "notes.txt", Buffer.from("these are no masks"));
   checks.that((await page.waitForSelector(".trouble")) !== null, "a file that can't be read is refused with the reason");
+  await drop(page, masks, "loud.npy", small.loud());
+  await page.click(".askscale >> text=255 means 1");
+  await page.waitForSelector("text=The calibration is taken.");
+  checks.that((await page.$(".askscale")) === null, "the full scale is asked for, and the file need not come again");
+  await page.fill("#calibration-name", "bench 3");
   await drop(page, masks, "masks.npy", scene.masks);
+  await page.waitForSelector(".step:nth-child(1) .verdict:has-text('960')");
   await page.waitForSelector("text=The calibration is taken.");
   await drop(page, data, "masks.npy", scene.masks.subarray(0, 200));
   await page.waitForSelector(".step:nth-child(2) .trouble");
@@ -32,6 +38,10 @@ export async function submit(page, checks, scene) {
   // One that takes some seconds, so that its progress can be watched.
   await page.selectOption("#algorithm", "admm-tv");
   await page.fill("#label", HOSTILE);
+  await page.waitForSelector(".estimate dd");
+  const estimate = await page.textContent(".estimate");
+  checks.that(["Done", "Memory", "Disk"].every((word) => estimate.includes(word)), `time, memory and disk are told before: ${estimate}`);
+  checks.that((await page.$("#sequence option[value=separate]")) !== null, "a sequence can be said to be none");
   await checks.look(page, "submit");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
@@ -42,13 +52,22 @@ export async function submit(page, checks, scene) {
 export async function watch(page, checks) {
   await page.waitForSelector(".tile.done", { timeout: 120_000 });
   checks.that((await page.textContent(".head h1")) === HOSTILE, "the name is shown as text");
-  checks.that((await page.$$("img")).length === 0, "and makes no element");
+  checks.that((await page.$$("main img")).length === 0, "and makes no element");
   const bar = () => page.$eval(".progressline progress", (bar) => bar.value);
   const before = await bar();
   await page.waitForFunction((before) => document.querySelector(".progressline progress").value > Math.min(before, 99), before, { timeout: 120_000 });
+  const line = await page.textContent(".progressline");
+  checks.that(!/iterations/.test(line) && !/≤/.test(line), `no count of iterations that is none of a tile, and no bound that is none: ${line}`);
+  // What is not final is marked.
+  await page.waitForSelector(".onpicture:has-text('Preview')");
+  await checks.look(page, "running");
   const early = await brightness(page);
   await state(page, "succeeded");
-  checks.that((await bar()) === 100, "the bar is full");
+  await page.waitForSelector(".onpicture", { state: "hidden" });
+  await page.waitForSelector(".downloads a[download]");
+  await page.waitForSelector("section[aria-label='How it was made']:has-text('Done')");
+  const made = await page.textContent("section[aria-label='How it was made']");
+  checks.that(/at most (\d+) iterations on each tile/.test(made), `iterations are told as on the form: ${made}`);
   await page.waitForSelector(".plot .line.residual");
   return early;
 }
@@ -56,7 +75,7 @@ export async function watch(page, checks) {
 /** The mean of what a pane shows, and of its left and right half. */
 export function brightness(page, pane = 1) {
   return page.evaluate((pane) => {
-    const canvas = document.querySelectorAll(".sight canvas")[pane];
+    const canvas = document.querySelectorAll(".viewer .sight canvas")[pane];
     const { width, height } = canvas;
     const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
     const sums = [0, 0];
@@ -64,6 +83,8 @@ export function brightness(page, pane = 1) {
     return { left: sums[0] / (data.length / 8), right: sums[1] / (data.length / 8) };
   }, pane);
 }
+
+const PICTURE = "[aria-label=Frames] .sight canvas";
 
 const frame = (page) => page.$eval("#frame", (slider) => Number(slider.value));
 
@@ -79,7 +100,14 @@ export async function view(page, checks, frames) {
   const last = await brightness(page);
   checks.that(first.left > first.right && last.right > last.left, `the bright square moves from left to right: ${JSON.stringify([first, last])}`);
 
+  // All frames are fetched once before the speed is looked at.
   await page.fill("#rate", "20");
+  await page.focus(PICTURE);
+  await page.keyboard.press("Home");
+  await page.click("#play");
+  await page.waitForFunction((last) => document.querySelector("#frame").value === String(last), frames, { timeout: 60_000 });
+  await page.waitForFunction(() => document.querySelector("#frame").value !== document.querySelector("#frame").max, null, { timeout: 60_000 });
+  await page.click("#play");
   const seen = await page.evaluate(() => new Promise((resolve) => {
     const seen = [];
     const slider = document.querySelector("#frame");
@@ -96,17 +124,17 @@ export async function view(page, checks, frames) {
   await page.click("#play");
   checks.that(seen.length >= 20, `in 2.5 s at 20 frames a second, ${seen.length} are seen`);
   const paused = await frame(page);
-  await page.focus(".sight canvas >> nth=1");
+  await page.focus(PICTURE);
   await page.keyboard.press("ArrowRight");
   checks.that((await frame(page)) === (paused % frames) + 1, "an arrow key steps");
 
   const pictures = () => page.$$eval(".sight canvas", (panes) => panes.map((pane) => pane.toDataURL()));
   const whole = await pictures();
-  const box = await (await page.$(".sight canvas >> nth=1")).boundingBox();
+  const box = await (await page.$(PICTURE)).boundingBox();
   await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
   for (let turn = 0; turn < 6; turn += 1) await page.mouse.wheel(0, -200);
   await page.waitForTimeout(1500);
-  const zoom = Number.parseInt(await page.textContent(".controls .row:last-child .muted"), 10);
+  const zoom = Number.parseInt(await page.textContent("#zoom"), 10);
   checks.that(zoom > 300, `the wheel zooms: ${zoom} %`);
   const near = await pictures();
   checks.that(near.every((picture, pane) => picture !== whole[pane]), "both panes zoom in step");
@@ -124,29 +152,58 @@ export async function view(page, checks, frames) {
     await checks.look(page, `job-${mode}`);
   }
   await page.selectOption("#mode", "frame");
-  checks.that((await page.$$eval(".card a[download]", (links) => links.length)) === 2 * frames + 3, "all files can be downloaded");
+  checks.that((await page.$$eval(".downloads a[download]", (links) => links.length)) === 2 * frames + 3, "all files can be downloaded");
   const line = await page.textContent("pre.line");
   checks.that(line.startsWith("curl -sS http") && line.includes("admm-tv"), "the line repeats the job");
+  await page.uncheck("#loop");
+  await page.fill("#rate", "60");
+  await page.click("#play");
+  await page.waitForFunction(() => document.querySelector("#play").textContent === "Play");
+  checks.that((await frame(page)) === frames, "without a loop it stops at the last frame");
+  await page.click("#full");
+  await page.waitForFunction(() => document.fullscreenElement?.classList.contains("viewer"));
+  await page.click("#full");
+  await page.waitForFunction(() => !document.fullscreenElement);
 }
 
-/** Chooses two jobs and compares them. */
+/** Chooses jobs and compares them in all ways. */
 export async function compare(page, checks, labels, truth) {
   await page.click("#nav >> text=Jobs");
   for (const label of labels) await page.check(`tr:has-text("${label}") input[type=checkbox]`);
-  await page.click("text=Compare the two");
+  await checks.look(page, "chosen");
+  await page.click("#compare");
   await page.waitForSelector(".figures");
   await page.waitForTimeout(1200);
   const [one, other] = [await brightness(page, 0), await brightness(page, 1)];
   checks.that(one.left > 1 && other.left > 1, "both panes show frames");
   await page.setInputFiles("#truth", { name: "truth.npy", mimeType: "application/octet-stream", buffer: truth });
   await page.waitForSelector(".quality");
-  const psnr = await page.$$eval(".quality:nth-last-child(2) td", (cells) => cells.map((cell) => Number.parseFloat(cell.textContent)));
+  const psnr = await page.$$eval(".quality:has-text('PSNR') td", (cells) => cells.map((cell) => Number.parseFloat(cell.textContent)));
   checks.that(psnr.every((value) => value > 10 && value < 80) && Math.max(...psnr) > 25, `PSNR is told: ${psnr} dB`);
+  const groups = await page.$$eval(".figures tbody", (bodies) => bodies.map((body) => body.className));
+  checks.that(groups[0] === "differs" && groups[1] === "same", `rows that differ come first: ${groups}`);
   await checks.look(page, "compare");
+  const picture = () => page.$eval(".sight canvas", (canvas) => canvas.toDataURL());
+  await page.click("#wipe");
+  await page.waitForTimeout(600);
+  const middle = await picture();
+  const handle = await (await page.$(".handle")).boundingBox();
+  await page.mouse.move(handle.x + 16, handle.y + 40);
+  await page.mouse.down();
+  await page.mouse.move(handle.x - 150, handle.y + 40, { steps: 3 });
+  await page.mouse.up();
+  await page.waitForTimeout(300);
+  checks.that((await picture()) !== middle && (await page.inputValue("#wipe-at")) < 450, "the wipe is dragged");
+  await checks.look(page, "compare-wipe");
+  await page.click("#difference");
+  await page.waitForTimeout(600);
+  const shown = await brightness(page, 0);
+  checks.that(shown.left + shown.right > 1, "the difference shows something");
+  await checks.look(page, "compare-difference");
+  await page.click("#flicker");
   await page.fill("#flicker-rate", "10");
   const titles = await page.evaluate(() => new Promise((resolve) => {
     const titles = new Set();
-    document.querySelector("#flicker").click();
     const timer = setInterval(() => titles.add(document.querySelector(".pane figcaption span").textContent), 20);
     setTimeout(() => {
       clearInterval(timer);
@@ -154,15 +211,81 @@ export async function compare(page, checks, labels, truth) {
     }, 1500);
   }));
   checks.that(titles.length === 2, `the two take turns: ${titles}`);
-  await checks.look(page, "compare-flicker");
+}
+
+/** Names the networks of a deep job beside one without. */
+export async function network(page, checks, url, deep, plain) {
+  await page.goto(`${url}/#/compare/${deep}/${plain}`);
+  const row = await page.waitForSelector(".figures tr:has-text('Network')");
+  const cells = await row.$$eval("td", (cells) => cells.map((cell) => cell.textContent));
+  checks.that(cells[0].includes("fastdvdnet") && cells[1] === "none", `the networks are named: ${cells}`);
 }
 
 /** Reads what the pilot of a job has decided; stage is its record in the manifest. */
 export async function decided(page, checks, stage) {
-  const card = await page.waitForSelector("section[aria-label=Manifest]:has-text('Pilot, tv')", { timeout: 30_000 });
+  const card = await page.waitForSelector("section[aria-label='How it was made']:has-text('Pilot, tv')", { timeout: 30_000 });
   const text = await card.textContent();
   const expected = `total variation along time ${stage.temporal_weight === 0 ? "left out" : "kept"}, error at held-out pixels 1 to ${Number(stage.error_after.toPrecision(3))}`;
   checks.that(stage.planned_temporal_weight > 0 && text.includes(expected), `what the pilot decided is told: ${text}`);
+}
+
+/** From an empty service to a playing result and its verdict, without typing anything. */
+export async function sample(page, checks) {
+  await page.waitForSelector("text=One picture in");
+  await checks.look(page, "empty");
+  await page.click("#sample");
+  await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
+  return page.url().slice(-36);
+}
+
+/** The end of that walk, once the job has succeeded. */
+export async function judged(page, checks, url, id) {
+  await page.goto(`${url}/#/jobs/${id}`);
+  await page.waitForSelector(".quality");
+  const psnr = Number.parseFloat(await page.textContent(".quality b"));
+  checks.that(psnr > 15 && psnr < 40, `the verdict tells the true PSNR: ${psnr}`);
+  checks.that((await page.textContent(".judgement")).length > 3, "and says it in words");
+  const before = await frame(page);
+  await page.click("#play");
+  await page.waitForFunction((before) => document.querySelector("#frame").value !== String(before), before);
+  await page.click("#play");
+  await checks.look(page, "good");
+}
+
+/** From raw captures to masks to a job. */
+export async function captures(page, checks, scene) {
+  await page.click("#nav >> text=New job");
+  await page.check("input[value=captures]");
+  const { patterns, white, black } = scene.captures();
+  const file = (name, buffer) => ({ name, mimeType: "application/octet-stream", buffer });
+  // The names of the first two are swapped: the order is mended by hand.
+  const names = patterns.map((_, index) => `pattern-${[2, 1][index] ?? index + 1}.npy`);
+  await page.setInputFiles("#captures", [...patterns.map((bytes, index) => file(names[index], bytes)), file("white.npy", white)]);
+  await page.waitForSelector("text=Still missing: a black capture.");
+  await page.setInputFiles("#captures", [file("black.npy", black)]);
+  await page.waitForSelector(`text=${patterns.length} patterns. Check their order`);
+  checks.that((await page.$$(".capture canvas")).length === patterns.length + 2, "each capture has its picture");
+  const order = () => page.$$eval(".capture .filename", (lines) => lines.slice(0, 2).map((line) => line.textContent));
+  checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `they come in the order of their names: ${await order()}`);
+  await page.dragAndDrop(".capture:nth-child(1) .filename", ".capture:nth-child(2) .filename");
+  checks.that((await order()).join() === "pattern-2.npy,pattern-1.npy", `they are dragged: ${await order()}`);
+  await page.focus(".capture:nth-child(2) button");
+  await page.keyboard.press("Enter");
+  checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `and moved by keys: ${await order()}`);
+  await page.focus(".capture:nth-child(2) button");
+  await page.keyboard.press("Enter");
+  await checks.look(page, "captures");
+  await page.click("text=Make the masks");
+  await page.waitForSelector("text=The calibration is taken.", { timeout: 60_000 });
+  await drop(page, "label.drop:has(#data)", "measurement.npy", scene.measurement);
+  await page.waitForSelector("text=The measurement fits the calibration.");
+  await page.selectOption("#algorithm", "gap-tv");
+  await page.fill("#label", "from captures");
+  await page.click("button[type=submit]");
+  await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
+  await state(page, "succeeded");
+  const { pathname } = new URL(await page.$eval("a[href^='#/calibrations/']", (link) => `http://x/${link.getAttribute("href").slice(1)}`));
+  return pathname;
 }
 
 /** Cancels, retries and deletes a job that would run for long. */
@@ -182,7 +305,20 @@ export async function manage(page, checks, label) {
   await checks.look(page, "delete");
   await page.click("dialog >> text=Keep");
   checks.that((await page.$(row)) !== null, "a job that is kept stays");
-  await page.click(`${row} button.delete`);
+  await page.check(`${row} input[type=checkbox]`);
+  await page.click("#delete-all");
   await page.click("dialog button.danger");
   await page.waitForSelector(row, { state: "detached", timeout: 15_000 });
+  await page.selectOption("#state", "succeeded");
+  await page.click("text=Keep this filter");
+  await page.selectOption("#state", "failed");
+  await page.waitForSelector("text=No job fits.");
+  await page.click(".chip a");
+  await page.waitForSelector(`tr:has-text("${HOSTILE}")`);
+  await page.click(".chip button");
+  checks.that((await page.$(".chip")) === null, "a filter is kept, and forgotten");
+  await page.goto(page.url().replace(/\?.*/, ""));
+  await page.waitForSelector(row, { state: "detached" });
+  const cut = await page.$$eval(".list td.shape, .list td.created, .list td.checks, .list th", (cells) => cells.filter((cell) => cell.scrollWidth > cell.clientWidth).map((cell) => cell.textContent));
+  checks.that(cut.length === 0, `nothing is cut: ${cut}`);
 }

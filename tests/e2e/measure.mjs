@@ -80,7 +80,7 @@ export async function scroll(page, checks, url) {
   checks.that(found.p95 < 100, `scrolling is smooth: ${JSON.stringify(found)}`);
   // One label holds this number, and no longer one begins with it.
   await page.fill("#search", `shot ${MANY - 79}`);
-  await page.waitForFunction(() => document.querySelector("#count").textContent === "1 jobs", null, { timeout: 10_000 });
+  await page.waitForFunction(() => document.querySelector("#count").textContent === "1 job", null, { timeout: 10_000 });
   await page.selectOption("#state", "failed");
   await page.waitForSelector("text=No job fits.");
   const round = (value) => Math.round(value * 10) / 10;

@@ -12,7 +12,7 @@ if [ ${#missing[@]} -gt 0 ]; then
     echo "e2e: skipped, because there is no ${missing[*]} here (apt-get install ${missing[*]})"
     exit 0
 fi
-export CHROMIUM
+export CHROMIUM ORT_DYLIB_PATH=${ORT_DYLIB_PATH:-$PWD/runtime/libonnxruntime.so}
 
 # With the test, so that it is the program that `make test` has built.
 ${CARGO:-cargo} test --no-run --quiet --test service

@@ -1,6 +1,8 @@
 // A small scene, made here, so that a run needs no downloads: a square that moves over a ramp, seen
 // through random masks. Written as npy, as a lab would send it.
 
+const [BLACK, LIGHT] = [100, 2000];
+
 /** `frames` frames of `height` x `width` and a snapshot of them; gives the files' bytes. */
 export function scene(frames, height, width, seed = 1) {
   const masks = new Float32Array(frames * height * width);
@@ -29,8 +31,18 @@ export function scene(frames, height, width, seed = 1) {
       }
     }
   }
+  const pixels = height * width;
+  const capture = (frame) => npy([height, width], Float32Array.from({ length: pixels }, (_, at) => BLACK + (frame === null ? 1 : 0.5 * masks[frame * pixels + at]) * LIGHT));
   return {
     masks: npy([frames, height, width], masks),
+    /** The masks as a camera of 8 bits would tell them. */
+    loud: () => npy([frames, height, width], masks.map((value) => 255 * value)),
+    /** What a camera sees of a white board: each pattern through the mask, then white and black. */
+    captures: () => ({
+      patterns: Array.from({ length: frames }, (_, frame) => capture(frame)),
+      white: capture(null),
+      black: npy([height, width], new Float32Array(pixels).fill(BLACK)),
+    }),
     measurement: npy([1, height, width], measurement),
     truth: npy([frames, height, width], truth),
   };

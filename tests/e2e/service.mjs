@@ -1,7 +1,7 @@
 // The service under test: the real program on a free port with a fresh folder.
 
-import { spawn } from "node:child_process";
-import { mkdtempSync, rmSync } from "node:fs";
+import { execFileSync, spawn } from "node:child_process";
+import { mkdtempSync, readFileSync, readdirSync, rmSync, statSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { createInterface } from "node:readline";
@@ -10,6 +10,7 @@ export class Service {
   /** Starts it with these arguments; resolves when it listens. */
   static async start(program, ...options) {
     const service = new Service();
+    service.program = program;
     service.folder = mkdtempSync(join(tmpdir(), "sci-recon-e2e-"));
     service.process = spawn(program, ["serve", "--listen", "127.0.0.1:0", "--min-free-bytes", "1000000", "--data", service.folder, ...options], {
       env: { ...process.env, RUST_LOG: process.env.RUST_LOG ?? "error" },
@@ -44,6 +45,23 @@ export class Service {
     return { calibration: calibration.id, measurement: measurement.id };
   }
 
+  /** Makes a token of this role; gives it. */
+  token(role) {
+    const made = execFileSync(this.program, ["token", "--data", this.folder, "create", "--lab", "optics", "--role", role], { encoding: "utf8" });
+    return /sci_[\x21-\x7e]*[\w]/.exec(made)[0];
+  }
+
+  /** Turns a bit in every stored file. */
+  damage() {
+    for (const name of readdirSync(join(this.folder, "blobs"), { recursive: true })) {
+      const path = join(this.folder, "blobs", name);
+      if (!statSync(path).isFile()) continue;
+      const bytes = readFileSync(path);
+      bytes[bytes.length >> 1] ^= 0x10;
+      writeFileSync(path, bytes);
+    }
+  }
+
   submit(body) {
     return this.call("POST", "/v1/jobs", body);
   }
@@ -59,6 +77,7 @@ export class Service {
   }
 
   async stop() {
+    if (this.process.exitCode !== null) return;
     const ended = new Promise((resolve) => this.process.once("exit", resolve));
     this.process.kill("SIGTERM");
     await ended;

@@ -1,4 +1,4 @@
-// What can be done with a job: cancel, retry, delete (after a question).
+// What can be done with a job, or many: cancel, retry, rename, delete (after a question).
 
 import { announce, h, put } from "./dom.js";
 import { nameOf } from "./format.js";
@@ -40,6 +40,62 @@ async function remove(job) {
   return send("DELETE", `/v1/jobs/${job.id}`);
 }
 
+/** Cancels jobs; those that have ended meanwhile stay as they are. */
+export async function cancelAll(jobs) {
+  await each(jobs, "cancelled", (job) => send("POST", `/v1/jobs/${job.id}/cancel`));
+}
+
+/** Deletes jobs, after a question; false if the answer was no. */
+export async function removeAll(jobs) {
+  const text = [`${jobs.length} ${jobs.length === 1 ? "job" : "jobs"} and their frames will be gone: `, h("b", null, jobs.slice(0, 3).map(nameOf).join(", ")), jobs.length > 3 ? ` and ${jobs.length - 3} more. ` : ". ", "Measurements and calibrations stay."];
+  if (!(await ask(`Delete ${jobs.length} ${jobs.length === 1 ? "job" : "jobs"}?`, text, "Delete"))) return false;
+  await each(jobs, "deleted", (job) => send("DELETE", `/v1/jobs/${job.id}`));
+  return true;
+}
+
+/** Does the same to each, a few at a time, and says what was not possible. */
+async function each(jobs, word, act) {
+  const left = [...jobs];
+  const refused = [];
+  const work = async () => {
+    for (let job = left.shift(); job; job = left.shift()) {
+      await act(job).catch((error) => refused.push([job, error]));
+    }
+  };
+  await Promise.all(Array.from({ length: 4 }, work));
+  announce(`${jobs.length - refused.length} jobs are ${word}`);
+  if (refused.length === 0) return;
+  await tell(`${refused.length} of ${jobs.length} could not be ${word}`, h("span", null, refused.slice(0, 5).map(([job, error]) => [`${nameOf(job)}: ${error.message}`, h("br")])));
+}
+
+/** Asks for another name; `change(name)` sends it (null for none). */
+export function rename(before, change) {
+  const input = h("input", { type: "text", id: "new-name", maxlength: 200, value: before ?? "", autocomplete: "off" });
+  const status = h("div", { "aria-live": "polite" });
+  const element = h("dialog", { "aria-labelledby": "question" });
+  const form = h("form", null, h("h2", { id: "question" }, "Rename"), h("label", { class: "field", for: "new-name" }, "Name", input), status,
+    h("div", { class: "row end" }, h("button", { type: "button", onclick: () => element.close() }, "Keep"), h("button", { type: "submit", class: "primary" }, "Rename")));
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    try {
+      await change(input.value.trim() || null);
+      announce("It is renamed");
+      element.close();
+    } catch (error) {
+      put(status, h("p", { class: "trouble", role: "alert" }, error.message));
+    }
+  });
+  open(element, form);
+  input.select();
+}
+
+function open(element, form) {
+  element.append(form);
+  element.addEventListener("close", () => element.remove());
+  document.body.append(element);
+  element.showModal();
+}
+
 /** Asks; gives true if the answer is yes. */
 export function ask(title, text, yes) {
   return new Promise((resolve) => {
@@ -61,12 +117,8 @@ export function tell(title, text) {
 function dialog(title, text, buttons, closed) {
   const heading = h("h2", { id: "question" }, title);
   const form = h("form", { method: "dialog" }, heading, h("p", null, text), h("div", { class: "row end" }, buttons));
-  const element = h("dialog", { "aria-labelledby": "question" }, form);
-  element.addEventListener("close", () => {
-    element.remove();
-    closed(element.returnValue);
-  });
-  document.body.append(element);
-  element.showModal();
+  const element = h("dialog", { "aria-labelledby": "question" });
+  element.addEventListener("close", () => closed(element.returnValue));
+  open(element, form);
   put(document.getElementById("announce"));
 }

@@ -1,13 +1,19 @@
 // The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
 
 import { place } from "./dom.js";
-import { authorization, signIn } from "./token.js";
+import { authorization } from "./token.js";
 
-/** As `fetch`, with the token that the service wants, if it wants one. */
+/** As `fetch`, with the token that is kept. Who is not let in is told by the event `signed-out`. */
 export async function ask(path, options = {}) {
   const token = authorization();
   const response = await fetch(place(path), { ...options, headers: { ...options.headers, ...token } });
-  return response.status === 401 && signIn(token.Authorization) ? ask(path, options) : response;
+  if (response.status === 401) signedOut(token);
+  return response;
+}
+
+/** An answer to a token that was replaced meanwhile says nothing. */
+function signedOut(tried) {
+  if (authorization().Authorization === tried.Authorization) dispatchEvent(new Event("signed-out"));
 }
 
 /** A refused or failed request. */
@@ -16,11 +22,13 @@ export class Refused extends Error {
     super(problem.detail ?? problem.title ?? `the service answered ${status}`);
     this.status = status;
     this.code = problem.code ?? "unknown";
+    this.reason = problem.reason ?? null;
     this.errors = problem.errors ?? [];
   }
 }
 
-const known = new Map();
+/** Answers that may still hold, by path. */
+export const known = new Map();
 const KNOWN = 60;
 
 /** Asks with `If-None-Match`; gives the very object of last time if nothing has changed. */
@@ -66,7 +74,8 @@ export function upload(file, progress, signal) {
     const request = new XMLHttpRequest();
     request.open("POST", place("/v1/blobs"));
     request.setRequestHeader("Content-Type", "application/octet-stream");
-    for (const [name, value] of Object.entries(authorization())) request.setRequestHeader(name, value);
+    const token = authorization();
+    for (const [name, value] of Object.entries(token)) request.setRequestHeader(name, value);
     request.upload.onprogress = (event) => progress(event.loaded, event.total || file.size);
     request.onload = () => {
       let body = {};
@@ -75,6 +84,7 @@ export function upload(file, progress, signal) {
       } catch {
         // As above.
       }
+      if (request.status === 401) signedOut(token);
       if (request.status >= 200 && request.status < 300) resolve(body);
       else reject(new Refused(request.status, body));
     };
@@ -90,6 +100,18 @@ export async function picture(path, signal) {
   const response = await ask(path, { signal });
   if (!response.ok) throw await refused(response);
   return createImageBitmap(await response.blob());
+}
+
+/** What one may not do by one's role becomes a page, wherever it is noticed. */
+export function forbidden(error) {
+  if (error.status !== 403) return false;
+  dispatchEvent(new CustomEvent("forbidden", { detail: error.message }));
+  return true;
+}
+
+/** True where no answer came at all. */
+export function unanswered(error) {
+  return error instanceof TypeError || error.status === 502 || error.status === 503 || error.status === 504;
 }
 
 /** True for the end of a request that a view gave up on. */

@@ -2,68 +2,91 @@
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
+import { Player } from "./player.js";
 import { View } from "./view.js";
-import { announce, facts, h, say } from "./dom.js";
-import { ask, tell } from "./actions.js";
+import { announce, facts, h, place, put } from "./dom.js";
+import { ask, rename, tell } from "./actions.js";
+import { every } from "./live.js";
 import { figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
-import { report } from "./report.js";
+import { grade, report } from "./report.js";
 
 export async function calibrations(root, _, signal) {
-  const body = h("tbody");
+  const list = h("ul", { class: "tiling" });
   const more = h("button", { type: "button", hidden: true }, "More");
   let cursor = null;
   const load = async () => {
-    const page = await get(`/v1/calibrations?limit=100${cursor ? `&cursor=${cursor}` : ""}`, signal);
-    body.append(...page.items.map(line));
+    const page = await get(`/v1/calibrations?limit=50${cursor ? `&cursor=${cursor}` : ""}`, signal);
+    list.append(...page.items.map((item) => h("li", null, tile(item, signal))));
     cursor = page.next_cursor;
     more.hidden = cursor === null;
     return page.items.length;
   };
   more.addEventListener("click", load);
-  const heads = ["Name", "Masks", "Mean", "Dead pixels", "File", "Made"].map((name) => h("th", { scope: "col" }, name));
-  const list = h("div", { class: "wide card", tabindex: 0, role: "region", "aria-label": "Calibrations" }, h("table", null, h("thead", null, h("tr", null, heads)), body), more);
-  root.append(h("h1", null, "Calibrations"));
   const count = await load();
-  root.append(count ? list : h("p", { class: "note" }, "There are none yet. A ", h("a", { href: "#/new" }, "new job"), " begins with one."));
+  root.append(h("div", { class: "row head" }, h("h1", null, "Calibrations"), h("span", { class: "grow" }), h("a", { class: "button primary writes", href: "#/new" }, "New calibration")));
+  root.append(count ? h("section", { "aria-label": "Calibrations" }, list, more) : h("p", { class: "note" }, "There are none yet. A ", h("a", { href: "#/new" }, "new job"), " begins with one."));
 }
 
-function line(item) {
-  const name = h("th", { scope: "row" }, h("a", { href: `#/calibrations/${item.id}` }, nameOf(item)));
-  if (item.state !== "ready") {
-    return h("tr", null, name, h("td", { colspan: 4 }, ...unready(item)),
-      h("td", { title: momentInFull(item.created_at) }, moment(item.created_at)));
-  }
-  return h("tr", null,
-    name,
-    h("td", null, `${item.frames} × ${item.height} × ${item.width}`),
-    h("td", null, figure(item.mask_mean)),
-    h("td", null, item.dead_pixels),
-    h("td", null, `${item.sample}, ${item.format}`),
-    h("td", { title: momentInFull(item.created_at) }, moment(item.created_at)));
+/** A calibration at a glance: a mask, its name, its grade. */
+function tile(item, signal) {
+  return h("a", { class: "card calibration", href: `#/calibrations/${item.id}` }, ...glance(item, signal));
+}
+
+/** Picture, name, size and grade, for a list and for a choice. */
+export function glance(item, signal) {
+  const ready = item.state === "ready";
+  return [
+    ready ? h("img", { src: place(`/v1/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
+    h("span", { class: "about" }, h("b", null, nameOf(item)),
+      ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}`) : h("span", { class: item.state === "failed" ? "warn" : "muted" }, unready(item)),
+      ready && grade(item.id, signal), h("time", { class: "muted", datetime: item.created_at, title: momentInFull(item.created_at) }, moment(item.created_at))),
+  ];
 }
 
 /** What is to be said of a calibration whose masks are not there. */
 function unready(item) {
-  if (item.state === "failed") return [h("span", { class: "warn" }, `No masks: ${item.error}`)];
-  return [`Masks are being made of ${item.frames} patterns: ${item.percent} %`];
+  if (item.state === "failed") return `No masks: ${item.error}`;
+  return `Masks are being made of ${item.frames} patterns: ${Math.floor(item.percent)} %`;
 }
 
 export async function calibration(root, [id], signal) {
-  const item = await get(`/v1/calibrations/${id}`, signal);
-  document.title = `${nameOf(item)} – sci-recon`;
-  const remove = h("button", { type: "button", class: "delete" }, "Delete");
-  remove.addEventListener("click", () => erase(item));
-  if (item.state !== "ready") {
-    root.append(h("div", { class: "row head" }, h("h1", null, nameOf(item)), h("span", { class: "grow" }), remove), h("p", null, ...unready(item)));
-    return;
-  }
-  const masks = new Masks(item, signal);
-  root.append(
-    h("div", { class: "row head" }, h("h1", null, nameOf(item)), h("span", { class: "grow" }),
-      h("a", { class: "button", href: `#/new?calibration=${id}` }, "Use for a new job"), remove),
-    masks.element, h("div", { class: "cards" }, report(item, signal), about(item)));
-  await masks.show();
+  const body = h("div");
+  const title = h("h1");
+  const buttons = h("span", { class: "row writes" });
+  root.append(h("p", { class: "back" }, h("a", { href: "#/calibrations" }, "← All calibrations")), h("div", { class: "row head" }, title, h("span", { class: "grow" }), buttons), body);
+  const call = (item) => {
+    put(title, nameOf(item));
+    document.title = `${nameOf(item)} – sci-recon`;
+  };
+  const show = async (item) => {
+    call(item);
+    put(buttons,
+      item.state === "ready" && h("a", { class: "button primary", href: `#/new?calibration=${id}` }, "Use for a new job"),
+      h("button", { type: "button", onclick: () => rename(item.name, async (name) => {
+        Object.assign(item, await send("PATCH", `/v1/calibrations/${id}`, { name }));
+        call(item);
+      }) }, "Rename"),
+      h("button", { type: "button", class: "delete", onclick: () => erase(item) }, "Delete"));
+    if (item.state !== "ready") {
+      put(body, h("p", { class: item.state === "failed" ? "trouble" : "note" }, unready(item)));
+      return;
+    }
+    const masks = new Masks(item, signal);
+    put(body, h("div", { class: "stage" }, h("div", { class: "side" }, report(item, signal)), masks.element), h("div", { class: "cards" }, about(item)));
+    await masks.show();
+  };
+  const first = await get(`/v1/calibrations/${id}`, signal);
+  await show(first);
+  if (first.state !== "preparing") return;
+  // Until its masks are made.
+  const done = new AbortController();
+  signal.addEventListener("abort", () => done.abort());
+  every(1000, async () => {
+    const item = await get(`/v1/calibrations/${id}`, signal);
+    await show(item);
+    if (item.state !== "preparing") done.abort();
+  }, done.signal);
 }
 
 async function erase(item) {
@@ -94,44 +117,45 @@ function about(item) {
   ]));
 }
 
-/** The masks one by one, their mean, the gram diagonal and the dead pixels. */
+const WHOLE = [["mean", "Mean of all masks"], ["gram", "Gram diagonal: sum of squares"], ["dead", "Dead pixels (white)"]];
+
+/** The masks one by one or played, their mean, the gram diagonal and the dead pixels. */
 class Masks {
   constructor(item, signal) {
     Object.assign(this, { item, signal });
     this.view = new View(item.height, item.width);
     this.pane = new Pane("Masks", this.view, signal);
     this.contrast = new Contrast("masks", () => this.draw());
-    const whole = [["mean", "Mean of all masks"], ["gram", "Gram diagonal: sum of squares"], ["dead", "Dead pixels (white)"]];
-    this.choice = h("select", { id: "picture", "aria-label": "Picture" }, h("option", { value: "mask" }, "Masks one by one"), whole.map(([value, text]) => h("option", { value }, text)));
-    this.slider = h("input", { type: "range", id: "mask", min: 1, max: item.frames, value: 1, "aria-label": "Mask" });
-    this.number = h("output", { for: "mask", class: "count" });
-    this.row = h("div", { class: "row player" }, h("label", { for: "mask" }, "Mask"), this.slider, this.number);
+    this.choice = h("select", { id: "picture", "aria-label": "Picture" }, h("option", { value: "mask" }, "Masks one by one"), WHOLE.map(([value, text]) => h("option", { value }, text)));
+    this.player = new Player(item.frames, signal, () => this.draw());
+    this.player.ahead = (frame) => this.pane.prepare(this.source(`mask-${frame}`), ...this.contrast.window());
     this.choice.addEventListener("change", () => {
       this.contrast.touched = false;
+      this.player.stop();
       this.show();
     });
-    this.slider.addEventListener("input", () => this.show());
-    this.pane.tools.append(this.choice);
-    this.element = h("section", { class: "card viewer", "aria-label": "Masks" }, this.pane.element, this.contrast.element, this.row,
-      h("p", { class: "muted keys" }, "Keys on the picture: + − 0 1 zoom, shift and arrows move. The wheel zooms, dragging moves."));
+    this.pane.tools.append(this.choice, h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit"));
+    this.element = h("section", { class: "card viewer", "aria-label": "Masks" }, this.pane.element, this.player.element, this.contrast.element,
+      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on the picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms, dragging moves.")));
+    this.player.keys(this.element);
   }
 
-  name() {
-    return this.choice.value === "mask" ? `mask-${this.slider.value}` : this.choice.value;
+  source(name) {
+    const { levels, tile } = this.spread;
+    return { base: `/v1/calibrations/${this.item.id}/pictures/${name}`, levels, tile, label: this.choice.selectedOptions[0].textContent };
   }
 
+  /** The spread of what is shown, of the first mask for all of them. */
   async show() {
-    this.row.hidden = this.choice.value !== "mask";
-    say(this.number, `${this.slider.value} / ${this.item.frames}`);
-    const base = `/v1/calibrations/${this.item.id}/pictures/${this.name()}`;
-    this.spread = await get(`${base}/spread`, this.signal);
+    const one = this.choice.value === "mask";
+    this.player.element.hidden = !one;
+    this.spread = await get(`/v1/calibrations/${this.item.id}/pictures/${one ? "mask-1" : this.choice.value}/spread`, this.signal);
     this.contrast.offer(this.spread);
     this.draw();
   }
 
   draw() {
-    const { levels, tile } = this.spread;
-    const base = `/v1/calibrations/${this.item.id}/pictures/${this.name()}`;
-    this.pane.show({ base, levels, tile, label: this.choice.selectedOptions[0].textContent }, ...this.contrast.window());
+    const name = this.choice.value === "mask" ? `mask-${this.player.frame}` : this.choice.value;
+    this.pane.show(this.source(name), ...this.contrast.window());
   }
 }

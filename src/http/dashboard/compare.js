@@ -1,50 +1,65 @@
-// Two jobs side by side: the same place, the same frame, the same contrast; or in turn in one pane.
+// Two to four jobs: the same place, the same frame, the same contrast, side by side, one wiped over the
+// other, their difference, or in turn; and a table in which what differs comes first.
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, h, put, say } from "./dom.js";
-import { bytes, duration, figure, nameOf, shapeOf } from "./format.js";
+import { bytes, duration, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
 import { gaveUp, get, upload } from "./api.js";
+import { keepTruth, truthOf } from "./keeping.js";
+import { networks, ran } from "./made.js";
 
-export async function compare(root, [first, second], signal) {
-  const jobs = await Promise.all([first, second].map((id) => get(`/v1/jobs/${id}`, signal)));
-  root.append(h("h1", null, "Two jobs"));
-  const same = ["frames", "height", "width"].every((axis) => jobs[0].shape[axis] === jobs[1].shape[axis]);
+export async function compare(root, [path], signal) {
+  const ids = path.split("/");
+  const jobs = await Promise.all(ids.map((id) => get(`/v1/jobs/${id}`, signal)));
+  root.append(h("h1", null, `${jobs.length} jobs compared`));
+  const same = ["frames", "height", "width"].every((axis) => jobs.every((job) => job.shape[axis] === jobs[0].shape[axis]));
   const manifests = await Promise.all(jobs.map((job) => manifest(job, signal)));
+  const all = manifests.every(Boolean);
   if (!same) {
     root.append(h("p", { class: "trouble" }, `They can't be laid side by side: their frames are ${jobs.map(shapeOf).join(" and ")}.`));
-  } else if (manifests.every(Boolean)) {
-    const pair = new Pair(jobs, signal);
-    root.append(pair.element);
-    await pair.open();
+  } else if (all) {
+    const group = new Group(jobs, signal);
+    root.append(group.element);
+    await group.open();
   } else {
-    root.append(h("p", { class: "note" }, "Both jobs must have succeeded before their frames can be compared."));
+    root.append(h("p", { class: "note" }, "All jobs must have succeeded before their frames can be compared."));
   }
   const table = h("div");
-  root.append(h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), table, manifests.every(Boolean) && truth(jobs, manifests, table, signal)));
+  root.append(h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), table, all && truth(jobs, manifests, table, signal)));
   put(table, figures(jobs, manifests));
 }
 
-/** Asks for the true frames, and for both jobs' PSNR and SSIM against them. */
+/** PSNR and SSIM of all jobs, against true frames that are attached here or were before. */
 function truth(jobs, manifests, table, signal) {
-  const input = h("input", { type: "file", id: "truth" });
-  const status = h("p", { class: "muted", "aria-live": "polite" }, "Where the true frames are known, PSNR and SSIM are told: npy, TIFF or .mat, on the scale of the frames.");
+  const input = h("input", { type: "file", id: "truth", class: "unseen" });
+  const status = h("span", { class: "muted", "aria-live": "polite" }, "npy, TIFF or .mat, on the scale of the frames");
+  const measure = async ({ sha256, name }) => {
+    say(status, "The frames are compared …");
+    const found = await Promise.all(jobs.map((job) => get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/quality?truth=${sha256}`, signal)));
+    jobs.forEach((job) => keepTruth(job.id, { sha256, name }));
+    put(table, figures(jobs, manifests, found));
+    say(status, `Measured against ${name}.`);
+  };
+  const tell = (error) => gaveUp(error) || put(status, h("span", { class: "warn" }, error.message));
   input.addEventListener("change", async () => {
     const file = input.files[0];
     if (!file) return;
     try {
       const { sha256 } = await upload(file, (done, total) => say(status, `${bytes(done)} of ${bytes(total)}`), signal);
-      say(status, "The frames are compared …");
-      const found = await Promise.all(jobs.map((job) => get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/quality?truth=${sha256}`, signal)));
-      put(table, figures(jobs, manifests, found));
-      say(status, `Compared with ${file.name}.`);
+      await measure({ sha256, name: file.name });
     } catch (error) {
-      if (!gaveUp(error)) put(status, h("span", { class: "warn" }, error.message));
+      tell(error);
     }
   });
-  return h("div", null, h("div", { class: "row" }, h("label", { for: "truth" }, "True frames"), input), status);
+  const before = jobs.map((job) => truthOf(job.id));
+  const one = before.find(Boolean);
+  // The truth of one scene says nothing about another.
+  const fits = (job, index) => job.measurement === jobs[before.indexOf(one)].measurement || before[index]?.sha256 === one.sha256;
+  if (one && jobs.every(fits)) measure(one).catch(tell);
+  return h("div", { class: "row" }, h("label", { for: "truth", class: "button small filebutton" }, "Attach true frames", input), status);
 }
 
 async function manifest(job, signal) {
@@ -52,26 +67,56 @@ async function manifest(job, signal) {
   return get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/manifest.json`, signal);
 }
 
-/** Two panes in step, and one in which the two take turns. */
-class Pair {
+const MODES = [["beside", "Side by side"], ["wipe", "Wipe"], ["difference", "Difference"], ["flicker", "In turn"]];
+
+/** Panes in step, and one pane in which two meet. */
+class Group {
   constructor(jobs, signal) {
     const { frames, height, width } = jobs[0].shape;
-    Object.assign(this, { jobs, signal, turn: 0, flickering: false });
+    Object.assign(this, { jobs, signal, turn: 0, mode: "beside" });
     this.view = new View(height, width);
     this.panes = jobs.map((job) => new Pane(nameOf(job), this.view, signal));
     this.contrast = new Contrast("frames", () => this.show());
     this.player = new Player(frames, signal, () => this.show());
     this.player.ahead = (frame) => this.panes.every((pane, index) => pane.prepare(this.source(index, frame), ...this.contrast.window()));
+    this.modes = MODES.map(([value, text]) => h("button", { type: "button", id: value, "aria-pressed": String(value === this.mode), onclick: () => this.choose(value) }, text));
+    const pick = (id, label, chosen) => {
+      const select = h("select", { id, "aria-label": label, onchange: () => this.show() }, jobs.map((job, index) => h("option", { value: index, selected: index === chosen }, nameOf(job))));
+      return select;
+    };
+    [this.one, this.other] = [pick("one", "Left, or first", 0), pick("other", "Right, or second", 1)];
+    this.wipe = h("input", { type: "range", id: "wipe-at", min: 0, max: 1000, value: 500, "aria-label": "Where the wipe is", oninput: () => this.show() });
+    this.gain = h("select", { id: "gain", "aria-label": "Brightness of the difference", onchange: () => this.show() }, [1, 2, 4, 8, 16].map((by) => h("option", { value: by, selected: by === 4 }, `× ${by}`)));
     this.rate = h("input", { type: "number", id: "flicker-rate", min: 0.2, max: 20, step: "any", value: 2 });
-    this.button = h("button", { type: "button", id: "flicker", "aria-pressed": "false", onclick: () => this.flicker() }, "Flicker");
-    this.panels = h("div", { class: "panes" }, this.panes.map((pane) => pane.element));
-    this.element = h("section", { class: "card viewer", "aria-label": "Frames of both jobs" }, this.panels, this.contrast.element,
-      h("div", { class: "row controls" }, this.player.element,
-        h("div", { class: "row" }, this.button, h("label", { for: "flicker-rate", class: "row muted" }, this.rate, "changes/s"),
-          h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit"))),
-      h("p", { class: "muted keys" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move."));
+    this.rateLabel = h("label", { for: "flicker-rate", class: "row muted" }, this.rate, "changes/s");
+    this.pairing = h("span", { class: "row" }, this.one, h("span", { class: "muted" }, "and"), this.other);
+    this.panels = h("div", { class: `panes of${jobs.length}` }, this.panes.map((pane) => pane.element));
+    this.element = h("section", { class: "card viewer", "aria-label": "Frames of the jobs" },
+      h("div", { class: "row", role: "group", "aria-label": "How they are compared" }, this.modes, this.pairing, this.wipe, this.gain, this.rateLabel,
+        h("span", { class: "grow" }), h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit")),
+      this.panels, this.player.element, this.contrast.element,
+      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wipe is dragged by its line, or moved by its slider.")));
     this.player.keys(this.element);
+    this.drag();
     signal.addEventListener("abort", () => clearTimeout(this.timer), { once: true });
+  }
+
+  /** The line of the wipe follows a pointer that takes it. */
+  drag() {
+    const { sight } = this.panes[0];
+    const handle = h("div", { class: "handle", "aria-hidden": "true" });
+    sight.append(handle);
+    this.handle = handle;
+    const move = (event) => {
+      const box = sight.getBoundingClientRect();
+      this.wipe.value = Math.round(1000 * Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)));
+      this.show();
+    };
+    handle.addEventListener("pointerdown", (event) => {
+      handle.setPointerCapture(event.pointerId);
+      handle.addEventListener("pointermove", move);
+    });
+    for (const kind of ["pointerup", "pointercancel"]) handle.addEventListener(kind, () => handle.removeEventListener("pointermove", move));
   }
 
   base(index, frame) {
@@ -86,45 +131,73 @@ class Pair {
 
   async open() {
     const middle = Math.ceil(this.player.count / 2);
-    const [one, other] = await Promise.all([0, 1].map((index) => get(`${this.base(index, middle)}/spread`, this.signal)));
-    // One window for both: a difference of brightness should show.
-    this.spread = {
-      ...one,
-      minimum: Math.min(one.minimum, other.minimum), maximum: Math.max(one.maximum, other.maximum),
-      low: Math.min(one.low, other.low), high: Math.max(one.high, other.high),
-    };
+    const spreads = await Promise.all(this.jobs.map((_, index) => get(`${this.base(index, middle)}/spread`, this.signal)));
+    // One window for all: a difference of brightness should show.
+    const least = (name) => Math.min(...spreads.map((spread) => spread[name]));
+    const most = (name) => Math.max(...spreads.map((spread) => spread[name]));
+    this.spread = { ...spreads[0], minimum: least("minimum"), maximum: most("maximum"), low: least("low"), high: most("high") };
     this.contrast.offer(this.spread);
+    this.choose("beside");
+  }
+
+  choose(mode) {
+    this.mode = mode;
+    const alone = mode !== "beside";
+    this.modes.forEach((button) => button.setAttribute("aria-pressed", String(button.id === mode)));
+    this.panels.classList.toggle("one", alone);
+    this.panes.slice(1).forEach((pane) => (pane.element.hidden = alone));
+    this.pairing.hidden = !alone;
+    this.wipe.hidden = this.handle.hidden = mode !== "wipe";
+    this.gain.hidden = mode !== "difference";
+    this.rateLabel.hidden = mode !== "flicker";
+    announce(MODES.find(([value]) => value === mode)[1]);
+    clearTimeout(this.timer);
+    this.turn = 0;
+    if (mode === "flicker") this.next();
     this.show();
+  }
+
+  pair() {
+    return [Number(this.one.value), Number(this.other.value)];
   }
 
   show() {
     const { frame } = this.player;
-    this.panes.forEach((pane, index) => {
-      const which = this.flickering ? this.turn : index;
-      if (this.flickering && index === 1) return;
-      pane.show(this.source(which, frame), ...this.contrast.window());
-      say(pane.title, nameOf(this.jobs[which]));
-    });
-  }
-
-  flicker() {
-    this.flickering = !this.flickering;
-    this.turn = 0;
-    this.button.setAttribute("aria-pressed", String(this.flickering));
-    this.panels.classList.toggle("one", this.flickering);
-    this.panes[1].element.hidden = this.flickering;
-    announce(this.flickering ? "The two take turns in one pane" : "Side by side");
-    clearTimeout(this.timer);
-    if (this.flickering) this.next();
-    this.show();
+    const window = this.contrast.window();
+    const [black, white] = window;
+    const first = this.panes[0];
+    if (this.mode === "beside") {
+      this.panes.forEach((pane, index) => {
+        pane.lay(null);
+        pane.show(this.source(index, frame), ...window);
+        say(pane.title, nameOf(this.jobs[index]));
+      });
+      return;
+    }
+    const [one, other] = this.pair();
+    const shown = this.mode === "flicker" && this.turn === 1 ? other : one;
+    const over = { ...this.source(other, frame), black, white };
+    first.show(this.source(shown, frame), ...window);
+    if (this.mode === "wipe") {
+      const at = Number(this.wipe.value) / 1000;
+      this.handle.style.left = `${100 * at}%`;
+      first.lay({ source: over, at });
+      say(first.title, `${nameOf(this.jobs[one])} | ${nameOf(this.jobs[other])}`);
+    } else if (this.mode === "difference") {
+      first.lay({ source: over, gain: Number(this.gain.value) });
+      say(first.title, `|${nameOf(this.jobs[one])} − ${nameOf(this.jobs[other])}|`);
+    } else {
+      first.lay(null);
+      say(first.title, nameOf(this.jobs[shown]));
+    }
   }
 
   next() {
     this.timer = setTimeout(() => {
-      const other = 1 - this.turn;
+      const index = this.pair()[1 - this.turn];
       // The other one is shown when it is here, so that nothing but the pictures changes.
-      if (this.panes[0].prepare(this.source(other, this.player.frame), ...this.contrast.window())) {
-        this.turn = other;
+      if (this.panes[0].prepare(this.source(index, this.player.frame), ...this.contrast.window())) {
+        this.turn = 1 - this.turn;
         this.show();
       }
       this.next();
@@ -132,21 +205,27 @@ class Pair {
   }
 }
 
-/** What the two jobs were and what came of them. */
+/** What the jobs were and what came of them: rows that differ first. */
 function figures(jobs, manifests, measured) {
-  const row = (name, value) => h("tr", null, h("th", { scope: "row" }, name), jobs.map((job, index) => h("td", null, value(job, manifests[index]) ?? "–")));
-  const rowOf = (name, unit, digits) => measured && h("tr", { class: "quality" }, h("th", { scope: "row" }, name.toUpperCase()), measured.map((found) => h("td", null, `${figure(found[name], digits)}${unit}`)));
-  const body = h("tbody", null,
-    row("State", (job) => h("span", { class: `badge ${job.state}` }, job.state)),
-    row("Algorithm", (job) => job.algorithm),
-    row("Schedule", (job) => job.schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ")),
-    row("Tiles", (job) => `${job.tile.size} pixels, ${job.tile.overlap} shared`),
-    row("Residual ‖y − Hx‖ / ‖y‖", (_, found) => found && figure(found.content.summary.residual)),
-    row("Iterations", (_, found) => found && `${found.content.summary.tv_iterations} with TV, ${found.content.summary.denoiser_passes} deep`),
-    row("Ended", (_, found) => found && (found.content.summary.stop_reason === "converged" ? "converged" : "all planned iterations done")),
-    row("Computing", (_, found) => found && duration(found.run.cpu_seconds)),
-    row("Network", (_, found) => found?.content.model?.name),
-    rowOf("psnr", " dB", 4), rowOf("ssim", "", 4));
+  const rows = [
+    measured && ["PSNR", (_, index) => (measured[index].psnr === null ? "∞" : `${figure(measured[index].psnr, 4)} dB`), "quality"],
+    measured && ["SSIM", (_, index) => figure(measured[index].ssim, 4), "quality"],
+    ["State", (job) => job.state],
+    ["Algorithm", (job) => job.algorithm],
+    ["Planned iterations on a tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],
+    ["Schedule", (job) => job.schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ") || "–"],
+    ["Done", (job, index) => (manifests[index] ? ran(job, manifests[index].content) : "–")],
+    ["Network", (_, index) => (manifests[index] ? networks(manifests[index].content) : "–")],
+    ["Computing", (_, index) => (manifests[index] ? duration(manifests[index].run.cpu_seconds) : "–")],
+    ["Tiles", (job) => `${job.tile.size} pixels, ${job.tile.overlap} shared`],
+    ["Measurement", (job) => job.measurement],
+    ["Calibration", (job) => job.calibration],
+    ["Residual (no measure of quality)", (_, index) => (manifests[index] ? figure(manifests[index].content.summary.residual) : "–")],
+  ].filter(Boolean).map(([name, value, kind]) => ({ name, kind, cells: jobs.map(value) }));
+  const differs = ({ cells }) => cells.some((cell) => cell !== cells[0]);
+  const line = (row) => h("tr", { class: row.kind }, h("th", { scope: "row" }, row.name), row.cells.map((cell) => h("td", null, cell)));
+  const [different, equal] = [rows.filter(differs), rows.filter((row) => !differs(row))];
   const head = h("thead", null, h("tr", null, h("td"), jobs.map((job) => h("th", { scope: "col" }, h("a", { href: `#/jobs/${job.id}` }, nameOf(job))))));
-  return h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Figures of both jobs" }, h("table", { class: "figures" }, head, body));
+  const group = (title, found, kind) => found.length > 0 && h("tbody", { class: kind }, h("tr", null, h("th", { scope: "rowgroup", colspan: jobs.length + 1, class: "grouphead" }, title)), found.map(line));
+  return h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Figures of the jobs" }, h("table", { class: "figures" }, head, group("What differs", different, "differs"), group("The same in all", equal, "same")));
 }

@@ -66,7 +66,7 @@ export function shapeOf(job) {
 export function stageOf(job) {
   const words = {
     waiting: "waiting",
-    preparing: "measuring the scale",
+    preparing: "measuring the brightness",
     tv: "total variation",
     deep: "deep denoiser",
     nonlocal: "nonlocal prior",
@@ -75,4 +75,29 @@ export function stageOf(job) {
   };
   const stage = job.progress.stage;
   return words[stage] ?? stage;
+}
+
+/** What is ahead of a job that has not ended, and how long one that has took. */
+export function timeOf(job) {
+  const { eta_seconds: eta, queue_position: position } = job.progress;
+  if (job.state === "queued") return [position && `no. ${position} in the queue`, eta === null ? "no worker lives" : `done in up to about ${duration(eta)}`].filter(Boolean).join(", ");
+  if (job.state === "running") return eta === null ? "no worker lives" : `up to about ${duration(eta)} left`;
+  if (job.state === "cancelling") return "its workers let go";
+  if (!job.started_at || !job.finished_at) return "";
+  const took = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
+  return job.state === "succeeded" ? `took ${duration(took)}` : `after ${duration(took)}`;
+}
+
+/** Iterations of a schedule on one tile: all that there may be. */
+export function iterationsOf(schedule) {
+  return schedule.stages.reduce((sum, stage) => sum + stage.iterations, 0);
+}
+
+/** How many findings there are, and how grave the gravest is; null where there are none. */
+export function doubts(job) {
+  const errors = job.warnings.filter((item) => item.severity === "error").length;
+  const warnings = job.warnings.length - errors;
+  const count = (number, word) => number > 0 && `${number} ${word}${number > 1 ? "s" : ""}`;
+  if (job.warnings.length === 0) return null;
+  return { severity: errors > 0 ? "error" : "warning", text: [count(errors, "error"), count(warnings, "warning")].filter(Boolean).join(", ") };
 }

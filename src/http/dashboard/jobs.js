@@ -1,48 +1,82 @@
 // The list of jobs: newest first, as many as there are, filtered by the service.
 
-import { announce, calmly, h, put, say } from "./dom.js";
-import { duration, moment, momentInFull, nameOf, shapeOf, short, stageOf } from "./format.js";
-import { actions } from "./actions.js";
+import { announce, h, place, put, say } from "./dom.js";
+import { cancelAll, removeAll, actions } from "./actions.js";
+import { doubts, nameOf, moment, momentInFull, shapeOf, short, stageOf, timeOf } from "./format.js";
+import { filters } from "./filters.js";
 import { get } from "./api.js";
-import { table, textColumn } from "./rows.js";
+import { table } from "./rows.js";
 import { watch } from "./live.js";
+import { welcome } from "./welcome.js";
 
 const PAGE = 100;
 /** Changed jobs that are asked for one by one; more of them are cheaper as a page. */
 const SOME = 8;
 /** Time after which places in the queue are looked at again though no waiting job has changed. */
 const STALE = 10_000;
-const STATES = ["queued", "running", "succeeded", "failed", "cancelling", "cancelled"];
+/** Jobs that can be compared at once. */
+const MOST = 4;
 
 export async function jobs(root, [query], signal) {
   const chosen = new Set();
   const list = new JobList(signal);
-  const state = h("select", { id: "state" }, h("option", { value: "" }, "all states"), STATES.map((name) => h("option", { value: name, selected: query.get("state") === name }, name)));
-  const search = h("input", { type: "search", id: "search", placeholder: "label or identifier", maxlength: 200, autocomplete: "off", value: query.get("search") ?? "" });
+  const filter = filters(query, () => refilter());
   const count = h("span", { class: "muted", id: "count" });
-  const compare = h("a", { class: "button", hidden: true }, "Compare the two");
-  const empty = h("p", { class: "note", hidden: true });
+  const empty = h("div", { hidden: true });
+  const picked = h("div", { class: "bar picked", role: "region", "aria-label": "Chosen jobs", hidden: true });
   root.className = "fill";
   const scroller = h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Jobs, newest first" });
   const rows = table("Jobs", columns(chosen, () => choose(), () => look(null)), scroller, rowHeight);
-  root.append(
-    h("div", { class: "bar" }, h("h1", null, "Jobs"),
-      h("label", { for: "state" }, "State"), state,
-      h("label", { for: "search" }, "Search"), search, count, h("span", { class: "grow" }), compare,
-      h("a", { class: "button primary", href: "#/new" }, "New job")),
-    scroller);
+  const bar = h("div", { class: "bar" }, h("h1", null, "Jobs"), filter.element, count, h("span", { class: "grow" }), h("a", { class: "button primary writes", href: "#/new" }, "New job"));
+  root.append(bar, picked, scroller);
   scroller.append(rows.element, empty);
 
+  /** What can be done with the chosen ones. */
   function choose() {
-    compare.hidden = chosen.size !== 2;
-    if (chosen.size === 2) compare.href = `#/compare/${[...chosen].sort().join("/")}`;
+    const found = list.items.filter((job) => chosen.has(job.id));
+    const ended = found.filter((job) => ["succeeded", "failed", "cancelled"].includes(job.state));
+    const live = found.filter((job) => ["queued", "running"].includes(job.state));
+    picked.hidden = found.length === 0;
+    const after = () => {
+      none();
+      look(null);
+    };
+    put(picked, h("b", null, `${found.length} chosen`),
+      found.length >= 2 && found.length <= MOST && h("a", { class: "button small", id: "compare", href: `#/compare/${found.map((job) => job.id).reverse().join("/")}` }, "Compare"),
+      found.length > MOST && h("span", { class: "muted" }, `(up to ${MOST} can be compared)`),
+      live.length > 0 && h("button", { type: "button", class: "small writes", id: "cancel-all", onclick: () => cancelAll(live).then(after) }, `Cancel ${live.length}`),
+      ended.length > 0 && h("button", { type: "button", class: "small delete writes", id: "delete-all", onclick: () => removeAll(ended).then((gone) => gone && after()) }, `Delete ${ended.length}`),
+      h("button", { type: "button", class: "small", onclick: () => all() }, "Choose all loaded"),
+      h("button", { type: "button", class: "small", onclick: () => none() }, "Choose none"));
+  }
+
+  function all() {
+    list.items.forEach((job) => chosen.add(job.id));
+    mark();
+  }
+
+  function none() {
+    chosen.clear();
+    mark();
+  }
+
+  function mark() {
+    for (const box of scroller.querySelectorAll(".pick input")) box.checked = chosen.has(box.value);
+    choose();
   }
 
   function draw() {
     const [, last] = rows.show(list.items, list.complete);
-    say(count, list.complete ? `${list.items.length} jobs` : `${list.items.length} loaded, more below`);
-    empty.hidden = !list.complete || list.items.length > 0;
-    if (!empty.hidden) put(empty, state.value || search.value ? "No job fits." : ["There are no jobs yet. ", h("a", { href: "#/new" }, "Submit the first one.")]);
+    say(count, list.complete ? `${list.items.length} ${list.items.length === 1 ? "job" : "jobs"}` : `${list.items.length} loaded, more below`);
+    const nothing = list.complete && list.items.length === 0;
+    const first = nothing && !filter.value().state && !filter.value().search;
+    rows.element.hidden = nothing;
+    bar.hidden = first;
+    if (empty.hidden === nothing) {
+      empty.hidden = !nothing;
+      put(empty, nothing && (first ? welcome() : h("p", { class: "note" }, "No job fits. ", h("a", { href: "#/jobs" }, "All jobs"))));
+    }
+    if (!picked.hidden) choose();
     if (!list.complete && last + PAGE / 2 > list.items.length) list.more().then((more) => more && draw());
   }
 
@@ -51,38 +85,38 @@ export async function jobs(root, [query], signal) {
     draw();
   }
 
-  const filter = calmly(200, async () => {
-    list.filter(state.value, search.value.trim());
+  async function refilter() {
+    list.filter(filter.value());
+    empty.hidden = true;
     scroller.scrollTop = 0;
     await list.refresh(0);
     draw();
     announce(list.complete ? `${list.items.length} jobs` : `more than ${list.items.length} jobs`);
-  });
-  state.addEventListener("change", filter);
-  search.addEventListener("input", filter);
+  }
+
   let frame = 0;
   scroller.addEventListener("scroll", () => {
     cancelAnimationFrame(frame);
     frame = requestAnimationFrame(draw);
   }, { passive: true });
   addEventListener("resize", draw, { signal });
-  list.filter(state.value, search.value.trim());
+  list.filter(filter.value());
   const look = watch(refresh, signal);
 }
 
 /** The height of a row as the style sheet has it. */
 function rowHeight() {
-  return matchMedia("(max-width: 720px)").matches ? 92 : 38;
+  return matchMedia("(max-width: 720px)").matches ? 96 : 60;
 }
 
 /** The jobs that are loaded: a growing beginning of the filtered list. */
 class JobList {
   constructor(signal) {
     this.signal = signal;
-    this.filter("", "");
+    this.filter({});
   }
 
-  filter(state, search) {
+  filter({ state, search }) {
     this.query = new URLSearchParams({ limit: PAGE });
     if (state) this.query.set("state", state);
     if (search) this.query.set("search", search);
@@ -153,15 +187,13 @@ class JobList {
 function columns(chosen, choose, done) {
   return [
     { title: h("span", { class: "unseen" }, "Choose"), class: "pick", fill: (cell, job) => pick(cell, job, chosen, choose) },
+    { title: h("span", { class: "unseen" }, "Picture"), class: "thumb", fill: thumb },
     { title: "Job", class: "name", fill: name },
     { title: "State", class: "state", fill: state },
-    { title: "Progress", class: "progress", fill: progress },
-    textColumn("Stage", "stage", stageOf),
-    textColumn("Time", "left", left),
-    textColumn("Frames", "shape", shapeOf),
-    textColumn("Algorithm", "algorithm", (job) => job.algorithm),
-    { title: "Created", class: "created", fill: created },
-    { title: h("span", { class: "unseen" }, "Actions"), class: "actions", fill: (cell, job, before) => buttons(cell, job, before, done) },
+    { title: "Checks", class: "checks", fill: checks },
+    { title: "Frames", class: "shape", fill: (cell, job) => say(cell, shapeOf(job)) },
+    { title: "Submitted", class: "created", fill: created },
+    { title: h("span", { class: "unseen" }, "Actions"), class: "actions writes", fill: (cell, job, before) => buttons(cell, job, before, done) },
   ];
 }
 
@@ -172,36 +204,47 @@ function pick(cell, job, chosen, choose) {
     else chosen.delete(job.id);
     choose();
   };
-  cell.append(h("input", { type: "checkbox", "aria-label": `Choose ${nameOf(job)} to compare`, checked: chosen.has(job.id), onchange: toggle }));
+  cell.append(h("input", { type: "checkbox", "aria-label": `Choose ${nameOf(job)}`, value: job.id, checked: chosen.has(job.id), onchange: toggle }));
 }
 
-function name(cell, job) {
-  if (cell.firstChild) return;
-  cell.append(h("a", { href: `#/jobs/${job.id}`, title: `${nameOf(job)} (${job.id})` }, nameOf(job)));
-  if (job.label) cell.append(h("span", { class: "muted id" }, short(job.id)));
+/** The middle frame, as soon as there is something of it: a preview, tiles, or all. */
+function thumb(cell, job, before) {
+  const { previews_done: previews, tiles_done: tiles, snapshots_done: snapshots } = job.progress;
+  const version = snapshots > 0 ? "done" : tiles > 0 ? "tiles" : previews > 0 ? "preview" : "";
+  if (before && cell.dataset.version === version) return;
+  cell.dataset.version = version;
+  if (!version) {
+    put(cell, h("span", { class: "blank" }));
+    return;
+  }
+  const path = `/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/frame-${Math.ceil(job.shape.frames / 2)}?size=128`;
+  const image = h("img", { src: place(`${path}#${version}`), alt: "", loading: "lazy", decoding: "async", width: 64, height: 46 });
+  image.addEventListener("error", () => image.replaceWith(h("span", { class: "blank" })));
+  put(cell, image);
+}
+
+function name(cell, job, before) {
+  if (before && nameOf(before) === nameOf(job)) return;
+  put(cell, h("a", { href: `#/jobs/${job.id}`, title: `${nameOf(job)} (${job.id})` }, nameOf(job)),
+    h("span", { class: "sub" }, job.label ? `${job.algorithm} · ${short(job.id)}` : job.algorithm));
 }
 
 function state(cell, job, before) {
-  if (before?.state === job.state) return;
-  put(cell, h("span", { class: `badge ${job.state}`, title: job.error }, job.state));
+  if (before?.state !== job.state) {
+    const running = job.state === "running" || job.state === "cancelling";
+    put(cell, h("span", { class: "line" }, h("span", { class: `badge ${job.state}`, title: job.error }, job.state), running && h("progress", { max: 100, "aria-label": `Progress of ${nameOf(job)}` })), h("span", { class: "sub" }));
+  }
+  const bar = cell.querySelector("progress");
+  if (bar) bar.value = job.progress.percent;
+  say(cell.lastChild, [bar && `${Math.floor(job.progress.percent)} %`, bar && stageOf(job), timeOf(job)].filter(Boolean).join(" · "));
 }
 
-function progress(cell, job) {
-  const percent = job.progress.percent;
-  if (!cell.firstChild) cell.append(h("progress", { max: 100, "aria-label": `Progress of ${nameOf(job)}` }), h("span", { class: "percent" }));
-  const [bar, text] = cell.children;
-  if (bar.value !== percent) bar.value = percent;
-  say(text, `${percent < 10 && percent > 0 ? percent.toFixed(1) : Math.floor(percent)} %`);
-}
-
-/** What is ahead of a job that is not done, and how long one that is took. */
-export function left(job) {
-  const { eta_seconds: eta, queue_position: position } = job.progress;
-  const place = position ? `no. ${position}` : "";
-  if (job.state === "queued") return [place, eta === null ? "no worker" : `≤ ${duration(eta)}`].filter(Boolean).join(", ");
-  if (job.state === "running") return eta === null ? "no worker" : `≤ ${duration(eta)}`;
-  if (job.state === "succeeded") return `took ${duration((new Date(job.finished_at) - new Date(job.started_at)) / 1000)}`;
-  return "";
+/** What the checks of measurement and calibration found. */
+function checks(cell, job, before) {
+  if (before) return;
+  const found = doubts(job);
+  put(cell, found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text));
+  if (!found) put(cell, h("span", { class: "mark fine" }, "nothing found"));
 }
 
 function created(cell, job) {

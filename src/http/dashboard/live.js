@@ -3,7 +3,8 @@
 // A tab that nobody looks at holds no connection: browsers have few of them for one server.
 
 import { say } from "./dom.js";
-import { ask, gaveUp } from "./api.js";
+import { moment } from "./format.js";
+import { ask, forbidden, gaveUp, unanswered } from "./api.js";
 
 const POLL = 2000;
 const RETRY = 5000;
@@ -24,7 +25,7 @@ export function watch(changed, signal) {
       await changed(ids);
       link(true);
     } catch (error) {
-      if (!gaveUp(error)) link(error.status < 500);
+      trouble(error);
       // What was to be read is not known: everything is looked at again, but not at once.
       pending.all = true;
       await pause(POLL, signal);
@@ -102,7 +103,7 @@ export async function every(period, look, signal) {
         await look();
         link(true);
       } catch (error) {
-        if (!gaveUp(error)) link(error.status < 500);
+        trouble(error);
       }
     }
     await pause(period, signal);
@@ -132,9 +133,22 @@ function seen(signal) {
   });
 }
 
-/** Shows whether the service answers; a refusal is an answer. */
+function trouble(error) {
+  if (gaveUp(error)) return;
+  // A refusal is an answer.
+  link(!unanswered(error));
+  forbidden(error);
+}
+
+let answered = null;
+
+/** Shows whether the service answers, and since when not. */
 export function link(good) {
+  if (good) answered = new Date();
+  document.getElementById("offline").hidden = good;
+  const since = answered ? `What you see is as of ${moment(answered)}.` : "";
+  if (!good) say(document.getElementById("offline"), `The service does not answer. ${since} It is asked again every few seconds; nothing is lost.`);
   const element = document.getElementById("link");
-  say(element, good ? "live" : "no connection, trying again");
+  say(element, good ? "live" : "offline");
   element.classList.toggle("lost", !good);
 }

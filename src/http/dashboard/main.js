@@ -1,30 +1,43 @@
 // Which view an address shows. A view is a function of its root, its parameters and a signal that
 // ends when another view takes its place.
 
+import { forbidden, gaveUp, unanswered } from "./api.js";
 import { h, put, trouble } from "./dom.js";
-import { gaveUp } from "./api.js";
 import { jobs } from "./jobs.js";
 import { link } from "./live.js";
+import { account, nameplate, signIn } from "./signin.js";
 
 const ID = "([0-9a-f-]{36})";
+const AGAIN = 3000;
 const VIEWS = [
   [/^\/jobs$/, "Jobs", async () => jobs],
+  [/^\/start$/, "Start", async () => (await import("./welcome.js")).start],
   [new RegExp(`^/jobs/${ID}$`), "Job", async () => (await import("./job.js")).job],
-  [new RegExp(`^/compare/${ID}/${ID}$`), "Two jobs", async () => (await import("./compare.js")).compare],
+  [new RegExp(`^/compare/(${ID}(?:/${ID}){1,3})$`), "Compare", async () => (await import("./compare.js")).compare],
   [/^\/calibrations$/, "Calibrations", async () => (await import("./calibrations.js")).calibrations],
   [new RegExp(`^/calibrations/${ID}$`), "Calibration", async () => (await import("./calibrations.js")).calibration],
   [/^\/new$/, "New job", async () => (await import("./submit.js")).submit],
   [/^\/system$/, "System", async () => (await import("./system.js")).system],
+  [/^\/account$/, "Account", async () => account],
 ];
 
+const root = document.getElementById("content");
 let current = new AbortController();
 
-async function show() {
+/** Ends what is shown; gives the signal of what comes. */
+function clear() {
   current.abort();
   current = new AbortController();
-  const { signal } = current;
+  root.className = "";
+  // Out of sight as soon as the view puts something beside it.
+  put(root, h("h1", { class: "loading" }, "Loading …"));
+  root.scrollTop = 0;
+  return current.signal;
+}
+
+async function show() {
+  const signal = clear();
   const [path, query] = (location.hash.slice(1) || "/jobs").split("?");
-  const root = document.getElementById("content");
   const found = VIEWS.map(([pattern, title, load]) => ({ match: pattern.exec(path), title, load })).find((view) => view.match);
   mark(path);
   if (!found) {
@@ -32,17 +45,34 @@ async function show() {
     return;
   }
   document.title = `${found.title} – sci-recon`;
-  root.scrollTop = 0;
   try {
     const view = await found.load();
     if (signal.aborted) return;
-    root.className = "";
-    put(root);
     await view(root, [...found.match.slice(1), new URLSearchParams(query)], signal);
-    link(true);
+    if (!signal.aborted) link(true);
   } catch (error) {
-    if (!gaveUp(error) && !signal.aborted) root.append(trouble(error));
+    if (gaveUp(error) || signal.aborted) return;
+    if (unanswered(error)) silent(signal);
+    else if (error.status === 404) missing(error);
+    else if (!forbidden(error) && error.status !== 401) root.append(trouble(error));
   }
+}
+
+/** Nothing could be read: it is tried again until something can. */
+function silent(signal) {
+  link(false);
+  // The page itself says it.
+  document.getElementById("offline").hidden = true;
+  put(root, h("div", { class: "card gate" }, h("h1", null, "The service does not answer"),
+    h("p", null, "It may be starting, or the network is down. Jobs go on without this page."),
+    h("div", { class: "row" }, h("button", { type: "button", class: "primary", onclick: show }, "Try again"))));
+  const timer = setTimeout(show, AGAIN);
+  signal.addEventListener("abort", () => clearTimeout(timer));
+}
+
+function missing(error) {
+  clear();
+  put(root, h("div", { class: "card gate" }, h("h1", null, "This is not here"), h("p", null, error.message), h("p", null, h("a", { href: "#/jobs" }, "All jobs"))));
 }
 
 /** Marks the entry of the menu that the view belongs to. */
@@ -54,13 +84,39 @@ function mark(path) {
   }
 }
 
+addEventListener("signed-out", () => {
+  // Told once, however many requests were refused: what is being typed stays.
+  if (document.body.classList.contains("outside")) return;
+  clear();
+  root.className = "gated";
+  document.getElementById("who").hidden = true;
+  document.body.classList.add("outside");
+  signIn(root, () => {
+    document.body.classList.remove("outside");
+    enter();
+  });
+});
+addEventListener("forbidden", ({ detail }) => {
+  clear();
+  document.title = "Not allowed – sci-recon";
+  put(root, h("div", { class: "card gate" }, h("h1", null, "Your role does not allow this"), h("p", null, `The service says: ${detail}.`),
+    h("p", null, "Ask who runs the service for a token with that role, or sign in with another one."),
+    h("div", { class: "row" }, h("a", { class: "button", href: "#/jobs" }, "All jobs"), h("a", { class: "button", href: "#/account" }, "What I may do"))));
+});
+
+function enter() {
+  nameplate(document.getElementById("who"));
+  show();
+}
+
 document.getElementById("skip").addEventListener("click", (event) => {
   // The address after # names the view.
   event.preventDefault();
-  document.getElementById("content").focus();
+  root.focus();
 });
 addEventListener("hashchange", () => {
+  if (document.body.classList.contains("outside")) return;
   show();
-  document.getElementById("content").focus({ preventScroll: true });
+  root.focus({ preventScroll: true });
 });
-show();
+enter();

@@ -56,6 +56,10 @@ async function fetchTile(url, key, entry) {
   entry.ready.forEach((call) => call());
 }
 
+function url({ base, black, white }, { level, row, column }) {
+  return `${base}/tiles/${level}/${row}/${column}?black=${black}&white=${white}`;
+}
+
 export class Pane {
   /** A pane with a title; `view` is where it looks. */
   constructor(title, view, signal) {
@@ -64,9 +68,12 @@ export class Pane {
     this.tools = h("span", { class: "row" });
     this.canvas = h("canvas", { tabindex: 0, role: "img", "aria-label": title });
     this.note = h("p", { class: "note", hidden: true });
-    this.element = h("figure", { class: "pane" }, h("figcaption", null, this.title, this.tools), h("div", { class: "sight" }, this.canvas, this.note));
+    this.badge = h("p", { class: "onpicture", hidden: true });
+    this.sight = h("div", { class: "sight" }, this.canvas, this.note, this.badge);
+    this.element = h("figure", { class: "pane" }, h("figcaption", null, this.title, this.tools), this.sight);
     this.generation = 0;
     this.source = null;
+    this.over = null;
     this.marks = [];
     this.redraw = this.redraw.bind(this);
     view.listen(() => {
@@ -84,6 +91,20 @@ export class Pane {
     this.source = source && { ...source, black, white };
     if (source) this.canvas.setAttribute("aria-label", source.label);
     this.redraw();
+  }
+
+  /** Lays a second picture over the first, right of a share of the width (a wipe) or as a difference; null for none. */
+  lay(over) {
+    this.over = over;
+    this.moved = true;
+    this.redraw();
+  }
+
+  /** Marks the picture as what it is: a preview, say. */
+  brand(text, kind = "") {
+    this.badge.hidden = !text;
+    this.badge.className = `onpicture ${kind}`;
+    say(this.badge, text);
   }
 
   /** Says why there is nothing to see. */
@@ -127,7 +148,7 @@ export class Pane {
   draw() {
     const context = this.canvas.getContext("2d");
     const scale = this.canvas.width / (this.canvas.clientWidth || 1);
-    if (this.moved || !this.source) context.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    if (this.moved || !this.source || this.over) context.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.moved = false;
     if (!this.source || this.canvas.width === 0) return;
     const { zoom, left, top } = this.place();
@@ -138,8 +159,36 @@ export class Pane {
       const [x0, y0] = [Math.round((x - left) * by), Math.round((y - top) * by)];
       return [x0, y0, Math.round((x + width - left) * by) - x0, Math.round((y + height - top) * by) - y0];
     };
+    this.paint(context, this.source, target);
+    if (this.over) this.layered(context, target);
+    this.marks.forEach((mark) => mark(context, target, scale));
+  }
+
+  layered(context, target) {
+    const { source, at, gain } = this.over;
+    const { width, height } = this.canvas;
+    context.save();
+    if (at !== undefined) {
+      context.beginPath();
+      context.rect(at * width, 0, width, height);
+      context.clip();
+      context.clearRect(0, 0, width, height);
+      this.paint(context, source, target);
+      context.fillStyle = "rgb(255 176 0)";
+      context.fillRect(Math.round(at * width) - 1, 0, 2, height);
+    } else {
+      context.globalCompositeOperation = "difference";
+      this.paint(context, source, target);
+      // Added to itself, it is twice as bright.
+      context.globalCompositeOperation = "lighter";
+      for (let bright = 1; bright < gain; bright *= 2) context.drawImage(this.canvas, 0, 0);
+    }
+    context.restore();
+  }
+
+  paint(context, source, target) {
     for (const at of this.inSight()) {
-      const bitmap = tile(this.url(at), this.generation, this.redraw);
+      const bitmap = tile(url(source, at), this.generation, this.redraw);
       const span = this.source.tile * 2 ** at.level;
       const [x, y] = [at.column * span, at.row * span];
       if (bitmap) {
@@ -147,18 +196,17 @@ export class Pane {
         const [width, height] = [Math.min(bitmap.width * unit, this.view.width - x), Math.min(bitmap.height * unit, this.view.height - y)];
         context.drawImage(bitmap, ...target(x, y, width, height));
       } else {
-        this.coarser(context, at, target);
+        this.coarser(context, source, at, target);
       }
     }
-    this.marks.forEach((mark) => mark(context, target, scale));
   }
 
   /** What is known of a missing tile from a coarser level. */
-  coarser(context, at, target) {
+  coarser(context, source, at, target) {
     const size = this.source.tile;
     for (let up = 1; at.level + up <= this.source.levels; up += 1) {
       const above = { level: at.level + up, row: at.row >> up, column: at.column >> up };
-      const bitmap = tile(this.url(above), this.generation, null);
+      const bitmap = tile(url(source, above), this.generation, null);
       if (!bitmap) continue;
       const part = size / 2 ** up;
       const [sx, sy] = [(at.column % 2 ** up) * part, (at.row % 2 ** up) * part];
@@ -169,11 +217,6 @@ export class Pane {
       context.drawImage(bitmap, sx, sy, width, height, ...target(x, y, width * unit, height * unit));
       return;
     }
-  }
-
-  url({ level, row, column }) {
-    const { base, black, white } = this.source;
-    return `${base}/tiles/${level}/${row}/${column}?black=${black}&white=${white}`;
   }
 
   /** The tiles that the pane needs at its zoom. */
@@ -194,10 +237,8 @@ export class Pane {
 
   /** Asks for the tiles in sight of another picture before it is shown; says whether all are here. */
   prepare(source, black, white) {
-    const before = this.source;
-    this.source = { ...source, black, white };
-    const missing = this.inSight().filter((at) => !tile(this.url(at), this.generation, () => {}));
-    this.source = before;
-    return missing.length === 0;
+    if (!this.source) return true;
+    const wanted = { ...source, black, white };
+    return this.inSight().filter((at) => !tile(url(wanted, at), this.generation, () => {})).length === 0;
   }
 }

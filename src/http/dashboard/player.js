@@ -1,6 +1,10 @@
 // Which frame is shown: slider, play at any rate, keys.
 
+import { figure } from "./format.js";
 import { h, put, say } from "./dom.js";
+
+/** Frames a second, beyond which no screen shows what is played. */
+const FASTEST = 240;
 
 /** A player of `count` frames; `show(frame)` is called with 1 to `count`. */
 export class Player {
@@ -9,13 +13,38 @@ export class Player {
     this.slider = h("input", { type: "range", id: "frame", min: 1, max: count, value: 1, "aria-label": "Frame" });
     this.slider.addEventListener("input", () => this.go(Number(this.slider.value)));
     this.button = h("button", { type: "button", id: "play", "aria-pressed": "false", onclick: () => this.toggle() }, "Play");
-    this.rate = h("input", { type: "number", id: "rate", min: 0.1, max: 240, step: "any", value: Math.min(12, Math.max(4, count)) });
+    this.rate = h("input", { type: "number", id: "rate", min: 0.1, max: FASTEST, step: "any", value: Math.min(12, Math.max(4, count)) });
+    this.rate.addEventListener("input", () => this.pace());
     this.text = h("output", { for: "frame", class: "count" });
-    this.element = h("div", { class: "row player" }, this.button,
-      this.step(-1, "Frame before", "‹"), this.slider, this.step(1, "Next frame", "›"), this.text,
-      h("label", { for: "rate", class: "row muted" }, this.rate, "frames/s"));
+    this.loop = h("input", { type: "checkbox", id: "loop", checked: true });
+    this.slow = h("span", { class: "muted" });
+    this.true = h("button", { type: "button", class: "small", hidden: true, onclick: () => this.trueSpeed() }, "True speed");
+    this.element = h("div", { class: "player" },
+      h("div", { class: "row" }, this.button, this.step(-1, "Frame before", "‹"), this.slider, this.step(1, "Next frame", "›"), this.text),
+      h("div", { class: "row" }, h("label", { for: "rate", class: "row muted" }, this.rate, "frames/s"), this.true, this.slow,
+        h("label", { for: "loop", class: "row muted" }, this.loop, "Loop")));
     signal.addEventListener("abort", () => this.stop(), { once: true });
     this.tell();
+  }
+
+  /** How many frames a second the scene had; null where the camera's times are not known. */
+  real(rate) {
+    this.actual = rate;
+    this.true.hidden = rate === null || rate > FASTEST;
+    this.pace();
+  }
+
+  trueSpeed() {
+    this.rate.value = Number(this.actual.toPrecision(4));
+    this.pace();
+    this.play();
+  }
+
+  /** Says how slow the motion is. */
+  pace() {
+    const by = this.actual / Number(this.rate.value);
+    const text = by > 1.05 ? `${figure(by, 2)} times slower than it was` : by < 0.95 ? `${figure(1 / by, 2)} times faster than it was` : "as fast as it was";
+    say(this.slow, this.actual && Number.isFinite(by) && by > 0 ? text : "");
   }
 
   step(by, label, sign) {
@@ -40,6 +69,9 @@ export class Player {
   }
 
   play() {
+    if (this.playing) return;
+    // From the beginning, if it stands at an end at which it would stop.
+    if (!this.loop.checked && this.frame === this.count) this.go(1);
     this.playing = true;
     this.mark();
     let before = performance.now();
@@ -47,13 +79,16 @@ export class Player {
     this.fps = 0;
     const turn = (now) => {
       if (!this.playing) return;
-      const period = 1000 / Math.min(240, Math.max(0.1, Number(this.rate.value) || 1));
+      const period = 1000 / Math.min(FASTEST, Math.max(0.1, Number(this.rate.value) || 1));
       const steps = Math.floor((now - before) / period);
       if (steps >= 1) {
         // What is asked for faster than the screen is skipped; what has not come yet is waited for.
         const next = ((this.frame - 1 + steps) % this.count) + 1;
         if (this.frame - 1 + steps >= this.count && this.onward()) {
           before = now;
+        } else if (this.frame - 1 + steps >= this.count && !this.loop.checked) {
+          this.go(this.count);
+          this.stop();
         } else if (this.ahead(next)) {
           before += steps * period;
           this.go(next);

@@ -2,22 +2,44 @@
 
 import { facts, h, put, s } from "./dom.js";
 import { figure } from "./format.js";
-import { get } from "./api.js";
+import { gaveUp, get } from "./api.js";
 
 /** What a check found, each with what to do about it; null where there is nothing. */
 export function findings(found) {
   if (!found?.length) return null;
   const about = (item) => (item.snapshot !== undefined && item.snapshot !== null ? `Snapshot ${item.snapshot}: ` : "");
   return h("ul", { class: "findings" }, found.map((item) => h("li", { class: item.severity },
-    h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about(item), item.detail,
-    item.remedy && h("span", { class: "muted" }, ` ${item.remedy}`))));
+    h("p", null, h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about(item), item.detail),
+    item.remedy && h("p", null, h("b", null, "What to do: "), item.remedy))));
+}
+
+/** The grade of a calibration, when it is known; in a list it is asked for when it comes into sight. */
+export function grade(id, signal) {
+  const element = h("span", { class: "grade" }, " ");
+  const ask = async () => {
+    try {
+      const { grade: found, findings: reasons } = await get(`/v1/calibrations/${id}/report.json`, signal);
+      element.classList.add(found);
+      put(element, found, reasons.length > 0 && h("span", { class: "muted" }, ` ${reasons.length} ${reasons.length === 1 ? "finding" : "findings"}`));
+    } catch (error) {
+      if (!gaveUp(error)) put(element, h("span", { class: "muted" }, error.code === "not_ready" ? "not graded yet" : "no grade"));
+    }
+  };
+  const watch = new IntersectionObserver((entries) => {
+    if (!entries.some((entry) => entry.isIntersecting)) return;
+    watch.disconnect();
+    ask();
+  });
+  watch.observe(element);
+  signal.addEventListener("abort", () => watch.disconnect(), { once: true });
+  return element;
 }
 
 /** A card with the report, as soon as there is one. */
 export function report(item, signal) {
   const body = h("div", null, h("p", { class: "muted" }, "…"));
   const element = h("section", { class: "card", "aria-label": "Report" },
-    h("h2", { class: "row" }, "Report", h("span", { class: "grow" }), h("a", { href: `/v1/calibrations/${item.id}/report.html` }, "as a page")), body);
+    h("h2", { class: "row" }, "Are the masks good?", h("span", { class: "grow" }), h("a", { href: `/v1/calibrations/${item.id}/report.html`, target: "_blank", rel: "noopener" }, "To print (new tab)")), body);
   load(item, body, signal);
   return element;
 }
@@ -36,9 +58,11 @@ async function load(item, body, signal) {
 function show(body, found) {
   const { masks, captures } = found;
   put(body,
-    h("p", null, "Grade: ", h("span", { class: `grade ${found.grade}` }, found.grade)),
-    findings(found.findings) ?? h("p", { class: "muted" }, "Nothing is wrong with it."),
-    facts([
+    h("p", { class: `judgement ${found.grade}` }, found.grade[0].toUpperCase() + found.grade.slice(1)),
+    findings(found.findings) ?? h("p", { class: "muted" }, "Nothing is wrong with them."),
+    h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)),
+    masks.correlation_mean !== null && h("p", { class: "muted" }, meaning(masks)),
+    h("details", null, h("summary", null, "All figures"), facts([
       ["Deviation over the frames", figure(masks.deviation)],
       ["1st to 99th percentile", `${figure(masks.percentile_1)} to ${figure(masks.percentile_99)}`],
       ["Gram diagonal", `${figure(masks.gram[0])} to ${figure(masks.gram[2])}, mean ${figure(masks.gram[1])}`],
@@ -49,8 +73,12 @@ function show(body, found) {
       captures && ["Noise of a mask value", figure(captures.noise)],
       captures && ["Dynamic range", captures.dynamic_range_db === null ? "–" : `${figure(captures.dynamic_range_db)} dB`],
       captures && ["Evenness of the light", figure(captures.illumination_flatness)],
-    ]),
-    h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)));
+    ])));
+}
+
+/** What the matrix says, for who has never seen one. */
+function meaning({ correlation_largest: largest }) {
+  return `Each cell tells how alike two masks are: empty for not at all, full for the same. The diagonal is each mask with itself; all else should be pale. The most alike two are at ${figure(largest)}.`;
 }
 
 /** The correlation of every two masks: grey at 0, blue above, orange below. */

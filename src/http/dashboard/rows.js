@@ -1,6 +1,6 @@
 // A table that holds only the rows in sight, so that thousands scroll like ten.
 
-import { h, say } from "./dom.js";
+import { h } from "./dom.js";
 
 const SPARE = 10;
 
@@ -81,9 +81,4 @@ export function table(caption, columns, scroller, rowHeight) {
       shown.clear();
     },
   };
-}
-
-/** A column of plain text. */
-export function textColumn(title, className, text) {
-  return { title, class: className, fill: (cell, item) => say(cell, text(item)) };
 }

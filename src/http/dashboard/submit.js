@@ -1,31 +1,34 @@
-// A new job: drop the calibration set and the measurement, read what the check says, submit.
+// A new job in three steps: masks or captures, the measurement, the reconstruction with what it will take.
 
-import { announce, facts, h, put, say } from "./dom.js";
-import { bytes, figure, moment, nameOf } from "./format.js";
+import { announce, calmly, facts, h, put, say } from "./dom.js";
+import { askScale, dropZone, problem, scaleInDoubt } from "./drop.js";
+import { bytes, duration, figure } from "./format.js";
+import { Captures } from "./captures.js";
 import { findings } from "./report.js";
-import { gaveUp, get, send, upload } from "./api.js";
+import { gaveUp, get, send } from "./api.js";
+import { given, numberField, textField } from "./fields.js";
+import { glance } from "./calibrations.js";
 
 const HINT = "npy, TIFF, PNG, .mat or HDF5";
 
 export async function submit(root, [query], signal) {
   const form = { calibration: null, measurement: null };
   const [known, algorithms] = await Promise.all([get("/v1/calibrations?limit=200", signal), get("/v1/algorithms", signal)]);
-  const button = h("button", { type: "submit", class: "primary", disabled: true }, "Submit the job");
+  const button = h("button", { type: "submit", class: "primary large", disabled: true }, "Submit the job");
   const result = h("div", { "aria-live": "polite" });
-  const ready = () => (button.disabled = !form.measurement);
-  const reset = () => {
-    form.measurement = null;
-    ready();
+  const job = jobStep(algorithms.items.filter((item) => item.planned_iterations > 0), form, signal);
+  const changed = () => {
+    button.disabled = !form.measurement;
+    job.renew();
   };
-  const measurement = measurementStep(form, ready, reset, signal);
-  const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, reset, query.get("calibration"), signal);
-  const job = jobStep(algorithms.items.filter((item) => item.planned_iterations > 0));
+  const measurement = measurementStep(form, changed, signal);
+  const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, query.get("calibration"), signal);
   const element = h("form", { class: "steps" }, calibration, measurement.element, job.element, h("div", { class: "row" }, button), result);
   element.addEventListener("submit", async (event) => {
     event.preventDefault();
     button.disabled = true;
     try {
-      const made = await send("POST", "/v1/jobs", { measurement: form.measurement.id, ...job.values() });
+      const made = await send("POST", "/v1/jobs", job.request());
       announce("The job is accepted");
       location.hash = `#/jobs/${made.id}`;
     } catch (error) {
@@ -37,174 +40,227 @@ export async function submit(root, [query], signal) {
 }
 
 function step(number, title, ...content) {
-  return h("section", { class: "card step", "aria-label": title }, h("h2", null, `${number}. ${title}`), content);
+  return h("section", { class: "card step", "aria-label": title }, h("h2", null, h("span", { class: "stepnumber" }, number), title), content);
 }
 
-function calibrationStep(form, known, chosen, reset, wanted, signal) {
+/** Buttons of which one is chosen. */
+function choice(name, label, options, chosen, changed) {
+  const input = ([value, text]) => h("label", { class: "radio" }, h("input", { type: "radio", name, value, checked: value === chosen, onchange: () => changed(value) }), text);
+  return h("fieldset", { class: "choice" }, h("legend", null, label), options.map(input));
+}
+
+function calibrationStep(form, known, wake, wanted, signal) {
   const verdict = h("div", { class: "verdict", "aria-live": "polite" });
-  const select = h("select", { id: "calibration" }, h("option", { value: "" }, "a new one, from a file"),
-    known.map((item) => h("option", { value: item.id, selected: item.id === wanted }, `${nameOf(item)} (${item.frames} × ${item.height} × ${item.width}, ${moment(item.created_at)})`)));
-  const name = textField("calibration-name", "Its name", "bench 3, f/8");
-  const scale = scaleField("calibration-scale");
-  const fresh = h("div", null, h("div", { class: "fields" }, name.element, scale.element));
   const use = (calibration) => {
     form.calibration = calibration;
-    reset();
-    put(verdict, calibration && calibrationVerdict(calibration));
-    chosen();
+    wake();
   };
-  const drop = dropZone("masks", "Calibration set", `one mask a frame: ${HINT}`, signal, async (sha256) => {
+  const name = textField("calibration-name", "Name of the calibration", "bench 3, f/8");
+  const nameRow = h("div", { class: "fields" }, name.element);
+  const parts = { known: old(known, wanted, use, signal), masks: masks(name, use, verdict, signal), captures: captures(name, use, verdict, signal) };
+  const options = [known.length > 0 && ["known", "A stored calibration"], ["masks", "Ready masks"], ["captures", "Raw captures"]].filter(Boolean);
+  const show = (value) => {
+    for (const [key, part] of Object.entries(parts)) part.element.hidden = key !== value;
+    nameRow.hidden = value === "known";
+    put(verdict);
     use(null);
-    use(await send("POST", "/v1/calibrations", { masks: sha256, ...given({ name: name.value(), full_scale: scale.value() }) }));
-  });
-  fresh.append(drop);
-  const pick = () => {
-    fresh.hidden = select.value !== "";
-    use(known.find((item) => item.id === select.value) ?? null);
+    parts[value].wake?.();
   };
-  select.addEventListener("change", pick);
-  const element = step(1, "Calibration", known.length ? h("div", { class: "fields" }, h("label", { for: "calibration" }, "Calibration", select)) : null, fresh, verdict);
-  queueMicrotask(pick);
+  const first = options[0][0];
+  const element = step(1, "Calibration", choice("calibration-kind", "What do you have?", options, first, show), nameRow, Object.values(parts).map((part) => part.element), verdict);
+  queueMicrotask(() => show(first));
   return element;
 }
 
-function measurementStep(form, ready, reset, signal) {
-  const verdict = h("div", { class: "verdict", "aria-live": "polite" });
-  const wait = h("p", { class: "muted" }, "First choose or drop the calibration.");
-  const [name, scale] = [textField("measurement-name", "Its name", "shot 12"), scaleField("measurement-scale")];
-  const [fps, exposure] = [numberField("fps", "Snapshots a second"), numberField("exposure", "Exposure in s")];
-  const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, async (sha256) => {
-    reset();
+/** Calibrations that are here, each with a mask, its name and its grade. */
+function old(known, wanted, use, signal) {
+  const chosen = () => known.find((item) => item.id === element.querySelector("input:checked")?.value) ?? null;
+  const wake = () => use(chosen());
+  const option = (item) => h("label", { class: "pickone" }, h("input", { type: "radio", name: "calibration", value: item.id, checked: item.id === wanted, onchange: wake }), ...glance(item, signal));
+  const element = h("div", { class: "pickings", role: "radiogroup", "aria-label": "Calibrations" }, known.map(option));
+  return { element, wake };
+}
+
+function masks(name, use, verdict, signal) {
+  const make = async (sha256, scale) => {
+    use(null);
     put(verdict);
-    const body = { name: name.value(), full_scale: scale.value(), camera_fps: fps.value(), exposure_s: exposure.value() };
-    form.measurement = await send("POST", "/v1/measurements", { calibration: form.calibration.id, data: sha256, ...given(body) });
-    put(verdict, measurementVerdict(form.measurement));
-    ready();
-  });
-  const inside = h("div", { hidden: true }, h("div", { class: "fields" }, name.element, scale.element, fps.element, exposure.element), drop);
-  const wake = () => {
-    inside.hidden = !form.calibration;
-    wait.hidden = !inside.hidden;
-    put(verdict);
-  };
-  return { element: step(2, "Measurement", wait, inside, verdict), wake };
-}
-
-function jobStep(algorithms) {
-  const choice = h("select", { id: "algorithm" }, algorithms.map((item) => h("option", { value: item.name, selected: item.planned_passes > 0 }, item.name)));
-  const label = textField("label", "Label", "drop of milk, first try");
-  const priority = numberField("priority", "Priority (−100 to 100)", "any");
-  const plan = h("p", { class: "muted" });
-  const tell = () => {
-    const item = algorithms.find((found) => found.name === choice.value);
-    const passes = item.planned_passes ? `, ${item.planned_passes} of them with the deep denoiser` : "";
-    say(plan, `At most ${item.planned_iterations} iterations${passes}; tiles of ${item.tile.size} × ${item.tile.size} pixels.`);
-  };
-  choice.addEventListener("change", tell);
-  tell();
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", choice), label.element, priority.element), plan);
-  return { element, values: () => ({ algorithm: choice.value, ...given({ label: label.value(), priority: priority.value() }) }) };
-}
-
-/** Only what was given: nothing is guessed here, and the service has its own defaults. */
-function given(values) {
-  return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== null));
-}
-
-function field(id, label, properties) {
-  const input = h("input", { id, ...properties });
-  return { input, element: h("label", { for: id }, label, input) };
-}
-
-function textField(id, label, placeholder) {
-  const { input, element } = field(id, label, { type: "text", maxlength: 200, placeholder, autocomplete: "off" });
-  return { element, value: () => input.value.trim() || null };
-}
-
-function numberField(id, label, stepBy) {
-  const { input, element } = field(id, label, { type: "number", step: stepBy === "any" ? 1 : "any" });
-  return { element, value: () => (input.value === "" ? null : Number(input.value)) };
-}
-
-function scaleField(id) {
-  return numberField(id, "Full scale (empty: the type’s)");
-}
-
-/** A place to drop a file on, or to choose one by; `take(sha256)` gets the uploaded file. */
-function dropZone(id, title, hint, signal, take) {
-  const input = h("input", { type: "file", id, class: "unseen" });
-  const text = h("span", { class: "muted" }, hint);
-  const bar = h("progress", { max: 1, value: 0, hidden: true, "aria-label": `Upload of the ${title.toLowerCase()}` });
-  const status = h("div", { class: "status", "aria-live": "polite" });
-  const zone = h("label", { class: "drop", for: id }, h("b", null, title), h("span", null, "drop a file here, or choose one"), text, bar, input);
-  let current = null;
-  const start = async (file) => {
-    if (!file) return;
-    current?.abort();
-    current = new AbortController();
-    const mine = current;
-    signal.addEventListener("abort", () => mine.abort());
-    bar.hidden = false;
-    put(status);
     try {
-      const blob = await upload(file, (done, total) => {
-        bar.value = total ? done / total : 0;
-        say(text, `${file.name}: ${bytes(done)} of ${bytes(total)}`);
-      }, mine.signal);
-      say(text, `${file.name}: ${bytes(blob.size)}, is being checked …`);
-      await take(blob.sha256);
-      say(text, `${file.name}: ${bytes(blob.size)}`);
+      const made = await send("POST", "/v1/calibrations", { masks: sha256, ...given({ name: name.value(), full_scale: scale }) });
+      put(verdict, taken(made));
+      use(made);
     } catch (error) {
-      if (!gaveUp(error)) put(status, problem(error));
-      if (mine === current) say(text, hint);
+      if (!scaleInDoubt(error)) throw error;
+      put(verdict, problem(error), askScale((next) => make(sha256, next).catch((later) => put(verdict, problem(later)))));
     }
-    if (mine === current) bar.hidden = true;
-    input.value = "";
   };
-  input.addEventListener("change", () => start(input.files[0]));
-  for (const kind of ["dragenter", "dragover"]) {
-    zone.addEventListener(kind, (event) => {
-      event.preventDefault();
-      zone.classList.add("over");
-    });
-  }
-  for (const kind of ["dragleave", "drop"]) zone.addEventListener(kind, () => zone.classList.remove("over"));
-  zone.addEventListener("drop", (event) => {
-    event.preventDefault();
-    start(event.dataTransfer.files[0]);
+  const drop = dropZone("masks", "Calibration set", `one mask a frame: ${HINT}`, signal, (blob) => make(blob.sha256, null));
+  return { element: drop.element };
+}
+
+function captures(name, use, verdict, signal) {
+  const button = h("button", { type: "button", class: "primary", disabled: true }, "Make the masks");
+  const found = new Captures(signal, () => (button.disabled = found.missing() !== null));
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    use(null);
+    try {
+      let made = await send("POST", "/v1/calibrations", { captures: found.value(), ...given({ name: name.value() }) });
+      const words = h("p", { class: "muted" });
+      put(verdict, words);
+      while (made.state === "preparing" && !signal.aborted) {
+        say(words, `Masks are being made of ${made.frames} patterns: ${Math.floor(made.percent)} %`);
+        await new Promise((resolve) => setTimeout(resolve, 700));
+        made = await get(`/v1/calibrations/${made.id}`, signal);
+      }
+      if (made.state === "failed") throw new Error(made.error);
+      put(verdict, taken(made));
+      use(made);
+    } catch (error) {
+      if (!gaveUp(error)) put(verdict, problem(error));
+    }
+    button.disabled = found.missing() !== null;
   });
-  return h("div", null, zone, status);
+  const element = h("div", null,
+    h("p", { class: "muted" }, "Captures of a white board, at one exposure: each pattern with the mask; white and black without it. Black with the mask is better where there is one."),
+    found.element, h("div", { class: "row" }, button));
+  return { element };
 }
 
-/** A refusal with each field that is wrong. */
-function problem(error) {
-  const errors = error.errors ?? [];
-  const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: ${item.detail}`))) : null;
-  return h("div", { class: "trouble", role: "alert" }, h("b", null, "Refused: "), errors.length > 1 ? null : error.message, list);
-}
-
-function calibrationVerdict(item) {
+function taken(item) {
   const dead = item.dead_pixels / (item.height * item.width);
   return [
     h("p", { class: "good" }, "The calibration is taken."),
     facts([
-      ["Masks", `${item.frames} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
+      ["Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): nothing is known there`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
-      ["Report", h("a", { href: `/v1/calibrations/${item.id}/report.html` }, "what is known of the masks")],
+      ["Report", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "grade and reasons (new tab)")],
     ]),
   ];
 }
 
-function measurementVerdict(item) {
+const SEQUENCES = [["", "As the camera’s times tell"], ["contiguous", "One after the other, without a gap"], ["separate", "Each on its own"]];
+
+function measurementStep(form, changed, signal) {
+  const verdict = h("div", { class: "verdict", "aria-live": "polite" });
+  const wait = h("p", { class: "muted" }, "First choose or make the calibration.");
+  const name = textField("measurement-name", "Name of the measurement", "shot 12");
+  const [fps, exposure] = [numberField("fps", "Snapshots a second"), numberField("exposure", "Exposure in s")];
+  const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
+  const darks = [];
+  const darkList = h("p", { class: "muted" });
+  const forget = h("button", { type: "button", class: "small", hidden: true, onclick: () => tellDarks([]) }, "Use no darks");
+  const tellDarks = (next) => {
+    darks.splice(0, darks.length, ...next);
+    say(darkList, darks.length ? `Subtracted is the average of ${darks.map((dark) => dark.name).join(", ")}.` : "");
+    forget.hidden = darks.length === 0;
+    if (last) make(last, scaled).catch((error) => put(verdict, problem(error)));
+  };
+  // The file that was dropped last, the full scale that was chosen for it, and which attempt counts.
+  let [last, scaled, turn] = [null, null, 0];
+  const make = async (sha256, scale = null) => {
+    turn += 1;
+    const mine = turn;
+    form.measurement = null;
+    changed();
+    put(verdict);
+    const body = { name: name.value(), full_scale: scale, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
+    const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
+    [last, scaled] = [sha256, scale];
+    try {
+      const made = await send("POST", "/v1/measurements", { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) });
+      // Something else was chosen meanwhile.
+      if (mine !== turn) return;
+      form.measurement = made;
+    } catch (error) {
+      if (mine !== turn) return;
+      if (!scaleInDoubt(error)) {
+        last = null;
+        throw error;
+      }
+      put(verdict, problem(error), askScale(again));
+      return;
+    }
+    const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale(again);
+    put(verdict, fits(form.measurement), doubt);
+    changed();
+  };
+  // What is stated later goes with the same file: it need not be dropped again.
+  for (const input of [fps.input, exposure.input, sequence]) {
+    input.addEventListener("change", () => last && make(last, scaled).catch((error) => put(verdict, problem(error))));
+  }
+  const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
+  const dark = dropZone("darks", "Dark captures", "Optional: with the LCoS all black, at the same exposure", signal, async (blob, file) => {
+    tellDarks([...darks, { sha256: blob.sha256, name: file.name }]);
+  }, true);
+  const inside = h("div", { hidden: true },
+    h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Several snapshots are", sequence)),
+    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))));
+  const wake = () => {
+    turn += 1;
+    inside.hidden = !form.calibration;
+    wait.hidden = !inside.hidden;
+    form.measurement = null;
+    put(verdict);
+    // The file that was dropped for another calibration is tried with this one.
+    if (form.calibration && last) make(last, scaled).catch((error) => put(verdict, problem(error)));
+    changed();
+  };
+  return { element: step(2, "Measurement", wait, inside, verdict), wake };
+}
+
+function fits(item) {
   const wrong = findings(item.warnings);
   return [
     h("p", { class: wrong ? "warn" : "good" }, wrong ? "The measurement is taken, but:" : "The measurement fits the calibration."),
     wrong,
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
+      item.snapshots > 1 && ["They are", item.sequence === "contiguous" ? "taken one after the other, and reconstructed together where that pays" : "reconstructed each on its own"],
       ["Full scale", figure(item.full_scale)],
     ]),
   ];
+}
+
+function jobStep(algorithms, form, signal) {
+  const select = h("select", { id: "algorithm" }, algorithms.map((item) => h("option", { value: item.name, selected: item.name === "pnp-tv-fastdvdnet" }, item.name)));
+  const label = textField("label", "Name of the job", "drop of milk, first try");
+  const priority = numberField("priority", "Priority (−100 to 100)", 1);
+  const plan = h("p", { class: "muted" });
+  const estimate = h("div", { class: "estimate", "aria-live": "polite" });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value() }) });
+  const ask = calmly(250, async () => {
+    if (!form.measurement || signal.aborted) return;
+    const asked = JSON.stringify(request());
+    try {
+      const found = await send("POST", "/v1/jobs/estimate", request());
+      if (form.measurement && JSON.stringify(request()) === asked) put(estimate, told(found));
+    } catch (error) {
+      if (form.measurement) put(estimate, problem(error));
+    }
+  });
+  const renew = () => {
+    const item = algorithms.find((found) => found.name === select.value);
+    say(plan, `${item.summary} At most ${item.planned_iterations} iterations on each tile.`);
+    if (!form.measurement) put(estimate);
+    ask();
+  };
+  select.addEventListener("change", renew);
+  priority.input.addEventListener("change", renew);
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan, estimate);
+  queueMicrotask(renew);
+  return { element, renew, request };
+}
+
+/** What a job would take. */
+function told(found) {
+  const when = found.eta_seconds === null ? "no worker lives: it would wait" : `in up to about ${duration(found.eta_seconds)}`;
+  return facts([
+    ["Done", `${when}${found.queue_position > 1 ? `, no. ${found.queue_position} in the queue` : ""}`],
+    ["Computing", `up to about ${duration(found.cpu_seconds)} of processor time, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
+    ["Memory", `${bytes(found.worker_memory_bytes)} at most`],
+    ["Disk", `${bytes(found.disk_bytes)} at most`],
+  ]);
 }

@@ -1,7 +1,7 @@
 // The tiles of a snapshot: which are done, which run; one of them is chosen for the plot.
 
 import { convergence } from "./convergence.js";
-import { figure } from "./format.js";
+import { figure, iterationsOf } from "./format.js";
 import { get } from "./api.js";
 import { h, put, s } from "./dom.js";
 
@@ -74,6 +74,9 @@ export class TileMap {
       },
     }, s("title", null, `tile ${tile.tile + 1}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
     put(this.map, s("svg", { viewBox: `0 0 ${width} ${height}`, class: "tiles", role: "img", "aria-label": text }, this.tiles.map(rectangle)));
-    put(this.note, `${text}${done.length ? `; the largest residual is ${figure(worst)}` : ""}.`);
+    const most = iterationsOf(this.job.schedule);
+    const runs = this.tiles.filter((tile) => tile.state === "running" && tile.iterations > 0);
+    const going = runs.map((tile) => ` Tile ${tile.tile + 1}: iteration ${tile.iterations} of at most ${most}.`).join("");
+    put(this.note, `${text}${done.length ? `; the largest residual is ${figure(worst)}` : ""}.${most > 0 ? going : ""}`);
   }
 }

@@ -1,25 +1,26 @@
-// The token, where the service wants one. It is kept in a cookie for as long as the browser runs, so
-// that links for downloads work; what changes something also needs it as a header.
+// Who signs in. The one place that knows how the service is shown who asks: today by a token in a cookie
+// (so that pictures and downloads work) and in a header (which alone may change something).
 
 const NAME = "sci_recon_token";
-let refused = false;
 
-const token = () => document.cookie.split("; ").find((pair) => pair.startsWith(`${NAME}=`))?.slice(NAME.length + 1);
+const kept = () => document.cookie.split("; ").find((pair) => pair.startsWith(`${NAME}=`))?.slice(NAME.length + 1);
 
-/** The header that goes with every request. */
-export function authorization() {
-  const text = token();
-  return text ? { Authorization: `Bearer ${text}` } : {};
+function write(value, more) {
+  const secure = location.protocol === "https:" ? "; Secure" : "";
+  document.cookie = `${NAME}=${value}; path=${new URL(".", document.baseURI).pathname}; SameSite=Strict${secure}${more}`;
 }
 
-/** Asks for a token, after one (or none) was refused; true if there is another one to try. */
-export function signIn(tried) {
-  if (authorization().Authorization !== tried) return true;
-  if (refused) return false;
-  const text = window.prompt("This service wants a token (sci-recon token create):")?.trim();
-  refused = !text;
-  if (refused) return false;
-  const secure = location.protocol === "https:" ? "; Secure" : "";
-  document.cookie = `${NAME}=${encodeURIComponent(text)}; path=${new URL(".", document.baseURI).pathname}; SameSite=Strict${secure}`;
-  return true;
+/** The header that goes with a request, of the token that is kept or of another one. */
+export function authorization(token = kept()) {
+  return token ? { Authorization: `Bearer ${token}` } : {};
+}
+
+/** Keeps a token for as long as the browser runs. */
+export function keep(token) {
+  write(encodeURIComponent(token), "");
+}
+
+/** Signs out. */
+export function forget() {
+  write("", "; Max-Age=0");
 }

@@ -49,6 +49,10 @@ function clamp(value, least, most) {
 /** Lets a pane's canvas be dragged, pinched, turned the wheel over and driven by keys. */
 export function steer(canvas, view, pane, signal) {
   const pointers = new Map();
+  // One finger is for the page, unless the picture is all there is.
+  const idle = () => pointers.size === 1 && [...pointers.values()][0].pointerType === "touch" && !document.fullscreenElement;
+  const hold = (event) => event.touches.length > 1 && event.cancelable && event.preventDefault();
+  for (const kind of ["touchstart", "touchmove"]) canvas.addEventListener(kind, hold, { signal, passive: false });
   const place = (event) => {
     const box = canvas.getBoundingClientRect();
     const { zoom } = pane.place();
@@ -65,7 +69,9 @@ export function steer(canvas, view, pane, signal) {
     const before = pointers.get(event.pointerId);
     if (!before) return;
     const { zoom } = pane.place();
-    if (pointers.size === 1) {
+    if (idle()) {
+      // Nothing: the browser scrolls.
+    } else if (pointers.size === 1) {
       if (view.zoom === null) view.zoom = zoom;
       view.pan((before.clientX - event.clientX) / zoom, (before.clientY - event.clientY) / zoom);
     } else if (pointers.size === 2) {

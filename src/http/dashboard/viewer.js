@@ -1,4 +1,4 @@
-// The measurement beside the frames that came of it, in step.
+// The frames in one large player, and the measurement that they came of, in step.
 
 import { h, say } from "./dom.js";
 import { Contrast } from "./contrast.js";
@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { get } from "./api.js";
+import { get, unanswered } from "./api.js";
 
 const MODES = [["frame", "Frames"], ["difference", "Difference to the frame before"], ["residual", "Residual |y − Hx|"]];
 
@@ -15,8 +15,8 @@ export class Viewer {
     const { frames, height, width } = job.shape;
     Object.assign(this, { job, signal, snapshot: job.snapshots.first, spreads: new Map() });
     this.view = new View(height, width);
-    this.left = new Pane("Measurement", this.view, signal);
     this.right = new Pane("Frames", this.view, signal);
+    this.left = new Pane("Measurement", this.view, signal);
     this.leftContrast = new Contrast("measurement", () => this.showLeft());
     this.rightContrast = new Contrast("frames", () => this.showRight());
     this.player = new Player(frames, signal, () => this.showRight());
@@ -24,35 +24,39 @@ export class Viewer {
     // Of a sequence playing goes on from snapshot to snapshot, if asked to.
     this.through = h("input", { type: "checkbox", id: "through" });
     this.player.onward = () => this.through.checked && this.goOn();
-    if (job.snapshots.count > 1) this.player.element.append(h("label", { for: "through", class: "row muted" }, this.through, "through all snapshots"));
+    if (job.snapshots.count > 1) this.player.element.lastChild.append(h("label", { for: "through", class: "row muted" }, this.through, "Through all snapshots"));
     this.choice = h("select", { id: "mode", "aria-label": "What is shown" }, MODES.map(([value, text]) => h("option", { value }, text)));
     this.choice.addEventListener("change", () => {
       this.rightContrast.touched = false;
       this.offerRight();
     });
     this.slice = new Slice(this.view, frames, height, () => this.sliceBase(), () => this.frameWindow, signal);
-    this.right.marks.push((context, target, scale) => this.slice.mark(context, target, scale));
-    this.right.tools.append(this.choice);
-    this.zoom = h("span", { class: "muted" });
-    const zoomTools = h("div", { class: "row" },
-      h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit"),
-      h("button", { type: "button", class: "small", onclick: () => this.nearer(null) }, "1 : 1"),
-      h("button", { type: "button", class: "small", "aria-label": "Zoom in", onclick: () => this.nearer(1.5) }, "+"),
-      h("button", { type: "button", class: "small", "aria-label": "Zoom out", onclick: () => this.nearer(1 / 1.5) }, "−"), this.zoom);
+    this.right.marks.push((context, target, scale) => this.slicing.open && this.slice.mark(context, target, scale));
+    this.right.tools.append(this.choice, h("span", { class: "row" }, this.zoomTools()));
     this.left.element.append(this.leftContrast.element);
-    this.right.element.append(this.rightContrast.element);
-    this.element = h("section", { class: "card viewer", "aria-label": "Frames" },
-      h("div", { class: "panes" }, this.left.element, this.right.element),
-      h("div", { class: "row controls" }, this.player.element, zoomTools),
-      this.slice.element,
-      h("p", { class: "muted keys" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms, dragging moves."));
+    this.slicing = h("details", { class: "slicing" }, h("summary", null, "x–t slice"), this.slice.element);
+    this.slicing.addEventListener("toggle", () => this.showRight());
+    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.slicing,
+      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
+        h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms, dragging moves. On a touch screen two fingers zoom and move; in full screen one finger moves, too.")));
+    this.measured = null;
+    this.beside = h("section", { class: "card viewer beside", "aria-label": "Measurement" }, this.left.element);
     this.player.keys(this.element);
-    const tellZoom = () => say(this.zoom, `${Math.round(100 * this.right.place().zoom)} %`);
-    this.view.listen(tellZoom, signal);
     this.slice.changed = () => {
       this.right.moved = true;
       this.right.redraw();
     };
+  }
+
+  zoomTools() {
+    const small = (label, text, act) => h("button", { type: "button", class: "small", "aria-label": label, title: label, onclick: act }, text);
+    const zoom = h("span", { class: "muted count", id: "zoom" }, "fit");
+    this.view.listen(() => say(zoom, this.view.zoom === null ? "fit" : `${Math.round(100 * this.right.place().zoom)} %`), this.signal);
+    const full = small("Full screen", "Full screen", () => (document.fullscreenElement ? document.exitFullscreen() : this.element.requestFullscreen()));
+    full.id = "full";
+    if (!document.fullscreenEnabled) full.hidden = true;
+    return [small("Zoom out", "−", () => this.nearer(1 / 1.5)), zoom, small("Zoom in", "+", () => this.nearer(1.5)),
+      small("Fit the whole picture", "Fit", () => this.view.fit()), small("1 : 1, one pixel of the screen for one of the picture", "1 : 1", () => this.nearer(null)), full];
   }
 
   mode() {
@@ -70,7 +74,7 @@ export class Viewer {
   }
 
   sliceBase() {
-    return this.ready ? `${this.base()}/slice-${this.slice.row()}` : null;
+    return this.ready && this.slicing.open ? `${this.base()}/slice-${this.slice.row()}` : null;
   }
 
   name(frame) {
@@ -100,11 +104,20 @@ export class Viewer {
     this.waiting = false;
     this.player.tell();
     const base = `/v1/measurements/${this.job.measurement}/pictures/snapshot-${snapshot}`;
-    const spread = await get(`${base}/spread`, this.signal);
-    Object.assign(this, { levels: spread.levels, tile: spread.tile });
-    this.measured = { base, levels: spread.levels, tile: spread.tile, label: `Measurement, snapshot ${snapshot}` };
-    this.leftContrast.offer(spread);
-    this.showLeft();
+    try {
+      const spread = await get(`${base}/spread`, this.signal);
+      this.measured = { base, levels: spread.levels, tile: spread.tile, label: `Measurement, snapshot ${snapshot}` };
+      this.left.tell("");
+      this.leftContrast.offer(spread);
+      this.showLeft();
+    } catch (error) {
+      // A damaged measurement is no reason not to show the job.
+      if (!error.errors || unanswered(error)) throw error;
+      this.measured = null;
+      this.left.show(null);
+      this.left.tell(error.message);
+    }
+    this.leftContrast.element.hidden = !this.measured;
     await this.renew();
   }
 
@@ -116,18 +129,33 @@ export class Viewer {
     await this.offerRight();
   }
 
+  /** Says over the picture how the job stands, where it is not done. */
+  stand(job, written) {
+    const { tiles_done: done, tiles_total: total } = job.progress;
+    const whole = `${done} of ${total} tiles are done`;
+    const words = {
+      failed: [`Failed: ${this.ready ? "the frames are incomplete" : "there are no frames"}`, "bad"],
+      cancelled: [`Cancelled: ${this.ready ? "the frames are incomplete" : "there are no frames"}`, "ended"],
+      cancelling: ["Being cancelled", "ended"],
+    }[job.state];
+    if (words) this.right.brand(...words);
+    else this.right.brand(written || !this.ready ? "" : done > 0 ? `Preview: ${whole}` : "Preview: coarse frames", "preview");
+  }
+
   async offerRight() {
     if (this.player.count < 2 && this.mode() === "difference") {
       this.right.tell("There is one frame only.");
       return;
     }
     try {
-      this.rightContrast.offer(await this.spread());
+      const spread = await this.spread();
+      Object.assign(this, { levels: spread.levels, tile: spread.tile });
+      this.rightContrast.offer(spread);
     } catch (error) {
-      if (error.code !== "not_ready") throw error;
+      if (!error.errors || unanswered(error)) throw error;
       this.ready = false;
       this.right.show(null);
-      this.right.tell("Nothing of this snapshot is done yet. A coarse preview comes first, then the frames tile by tile.");
+      this.right.tell(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "It ended before anything could be shown." : "Nothing can be seen yet. A coarse preview comes first, then the frames tile by tile.");
       this.rightContrast.element.hidden = true;
       return;
     }

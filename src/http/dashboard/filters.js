@@ -1,0 +1,50 @@
+// The filter of the list: state and search, in the address, and those that are kept for later.
+
+import { calmly, h, put } from "./dom.js";
+import { recall, remember } from "./keeping.js";
+
+const STATES = ["queued", "running", "succeeded", "failed", "cancelling", "cancelled"];
+const CHOICES = [["", "All states"], ["queued,running", "Not ended"], ...STATES.map((state) => [state, state[0].toUpperCase() + state.slice(1)])];
+
+/** The filter's fields; `changed()` is called when it is another one. */
+export function filters(query, changed) {
+  const wanted = query.get("state") ?? "";
+  // An address may name several states that the list of choices does not.
+  const choices = CHOICES.some(([value]) => value === wanted) ? CHOICES : [...CHOICES, [wanted, wanted]];
+  const state = h("select", { id: "state" }, choices.map(([value, text]) => h("option", { value, selected: value === wanted }, text)));
+  const search = h("input", { type: "search", id: "search", placeholder: "Name or identifier", maxlength: 200, autocomplete: "off", value: query.get("search") ?? "" });
+  const keep = h("button", { type: "button", class: "small", hidden: true, onclick: () => store([...saved(), value()]) }, "Keep this filter");
+  const chips = h("span", { class: "row chips" });
+
+  const value = () => ({ state: state.value, search: search.value.trim() });
+  const address = (filter) => `#/jobs?${new URLSearchParams(Object.entries(filter).filter(([, text]) => text))}`.replace(/\?$/, "");
+  const saved = () => recall("filters", []);
+  const same = (one, other) => one.state === other.state && one.search === other.search;
+  const title = (filter) => [CHOICES.find(([name]) => name === filter.state)?.[1], filter.search && `“${filter.search}”`].filter((part) => part && part !== "All states").join(", ");
+
+  function store(list) {
+    remember("filters", list);
+    show();
+  }
+
+  function show() {
+    const now = value();
+    keep.hidden = !(now.state || now.search) || saved().some((filter) => same(filter, now));
+    put(chips, saved().map((filter) => h("span", { class: "chip" },
+      h("a", { href: address(filter), "aria-current": same(filter, now) ? "true" : null }, title(filter)),
+      h("button", { type: "button", "aria-label": `Forget the filter ${title(filter)}`, onclick: () => store(saved().filter((other) => !same(other, filter))) }, "×"))));
+  }
+
+  const tell = calmly(200, () => {
+    history.replaceState(null, "", address(value()));
+    show();
+    changed();
+  });
+  state.addEventListener("change", tell);
+  search.addEventListener("input", tell);
+  show();
+  return {
+    value,
+    element: [h("label", { for: "state", class: "unseen" }, "State"), state, h("label", { for: "search", class: "unseen" }, "Search"), search, keep, chips],
+  };
+}

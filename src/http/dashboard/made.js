@@ -1,0 +1,131 @@
+// How it was made: one card in place of many, the manifest behind it.
+
+import { announce, facts, h, place, put, say } from "./dom.js";
+import { bytes, duration, figure, iterationsOf, momentInFull, shapeOf } from "./format.js";
+import { gaveUp, get } from "./api.js";
+
+/** The card; `show(job, snapshot)` adds what the manifest of a snapshot tells. */
+export class Made {
+  constructor(job, signal) {
+    Object.assign(this, { job, signal });
+    this.body = h("div", null, this.plan());
+    this.element = h("section", { class: "card", "aria-label": "How it was made" }, h("h2", null, "How it was made"), this.body, repeat(job));
+  }
+
+  plan() {
+    const { job } = this;
+    return facts([
+      ["Frames", shapeOf(job)],
+      job.snapshots.count > 1 && ["Snapshots", job.run.length > 1 ? `together in runs of up to ${job.run.length}` : "each alone"],
+      ["Algorithm", job.algorithm],
+      job.schedule.stages.length > 0 && ["Planned", `at most ${iterationsOf(job.schedule)} iterations on each tile: ${stages(job.schedule)}`],
+      ["Tiles", `${job.tile.size} pixels, ${job.tile.overlap} shared`],
+      job.priority !== 0 && ["Priority", job.priority],
+      ["Calibration", h("a", { href: `#/calibrations/${job.calibration}` }, h("code", null, job.calibration))],
+      ["Measurement", h("code", null, job.measurement)],
+      ["Identifier", h("code", null, job.id)],
+      ["Submitted", momentInFull(job.created_at)],
+    ]);
+  }
+
+  async show(job, snapshot) {
+    if (job.state !== "succeeded") return;
+    let manifest;
+    try {
+      manifest = await get(`/v1/jobs/${job.id}/snapshots/${snapshot}/manifest.json`, this.signal);
+    } catch (error) {
+      if (gaveUp(error)) throw error;
+      put(this.body, this.plan(), h("p", { class: "warn" }, error.message));
+      return;
+    }
+    const { content, run } = manifest;
+    put(this.body, this.plan(), facts([
+      ["Done", ran(job, content)],
+      ["Networks", networks(content)],
+      ...pilot(content),
+      ...joints(content),
+      ["White level", figure(content.scale.white)],
+      ["Computing", `${duration(run.cpu_seconds)} of processor time${run.provider ? `, ${run.provider}` : ""}`],
+      ["Memory", bytes(run.peak_rss_bytes)],
+      ["Residual ‖y − Hx‖ / ‖y‖", figure(content.summary.residual)],
+    ]), h("p", { class: "muted" }, RESIDUAL),
+    h("details", null, h("summary", null, "Manifest: all of it"),
+      h("div", { class: "row" }, h("a", { class: "button small", href: `/v1/jobs/${job.id}/snapshots/${snapshot}/manifest.json`, download: `${job.id}-manifest.json` }, "Download")),
+      h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
+  }
+}
+
+const RESIDUAL = "The residual tells how well the frames explain the measurement, not how good they are: many wrong videos explain it as well. A large one is a sign of wrong masks; a smaller one is not a better video.";
+
+function stages(schedule) {
+  return schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ");
+}
+
+/** What the tiles did of what the job planned. */
+export function ran(job, content) {
+  const { summary, schedule } = content;
+  const [planned, decided] = [iterationsOf(job.schedule), iterationsOf(schedule)];
+  if (decided === 0) return "one pass of the model on each tile";
+  if (summary.stop_reason === "converged") {
+    // Of the nonlocal prior's iterations the manifest keeps no count.
+    const counted = !schedule.stages.some((stage) => stage.prior === "nonlocal");
+    return counted ? `${summary.tv_iterations + summary.denoiser_passes} of at most ${planned} iterations on each tile, then it had converged` : `converged within ${decided} iterations on each tile`;
+  }
+  return `${decided} of at most ${planned} iterations on each tile${decided < planned ? "; the pilot found that the others would not pay" : ""}`;
+}
+
+/** The networks by name; "none" where there was none. */
+export function networks(content) {
+  return content.models.map((model) => `${model.name}, ${model.sha256.slice(0, 12)}…`).join("; ") || "none";
+}
+
+/** What the pilot decided of the stages of an adaptive schedule, and why. */
+function pilot(content) {
+  const why = { "max-iterations": "all that were planned", converged: "later ones raise the error", diverged: "later ones diverge" };
+  const row = (stage) => {
+    const decided = [
+      why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
+      stage.planned_temporal_weight > 0 && `total variation along time ${stage.temporal_weight > 0 ? "kept" : "left out"}`,
+    ].filter(Boolean);
+    const error = `error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`;
+    return decided.length > 0 && [`Pilot, ${stage.prior}`, [...decided, error].join(", ")];
+  };
+  return (content.pilot?.stages ?? []).map(row).filter(Boolean);
+}
+
+/** Which snapshots were reconstructed together, and why not others. */
+function joints(content) {
+  const held = (content.runs ?? []).filter(([first, last]) => last > first && first <= content.snapshot && content.snapshot <= last);
+  const near = (content.pilot?.joints ?? []).filter((joint) => joint.after === content.snapshot || joint.after + 1 === content.snapshot);
+  const row = (joint) => {
+    const error = `error at held-out pixels ${figure(joint.error_alone)} alone, ${figure(joint.error_together)} together`;
+    return [`Snapshots ${joint.after}, ${joint.after + 1}`, `${joint.together ? "together" : "apart"}, ${error}`];
+  };
+  return [...(held.length ? [["Runs", held.map(([first, last]) => `${first} to ${last}`).join("; ")]] : []), ...near.map(row)];
+}
+
+/** The line that asks for the same job again. */
+function repeat(found) {
+  const last = found.snapshots.first + found.snapshots.count - 1;
+  const body = {
+    measurement: found.measurement,
+    algorithm: found.algorithm,
+    snapshots: [found.snapshots.first, last],
+    ...(last > found.snapshots.first ? { sequence: found.sequence } : {}),
+    ...(found.model ? { model: found.model } : { schedule: found.schedule }),
+    tile: found.tile,
+    priority: found.priority,
+    label: found.label,
+  };
+  // A label may hold quotes, which the shell would take for its own.
+  const json = JSON.stringify(body).replaceAll("'", "'\\''");
+  const text = `curl -sS ${new URL(place("/v1/jobs"), document.baseURI)} --json '${json}'`;
+  const copy = h("button", { type: "button", class: "small" }, "Copy");
+  copy.addEventListener("click", async () => {
+    await navigator.clipboard.writeText(text);
+    say(copy, "Copied");
+    announce("The line is copied");
+  });
+  if (!navigator.clipboard) copy.hidden = true;
+  return h("details", null, h("summary", null, "Ask for it again"), h("pre", { tabindex: 0, class: "line" }, text), copy);
+}

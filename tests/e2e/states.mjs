@@ -1,0 +1,150 @@
+// States that come of faults, of rights and of small screens: what the dashboard says then.
+
+import { scene } from "./scene.mjs";
+import { Service } from "./service.mjs";
+
+const DESKTOP = { viewport: { width: 1400, height: 900 } };
+
+/** A result with warnings, a failed and a cancelled job, and a service that has gone. */
+export async function faults(browser, checks, program, services) {
+  const service = await Service.start(program, "--workers", "1");
+  services.push(service);
+  const [own, foreign] = [scene(8, 96, 128, 1), scene(8, 96, 128, 77)];
+  const { calibration } = await service.take(own);
+  const data = await service.call("POST", "/v1/blobs", foreign.measurement);
+  const measurement = await service.call("POST", "/v1/measurements", { calibration, data: data.sha256, exposure_s: 0.1 });
+  const bad = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "wrong masks" });
+  await service.when(bad.id, (job) => job.state === "succeeded");
+  const page = await checks.page(await browser.newContext(DESKTOP));
+  await page.goto(`${service.url}/#/jobs/${bad.id}`);
+  await page.waitForSelector(".judgement.bad, .judgement.usable");
+  checks.that(/trusted|reservations/.test(await page.textContent(".judgement")), "the verdict warns");
+  checks.that((await page.textContent(".findings")).includes("What to do:"), "and what to do stands apart from the finding");
+  await page.waitForSelector("text=10 times slower than it was");
+  await page.click("text=True speed");
+  await page.waitForSelector("text=as fast as it was");
+  checks.that((await page.inputValue("#rate")) === "80", "eight frames in a tenth of a second are 80 a second");
+  await page.click("#play");
+  await checks.look(page, "warning");
+  const stages = [{ prior: "tv", iterations: 10000, tv_weight: 0.05, tv_updates: 40, tolerance: 0 }];
+  const long = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "given up", schedule: { stages } });
+  await service.when(long.id, (job) => job.progress.tiles_running > 0 && job.progress.previews_done > 0);
+  await page.goto(`${service.url}/#/jobs/${long.id}`);
+  await page.waitForSelector(".onpicture:has-text('Preview')");
+  await checks.look(page, "preview");
+  await page.click("text=Cancel");
+  await page.waitForSelector(".onpicture:has-text('Cancelled')");
+  checks.that((await page.$(".downloads a")) === null, "nothing incomplete is offered");
+  await checks.look(page, "cancelled");
+  service.damage();
+  const failed = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "damaged" });
+  await service.when(failed.id, (job) => job.state === "failed");
+  await page.goto(`${service.url}/#/jobs/${failed.id}`);
+  await page.waitForSelector(".onpicture:has-text('Failed')");
+  await checks.look(page, "failed");
+  await page.goto(`${service.url}/#/jobs`);
+  await page.waitForSelector(".badge.failed");
+  checks.that((await page.$(".list .mark.error, .list .mark.warning")) !== null, "the list shows what was found");
+  await checks.look(page, "jobs-states");
+  await page.click("text=damaged");
+  await page.waitForSelector("h1:has-text('damaged')");
+  await page.click("text=Rename");
+  await page.fill("#new-name", "another name");
+  await page.keyboard.press("Enter");
+  await page.waitForSelector("h1:has-text('another name')");
+  await page.click("#nav >> text=Jobs");
+  await page.waitForSelector(".list >> text=another name");
+  await service.stop();
+  await page.waitForSelector("#offline:not([hidden])", { timeout: 20_000 });
+  await checks.look(page, "offline");
+  await page.click("#nav >> text=Calibrations");
+  await page.waitForSelector("h1:has-text('The service does not answer')");
+  await checks.look(page, "offline-view");
+}
+
+/** Sign-in, a wrong token, what a role forbids, sign-out. */
+export async function access(browser, checks, program, services) {
+  const service = await Service.start(program, "--workers", "0");
+  services.push(service);
+  const [submit, admin] = [service.token("submit"), service.token("admin")];
+  const page = await checks.page(await browser.newContext(DESKTOP));
+  await page.goto(service.url);
+  await page.waitForSelector("h1:has-text('Sign in')");
+  await checks.look(page, "signed-out");
+  await page.fill("#token", `${submit}x`);
+  await page.keyboard.press("Enter");
+  await page.waitForSelector(".trouble:has-text('does not know this token')");
+  await checks.look(page, "wrong-token");
+  await page.fill("#token", submit);
+  await page.keyboard.press("Enter");
+  await page.waitForSelector("text=One picture in");
+  await page.waitForSelector("#who:has-text('optics · submit')");
+  checks.that(!(await page.isVisible("#nav >> text=System")), "what the role forbids is not offered");
+  await page.goto(`${service.url}/#/system`);
+  await page.waitForSelector("h1:has-text('Your role does not allow this')");
+  await checks.look(page, "forbidden");
+  await page.click("#who");
+  await page.waitForSelector("h1:has-text('Lab optics')");
+  await checks.look(page, "account");
+  await page.click("#sign-out");
+  await page.waitForSelector("h1:has-text('Sign in')");
+  checks.that((await page.evaluate(() => document.cookie)) === "", "the token is gone");
+  await page.reload();
+  await page.fill("#token", admin);
+  await page.click("text=Sign in >> nth=1");
+  await page.waitForSelector("#nav >> text=System >> visible=true");
+  await page.context().close();
+}
+
+/** Touch: a swipe scrolls the page, two fingers zoom the picture. */
+export async function phone(browser, checks, url, job) {
+  const context = await browser.newContext({ viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true });
+  const page = await checks.page(context);
+  await page.goto(`${url}/#/jobs/${job}`);
+  await page.waitForSelector(".downloads a");
+  await page.$eval("[aria-label=Frames] .sight", (sight) => sight.scrollIntoView({ block: "center" }));
+  await page.waitForTimeout(600);
+  const wire = await context.newCDPSession(page);
+  const touch = (type, points) => wire.send("Input.dispatchTouchEvent", { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
+  const box = await (await page.$("[aria-label=Frames] .sight")).boundingBox();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  const top = () => page.$eval("#content", (main) => main.scrollTop);
+  const zoom = () => page.textContent("#zoom");
+  const before = await top();
+  await touch("touchStart", [[x, y]]);
+  for (let step = 1; step <= 8; step += 1) await touch("touchMove", [[x, y - 15 * step]]);
+  await touch("touchEnd", []);
+  await page.waitForTimeout(500);
+  checks.that((await top()) > before + 40, `a swipe over the picture scrolls the page: ${before} to ${await top()}`);
+  checks.that((await zoom()) === "fit", "and leaves the picture as it is");
+  const held = await top();
+  await page.$eval("[aria-label=Frames] .sight", (sight) => sight.scrollIntoView({ block: "center" }));
+  await page.waitForTimeout(300);
+  const still = await top();
+  await touch("touchStart", [[x - 30, y], [x + 30, y]]);
+  for (let step = 1; step <= 8; step += 1) await touch("touchMove", [[x - 30 - 8 * step, y], [x + 30 + 8 * step, y]]);
+  await touch("touchEnd", []);
+  await page.waitForTimeout(500);
+  checks.that(Number.parseInt(await zoom(), 10) > 80, `two fingers zoom the picture: ${await zoom()}`);
+  checks.that(Math.abs((await top()) - still) < 5, `and the page stays: ${still} (${held})`);
+  await context.close();
+}
+
+/** What is seen while nothing has come yet. */
+export async function loading(browser, checks, url) {
+  const page = await checks.page(await browser.newContext(DESKTOP));
+  let go;
+  const gate = new Promise((resolve) => (go = resolve));
+  await page.route("**/v1/calibrations?*", async (route) => {
+    await gate;
+    await route.continue();
+  });
+  await page.goto(`${url}/#/calibrations`);
+  await page.waitForSelector(".loading >> visible=true");
+  await checks.look(page, "loading");
+  go();
+  await page.waitForSelector(".calibration");
+  await page.waitForSelector(".calibration .grade.good");
+  await checks.look(page, "calibrations");
+  await page.context().close();
+}
