@@ -149,7 +149,7 @@ impl Drop for Waiter {
 
 async fn look(store: Store, sender: broadcast::Sender<Changes>) {
     let mut before: Option<Versions> = None;
-    let mut watcher = store.watcher().await.ok();
+    let mut watcher = store.watcher().ok();
     loop {
         let change = async {
             match &mut watcher {
@@ -158,7 +158,7 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             }
         };
         if !change.await {
-            watcher = store.watcher().await.ok();
+            watcher = store.watcher().ok();
             tokio::time::sleep(LOOK).await;
         }
         let start = Instant::now();

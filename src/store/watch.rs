@@ -1,52 +1,51 @@
-//! Whether anything in the database has changed, without a query.
+//! Whether anything in the database has changed, without asking it.
 
-use std::time::{Duration, Instant};
+use std::io;
+use std::mem::MaybeUninit;
+use std::os::fd::OwnedFd;
+use std::time::Duration;
 
-use sqlx::{ConnectOptions, SqliteConnection};
+use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
+use rustix::io::Errno;
+use tokio::io::unix::AsyncFd;
 
 use super::Store;
-use super::error::Result;
-use super::rows::sql_scalar;
 
-/// Time between two looks; a look takes microseconds.
-const LOOK: Duration = Duration::from_millis(20);
-
-/// Sees changes that any process has committed.
+/// Sees when any process writes to the database: each commit goes through a file beside it, of which the
+/// kernel tells (inotify).
 #[derive(Debug)]
-pub struct Watcher {
-    connection: SqliteConnection,
-    /// What SQLite's `data_version` was when a change was last seen.
-    version: i64,
-}
+pub struct Watcher(AsyncFd<OwnedFd>);
 
 impl Store {
-    /// A watcher with a connection of its own: SQLite tells a connection of the changes by others.
-    pub async fn watcher(&self) -> Result<Watcher> {
-        let options = self.readers.connect_options().as_ref().clone();
-        let mut watcher = Watcher { connection: options.connect().await?, version: 0 };
-        watcher.version = watcher.look().await?;
-        Ok(watcher)
+    /// A watcher of this store.
+    ///
+    /// # Errors
+    /// If the kernel gives no more of them.
+    pub fn watcher(&self) -> io::Result<Watcher> {
+        let queue = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC)?;
+        // The folder, since SQLite makes and removes its files. Blobs and results are in folders of their own.
+        inotify::add_watch(&queue, self.dir.root(), WatchFlags::MODIFY)?;
+        Ok(Watcher(AsyncFd::register(queue)?))
     }
 }
 
 impl Watcher {
-    async fn look(&mut self) -> Result<i64> {
-        Ok(sql_scalar!("PRAGMA data_version", []).fetch_one(&mut self.connection).await?)
-    }
-
-    /// Waits for a change since the last call, at most for `time`, and tells whether there was one.
-    pub async fn changed(&mut self, time: Duration) -> Result<bool> {
-        let start = Instant::now();
+    /// Waits for a change since the last call, at most for `time`.
+    ///
+    /// # Errors
+    /// If the kernel's queue can't be read.
+    pub async fn changed(&mut self, time: Duration) -> io::Result<()> {
+        let Ok(ready) = tokio::time::timeout(time, self.0.readable()).await else { return Ok(()) };
+        let mut ready = ready?;
+        let mut buffer = [MaybeUninit::uninit(); 4096];
         loop {
-            let version = self.look().await?;
-            if version != std::mem::replace(&mut self.version, version) {
-                return Ok(true);
+            match inotify::Reader::new(ready.get_inner(), &mut buffer).next() {
+                Ok(_) => {}
+                Err(Errno::AGAIN) => break,
+                Err(error) => return Err(error.into()),
             }
-            let left = time.saturating_sub(start.elapsed());
-            if left.is_zero() {
-                return Ok(false);
-            }
-            tokio::time::sleep(left.min(LOOK)).await;
         }
+        ready.clear_ready();
+        Ok(())
     }
 }

@@ -155,7 +155,7 @@ impl Transport for Local {
         let changed = async {
             let watcher = match &mut *place {
                 Some(watcher) => watcher,
-                none => none.insert(self.store.watcher().await?),
+                none => none.insert(self.store.watcher()?),
             };
             watcher.changed(time).await
         };
