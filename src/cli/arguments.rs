@@ -13,6 +13,7 @@ use crate::job::{Algorithm, InvalidField, Sequence};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
+use serde_json::{Value, json};
 use strum::{VariantArray, VariantNames};
 
 /// Which algorithm, and how long.
@@ -20,7 +21,7 @@ use strum::{VariantArray, VariantNames};
 pub(super) struct ScheduleArguments {
     /// The algorithm.
     #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
-          value_parser = named(Algorithm::VARIANTS))]
+          value_parser = named_all())]
     pub(super) algorithm: Algorithm,
     /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
     #[arg(long, value_name = "FILE")]
@@ -103,6 +104,17 @@ impl FromStr for Snapshots {
     }
 }
 
+impl Snapshots {
+    /// As a request of a job has it.
+    pub(super) fn request(self) -> Value {
+        match (self.first, self.last) {
+            (0, None) => json!("all"),
+            (first, Some(last)) if first == last => json!(first),
+            (first, last) => json!([first, last]),
+        }
+    }
+}
+
 impl NetworkArguments {
     /// Whether the network runs on the processor.
     pub(super) fn on_cpu(&self) -> bool {
@@ -130,6 +142,11 @@ pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
 /// Kinds of sequences.
 pub(super) fn sequence() -> impl TypedValueParser<Value = Sequence> {
     PossibleValuesParser::new(Sequence::VARIANTS).try_map(|name: String| name.parse::<Sequence>())
+}
+
+/// Names of all algorithms.
+pub(super) fn named_all() -> impl TypedValueParser<Value = Algorithm> {
+    named(Algorithm::VARIANTS)
 }
 
 fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {

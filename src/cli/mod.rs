@@ -1,6 +1,7 @@
 //! The commands, one file each.
 
 mod arguments;
+mod client;
 mod confine;
 mod error;
 #[cfg(feature = "nats")]
@@ -10,17 +11,21 @@ mod maintenance;
 mod masks;
 mod model;
 mod progress;
+mod submission;
 mod supervisor;
 mod wait;
 
 pub mod backup;
 pub mod calibrate;
+pub mod cancel;
 pub mod check_model;
 #[cfg(feature = "nats")]
 pub mod cluster;
 pub mod demo;
+pub mod fetch;
 pub mod health;
 pub mod lab;
+pub mod ls;
 pub mod optics;
 pub mod reconstruct;
 pub mod schedule;
@@ -28,8 +33,11 @@ pub mod serve;
 pub mod settings;
 pub mod shell;
 pub mod simulate;
+pub mod submit;
 pub mod token;
 pub mod verify;
+pub mod watch;
+pub mod watch_folder;
 pub mod worker;
 
 pub use arguments::{NetworkArguments, algorithms};

@@ -1,5 +1,6 @@
 //! A progress bar, on a terminal only.
 
+use std::borrow::Cow;
 use std::io::IsTerminal;
 use std::sync::Mutex;
 
@@ -16,10 +17,18 @@ pub(super) fn target() -> ProgressDrawTarget {
 }
 
 /// A bar that goes from 0 to 1.
-pub(super) fn bar(title: &'static str) -> ProgressBar {
+pub(super) fn bar(title: impl Into<Cow<'static, str>>) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(STEPS), target()).with_message(title);
     // The template is fixed: if it were wrong, the default style would do.
     let style = ProgressStyle::with_template("{msg:>24} {wide_bar} {percent:>3}% {eta:>4}");
+    bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// A bar of bytes, whose number is told later.
+pub(super) fn bytes(title: impl Into<Cow<'static, str>>) -> ProgressBar {
+    let bar = ProgressBar::with_draw_target(None, target()).with_message(title);
+    let style = "{msg:>24} {wide_bar} {decimal_bytes}/{decimal_total_bytes} {eta:>4}";
+    let style = ProgressStyle::with_template(style);
     bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 

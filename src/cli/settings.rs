@@ -71,6 +71,8 @@ pub fn show(
             }
             (origin, ..) => (value(arg, rest, &origin), origin),
         };
+        let secret = arg.is_hide_env_values_set() && from != Origin::Default;
+        let value = if secret { "(hidden)".to_owned() } else { value };
         let from = match from {
             Origin::Line => "the command line".to_owned(),
             Origin::Variable(name) => format!("the variable {name}"),

@@ -25,13 +25,16 @@ use crate::store::{
 pub(super) struct CalibrationRequest {
     name: Option<Label>,
     masks: Option<Sha256>,
+    /// What the masks are called in a file of several arrays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    array: Option<Label>,
     full_scale: Option<f32>,
     captures: Option<Captures>,
 }
 
 impl CalibrationRequest {
     pub(super) fn of_masks(name: Option<Label>, masks: Sha256) -> Self {
-        Self { name, masks: Some(masks), full_scale: None, captures: None }
+        Self { name, masks: Some(masks), array: None, full_scale: None, captures: None }
     }
 }
 
@@ -158,9 +161,12 @@ async fn insert(
     request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
-    let CalibrationRequest { name, masks, full_scale, captures } = request;
+    let CalibrationRequest { name, masks, array, full_scale, captures } = request;
     match (masks, captures) {
-        (Some(masks), None) => of_masks(app, access, (name, masks, full_scale), key).await,
+        (Some(masks), None) => of_masks(app, access, (name, masks, array, full_scale), key).await,
+        (None, Some(_)) if array.is_some() => {
+            Err(ApiError::field("/array", "captures are pictures, not named arrays"))
+        }
         (None, Some(captures)) if full_scale.is_none() => {
             of_captures(app, access, (name, captures), key).await
         }
@@ -175,13 +181,15 @@ async fn insert(
 async fn of_masks(
     app: &App,
     access: &Access,
-    (name, masks, full_scale): (Option<Label>, Sha256, Option<f32>),
+    (name, masks, array, full_scale): (Option<Label>, Sha256, Option<Label>, Option<f32>),
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
     let (lab, token) = (&access.lab, access.token);
     app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
     let file = intake::upload(app, masks).await.map_err(|error| error.at("/masks"))?;
-    let prepared = intake::run(app, access, move |desk| intake::masks(desk, &file, full_scale));
+    let prepared = intake::run(app, access, move |desk| {
+        intake::masks(desk, &file, (array.as_ref(), full_scale))
+    });
     let prepared = prepared.await?;
     let facts = facts(name, masks, &prepared);
     let made = app.store.add_calibration((lab, token), facts, prepared.file, key).await?;

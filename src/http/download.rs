@@ -4,7 +4,7 @@ use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use tokio::fs::File;
-use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom};
+use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom, Take};
 use tokio_util::io::ReaderStream;
 
 use super::conditional::{self, Wanted};
@@ -30,6 +30,17 @@ impl Download {
     pub(super) async fn send(
         &self,
         open: impl Future<Output = Result<std::fs::File, StoreError>>,
+        request: (&Method, &HeaderMap),
+    ) -> Result<Response> {
+        let read =
+            async |start, length| part(open.await?, start, length).await.map(Body::from_stream);
+        self.answer(read, request).await
+    }
+
+    /// The same with a body that is made for its first byte and its length.
+    pub(super) async fn answer(
+        &self,
+        read: impl AsyncFnOnce(u64, u64) -> Result<Body>,
         (method, headers): (&Method, &HeaderMap),
     ) -> Result<Response> {
         let etag = conditional::etag(&self.sha256);
@@ -38,7 +49,7 @@ impl Download {
             return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
         }
         let (status, start, length) = self.portion(&etag, (method, headers))?;
-        let mut response = (status, part(open.await?, start, length).await?).into_response();
+        let mut response = (status, read(start, length).await?).into_response();
         let fields = response.headers_mut();
         fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(self.kind));
         fields.insert(header::CONTENT_LENGTH, length.into());
@@ -77,12 +88,17 @@ fn outside(size: u64) -> ApiError {
         .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
 }
 
-async fn part(file: std::fs::File, start: u64, length: u64) -> Result<Body> {
+/// The bytes of a file from `start` on.
+pub(super) async fn part(
+    file: std::fs::File,
+    start: u64,
+    length: u64,
+) -> Result<ReaderStream<Take<File>>> {
     let mut file = File::from_std(file);
     if start > 0 {
         file.seek(SeekFrom::Start(start)).await.map_err(|error| ApiError::internal(&error))?;
     }
-    Ok(Body::from_stream(ReaderStream::with_capacity(file.take(length), 64 * 1024)))
+    Ok(ReaderStream::with_capacity(file.take(length), 64 * 1024))
 }
 
 fn value(text: String) -> HeaderValue {

@@ -14,7 +14,7 @@ use crate::formats::mat::SceneArray;
 use crate::formats::validate::MaskStatistics;
 use crate::formats::{Limits, StackInfo, StackWriter, planar};
 use crate::intake::{self, Exposure, Source};
-use crate::job::{Finding, Sha256};
+use crate::job::{Finding, Label, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store, StoreError};
 
 /// What an upload turned out to be.
@@ -85,9 +85,10 @@ pub(super) async fn upload(app: &App, sha256: Sha256) -> Result<PathBuf> {
 pub(super) fn masks(
     desk: &Desk,
     upload: &Path,
-    full_scale: Option<f32>,
+    (array, full_scale): (Option<&Label>, Option<f32>),
 ) -> Result<Prepared<MaskStatistics>> {
-    let opened = Source::upload(upload, SceneArray::Masks, full_scale, *desk.limits()).open()?;
+    let source = Source::upload(upload, SceneArray::Masks, full_scale, *desk.limits());
+    let opened = source.named(array.map(Label::to_string)).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
     let (mut writer, room) = desk.writer(&info)?;
     let found = intake::masks(opened, |mask| writer.write_frame(mask))?;
@@ -99,12 +100,12 @@ pub(super) fn masks(
 pub(super) fn measurement(
     desk: &Desk,
     upload: &Path,
-    full_scale: Option<f32>,
+    (array, full_scale): (Option<&Label>, Option<f32>),
     exposure: &Exposure,
     calibration: &Calibration,
 ) -> Result<Prepared<Vec<Finding>>> {
-    let opened =
-        Source::upload(upload, SceneArray::Measurements, full_scale, *desk.limits()).open()?;
+    let source = Source::upload(upload, SceneArray::Measurements, full_scale, *desk.limits());
+    let opened = source.named(array.map(Label::to_string)).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
     let masks = &calibration.facts;
     if (info.height, info.width) != (masks.height, masks.width) {

@@ -22,6 +22,9 @@ pub(super) struct MeasurementRequest {
     name: Option<Label>,
     calibration: CalibrationId,
     data: Sha256,
+    /// What the snapshots are called in a file of several arrays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    array: Option<Label>,
     /// Captures of the dark, the LCoS all black, at the measurement's exposure: their average is
     /// subtracted.
     #[serde(default)]
@@ -44,6 +47,7 @@ impl MeasurementRequest {
             name,
             calibration,
             data,
+            array: None,
             dark: Vec::new(),
             saturation: None,
             full_scale: None,
@@ -100,8 +104,9 @@ async fn insert(
     }
     let frames = calibration.facts.frames;
     let exposure = Exposure { dark, saturation: request.saturation };
+    let array = request.array.clone();
     let prepared = intake::run(app, access, move |desk| {
-        intake::measurement(desk, &file, full_scale, &exposure, &calibration)
+        intake::measurement(desk, &file, (array.as_ref(), full_scale), &exposure, &calibration)
     });
     let Prepared { info, full_scale, found, file, room } = prepared.await?;
     let facts = facts(request, &info, full_scale, frames, found);

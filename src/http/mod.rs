@@ -14,6 +14,7 @@ mod dashboard;
 mod download;
 pub mod error;
 mod events;
+mod exports;
 mod extract;
 mod intake;
 mod jobs;

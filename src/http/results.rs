@@ -118,7 +118,7 @@ async fn send(
         sha256: file.sha256,
         size: file.size,
         kind: media_type(name),
-        disposition: disposition(job.id, snapshot, name),
+        disposition: format!("inline; {}", file_name(job.id, snapshot, name)),
         // Part of a JSON document would not be one.
         in_parts: media_type(name) != "application/json",
     };
@@ -152,14 +152,19 @@ fn media_type(name: &str) -> &'static str {
     }
 }
 
+/// That a browser saves the file, and under which name.
+pub(super) fn attachment(job: JobId, snapshot: Option<u32>, name: &str) -> String {
+    format!("attachment; {}", file_name(job, snapshot, name))
+}
+
 /// The name under which a browser saves the file: one that tells jobs and snapshots apart.
-fn disposition(job: JobId, snapshot: Option<u32>, name: &str) -> String {
+fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String {
     let file = name.rsplit('/').next().unwrap_or(name);
     let short: String =
         job.to_string().chars().rev().take(8).collect::<Vec<_>>().into_iter().rev().collect();
     match snapshot {
-        Some(snapshot) => format!("inline; filename=\"{short}_{snapshot:04}_{file}\""),
-        None => format!("inline; filename=\"{short}_{file}\""),
+        Some(snapshot) => format!("filename=\"{short}_{snapshot:04}_{file}\""),
+        None => format!("filename=\"{short}_{file}\""),
     }
 }
 

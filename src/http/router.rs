@@ -15,8 +15,8 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::pictures::{OfCalibration, OfJob, OfMeasurement};
 use super::{
-    algorithms, blobs, calibrations, dashboard, events, jobs, layers, me, measurements, models,
-    pictures, problems, quality, reports, results, samples, system, tiles, tus,
+    algorithms, blobs, calibrations, dashboard, events, exports, jobs, layers, me, measurements,
+    models, pictures, problems, quality, reports, results, samples, system, tiles, tus,
 };
 
 /// The largest JSON body.
@@ -54,6 +54,14 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::file),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::file),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.tif").get(exports::tiff),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/zarr.json").get(exports::zarr),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0").get(exports::chunk),
+        R::at("/v1/jobs/{job}/sequence/stack.tif").get(exports::tiff),
+        R::at("/v1/jobs/{job}/sequence/frames.npy").get(exports::array),
+        R::at("/v1/jobs/{job}/sequence/frames.zarr/zarr.json").get(exports::zarr),
+        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0").get(exports::chunk),
+        R::at("/v1/jobs/{job}/results.zip").get(exports::archive),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),

@@ -10,10 +10,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::fs::{Advice, fadvise};
-use sha2::Digest;
 
 use super::error::{Result, StoreError};
-use super::hashes::{Identity, hash, open};
+use super::hashes::{Digester, Digests, Identity, digest, open};
 use super::records::{self, Place, Record};
 use super::rows::{sql, sql_scalar};
 use super::{DataDir, Job, Store, on_files};
@@ -61,20 +60,21 @@ impl Store {
         name: &str,
     ) -> Result<(ResultFile, PathBuf, File)> {
         let (file, path) = self.result_file(job, snapshot, name).await?;
-        let place = Place::Result {
-            job: job.id,
-            snapshot: snapshot.map_or(super::tables::results::WHOLE_JOB, i64::from),
-            name: file.name.clone(),
-        };
-        let record = Record { place, sha256: file.sha256 };
-        let opened = self.open_intact(&record).await?;
+        let (opened, _) = self.open_intact(&result_record(job, snapshot, &file)).await?;
         Ok((file, path, opened))
+    }
+
+    /// The CRC-32 of a result file of a snapshot (or, with none, of the whole job).
+    /// Errors: as [`Self::open_result`].
+    pub async fn result_crc32(&self, job: &Job, snapshot: Option<u32>, name: &str) -> Result<u32> {
+        let (file, _) = self.result_file(job, snapshot, name).await?;
+        Ok(self.open_intact(&result_record(job, snapshot, &file)).await?.1.crc32)
     }
 
     /// Opens a stored file, whose bytes are those of its name.
     /// Errors: [`StoreError::Damaged`] if it is gone, or its bytes are others.
     pub async fn open_blob(&self, sha256: Sha256) -> Result<File> {
-        self.open_intact(&Record { place: Place::Blob(sha256), sha256 }).await
+        Ok(self.open_intact(&Record { place: Place::Blob(sha256), sha256 }).await?.0)
     }
 
     /// Where a stored file lies, whose bytes are those of its name.
@@ -84,22 +84,22 @@ impl Store {
         Ok(self.dir().blob(&sha256))
     }
 
-    async fn open_intact(&self, record: &Record) -> Result<File> {
+    async fn open_intact(&self, record: &Record) -> Result<(File, Digests)> {
         let path = record.path(self.dir());
         let opened = on_files(move || open(&path)).await?;
         let Some((mut file, meta)) = opened else { return Err(self.damaged(record).await) };
         let hashing = async {
             let again = file.try_clone().map_err(StoreError::io("open", self.dir().root()))?;
-            let hashed = on_files(move || hash(again)).await?;
+            let hashed = on_files(move || digest(again)).await?;
             Ok::<_, StoreError>(hashed)
         };
         let found = self.hashes.0.get_or_insert_async(&Identity::of(&meta), hashing).await?;
-        if found != record.sha256 {
+        if found.sha256 != record.sha256 {
             return Err(self.damaged(record).await);
         }
         on_files(move || {
             file.rewind().map_err(StoreError::io("read", Path::new("a stored file")))?;
-            Ok(file)
+            Ok((file, found))
         })
         .await
     }
@@ -164,7 +164,7 @@ impl Store {
                 let path = record.path(self.dir());
                 let found = on_files(move || {
                     let Some((file, meta)) = open(&path)? else { return Ok(None) };
-                    Ok(Some((hash(file)?, meta.len())))
+                    Ok(Some((digest(file)?.sha256, meta.len())))
                 })
                 .await?;
                 self.compare(&record, found, &mut audit).await?;
@@ -253,9 +253,9 @@ impl Store {
         let found = match opened {
             None => None,
             Some((file, meta)) => {
-                let sha256 = read_slowly(file, rate).await?;
-                self.hashes.0.insert(Identity::of(&meta), sha256);
-                Some(sha256)
+                let digests = read_slowly(file, rate).await?;
+                self.hashes.0.insert(Identity::of(&meta), digests);
+                Some(digests.sha256)
             }
         };
         if found != Some(record.sha256)
@@ -267,21 +267,30 @@ impl Store {
     }
 }
 
+fn result_record(job: &Job, snapshot: Option<u32>, file: &ResultFile) -> Record {
+    let place = Place::Result {
+        job: job.id,
+        snapshot: snapshot.map_or(super::tables::results::WHOLE_JOB, i64::from),
+        name: file.name.clone(),
+    };
+    Record { place, sha256: file.sha256 }
+}
+
 /// Hashes a file as it lies on the disk, not as the kernel remembers it, and stays below this rate. Between
 /// slices it can be broken off.
-async fn read_slowly(file: File, rate: u64) -> Result<Sha256> {
+async fn read_slowly(file: File, rate: u64) -> Result<Digests> {
     // Advice alone: where it is not taken, what the kernel remembers is hashed.
     let _ = fadvise(&file, 0, None, Advice::DontNeed);
-    let mut state = (file, sha2::Sha256::new());
+    let mut state = (file, Digester::default());
     loop {
         let (next, count) = on_files(move || {
-            let (mut file, mut hasher) = state;
+            let (mut file, mut digester) = state;
             let mut buffer = vec![0; SLICE];
             let count = file
                 .read(&mut buffer)
                 .map_err(StoreError::io("read", Path::new("a stored file")))?;
-            hasher.update(&buffer[..count]);
-            Ok(((file, hasher), count))
+            digester.update(&buffer[..count]);
+            Ok(((file, digester), count))
         })
         .await?;
         state = next;
@@ -291,16 +300,16 @@ async fn read_slowly(file: File, rate: u64) -> Result<Sha256> {
         #[allow(clippy::cast_precision_loss)] // a pause
         tokio::time::sleep(Duration::from_secs_f64(count as f64 / rate.max(1) as f64)).await;
     }
-    let (file, hasher) = state;
+    let (file, digester) = state;
     let _ = fadvise(&file, 0, None, Advice::DontNeed);
-    Ok(Sha256::new(hasher.finalize().into()))
+    Ok(digester.finish())
 }
 
 impl Record {
     /// Whether the file at this path has the bytes on record.
     pub(super) fn is_at(&self, dir: &DataDir) -> Result<bool> {
         match open(&self.path(dir))? {
-            Some((file, _)) => Ok(hash(file)? == self.sha256),
+            Some((file, _)) => Ok(digest(file)?.sha256 == self.sha256),
             None => Ok(false),
         }
     }

@@ -386,7 +386,7 @@ fn the_demo_shows_what_the_service_is_for() {
     let gain = pnp["psnr_db"].as_f64().unwrap() - tv["psnr_db"].as_f64().unwrap();
     assert!(gain >= 1.0, "{report:#}");
     assert!(pnp["ssim"].as_f64() > tv["ssim"].as_f64(), "{report:#}");
-    let frames = files.path("demo/frames/pnp-tv-fastdvdnet");
+    let frames = files.path("demo/frames/pnp-tv-fastdvdnet/snapshot_0000/frames");
     assert_eq!(std::fs::read_dir(frames).unwrap().count(), 8);
 }
 

@@ -11,6 +11,7 @@ mod client_libraries;
 mod clients;
 #[cfg(feature = "nats")]
 mod cluster;
+mod commands;
 mod conditions;
 mod contract;
 mod copies;
@@ -18,7 +19,9 @@ mod crashes;
 mod damage;
 mod dashboard;
 mod deep;
+mod exports;
 mod faults;
+mod formats;
 mod hangs;
 mod hostile;
 mod identity;

@@ -41,7 +41,10 @@ pub enum FormatError {
     OverLimit { format: Format, what: &'static str, value: u64, limit: u64 },
     /// A file of several arrays without the one that was asked for.
     #[error("{format} file has no array named '{name}'; it holds {present}")]
-    MissingArray { format: Format, name: &'static str, present: String },
+    MissingArray { format: Format, name: String, present: String },
+    /// An array was named, in a file that holds one without a name.
+    #[error("the file holds one array without a name: leave array out")]
+    NoNames,
     /// Integers of a type that has no scale of its own, and none was stated.
     #[error(
         "the samples are {0}, which has no full scale of its own: state full_scale, the stored number that means 1"
@@ -89,7 +92,7 @@ impl FormatError {
             Self::Truncated { .. } => "truncated",
             Self::Malformed { .. } => "malformed",
             Self::OverLimit { .. } => "over_limit",
-            Self::MissingArray { .. } => "missing_array",
+            Self::MissingArray { .. } | Self::NoNames => "missing_array",
             Self::FullScale(_) | Self::FullScaleNeeded(_) => "invalid_full_scale",
             Self::NotFinite { .. } => "not_finite",
             Self::AboveFullScale { .. } => "above_full_scale",

@@ -37,8 +37,13 @@ pub(super) struct Hdf5Reader {
 }
 
 impl Hdf5Reader {
-    /// Opens the array of `file` by its name. Errors: no HDF5; no such array; too large; another type.
-    pub(super) fn open(file: File, array: SceneArray, limits: &Limits) -> Result<Self> {
+    /// Opens the array of `file` with this name, which is what `array` says. Errors: no HDF5; no such array; too
+    /// large; another type.
+    pub(super) fn open(
+        file: File,
+        (array, name): (SceneArray, &str),
+        limits: &Limits,
+    ) -> Result<Self> {
         let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
         let options = OpenOptions {
             chunk_cache_bytes: CHUNK_CACHE_BYTES,
@@ -47,15 +52,16 @@ impl Hdf5Reader {
         };
         let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
         let (_, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
-        if !names.iter().any(|name| name == array.name()) {
-            let format = Format::Hdf5;
-            return Err(FormatError::MissingArray {
-                format,
-                name: array.name(),
-                present: list(&names),
-            });
-        }
-        let dataset = file.dataset(array.name()).map_err(error)?;
+        let dataset = match file.dataset(name) {
+            Ok(dataset) => dataset,
+            Err(Error::Io(source)) => return Err(error(Error::Io(source))),
+            // In a group that is not there, or a group itself.
+            Err(other) if names.iter().any(|there| there == name) => return Err(error(other)),
+            Err(_) => {
+                let (format, name) = (Format::Hdf5, name.to_owned());
+                return Err(FormatError::MissingArray { format, name, present: list(&names) });
+            }
+        };
         let class = dataset.attribute("MATLAB_class").ok();
         let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
         let sample = match (stored(dataset.dtype()), class.as_deref()) {

@@ -1,11 +1,17 @@
 //! Small files for the tests of the decoders.
 
 use std::io::Write;
+use std::path::{Path, PathBuf};
 
 use ndarray::{Array3, Axis};
 use tempfile::NamedTempFile;
 
 use super::{FormatError, FrameReader, Limits, StackInfo, open_stack, read_stack};
+
+/// A file that another program has written; `make.py` beside it says how.
+pub(super) fn sample(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/formats").join(name)
+}
 
 pub(super) fn file(bytes: &[u8]) -> NamedTempFile {
     let mut file = NamedTempFile::new().unwrap();

@@ -15,7 +15,9 @@ use crate::formats::error::Result;
 use directory::malformed;
 
 const ACCEPTED_SAMPLES: &str =
-    "one grey sample a pixel (BlackIsZero): unsigned 8 or 16 bit, or 32-bit float";
+    "one grey sample a pixel (BlackIsZero): unsigned 1, 8 or 16 bit, or 32- or 64-bit float";
+const ACCEPTED_COLOUR: &str = "grey, BlackIsZero (grey of colours: python -c \"import numpy, tifffile; a = tifffile.imread('in.tif'); \
+     tifffile.imwrite('out.tif', (a[..., :3] @ numpy.array([.299, .587, .114])).astype(a.dtype))\")";
 const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits";
 
 /// TIFF's numbers for the lossless compressions that are read.
@@ -74,13 +76,24 @@ impl FrameReader for TiffReader {
         self.next += 1;
         self.decoder.seek_to_image(page).map_err(|e| in_page(page, e))?;
         let values = match self.decoder.read_image().map_err(|e| in_page(page, e))? {
+            DecodingResult::U8(bytes) if self.info.sample == SampleType::Bool => {
+                bits(&bytes, self.info.width)
+            }
             DecodingResult::U8(values) => values.into_iter().map(f32::from).collect(),
             DecodingResult::U16(values) => values.into_iter().map(f32::from).collect(),
             DecodingResult::F32(values) => values,
+            DecodingResult::F64(values) => values.into_iter().map(|value| value as f32).collect(),
             _ => return Err(FormatError::Internal(format!("samples of TIFF page {page}"))),
         };
         samples::frame(self.info.height, self.info.width, values).map(Some)
     }
+}
+
+/// Rows of single bits, the first one in the highest place; each row begins with a byte.
+fn bits(bytes: &[u8], width: usize) -> Vec<f32> {
+    let rows = bytes.chunks_exact(width.div_ceil(8).max(1));
+    let bit = |row: &[u8], column: usize| f32::from(row[column / 8] >> (7 - column % 8) & 1);
+    rows.flat_map(|row| (0..width).map(move |column| bit(row, column))).collect()
 }
 
 /// Checks the header of the page that the decoder stands on; the result has one frame.
@@ -102,31 +115,35 @@ fn sample_type(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<Sa
     let tag = |decoder: &mut Decoder<_>, tag, default: u16| {
         decoder.find_tag_unsigned(tag).map(|v| v.unwrap_or(default)).map_err(|e| in_page(page, e))
     };
-    let unsupported = |found: String| FormatError::Unsupported {
+    let refused = |found: String, accepted| FormatError::Unsupported {
         format: Format::Tiff,
         found: format!("{found} (page {page})"),
-        accepted: ACCEPTED_SAMPLES,
+        accepted,
     };
+    let unsupported = |found| refused(found, ACCEPTED_SAMPLES);
     let black_is_zero = PhotometricInterpretation::BlackIsZero.to_u16();
     let photometric = tag(decoder, Tag::PhotometricInterpretation, black_is_zero)?;
     if photometric != black_is_zero {
-        return Err(unsupported(match PhotometricInterpretation::from_u16(photometric) {
+        let found = match PhotometricInterpretation::from_u16(photometric) {
             Some(name) => format!("{name:?} colours"),
             None => format!("photometric interpretation {photometric}"),
-        }));
+        };
+        return Err(refused(found, ACCEPTED_COLOUR));
     }
     let bits = match decoder.colortype().map_err(|e| in_page(page, e))? {
         ColorType::Gray(bits) => bits,
-        other => return Err(unsupported(format!("{other:?}"))),
+        other => return Err(refused(format!("{other:?}"), ACCEPTED_COLOUR)),
     };
     let formats: Vec<u16> = decoder
         .find_tag_unsigned_vec(Tag::SampleFormat)
         .map_err(|e| in_page(page, e))?
         .unwrap_or_else(|| vec![1]);
     match (formats.first().copied(), bits) {
+        (Some(1), 1) => Ok(SampleType::Bool),
         (Some(1), 8) => Ok(SampleType::U8),
         (Some(1), 16) => Ok(SampleType::U16),
         (Some(3), 32) => Ok(SampleType::F32),
+        (Some(3), 64) => Ok(SampleType::F64),
         (Some(1), _) => Err(unsupported(format!("unsigned {bits}-bit samples"))),
         (Some(2), _) => Err(unsupported(format!("signed {bits}-bit samples"))),
         (Some(3), _) => Err(unsupported(format!("{bits}-bit float samples"))),
@@ -172,7 +189,10 @@ fn check_chunks(
         }
         stored = stored.saturating_add(bytes);
     }
-    let needed = info.voxels() * info.sample.bytes() as u64;
+    let needed = match info.sample {
+        SampleType::Bool => (info.width.div_ceil(8) * info.height) as u64,
+        sample => info.voxels() * sample.bytes() as u64,
+    };
     let expansion = if compression == UNCOMPRESSED { 1 } else { MAX_EXPANSION };
     if stored.saturating_mul(expansion) < needed {
         return Err(FormatError::Truncated {

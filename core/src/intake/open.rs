@@ -14,6 +14,8 @@ use crate::intake::error::Result;
 pub struct Source<'a> {
     pub path: &'a Path,
     pub array: SceneArray,
+    /// What that array is called there; none for the field's own name.
+    pub named: Option<String>,
     /// The stored number that means 1; none for the file's own.
     pub full_scale: Option<f32>,
     pub limits: Limits,
@@ -48,15 +50,25 @@ impl<'a> Source<'a> {
         full_scale: Option<f32>,
         limits: Limits,
     ) -> Self {
-        Self { path, array, full_scale, limits, name: String::new() }
+        Self { path, array, named: None, full_scale, limits, name: String::new() }
+    }
+
+    /// The same file, of which the array with this name is meant.
+    pub fn named(self, named: Option<String>) -> Self {
+        Self { named, ..self }
     }
 
     /// Opens it.
     /// Errors: no file, or none of a format that is read; larger than the limits; no such array; no
     /// full scale.
     pub fn open(&self) -> Result<Opened> {
+        let named = self.named.as_deref();
         let opened = match mat::is_scene(self.path) {
-            Ok(true) => mat::open_array(self.path, self.array, &self.limits),
+            Ok(true) => {
+                let name = named.unwrap_or(self.array.name());
+                mat::open_named(self.path, (self.array, name), &self.limits)
+            }
+            Ok(false) if named.is_some() => Err(FormatError::NoNames),
             Ok(false) => formats::open_stack(self.path, &self.limits),
             Err(error) => Err(error),
         };

@@ -187,22 +187,22 @@ pub struct ScaleRecord {
 
 /// What the camera told about time.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-struct CameraRecord {
+pub struct CameraRecord {
     /// Snapshots a second.
-    fps: Option<f64>,
+    pub fps: Option<f64>,
     /// Seconds that one snapshot is exposed.
-    exposure_s: Option<f64>,
+    pub exposure_s: Option<f64>,
     /// Start of each frame in seconds after the start of snapshot 0; none where it does not
     /// follow from the two.
-    frame_times_s: Option<Vec<f64>>,
+    pub frame_times_s: Option<Vec<f64>>,
 }
 
 impl CameraRecord {
     /// The times of the `frames` frames of a snapshot.
     ///
     /// The masks share the exposure evenly; an unknown exposure is taken to fill the camera's
-    /// whole period. Without a frame rate only snapshot 0 has times.
-    fn new(
+    /// whole period. Without a frame rate only snapshot 0 has times. None if neither is known.
+    pub fn new(
         (fps, exposure_s): (Option<f64>, Option<f64>),
         snapshot: usize,
         frames: usize,
@@ -219,7 +219,7 @@ impl CameraRecord {
     }
 
     /// Seconds that each of `frames` frames lasts.
-    fn frame_exposure_s(&self, frames: usize) -> Option<f64> {
+    pub fn frame_exposure_s(&self, frames: usize) -> Option<f64> {
         let exposure = self.exposure_s.or_else(|| self.fps.map(|fps| 1.0 / fps))?;
         Some(exposure / frames as f64)
     }

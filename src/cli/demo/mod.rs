@@ -1,6 +1,5 @@
 //! `sci-recon demo`: a real clip through the real service.
 
-mod client;
 mod report;
 mod service;
 
@@ -10,14 +9,16 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use indicatif::MultiProgress;
-use ndarray::Array3;
-use serde_json::json;
+use ndarray::{Array3, Axis, concatenate};
+use serde_json::{Value, json};
+use uuid::Uuid;
 
+use super::client::{Client, Wanted};
 use super::{CliError, progress};
 use crate::cli::error::Result;
+use crate::formats::{Limits, exr};
 use crate::intake::sample;
-use crate::job::Algorithm;
-use client::{Client, JobView};
+use crate::job::{Algorithm, JobState};
 use report::{Quality, Report};
 use service::Service;
 
@@ -61,7 +62,7 @@ async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
     let service = Service::start(out).await?;
     say(format!("the service is at {}", service.url()));
     // 3. Over HTTP from here on, as a lab machine would.
-    let client = Client::new(service.url());
+    let client = Client::at(service.url(), None)?;
     let reports = through_http(&client, out, &truth).await;
     service.stop().await?;
     let [gap_tv, pnp_tv_fastdvdnet] = reports?;
@@ -80,43 +81,61 @@ async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
 /// Sends the files, asks for both algorithms, waits, and compares the frames that come back.
 async fn through_http(client: &Client, out: &Path, truth: &Array3<f32>) -> Result<[Quality; 2]> {
     let input = out.join("input");
-    let masks = client.upload(&input.join("masks.npy")).await?;
-    let measurement = client.upload(&input.join("measurement.npy")).await?;
-    let calibration = client.create("/v1/calibrations", &json!({"masks": masks})).await?;
+    let masks = client.sent(&input.join("masks.npy")).await?;
+    let measurement = client.sent(&input.join("measurement.npy")).await?;
+    let calibration = made(client, "/v1/calibrations", &json!({"masks": masks})).await?;
     let body = json!({"calibration": calibration, "data": measurement});
-    let measurement = client.create("/v1/measurements", &body).await?;
+    let measurement = made(client, "/v1/measurements", &body).await?;
     let mut jobs = Vec::new();
     for name in COMPARED.map(|algorithm| algorithm.into_str()) {
         let body = json!({"measurement": measurement, "algorithm": name, "label": "demo"});
-        jobs.push((name, client.create("/v1/jobs", &body).await?));
+        jobs.push((name, made(client, "/v1/jobs", &body).await?));
     }
     watch(client, &jobs).await?;
     let mut qualities = Vec::new();
     for (name, job) in &jobs {
         let folder = out.join("frames").join(name);
-        let frames = client.download_frames(job, &folder).await?;
-        qualities.push(report::compare(&frames, truth, client.cpu_seconds(job).await?)?);
+        let frames = frames(client, job, &folder).await?;
+        qualities.push(report::compare(&frames, truth, cpu_seconds(client, job).await?)?);
     }
     Ok([qualities[0], qualities[1]])
+}
+
+/// Makes a calibration, a measurement or a job; gives its identifier.
+async fn made(client: &Client, path: &str, body: &Value) -> Result<String> {
+    Ok(client.made(path, body, &Uuid::now_v7().to_string()).await?)
+}
+
+/// Fetches the EXR frames of snapshot 0 into `folder`, and reads them: \[B,H,W\].
+async fn frames(client: &Client, job: &str, folder: &Path) -> Result<Array3<f32>> {
+    let files = client.fetch(&client.job(job, 0).await?, &[Wanted::Frames], folder).await?;
+    let frames = files.iter().map(|file| exr::read_stack(file, &Limits::default()));
+    let frames = frames.collect::<std::result::Result<Vec<_>, _>>()?;
+    let views: Vec<_> = frames.iter().map(|(_, frame)| frame.view()).collect();
+    concatenate(Axis(0), &views)
+        .map_err(|error| CliError::Failure(format!("the frames of job {job}: {error}")))
+}
+
+/// Processor seconds that the job's computing took, from its manifest.
+async fn cpu_seconds(client: &Client, job: &str) -> Result<f64> {
+    let manifest = client.get(&format!("/v1/jobs/{job}/manifest.json")).await?;
+    let seconds = manifest["run"]["cpu_seconds"].as_f64();
+    seconds.ok_or_else(|| CliError::Failure("the manifest tells no cpu_seconds".into()))
 }
 
 /// Shows the progress of all jobs until they have succeeded.
 async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<()> {
     let screen = MultiProgress::with_draw_target(progress::target());
-    let bars: Vec<_> = jobs.iter().map(|(name, _)| screen.add(progress::bar(name))).collect();
+    let bars: Vec<_> = jobs.iter().map(|(name, _)| screen.add(progress::bar(*name))).collect();
     let mut done = vec![false; jobs.len()];
     while !done.iter().all(|&done| done) {
         for (((name, job), bar), done) in jobs.iter().zip(&bars).zip(&mut done) {
-            match client.job(job).await? {
-                JobView::Going(share) => progress::show(bar, share),
-                JobView::Succeeded => {
-                    progress::show(bar, 1.0);
-                    *done = true;
-                }
-                JobView::Ended(reason) => {
-                    return Err(CliError::Failure(format!("the {name} job {reason}")));
-                }
+            let job = client.job(job, 0).await?;
+            if let Some(reason) = job.failure() {
+                return Err(CliError::Failure(format!("{name}: {reason}")));
             }
+            progress::show(bar, job.progress.percent / 100.0);
+            *done = job.state == JobState::Succeeded;
         }
         tokio::time::sleep(POLL).await;
     }

@@ -1,4 +1,5 @@
-"""Makes the files of this folder with the writers that labs use. Needs h5py, numpy, Pillow.
+"""Makes the files of this folder with the writers that labs use. Needs h5py, numpy, Pillow, SciPy,
+tifffile.
 
 Each holds the same numbers: masks [3, 4, 5] whose value is (frame + 2 row + 3 column) mod 2, or measurements
 [2, 4, 5] whose value is 100 frame + 10 row + column.
@@ -8,6 +9,8 @@ import pathlib
 
 import h5py
 import numpy as np
+import scipy.io
+import tifffile
 from PIL import Image
 
 HERE = pathlib.Path(__file__).parent
@@ -42,6 +45,14 @@ def main():
     for name, type in [("int64", "<i8"), ("int32-big", ">i4"), ("float16", "<f2"), ("int8", "i1")]:
         np.save(HERE / f"masks-{name}.npy", masks.astype(type))
     Image.fromarray(masks[0].astype(bool)).save(HERE / "mask-1-bit.png")
+    Image.fromarray(masks[0].astype(bool)).save(HERE / "mask-1-bit.tif")
+    tifffile.imwrite(HERE / "masks-bool.tif", masks.astype(bool), photometric="minisblack")
+    tifffile.imwrite(HERE / "snapshots-float64.tif", snapshots.astype("f8"), photometric="minisblack")
+    np.save(HERE / "snapshots-fortran.npy", np.asfortranarray(snapshots.astype("<u2")))
+    with h5py.File(HERE / "names.h5", "w") as file:
+        file["calibrated/masks"] = masks.astype("u1")
+        file["shots"] = snapshots.astype("<u2")
+    scipy.io.savemat(HERE / "names.mat", {"shots": np.moveaxis(snapshots, 0, -1).astype("<u2")})
 
 
 main()

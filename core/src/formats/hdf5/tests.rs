@@ -1,18 +1,11 @@
-use std::path::{Path, PathBuf};
-
 use ndarray::Array3;
 use proptest::prelude::{any, prop, proptest};
 
-use crate::formats::mat::{SceneArray, open_array};
-use crate::formats::test_support::{assert_names, file};
+use crate::formats::mat::{SceneArray, open_array, open_named};
+use crate::formats::test_support::{assert_names, file, sample};
 use crate::formats::{
     Format, FormatError, FullScale, Limits, SampleType, StackInfo, collect, read_stack,
 };
-
-/// A file that another program has written; `make.py` beside it says how.
-fn sample(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/formats").join(name)
-}
 
 fn read(name: &str, array: SceneArray) -> Result<(StackInfo, Array3<f32>), FormatError> {
     collect(&mut *open_array(&sample(name), array, &Limits::default())?)
@@ -40,6 +33,25 @@ fn arrays_of_h5py_are_read() {
     assert_eq!((info.sample, info.default_full_scale, values), (SampleType::I64, None, masks()));
     let (info, values) = read("types.h5", SceneArray::Measurements).unwrap();
     assert_eq!((info.sample, values), (SampleType::F16, snapshots()));
+}
+
+#[test]
+fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
+    let open = |file: &str, name: &str| {
+        let array = (SceneArray::Measurements, name);
+        collect(&mut *open_named(&sample(file), array, &Limits::default())?)
+    };
+    for file in ["names.h5", "names.mat"] {
+        assert_eq!(open(file, "shots").unwrap().1, snapshots(), "{file}");
+        for name in ["nothing", "no/thing", "", "/"] {
+            let error = open(file, name).unwrap_err();
+            assert!(error.is_callers_fault(), "{file} {name}: {error:?}");
+            assert_names(&error.to_string(), &["'shots'", "array"]);
+        }
+    }
+    assert_eq!(open("names.h5", "calibrated/masks").unwrap().1, masks());
+    let group = open("names.h5", "calibrated").unwrap_err();
+    assert!(group.is_callers_fault(), "{group:?}");
 }
 
 #[test]

@@ -59,10 +59,19 @@ pub fn open_array(
     array: SceneArray,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
+    open_named(path, (array, array.name()), limits)
+}
+
+/// The same for an array of another name.
+pub fn open_named(
+    path: &Path,
+    (array, name): (SceneArray, &str),
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
     if format == Format::Hdf5 {
-        return Ok(Box::new(hdf5::Hdf5Reader::open(file, array, limits)?));
+        return Ok(Box::new(hdf5::Hdf5Reader::open(file, (array, name), limits)?));
     }
     if format != Format::Mat {
         return Err(FormatError::UnknownFormat {
@@ -74,13 +83,13 @@ pub fn open_array(
     let mut present = Vec::new();
     while let Some(element) = elements.next()? {
         let header = ArrayHeader::read(&mut elements.look_into(element)?)?;
-        if header.name == array.name() {
+        if header.name == name {
             let content = elements.into_content(element)?;
             return Ok(Box::new(MatReader::new(content, array, limits)?));
         }
         present.push(header.name);
     }
-    Err(FormatError::MissingArray { format, name: array.name(), present: list(&present) })
+    Err(FormatError::MissingArray { format, name: name.to_owned(), present: list(&present) })
 }
 
 /// Reads a scene: `mask` and `meas`, and `orig` where it is there.

@@ -6,7 +6,7 @@ mod write;
 
 pub(super) use read::NpyReader;
 pub use read::open_windows;
-pub use write::{write_f32, write_image_f32, write_u16, writer};
+pub use write::{stack_header, write_f32, write_image_f32, write_u16, writer};
 
 #[cfg(test)]
 mod tests;

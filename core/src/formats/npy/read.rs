@@ -1,7 +1,8 @@
 //! Reading npy stacks frame by frame.
 
 use std::fs::File;
-use std::io::{self, Read};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::ops::Range;
 use std::path::Path;
 
 use ndarray::Array2;
@@ -41,11 +42,31 @@ pub(in crate::formats) struct NpyReader {
     file: File,
     info: StackInfo,
     order: ByteOrder,
-    /// A two-dimensional array in Fortran order: its columns lie one after another.
-    by_columns: bool,
+    layout: Layout,
     next: usize,
     bytes: Vec<u8>,
 }
+
+/// How the samples lie one after another.
+#[derive(Debug)]
+enum Layout {
+    Rows,
+    /// Two dimensions in Fortran order: column by column.
+    Columns,
+    /// Three dimensions in Fortran order: all frames of a pixel, then those of the pixel below it. Several
+    /// frames are kept of each reading of the file.
+    Pixels {
+        start: u64,
+        kept: Vec<f32>,
+        /// The first frame that is kept, and the one behind the last.
+        range: Range<usize>,
+    },
+}
+
+/// Bytes of the frames that are kept, unless one takes more.
+const KEPT_BYTES: usize = if cfg!(test) { 200 } else { 64 << 20 };
+/// Bytes that are read at a time, unless the frames of a pixel take more.
+const BLOCK_BYTES: usize = if cfg!(test) { 100 } else { 1 << 20 };
 
 impl NpyReader {
     /// Reads the header of `file` (positioned at its start, `length` bytes long) and checks it
@@ -60,17 +81,11 @@ impl NpyReader {
             }
         };
         limits.check_shape(Format::Npy, frames, height, width)?;
-        let by_columns = header.fortran_order;
-        if by_columns && header.shape.len() == 3 {
-            // Its frames are scattered over the whole file: no way to read one at a time.
-            return Err(FormatError::Unsupported {
-                format: Format::Npy,
-                found: "a three-dimensional array in Fortran order".to_owned(),
-                accepted: "C order: python -c \"import numpy; numpy.save('out.npy', \
-                           numpy.ascontiguousarray(numpy.load('in.npy')))\"",
-            });
-        }
-        // The limits bound each axis below 2^32 only where they are sane; they are settings.
+        let layout = match (header.fortran_order, header.shape.len()) {
+            (false, _) => Layout::Rows,
+            (true, 2) => Layout::Columns,
+            (true, _) => Layout::Pixels { start: data_start, kept: Vec::new(), range: 0..0 },
+        };
         let [frames, height, width] =
             [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
         let info = StackInfo::new(Format::Npy, header.sample, frames, height, width);
@@ -79,7 +94,7 @@ impl NpyReader {
             file,
             info,
             order: header.order,
-            by_columns,
+            layout,
             next: 0,
             bytes: vec![0; height * width * header.sample.bytes()],
         })
@@ -95,15 +110,61 @@ impl FrameReader for NpyReader {
         if self.next == self.info.frames {
             return Ok(None);
         }
-        self.file.read_exact(&mut self.bytes).map_err(FormatError::io("read the frame"))?;
-        self.next += 1;
-        let values = samples::decode(&self.bytes, self.info.sample, self.order);
-        let (height, width) = (self.info.height, self.info.width);
-        if self.by_columns {
-            let columns = samples::frame(width, height, values)?;
-            return Ok(Some(columns.t().as_standard_layout().into_owned()));
+        let frame = self.next;
+        if !matches!(self.layout, Layout::Pixels { .. }) {
+            self.file.read_exact(&mut self.bytes).map_err(FormatError::io("read the frame"))?;
+        } else if !self.keeps(frame) {
+            self.gather(frame)?;
         }
-        samples::frame(height, width, values).map(Some)
+        self.next += 1;
+        let (height, width) = (self.info.height, self.info.width);
+        let decode = || samples::decode(&self.bytes, self.info.sample, self.order);
+        match &self.layout {
+            Layout::Rows => samples::frame(height, width, decode()).map(Some),
+            Layout::Columns => {
+                let columns = samples::frame(width, height, decode())?;
+                Ok(Some(columns.t().as_standard_layout().into_owned()))
+            }
+            Layout::Pixels { kept, range, .. } => {
+                let size = height * width;
+                let values = kept[(frame - range.start) * size..][..size].to_vec();
+                samples::frame(height, width, values).map(Some)
+            }
+        }
+    }
+}
+
+impl NpyReader {
+    fn keeps(&self, frame: usize) -> bool {
+        matches!(&self.layout, Layout::Pixels { range, .. } if range.contains(&frame))
+    }
+
+    /// Reads the file from the front and keeps frames from this one on.
+    fn gather(&mut self, first: usize) -> Result<()> {
+        let Layout::Pixels { start, kept, range } = &mut self.layout else { return Ok(()) };
+        let StackInfo { frames, height, width, sample, .. } = self.info;
+        let pixels = height * width;
+        let count = (KEPT_BYTES / (pixels * size_of::<f32>())).clamp(1, frames - first);
+        kept.clear();
+        kept.resize(count * pixels, 0.0);
+        *range = first..first + count;
+        let failed = || FormatError::io("read the frames");
+        self.file.seek(SeekFrom::Start(*start)).map_err(failed())?;
+        let each = frames * sample.bytes();
+        let block = (BLOCK_BYTES / each).clamp(1, pixels);
+        let mut bytes = vec![0; block * each];
+        for begin in (0..pixels).step_by(block) {
+            let bytes = &mut bytes[..block.min(pixels - begin) * each];
+            self.file.read_exact(bytes).map_err(failed())?;
+            let values = samples::decode(bytes, sample, self.order);
+            for (pixel, values) in (begin..).zip(values.chunks_exact(frames)) {
+                let (column, row) = (pixel / height, pixel % height);
+                for (frame, value) in values[range.clone()].iter().enumerate() {
+                    kept[frame * pixels + row * width + column] = *value;
+                }
+            }
+        }
+        Ok(())
     }
 }
 

@@ -11,6 +11,11 @@ use crate::formats::error::Result;
 use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::StackWriter;
 
+/// The bytes before the frames of an npy file of shape (frame, row, column), little-endian float32.
+pub fn stack_header(frames: usize, height: usize, width: usize) -> Vec<u8> {
+    header(&format!("({frames}, {height}, {width})"))
+}
+
 /// Writes the header of an npy file of shape (frame, row, column), little-endian float32; the frames
 /// come next. `to` should be buffered.
 pub fn writer<W: Write>(
@@ -19,7 +24,7 @@ pub fn writer<W: Write>(
     height: usize,
     width: usize,
 ) -> Result<StackWriter<W>> {
-    to.write_all(&header(&format!("({frames}, {height}, {width})")))
+    to.write_all(&stack_header(frames, height, width))
         .map_err(FormatError::io("write the npy header"))?;
     Ok(StackWriter::new(to, frames, height, width))
 }

@@ -4,8 +4,10 @@ use ::tiff::encoder::{Compression, DeflateLevel, Predictor, TiffEncoder, colorty
 use ndarray::{Array3, Axis};
 use proptest::prelude::{any, proptest};
 
-use crate::formats::test_support::{assert_names, file, open, ramp, read, refusal, survive};
-use crate::formats::{FormatError, Limits, SampleType, open_stack};
+use crate::formats::test_support::{
+    assert_names, file, open, ramp, read, refusal, sample, survive,
+};
+use crate::formats::{FormatError, Limits, SampleType, open_stack, read_stack};
 
 /// The pages of a stack as a TIFF of type `C`.
 macro_rules! pages {
@@ -144,7 +146,7 @@ fn other_samples_are_refused_by_name() {
     let half = with(grey(2, 2, 16, 8), 339, Value::Short(3));
     assert_names(&refusal(&page(false, &half, &[0; 8])), &["16-bit float"]);
     assert_names(&refusal(&page(false, &grey(2, 2, 32, 16), &[0; 16])), &["unsigned 32-bit"]);
-    assert_names(&refusal(&page(false, &grey(8, 2, 1, 2), &[0; 2])), &["unsigned 1-bit"]);
+    assert_names(&refusal(&page(false, &grey(8, 2, 4, 8), &[0; 8])), &["unsigned 4-bit"]);
     let palette = with(grey(2, 2, 8, 4), 262, Value::Short(3));
     assert_names(&refusal(&page(false, &palette, &[0; 4])), &["RGBPalette"]);
     let inverted = with(grey(2, 2, 8, 4), 262, Value::Short(0));
@@ -242,4 +244,19 @@ proptest! {
         bytes[position] = value;
         survive(&bytes);
     }
+}
+
+#[test]
+fn bits_and_doubles_of_others_are_read() {
+    let read = |name: &str| read_stack(&sample(name), &Limits::default()).unwrap();
+    let masks = Array3::from_shape_fn((3, 4, 5), |(k, i, j)| ((k + 2 * i + 3 * j) % 2) as f32);
+    let (info, values) = read("masks-bool.tif");
+    assert_eq!((info.sample, values), (SampleType::Bool, masks.clone()));
+    let (info, values) = read("mask-1-bit.tif");
+    assert_eq!(info.sample, SampleType::Bool);
+    assert_eq!(values.index_axis(Axis(0), 0), masks.index_axis(Axis(0), 0));
+    let (info, values) = read("snapshots-float64.tif");
+    assert_eq!(info.sample, SampleType::F64);
+    let snapshots = Array3::from_shape_fn((2, 4, 5), |(k, i, j)| (100 * k + 10 * i + j) as f32);
+    assert_eq!(values, snapshots);
 }

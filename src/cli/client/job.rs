@@ -1,0 +1,188 @@
+//! A job as the service shows it, and its files.
+
+use std::path::{Component, Path, PathBuf};
+
+use clap::ValueEnum;
+use indicatif::ProgressBar;
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::{Client, Result};
+use crate::cli::CliError;
+use crate::cli::progress;
+use crate::job::{JobState, Sha256, SnapshotRange, Timestamp};
+
+#[derive(Debug, Clone, Deserialize)]
+pub(in crate::cli) struct Job {
+    pub(in crate::cli) id: String,
+    pub(in crate::cli) state: JobState,
+    pub(in crate::cli) label: Option<String>,
+    pub(in crate::cli) algorithm: String,
+    pub(in crate::cli) error: Option<String>,
+    pub(in crate::cli) created_at: Timestamp,
+    pub(in crate::cli) snapshots: SnapshotRange,
+    pub(in crate::cli) progress: Progress,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+pub(in crate::cli) struct Progress {
+    pub(in crate::cli) percent: f64,
+}
+
+/// What of a job is fetched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum Wanted {
+    /// The frames of each snapshot, float32.
+    #[value(name = "frames.npy")]
+    Array,
+    /// The same as a multi-part EXR.
+    #[value(name = "stack.exr")]
+    Stack,
+    /// The same as a BigTIFF for Fiji and napari.
+    #[value(name = "stack.tif")]
+    Tiff,
+    /// Each frame as an EXR.
+    #[value(name = "frames")]
+    Frames,
+    /// Each frame as a PNG, to look at.
+    #[value(name = "png")]
+    Pictures,
+    /// How they were made.
+    #[value(name = "manifest.json")]
+    Manifest,
+    /// The frames of all snapshots, one after the other.
+    #[value(name = "sequence.npy")]
+    SequenceArray,
+    /// The same as a BigTIFF.
+    #[value(name = "sequence.tif")]
+    SequenceTiff,
+    /// All files as one archive.
+    #[value(name = "results.zip")]
+    Archive,
+}
+
+#[derive(Debug, Deserialize)]
+struct Listed {
+    name: String,
+    sha256: Sha256,
+    href: Option<String>,
+}
+
+impl Wanted {
+    /// Whether a file of a snapshot is meant.
+    fn has(self, name: &str) -> bool {
+        match self {
+            Self::Array => name == "frames.npy",
+            Self::Stack => name == "stack.exr",
+            Self::Frames => name.starts_with("frames/"),
+            Self::Pictures => name.starts_with("png/"),
+            Self::Manifest => name == "manifest.json",
+            Self::Tiff | Self::SequenceArray | Self::SequenceTiff | Self::Archive => false,
+        }
+    }
+
+    /// The file of the whole job that is meant: its address below that of the job, and its name.
+    fn of_job(self) -> Option<(&'static str, &'static str)> {
+        match self {
+            Self::Manifest => Some(("manifest.json", "manifest.json")),
+            Self::SequenceArray => Some(("sequence/frames.npy", "sequence.npy")),
+            Self::SequenceTiff => Some(("sequence/stack.tif", "sequence.tif")),
+            Self::Archive => Some(("results.zip", "results.zip")),
+            _ => None,
+        }
+    }
+}
+
+fn parsed<T: for<'de> Deserialize<'de>>(value: Value) -> Result<T> {
+    let unknown =
+        |error| CliError::Failure(format!("the service's answer is not understood: {error}"));
+    Ok(serde_json::from_value(value).map_err(unknown)?)
+}
+
+/// The identifier in what the service says of a thing.
+pub(super) fn id(value: &Value) -> Result<String> {
+    let id = value["id"].as_str().map(str::to_owned);
+    Ok(id.ok_or_else(|| CliError::Failure("the service names no identifier".into()))?)
+}
+
+impl Job {
+    pub(in crate::cli) fn new(value: Value) -> Result<Self> {
+        parsed(value)
+    }
+
+    /// How it has ended, unless it has succeeded or goes on.
+    pub(in crate::cli) fn failure(&self) -> Option<String> {
+        if !self.state.is_final() || self.state == JobState::Succeeded {
+            return None;
+        }
+        let error = self.error.as_ref().map_or(String::new(), |error| format!(": {error}"));
+        Some(format!("job {} is {}{error}", self.id, self.state))
+    }
+}
+
+impl Client {
+    /// A job; answered when it has ended, or after so many seconds.
+    pub(in crate::cli) async fn job(&self, id: &str, wait: u32) -> Result<Job> {
+        Job::new(self.get(&format!("/v1/jobs/{id}?wait={wait}")).await?)
+    }
+
+    /// Makes a thing with a key; gives its identifier.
+    pub(in crate::cli) async fn made(&self, path: &str, body: &Value, key: &str) -> Result<String> {
+        id(&self.create(path, body, key).await?)
+    }
+
+    /// Fetches files of a job into a folder: those of each snapshot into `snapshot_0000` and so on. Gives all
+    /// that are there now.
+    pub(in crate::cli) async fn fetch(
+        &self,
+        job: &Job,
+        wanted: &[Wanted],
+        folder: &Path,
+    ) -> Result<Vec<PathBuf>> {
+        let base = format!("/v1/jobs/{}", job.id);
+        let mut files = Vec::new();
+        for snapshot in job.snapshots.indices() {
+            let of_snapshot = format!("{base}/snapshots/{snapshot}");
+            let inside = folder.join(format!("snapshot_{snapshot:04}"));
+            let listed: Vec<Listed> = parsed(self.get(&of_snapshot).await?["files"].take())?;
+            for file in listed {
+                let Some(href) = &file.href else { continue };
+                if wanted.iter().any(|wanted| wanted.has(&file.name)) {
+                    let path = inside.join(relative(&file.name)?);
+                    files.push((href.clone(), path, Some(file.sha256)));
+                }
+            }
+            if wanted.contains(&Wanted::Tiff) {
+                files.push((format!("{of_snapshot}/stack.tif"), inside.join("stack.tif"), None));
+            }
+        }
+        for (place, name) in wanted.iter().filter_map(|wanted| wanted.of_job()) {
+            files.push((format!("{base}/{place}"), folder.join(name), None));
+        }
+        for (href, path, sha256) in &files {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let bar = progress::bytes(name);
+            self.download(href, path, *sha256, &bar).await?;
+            bar.finish_and_clear();
+        }
+        Ok(files.into_iter().map(|(_, path, _)| path).collect())
+    }
+
+    /// Sends a file, with a bar on a terminal.
+    pub(in crate::cli) async fn sent(&self, path: &Path) -> Result<Sha256> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let bar: ProgressBar = progress::bytes(name);
+        let sha256 = self.upload(path, &bar).await;
+        bar.finish_and_clear();
+        sha256
+    }
+}
+
+/// A name that leads out of no folder.
+fn relative(name: &str) -> Result<&Path> {
+    let path = Path::new(name);
+    if path.components().all(|part| matches!(part, Component::Normal(_))) {
+        return Ok(path);
+    }
+    Err(CliError::Failure(format!("the service names a file {name:?}")).into())
+}

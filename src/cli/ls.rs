@@ -1,0 +1,68 @@
+//! `sci-recon ls`: the jobs of a lab.
+
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::CliError;
+use super::client::{Client, Job, ServiceArguments};
+use super::error::Result;
+use super::wait::wait;
+use crate::job::JobState;
+
+/// List the lab's jobs, newest first.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    #[command(flatten)]
+    service: ServiceArguments,
+    /// Only those in this state; may be given several times.
+    #[arg(long, value_name = "STATE", value_delimiter = ',')]
+    state: Vec<JobState>,
+    /// The most that are listed.
+    #[arg(long, value_name = "N", default_value_t = 50)]
+    limit: usize,
+    /// Print a JSON array of jobs, as the service shows them.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Jobs in one answer.
+const PAGE: usize = 100;
+
+pub fn run(arguments: &Arguments) -> Result<()> {
+    wait(async {
+        let client = Client::new(&arguments.service)?;
+        let jobs = list(&client, &arguments.state, arguments.limit).await?;
+        if arguments.json {
+            println!("{}", json!(jobs));
+            return Ok(());
+        }
+        for job in jobs {
+            let job = Job::new(job)?;
+            let label = job.label.unwrap_or_default();
+            let percent = job.progress.percent;
+            let (id, state, time, algorithm) = (job.id, job.state, job.created_at, job.algorithm);
+            println!("{id}  {state:9}  {percent:3.0} %  {time}  {algorithm:18}  {label}");
+        }
+        Ok::<_, CliError>(())
+    })
+}
+
+async fn list(client: &Client, states: &[JobState], limit: usize) -> Result<Vec<Value>> {
+    let states: Vec<&str> = states.iter().map(|state| state.into_str()).collect();
+    let mut cursor = String::new();
+    let mut jobs = Vec::new();
+    while jobs.len() < limit {
+        let count = PAGE.min(limit - jobs.len());
+        let mut path = format!("/v1/jobs?limit={count}{cursor}");
+        if !states.is_empty() {
+            path += &format!("&state={}", states.join(","));
+        }
+        let mut page = client.get(&path).await?;
+        jobs.extend(page["items"].take().as_array().cloned().unwrap_or_default());
+        match page["next_cursor"].as_str() {
+            Some(next) => cursor = format!("&cursor={next}"),
+            None => break,
+        }
+    }
+    Ok(jobs)
+}

@@ -1,0 +1,72 @@
+//! `sci-recon watch`: waits for jobs.
+
+use clap::Args;
+use indicatif::MultiProgress;
+use serde_json::json;
+
+use super::CliError;
+use super::client::{Client, Job, ServiceArguments};
+use super::error::Result;
+use super::progress;
+use super::wait::wait;
+use crate::job::JobId;
+
+/// Wait until jobs have ended; ends with 1 unless all have succeeded.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// The jobs.
+    #[arg(required = true, value_name = "JOB")]
+    jobs: Vec<JobId>,
+    #[command(flatten)]
+    service: ServiceArguments,
+    /// Print a JSON object for each job.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Seconds between looks at a bar.
+const LOOK: u32 = 1;
+/// Seconds that the service waits for the end of a job.
+const LONG: u32 = 20;
+
+pub fn run(arguments: &Arguments) -> Result<()> {
+    wait(async {
+        let client = Client::new(&arguments.service)?;
+        let screen = MultiProgress::with_draw_target(progress::target());
+        let look = if screen.is_hidden() { LONG } else { LOOK };
+        let bars: Vec<_> = arguments
+            .jobs
+            .iter()
+            .map(|id| (id.to_string(), screen.add(progress::bar(id.to_string()))))
+            .collect();
+        // One waits at the service for each job; all of them at once.
+        let ends = bars.iter().map(|(id, bar)| async {
+            loop {
+                let asked = std::time::Instant::now();
+                let job = client.job(id, look).await?;
+                progress::show(bar, job.progress.percent / 100.0);
+                if job.state.is_final() {
+                    return Ok::<Job, CliError>(job);
+                }
+                // Where too many of a lab wait, the answer comes at once.
+                let pause = std::time::Duration::from_secs(1).saturating_sub(asked.elapsed());
+                tokio::time::sleep(pause).await;
+            }
+        });
+        let jobs = futures_util::future::try_join_all(ends).await;
+        // The bars are for looking at: that they can't be cleared is no failure.
+        let _ = screen.clear();
+        told(&jobs?, arguments.json)
+    })
+}
+
+fn told(jobs: &[Job], as_json: bool) -> Result<()> {
+    for job in jobs {
+        match as_json {
+            true => println!("{}", json!({"id": job.id, "state": job.state, "error": job.error})),
+            false => println!("{} {}", job.id, job.state),
+        }
+    }
+    let failures: Vec<String> = jobs.iter().filter_map(Job::failure).collect();
+    if failures.is_empty() { Ok(()) } else { Err(CliError::Failure(failures.join("; "))) }
+}

@@ -1,0 +1,162 @@
+//! What became of each file of a watched folder: one JSON object a line, of which the last one of a file holds.
+//! A line is on the disk before what it says is done, so that nothing is done twice under another key.
+
+use std::collections::HashMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::cli::CliError;
+use crate::cli::error::Result;
+use crate::cli::submission::Recipe;
+
+/// A file as it was when it was taken up: another size or time is another file.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub(super) struct Shot {
+    pub(super) name: String,
+    pub(super) size: u64,
+    /// Time of its last change, in seconds and nanoseconds.
+    pub(super) time: (i64, i64),
+}
+
+/// How far a file is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "state")]
+pub(super) enum Stage {
+    /// To be sent; by this key the service knows its job again.
+    Taken,
+    Submitted {
+        job: String,
+    },
+    /// Its results are there.
+    Done {
+        job: String,
+    },
+    Failed {
+        reason: String,
+    },
+}
+
+impl Stage {
+    pub(super) fn is_final(&self) -> bool {
+        matches!(self, Self::Done { .. } | Self::Failed { .. })
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Entry {
+    #[serde(flatten)]
+    pub(super) shot: Shot,
+    /// Of the requests that make its measurement and job.
+    pub(super) key: String,
+    /// What is asked for, as it was decided when the file was taken up.
+    pub(super) recipe: Recipe,
+    /// Where results come, or the reason of a failure: a name that was free.
+    pub(super) results: String,
+    #[serde(flatten)]
+    pub(super) stage: Stage,
+}
+
+pub(super) struct Ledger {
+    path: PathBuf,
+    file: File,
+    entries: HashMap<Shot, Entry>,
+}
+
+impl Ledger {
+    /// Opens the ledger of a folder, which is made if there is none.
+    /// Errors: another process has it open; a line in it is none of ours.
+    pub(super) fn open(path: PathBuf) -> Result<Self> {
+        let failed = |error: std::io::Error| CliError::file("open", &path, &error);
+        let mut options = OpenOptions::new();
+        let file = options.create(true).read(true).append(true).open(&path).map_err(failed)?;
+        file.try_lock().map_err(|error| {
+            let text = "another watch-folder is at it";
+            CliError::Input(format!("{}: {text} ({error})", path.display()))
+        })?;
+        let text = fs::read_to_string(&path).map_err(failed)?;
+        // A line that was being written when the power went: what it says was not done.
+        let whole = text.rfind('\n').map_or(0, |end| end + 1);
+        file.set_len(whole as u64).map_err(failed)?;
+        let mut entries = HashMap::new();
+        for (number, line) in text[..whole].lines().enumerate() {
+            let entry: Entry = serde_json::from_str(line).map_err(|error| {
+                let place = format!("{}, line {}", path.display(), number + 1);
+                CliError::Input(format!("{place}: {error}"))
+            })?;
+            entries.insert(entry.shot.clone(), entry);
+        }
+        Ok(Self { path, file, entries })
+    }
+
+    pub(super) fn has(&self, shot: &Shot) -> bool {
+        self.entries.contains_key(shot)
+    }
+
+    /// Whether results of some file come there.
+    pub(super) fn has_results(&self, name: &str) -> bool {
+        self.entries.values().any(|entry| entry.results == name)
+    }
+
+    /// What is not at its end yet, the oldest file first.
+    pub(super) fn open_entries(&self) -> Vec<Entry> {
+        let mut open: Vec<Entry> =
+            self.entries.values().filter(|entry| !entry.stage.is_final()).cloned().collect();
+        open.sort_by(|a, b| (a.shot.time, &a.shot.name).cmp(&(b.shot.time, &b.shot.name)));
+        open
+    }
+
+    /// Writes down how far a file is; it is on the disk when this returns.
+    pub(super) fn note(&mut self, entry: Entry) -> Result<()> {
+        let failed = |error: std::io::Error| CliError::file("write", &self.path, &error);
+        let line = serde_json::to_string(&entry).map_err(|error| failed(error.into()))?;
+        self.file.write_all(format!("{line}\n").as_bytes()).map_err(failed)?;
+        self.file.sync_data().map_err(failed)?;
+        self.entries.insert(entry.shot.clone(), entry);
+        Ok(())
+    }
+}
+
+/// The name of a ledger in its folder.
+pub(super) fn place(folder: &Path) -> PathBuf {
+    folder.join(".sci-recon.ledger")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::{Entry, Ledger, Shot, Stage};
+
+    fn entry(name: &str, stage: Stage) -> Entry {
+        let shot = Shot { name: name.into(), size: 3, time: (1, 2) };
+        let recipe = serde_json::json!({"measurement": {"calibration": "c"}, "job": {}});
+        let recipe = serde_json::from_value(recipe).unwrap();
+        Entry { shot, key: "k".into(), recipe, results: format!("{name}.result"), stage }
+    }
+
+    #[test]
+    fn the_last_whole_line_of_a_file_holds() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("ledger");
+        let mut ledger = Ledger::open(path.clone()).unwrap();
+        assert!(Ledger::open(path.clone()).is_err(), "one process at a time");
+        ledger.note(entry("a", Stage::Taken)).unwrap();
+        ledger.note(entry("b", Stage::Taken)).unwrap();
+        ledger.note(entry("a", Stage::Done { job: "j".into() })).unwrap();
+        drop(ledger);
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, format!("{text}{{\"name\": \"c\", \"si")).unwrap();
+        let mut ledger = Ledger::open(path.clone()).unwrap();
+        assert_eq!(ledger.open_entries(), [entry("b", Stage::Taken)]);
+        assert!(ledger.has(&entry("a", Stage::Taken).shot) && ledger.has_results("b.result"));
+        ledger.note(entry("b", Stage::Failed { reason: "r".into() })).unwrap();
+        drop(ledger);
+        assert!(Ledger::open(path.clone()).unwrap().open_entries().is_empty());
+        fs::write(&path, "nonsense\n").unwrap();
+        let error = Ledger::open(path).err().unwrap().to_string();
+        assert!(error.contains("line 1"), "{error}");
+    }
+}

@@ -1,0 +1,68 @@
+"""Reads a job's frames in every form that the service gives, and compares them bit for bit.
+
+Usage: read_exports.py URL JOB SNAPSHOTS, with SCI_RECON_TOKEN. Prints one JSON line.
+"""
+
+import io
+import json
+import os
+import sys
+import urllib.request
+import zipfile
+from xml.etree import ElementTree
+
+import numpy as np
+import tifffile
+import zarr
+
+
+def main():
+    url, job, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    headers = {"Authorization": f"Bearer {os.environ['SCI_RECON_TOKEN']}"}
+    base = f"{url}/v1/jobs/{job}"
+
+    def get(path, **more):
+        with urllib.request.urlopen(urllib.request.Request(base + path, headers=headers | more)) as answer:
+            return answer.read()
+
+    snapshots = [np.load(io.BytesIO(get(f"/snapshots/{index}/frames.npy"))) for index in range(count)]
+    clips = {f"/snapshots/{index}": frames for index, frames in enumerate(snapshots)}
+    clips["/sequence"] = np.concatenate(snapshots)
+    assert (np.load(io.BytesIO(get("/sequence/frames.npy"))) == clips["/sequence"]).all()
+    told = {}
+    for place, frames in clips.items():
+        with tifffile.TiffFile(io.BytesIO(get(f"{place}/stack.tif"))) as file:
+            assert file.is_bigtiff and file.is_ome and file.is_imagej and file.byteorder == "<"
+            assert len(file.pages) == len(frames)
+            found = file.asarray()
+            assert found.dtype == np.float32 and found.shape == frames.shape and (found == frames).all()
+            assert file.series[0].axes == "TYX", file.series[0].axes
+            imagej = file.imagej_metadata
+            assert imagej["frames"] == len(frames) and imagej["unit"] == "pixel", imagej
+            pixels = ElementTree.fromstring(file.ome_metadata).find(".//{*}Pixels")
+            assert int(pixels.get("SizeT")) == len(frames)
+            interval = pixels.get("TimeIncrement")
+            assert interval is None or pixels.get("TimeIncrementUnit") == "s"
+            told[place] = [imagej.get("finterval"), interval and float(interval)]
+            planes = [float(plane.get("DeltaT")) for plane in pixels.findall("{*}Plane")]
+            assert len(planes) == len(frames) and planes == sorted(planes)
+        array = zarr.open_array(
+            f"{base}{place}/frames.zarr", mode="r", storage_options={"client_kwargs": {"headers": headers}}
+        )
+        assert array.shape == frames.shape and array.dtype == np.float32 and array.chunks == (1, *frames.shape[1:])
+        assert (array[:] == frames).all() and (array[-1, 3:5] == frames[-1, 3:5]).all()
+    archive = get("/results.zip")
+    with zipfile.ZipFile(io.BytesIO(archive)) as file:
+        assert file.testzip() is None
+        assert all(info.compress_type == zipfile.ZIP_STORED for info in file.infolist())
+        names = file.namelist()
+        assert len(set(names)) == len(names) and "manifest.json" in names
+        for index, frames in enumerate(snapshots):
+            assert (np.load(io.BytesIO(file.read(f"snapshot_{index:04d}/frames.npy"))) == frames).all()
+    # A download that was cut goes on where it was.
+    cut = len(archive) // 3
+    assert archive[:cut] + get("/results.zip", Range=f"bytes={cut}-") == archive
+    print(json.dumps({"intervals": told, "members": len(names)}))
+
+
+main()

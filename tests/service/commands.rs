@@ -1,0 +1,285 @@
+//! The commands that talk to a service: the real program, over connections that are cut.
+
+use std::path::Path;
+use std::sync::atomic::Ordering;
+
+use serde_json::{Value, json};
+use tokio::process::Command;
+
+use crate::app::TestApp;
+use crate::resumable::cutting;
+use crate::samples::{Scene, constant};
+
+/// A lab machine with a folder of its own.
+struct Lab {
+    folder: tempfile::TempDir,
+    url: String,
+    token: String,
+}
+
+impl Lab {
+    fn new(url: String, token: &str) -> Self {
+        Self { folder: tempfile::tempdir().unwrap(), url, token: token.to_owned() }
+    }
+
+    fn write(&self, name: &str, bytes: &[u8]) {
+        std::fs::write(self.folder.path().join(name), bytes).unwrap();
+    }
+
+    fn path(&self, name: &str) -> std::path::PathBuf {
+        self.folder.path().join(name)
+    }
+
+    async fn run(&self, arguments: &[&str]) -> std::process::Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        command.args(arguments).current_dir(self.folder.path());
+        command.env("SCI_RECON_URL", &self.url).env("SCI_RECON_TOKEN", &self.token);
+        command.output().await.unwrap()
+    }
+
+    /// What a command that succeeds prints.
+    async fn text(&self, arguments: &[&str]) -> String {
+        let output = self.run(arguments).await;
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap().trim().to_owned()
+    }
+
+    async fn json(&self, arguments: &[&str]) -> Value {
+        serde_json::from_str(&self.text(arguments).await).unwrap()
+    }
+
+    /// What a command that ends with this code says.
+    async fn refused(&self, code: i32, arguments: &[&str]) -> String {
+        let output = self.run(arguments).await;
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{text}");
+        text
+    }
+}
+
+#[tokio::test]
+async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let (proxy, cuts) = cutting(app.address()).await;
+    let lab = Lab::new(format!("http://{proxy}"), &token);
+    let scene = Scene { frames: 8, height: 256, width: 256, snapshots: 2 };
+    lab.write("masks.npy", &scene.masks());
+    lab.write("shots.npy", &scene.snapshots());
+    let submit = ["submit", "shots.npy", "--masks", "masks.npy", "--algorithm", "gap-tv"];
+    let job = lab.text(&[&submit[..], &["--label", "first", "--key", "k"]].concat()).await;
+    // The same again is the same job, of the same calibration.
+    let again =
+        lab.json(&[&submit[..], &["--label", "first", "--key", "k", "--json"]].concat()).await;
+    assert_eq!((&again["id"], &again["label"]), (&json!(job), &json!("first")));
+    let calibrations = app.get("/v1/calibrations").await.expect(200).json();
+    assert_eq!(calibrations["items"].as_array().unwrap().len(), 1);
+
+    assert_eq!(lab.text(&["watch", &job]).await, format!("{job} succeeded"));
+    let everything = ["frames.npy,stack.exr,stack.tif,frames,png,manifest.json", "sequence.npy"];
+    let line =
+        ["fetch", &job, "--out", "out", "--json", "--file", everything[0], "--file", everything[1]];
+    let fetched = lab.json(&line).await;
+    // The array, the stacks, the manifest, EXR and PNG of each frame of each snapshot; the manifest and the array of all.
+    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (4 + 2 * 8) + 2, "{fetched:#}");
+    for file in ["snapshot_0001/frames.npy", "snapshot_0000/png/frame_0003.png", "sequence.npy"] {
+        let (place, name) = file.split_once('/').unwrap_or(("", file));
+        let path = match place {
+            "" => "sequence/frames.npy".to_owned(),
+            _ => {
+                format!("snapshots/{}/{}", &place[12..], name.replace("png/frame_0003", "frames/3"))
+            }
+        };
+        let served = app.get(&format!("/v1/jobs/{job}/{path}")).await.expect(200).bytes;
+        assert!(std::fs::read(lab.path("out").join(file)).unwrap() == served, "{file}");
+    }
+    assert!(parts(&lab.path("out")).is_empty(), "{:?}", parts(&lab.path("out")));
+    let cut = cuts.load(Ordering::Relaxed);
+    assert!(cut >= 5, "{cut} connections were cut");
+
+    // Once more costs nothing; a file of somebody else stays.
+    lab.text(&["fetch", &job, "--out", "out"]).await;
+    lab.write("out/snapshot_0000/frames.npy", b"mine");
+    let refused = lab.refused(2, &["fetch", &job, "--out", "out"]).await;
+    assert!(refused.contains("nothing is overwritten"), "{refused}");
+    assert_eq!(std::fs::read(lab.path("out/snapshot_0000/frames.npy")).unwrap(), b"mine");
+
+    let listed = lab.json(&["ls", "--json", "--state", "succeeded"]).await;
+    assert_eq!(listed[0]["id"], job);
+    let listed = lab.text(&["ls"]).await;
+    assert!(listed.contains(&job) && listed.contains("first") && listed.lines().count() == 1);
+    assert_eq!(lab.text(&["ls", "--state", "failed"]).await, "");
+}
+
+/// Files that were begun.
+fn parts(folder: &Path) -> Vec<std::path::PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(parts(&path));
+        } else if path.extension().is_some_and(|ending| ending == "part") {
+            found.push(path);
+        }
+    }
+    found
+}
+
+#[tokio::test]
+async fn refusals_say_what_is_wrong_and_where() {
+    let app = TestApp::start().await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let lab = Lab::new(format!("http://{}", app.address()), &token);
+    lab.write("masks.npy", &Scene::SMALL.masks());
+    lab.write("shots.npy", &Scene::SMALL.snapshots());
+    lab.write("small.npy", &constant(&[1, 8, 8], 0.5));
+    lab.write("empty.npy", b"");
+    let masks = ["--masks", "masks.npy", "--algorithm", "gap-tv"];
+    for (line, words) in [
+        (vec!["submit", "shots.npy"], "--calibration"),
+        (vec!["submit", "nothing.npy"], "nothing.npy"),
+        (vec!["submit", "empty.npy"], "is empty"),
+        (vec!["submit", "small.npy"], "size_mismatch"),
+        (vec!["submit", "shots.npy", "--snapshots", "7"], "/snapshots"),
+        (vec!["submit", "shots.npy", "--url", "ftp://here"], "http://"),
+        (vec!["submit", "shots.npy", "--token", "wrong"], "unauthorized"),
+    ] {
+        let whole =
+            if words == "--calibration" { line.clone() } else { [&line[..], &masks].concat() };
+        let output = lab.run(&whole).await;
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && text.contains(words), "{line:?}: {text}");
+    }
+    let submit = ["submit", "shots.npy", "--masks", "masks.npy", "--algorithm", "gap-tv"];
+    let job = lab.text(&submit).await;
+    let refused = lab.refused(1, &["fetch", &job]).await;
+    assert!(refused.contains("has no results"), "{refused}");
+    assert_eq!(lab.text(&["cancel", &job]).await, format!("{job} cancelled"));
+    let refused = lab.refused(1, &["watch", &job]).await;
+    assert!(refused.contains("is cancelled"), "{refused}");
+    let nothing = "00000000-0000-7000-8000-000000000000";
+    let refused = lab.refused(2, &["watch", nothing]).await;
+    assert!(refused.contains("not_found"), "{refused}");
+
+    // A configuration file says where the service is.
+    lab.write("lab.toml", format!("url = {:?}\ntoken = {token:?}\n", lab.url).as_bytes());
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.args(["--config", "lab.toml", "ls"]).current_dir(lab.folder.path());
+    let output = command.env_remove("SCI_RECON_URL").output().await.unwrap();
+    assert!(String::from_utf8_lossy(&output.stdout).contains(&job), "{output:?}");
+}
+
+/// Arrays of other names, in files that other programs have written.
+#[tokio::test]
+async fn arrays_have_any_name() {
+    let app = TestApp::start().await;
+    let lab = Lab::new(format!("http://{}", app.address()), "");
+    for file in ["names.h5", "names.mat"] {
+        let bytes = std::fs::read(format!("tests/data/formats/{file}")).unwrap();
+        lab.write(file, &bytes);
+    }
+    let masks =
+        ["--masks", "names.h5", "--masks-array", "calibrated/masks", "--algorithm", "gap-tv"];
+    let scale = ["--full-scale", "65535", "--masks-full-scale", "1"];
+    for file in ["names.h5", "names.mat"] {
+        let line = [&["submit", file, "--array", "shots"][..], &masks, &scale].concat();
+        lab.text(&line).await;
+        let line = [&["submit", file, "--array", "nothing"][..], &masks, &scale].concat();
+        let refused = lab.refused(2, &line).await;
+        assert!(refused.contains("/array") && refused.contains("'shots'"), "{refused}");
+    }
+    lab.write("plain.npy", &Scene::SMALL.snapshots());
+    let line = [&["submit", "plain.npy", "--array", "shots"][..], &masks, &scale].concat();
+    let refused = lab.refused(2, &line).await;
+    assert!(refused.contains("leave array out"), "{refused}");
+}
+
+/// 50 files, two of them equal, while the watcher is killed again and again.
+#[tokio::test]
+async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_is_killed() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let lab = Lab::new(format!("http://{}", app.address()), &token);
+    let scene = Scene { frames: 2, height: 24, width: 32, snapshots: 1 };
+    lab.write("masks.npy", &scene.masks());
+    let schedule = json!({"stages": [{"prior": "tv", "iterations": 2, "tv_weight": 0.1}]});
+    lab.write("schedule.json", schedule.to_string().as_bytes());
+    let bench = lab.path("bench");
+    std::fs::create_dir(&bench).unwrap();
+    let start = |once: bool| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        command.args(["watch-folder", "bench", "--masks", "masks.npy", "--algorithm", "gap-tv"]);
+        command.args(["--schedule", "schedule.json", "--settle-seconds", "0.1"]);
+        command.args(["--file", "frames.npy"]).args(once.then_some("--once"));
+        command.current_dir(lab.folder.path()).stdout(std::process::Stdio::null());
+        command.env("SCI_RECON_URL", &lab.url).env("SCI_RECON_TOKEN", &lab.token);
+        command.kill_on_drop(true).spawn().unwrap()
+    };
+    let plain = scene.snapshots();
+    let shot = |number: usize| {
+        // Numbers 0 and 1 are equal.
+        let mut bytes = plain.clone();
+        let last = bytes.len() - 4;
+        bytes[last..].copy_from_slice(&(number.max(1) as f32 * 1e-3).to_le_bytes());
+        bytes
+    };
+    for kill in 0..10 {
+        let mut watcher = start(false);
+        for number in kill * 5..kill * 5 + 5 {
+            // As camera software does: bit by bit, under its name.
+            let (path, bytes) = (bench.join(format!("shot_{number:02}.npy")), shot(number));
+            std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+            std::fs::write(&path, &bytes).unwrap();
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(150 + 40 * kill as u64)).await;
+        watcher.kill().await.unwrap();
+    }
+    // What is no regular file with snapshots is left alone.
+    std::os::unix::fs::symlink(lab.path("masks.npy"), bench.join("link.npy")).unwrap();
+    std::fs::create_dir(bench.join("folder.npy")).unwrap();
+    std::fs::write(bench.join("notes.txt"), "mine").unwrap();
+    // A name of results is taken; and a file can't be used.
+    std::fs::write(bench.join("taken.npy"), shot(99)).unwrap();
+    std::fs::write(bench.join("taken.npy.result"), "mine").unwrap();
+    std::fs::write(bench.join("bad.npy"), "no array").unwrap();
+    assert!(start(true).wait().await.unwrap().success());
+
+    let mut jobs = Vec::new();
+    let mut cursor = String::new();
+    loop {
+        let page = app.get(&format!("/v1/jobs?limit=200{cursor}")).await.expect(200).json();
+        jobs.extend(page["items"].as_array().unwrap().clone());
+        match page["next_cursor"].as_str() {
+            Some(next) => cursor = format!("&cursor={next}"),
+            None => break,
+        }
+    }
+    let mut labels: Vec<_> = jobs.iter().map(|job| job["label"].as_str().unwrap()).collect();
+    labels.sort_unstable();
+    let mut expected: Vec<_> = (0..50).map(|number| format!("shot_{number:02}.npy")).collect();
+    expected.push("taken.npy".into());
+    assert_eq!(labels, expected);
+    for label in &expected[..50] {
+        let result = bench.join(format!("{label}.result/snapshot_0000/frames.npy"));
+        let job = jobs.iter().find(|job| job["label"] == label.as_str()).unwrap();
+        let path = format!("/v1/jobs/{}/snapshots/0/frames.npy", job["id"].as_str().unwrap());
+        assert!(std::fs::read(&result).unwrap() == app.get(&path).await.expect(200).bytes);
+    }
+    assert!(parts(&bench).is_empty());
+    assert_eq!(std::fs::read(bench.join("taken.npy.result")).unwrap(), b"mine");
+    assert!(bench.join("taken.npy.2.result/snapshot_0000/frames.npy").exists());
+    let reason = std::fs::read_to_string(bench.join("bad.npy.failed.txt")).unwrap();
+    assert!(reason.contains("invalid_content") && reason.contains("bad.npy"), "{reason}");
+    assert!(!bench.join("link.npy.result").exists() && !bench.join("link.npy.failed.txt").exists());
+    // Another start has nothing to do; a file that was changed is another one.
+    assert!(start(true).wait().await.unwrap().success());
+    std::fs::write(bench.join("bad.npy"), shot(7)).unwrap();
+    assert!(start(true).wait().await.unwrap().success());
+    assert!(bench.join("bad.npy.2.result/snapshot_0000/frames.npy").exists());
+    let all = app.get("/v1/jobs?limit=200").await.expect(200).json();
+    assert_eq!(all["items"].as_array().unwrap().len(), 52);
+}
