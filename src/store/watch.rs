@@ -1,20 +1,17 @@
 //! Whether anything in the database has changed, without asking it.
 
 use std::io;
-use std::mem::MaybeUninit;
-use std::os::fd::OwnedFd;
 use std::time::Duration;
 
-use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
-use rustix::io::Errno;
-use tokio::io::unix::AsyncFd;
+use futures_util::{FutureExt, StreamExt};
+use inotify::{EventStream, Inotify, WatchMask};
 
 use super::Store;
 
 /// Sees when any process writes to the database: each commit goes through a file beside it, of which the
-/// kernel tells (inotify).
+/// kernel tells.
 #[derive(Debug)]
-pub struct Watcher(AsyncFd<OwnedFd>);
+pub struct Watcher(EventStream<Vec<u8>>);
 
 impl Store {
     /// A watcher of this store.
@@ -22,10 +19,10 @@ impl Store {
     /// # Errors
     /// If the kernel gives no more of them.
     pub fn watcher(&self) -> io::Result<Watcher> {
-        let queue = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC)?;
+        let inotify = Inotify::init()?;
         // The folder, since SQLite makes and removes its files. Blobs and results are in folders of their own.
-        inotify::add_watch(&queue, self.dir.root(), WatchFlags::MODIFY)?;
-        Ok(Watcher(AsyncFd::register(queue)?))
+        inotify.watches().add(self.dir.root(), WatchMask::MODIFY)?;
+        Ok(Watcher(inotify.into_event_stream(vec![0; 4096])?))
     }
 }
 
@@ -35,17 +32,12 @@ impl Watcher {
     /// # Errors
     /// If the kernel's queue can't be read.
     pub async fn changed(&mut self, time: Duration) -> io::Result<()> {
-        let Ok(ready) = tokio::time::timeout(time, self.0.readable()).await else { return Ok(()) };
-        let mut ready = ready?;
-        let mut buffer = [MaybeUninit::uninit(); 4096];
-        loop {
-            match inotify::Reader::new(ready.get_inner(), &mut buffer).next() {
-                Ok(_) => {}
-                Err(Errno::AGAIN) => break,
-                Err(error) => return Err(error.into()),
-            }
+        let mut event = tokio::time::timeout(time, self.0.next()).await.ok().flatten();
+        while let Some(seen) = event {
+            seen?;
+            // All that have come meanwhile are one.
+            event = self.0.next().now_or_never().flatten();
         }
-        ready.clear_ready();
         Ok(())
     }
 }

@@ -263,9 +263,9 @@ async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_i
     let mut expected: Vec<_> = (0..50).map(|number| format!("shot_{number:02}.npy")).collect();
     expected.push("taken.npy".into());
     assert_eq!(labels, expected);
-    for number in 0..50 {
-        let result = bench.join(format!("shot_{number:02}.npy.result/snapshot_0000/frames.npy"));
-        let job = jobs.iter().find(|job| job["label"] == expected[number].as_str()).unwrap();
+    for label in &expected[..50] {
+        let result = bench.join(format!("{label}.result/snapshot_0000/frames.npy"));
+        let job = jobs.iter().find(|job| job["label"] == label.as_str()).unwrap();
         let path = format!("/v1/jobs/{}/snapshots/0/frames.npy", job["id"].as_str().unwrap());
         assert!(std::fs::read(&result).unwrap() == app.get(&path).await.expect(200).bytes);
     }
