@@ -15,7 +15,7 @@ import { scene } from "./scene.mjs";
 import { access, faults, loading, phone } from "./states.mjs";
 
 const FRAMES = 8;
-const LIMITS = { bytes: 150_000, paint: 1000 };
+const LIMITS = { bytes: 150_000, paint: 300 };
 const program = process.argv[2];
 const checks = new Checks(fileURLToPath(new URL("../../e2e-output", import.meta.url)));
 const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium" });
