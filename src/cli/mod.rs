@@ -20,6 +20,7 @@ pub mod check_model;
 pub mod cluster;
 pub mod demo;
 pub mod health;
+pub mod job;
 pub mod lab;
 pub mod optics;
 pub mod reconstruct;

@@ -15,19 +15,16 @@ use axum::response::{IntoResponse, Response};
 use futures_util::stream;
 use serde::Serialize;
 use tokio::sync::broadcast;
-use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use crate::job::{JobId, Lab, TokenId};
+use crate::job::{JobId, Lab};
 use crate::store::{JobMark, Store};
 
 /// Time between two looks.
 const LOOK: Duration = Duration::from_secs(1);
-/// Time between two looks at whether a listener may still listen.
-const TOKEN_LOOK: Duration = Duration::from_secs(3);
 /// Listeners at the same time: each holds a connection.
 const LISTENERS: usize = 128;
 /// The most jobs that an event names; beyond that a list is cheaper to read again.
@@ -56,7 +53,6 @@ type Changes = Arc<HashMap<Lab, String>>;
 pub(super) struct Events {
     sender: broadcast::Sender<Changes>,
     places: Places,
-    store: Store,
     waiters: Waiters,
     closing: CancellationToken,
 }
@@ -65,10 +61,10 @@ impl Events {
     /// Begins to look, until `closing`.
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
-        let looking = look(store.clone(), sender.clone());
+        let looking = look(store, sender.clone());
         tokio::spawn(closing.clone().run_until_cancelled_owned(looking));
         let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
-        Self { sender, places, store, waiters, closing }
+        Self { sender, places, waiters, closing }
     }
 }
 
@@ -211,13 +207,8 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
         let detail = "all places for listeners are taken, or this lab has its share; poll instead";
         ApiError::new(Code::Unavailable, detail)
     })?;
-    let mut look = tokio::time::interval(TOKEN_LOOK);
-    look.reset();
     let listener = Listener {
         lab: access.lab,
-        token: access.token,
-        store: events.store.clone(),
-        look,
         receiver: events.sender.subscribe(),
         closing: events.closing.clone(),
         greeted: false,
@@ -231,10 +222,6 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
 
 struct Listener {
     lab: Lab,
-    /// It ends when this is revoked.
-    token: Option<TokenId>,
-    store: Store,
-    look: Interval,
     receiver: broadcast::Receiver<Changes>,
     closing: CancellationToken,
     greeted: bool,
@@ -242,16 +229,6 @@ struct Listener {
 }
 
 impl Listener {
-    /// True if its token was revoked, or the service, which was open, is not any more.
-    async fn has_left(&self) -> bool {
-        let may = match self.token {
-            Some(token) => self.store.token_holds(token).await,
-            None => self.store.is_open().await,
-        };
-        // A failing database shows in every other answer, too.
-        matches!(may, Ok(false))
-    }
-
     async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
         if !self.greeted {
             self.greeted = true;
@@ -261,12 +238,6 @@ impl Listener {
             let received = tokio::select! {
                 received = self.receiver.recv() => received,
                 () = self.closing.cancelled() => return None,
-                _ = self.look.tick() => {
-                    if self.has_left().await {
-                        return None;
-                    }
-                    continue;
-                }
             };
             match received {
                 Ok(changes) => {

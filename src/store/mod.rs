@@ -62,7 +62,7 @@ pub use tables::{
     JobChanges, JobFilter, LabRow, LabUse, Made, Measurement, Model, NewCalibration,
     NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey, TaskCounts,
     TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace,
-    WorkerRow, WorkerTask,
+    WorkerRow, WorkerTask, share_error,
 };
 
 /// The store: a handle that is cheap to clone.

@@ -4,6 +4,7 @@
 
 mod access;
 mod adaptive;
+mod all_labs;
 mod app;
 mod calibration;
 mod cli;

@@ -73,6 +73,22 @@ impl Store {
         Ok(rows.fetch_all(&self.readers).await?)
     }
 
+    /// Whether a lab is on record: it has a token, something in the queue, or limits.
+    pub async fn knows_lab(&self, lab: &Lab) -> Result<bool> {
+        let found = sql!("SELECT 1 FROM labs WHERE lab = ?", [lab]);
+        Ok(found.fetch_optional(&self.readers).await?.is_some())
+    }
+
+    /// What a lab is entitled to.
+    pub async fn entitlement(&self, lab: &Lab) -> Result<Entitlement> {
+        let found = sql_as!("SELECT share, max_bytes, max_jobs FROM labs WHERE lab = ?", [lab]);
+        let found: Option<(f64, Option<u64>, Option<u64>)> =
+            found.fetch_optional(&self.readers).await?;
+        let (share, max_bytes, max_jobs) = found.unwrap_or((1.0, None, None));
+        let (max_bytes, max_jobs) = (Some(max_bytes), Some(max_jobs));
+        Ok(Entitlement { share: Some(share), max_bytes, max_jobs })
+    }
+
     /// Sets what a lab is entitled to. A lab that is not on record yet is put there.
     pub async fn entitle(&self, lab: &Lab, to: Entitlement) -> Result<()> {
         let mut transaction = self.write().await?;
@@ -94,6 +110,12 @@ impl Store {
         .await?;
         Ok(transaction.commit().await?)
     }
+}
+
+/// What is wrong with a share, if something is.
+pub fn share_error(share: f64) -> Option<&'static str> {
+    let fits = (0.001..=1000.0).contains(&share);
+    (!fits).then_some("a share is a number from 0.001 to 1000")
 }
 
 /// Puts a lab on record, if it is not there.

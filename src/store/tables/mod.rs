@@ -20,7 +20,7 @@ pub use blobs::{Blob, BlobRow, Origin};
 pub use calibrations::{Calibration, NewCalibration, Unready};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
-pub use labs::{Entitlement, LabRow, LabUse};
+pub use labs::{Entitlement, LabRow, LabUse, share_error};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
