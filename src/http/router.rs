@@ -13,7 +13,7 @@ use tower_http::catch_panic::CatchPanicLayer;
 
 use super::access::{self, Rule};
 use super::app::App;
-use super::pictures::{OfCalibration, OfJob, OfMeasurement};
+use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
     algorithms, blobs, calibrations, dashboard, events, jobs, labs, layers, me, measurements,
     models, pictures, problems, quality, reports, results, samples, session, system, tiles, tus,
@@ -33,6 +33,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/blobs").get(blobs::list).post(blobs::create).uploads(),
         R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).delete(blobs::delete).uploads(),
         R::at("/v1/blobs/{sha256}/content").get(blobs::content),
+        R::at("/v1/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>),
         R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),

@@ -156,6 +156,19 @@ pub async fn set_state(
 ) -> Result<()> {
     let to = state(connection, id).await?.step(to)?;
     let now = Timestamp::now();
+    if to == JobState::Running {
+        // Before `started_at` is set: a job that is taken up again has waited once.
+        sql!(
+            "INSERT INTO lab_totals (lab, jobs_begun, wait_seconds)
+                 SELECT lab, 1, max(?1 - created_at, 0) / 1000.0 FROM jobs
+                 WHERE id = ?2 AND started_at IS NULL
+             ON CONFLICT (lab) DO UPDATE SET jobs_begun = jobs_begun + 1,
+                 wait_seconds = wait_seconds + excluded.wait_seconds",
+            [now, id]
+        )
+        .execute(&mut *connection)
+        .await?;
+    }
     sql!(
         "UPDATE jobs SET state = ?1, error = ?2,
              started_at = coalesce(started_at, ?3),
