@@ -101,6 +101,10 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
     pub request_seconds: u64,
 
+    /// Seconds that the check of a sent file may take, when it is made a calibration or a measurement.
+    #[arg(long, env = "SCI_RECON_CHECK_SECONDS", value_name = "SECONDS", default_value_t = 300.0, value_parser = seconds)]
+    pub check_seconds: f64,
+
     /// Jobs that may wait and run; more are told to come back later, but not those of a lab that has less than
     /// an equal part of them.
     #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
@@ -287,6 +291,12 @@ pub struct EngineArguments {
     pub stall_seconds: u64,
 }
 
+/// A time in seconds, above 0 and up to a day.
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().ok().filter(|seconds| *seconds > 0.0 && *seconds <= 86_400.0);
+    seconds.ok_or_else(|| format!("{text:?} is no number of seconds above 0 and up to 86400"))
+}
+
 /// Reads a number of bytes: `1000000`, `10GB` (powers of 1000) or `8GiB` (of 1024).
 pub fn bytes(text: &str) -> Result<u64, String> {
     let size: Result<ByteSize, String> = text.parse();
@@ -351,6 +361,11 @@ impl ServeArguments {
     #[must_use]
     pub fn upload_age(&self) -> Duration {
         Duration::from_secs(self.upload_hours.saturating_mul(3600))
+    }
+
+    #[must_use]
+    pub fn check_time(&self) -> Duration {
+        Duration::from_secs_f64(self.check_seconds)
     }
 
     #[must_use]

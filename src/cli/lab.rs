@@ -1,4 +1,4 @@
-//! `sci-recon lab`: the labs that a service has, their shares of the machine, and their limits.
+//! `sci-recon lab`: the labs that a service has, their shares of the machine, their limits, and their files.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -8,10 +8,10 @@ use clap::{Args, Subcommand};
 use super::CliError;
 use super::wait::wait;
 use crate::cli::error::Result;
-use crate::job::Lab;
-use crate::store::{Entitlement, LabRow, Purpose, Store};
+use crate::job::{Lab, Sha256};
+use crate::store::{Blob, BlobRow, Entitlement, LabRow, Purpose, Store, share_error};
 
-/// Lists labs, and sets their shares of the machine and their limits. The service may be running.
+/// Lists labs and their files, and sets their shares of the machine and their limits. The service may be running.
 ///
 /// Tasks are handed out by priority, then to each lab in turn. While two labs have work waiting, one with
 /// twice the share gets twice the processor time.
@@ -28,6 +28,18 @@ pub struct Arguments {
 enum Action {
     /// Shows all labs with their share, and what they have waiting.
     List,
+    /// Shows the files that a lab has sent, newest first.
+    Uploads {
+        /// The lab's name.
+        lab: Lab,
+    },
+    /// Deletes a file that a lab has sent, if nothing of the lab needs it.
+    DeleteUpload {
+        /// The lab's name.
+        lab: Lab,
+        /// The SHA-256 of the file.
+        sha256: Sha256,
+    },
     /// Sets what a lab is entitled to.
     Set {
         /// The lab's name.
@@ -58,16 +70,29 @@ fn limit(text: &str) -> Result<Limit, String> {
 
 fn share(text: &str) -> Result<f64, String> {
     let share: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
-    if (0.001..=1000.0).contains(&share) {
-        return Ok(share);
-    }
-    Err("a share is a number from 0.001 to 1000".into())
+    share_error(share).map_or(Ok(share), |error| Err(error.into()))
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let store = Store::open(&arguments.data, Purpose::Use).await?;
-        if let Action::Set { lab, share, bytes, jobs } = &arguments.action {
+        let acted = act(&store, &arguments.action).await;
+        store.close().await;
+        let text = acted?;
+        let mut stdout = std::io::stdout();
+        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
+    })
+}
+
+async fn act(store: &Store, action: &Action) -> Result<String> {
+    match action {
+        Action::List => {}
+        Action::Uploads { lab } => return uploads(store, lab).await,
+        Action::DeleteUpload { lab, sha256 } => {
+            store.delete_upload(lab, *sha256).await?;
+            return Ok(format!("deleted {sha256} of {lab}"));
+        }
+        Action::Set { lab, share, bytes, jobs } => {
             let to = Entitlement {
                 share: *share,
                 max_bytes: bytes.map(|limit| limit.0),
@@ -75,16 +100,30 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             };
             store.entitle(lab, to).await?;
         }
-        let mut rows = Vec::new();
-        for row in store.labs().await? {
-            let bytes = store.lab_bytes(&row.lab).await?;
-            rows.push((row, bytes));
+    }
+    let mut rows = Vec::new();
+    for row in store.labs().await? {
+        let bytes = store.lab_bytes(&row.lab).await?;
+        rows.push((row, bytes));
+    }
+    Ok(table(&rows))
+}
+
+async fn uploads(store: &Store, lab: &Lab) -> Result<String> {
+    let mut lines = vec![format!("{:64}  {:>14}  {:24}  in use", "sha256", "bytes", "sent")];
+    let mut after = None;
+    loop {
+        let page = store.uploads(lab, after, 200).await?;
+        for BlobRow { blob, in_use } in &page.items {
+            let Blob { sha256, size, created_at } = blob;
+            let used = if *in_use { "yes" } else { "no" };
+            lines.push(format!("{sha256}  {size:>14}  {:24}  {used}", created_at.to_string()));
+            after = Some((*created_at, *sha256));
         }
-        let text = table(&rows);
-        store.close().await;
-        let mut stdout = std::io::stdout();
-        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
-    })
+        if !page.more {
+            return Ok(lines.join("\n"));
+        }
+    }
 }
 
 fn table(labs: &[(LabRow, u64)]) -> String {

@@ -24,6 +24,7 @@ pub mod cluster;
 pub mod demo;
 pub mod fetch;
 pub mod health;
+pub mod job;
 pub mod lab;
 pub mod ls;
 pub mod optics;

@@ -2,9 +2,9 @@
 
 use std::io::Write;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{Args, Subcommand};
-use rand::TryRngCore;
 
 use super::CliError;
 use super::wait::wait;
@@ -44,6 +44,12 @@ struct Create {
     /// see the figures of the whole service.
     #[arg(long, value_name = "ROLE", default_value = "submit")]
     role: Role,
+    /// Good for all labs: with the role admin it also sets their limits.
+    #[arg(long)]
+    all_labs: bool,
+    /// When it ends: after a time, like 90d or 12h, or at a moment, like 2027-01-31T00:00:00Z [default: never].
+    #[arg(long, value_name = "WHEN", value_parser = expiry)]
+    expires: Option<Timestamp>,
     /// Bytes of uploads that it may keep here [default: no limit].
     #[arg(long, value_name = "BYTES", value_parser = crate::config::bytes)]
     max_bytes: Option<u64>,
@@ -97,38 +103,63 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
 }
 
 async fn make(store: &Store, create: &Create) -> Result<String> {
-    let mut bytes = [0; 32];
-    rand::rngs::OsRng
-        .try_fill_bytes(&mut bytes)
+    let secret = Secret::random()
         .map_err(|error| CliError::Failure(format!("no random numbers: {error}")))?;
-    let secret = Secret::from_bytes(bytes);
     let token = Token {
         id: TokenId::new(),
         lab: create.lab.clone(),
         role: create.role,
+        all_labs: create.all_labs,
         note: create.note.clone(),
         max_bytes: create.max_bytes,
         created_at: Timestamp::now(),
+        expires_at: create.expires,
+        used_at: None,
         revoked_at: None,
     };
     store.add_token(&token, &secret).await?;
     Ok(secret.reveal().to_owned())
 }
 
+/// A moment that lies ahead, or a number of days or hours from now.
+fn expiry(text: &str) -> Result<Timestamp, String> {
+    let now = Timestamp::now();
+    let seconds = |number: &str, unit: u64| {
+        let number = number.parse::<u64>().ok().filter(|number| (1..=87_600).contains(number));
+        number.map(|number| now.after(Duration::from_secs(number * unit)))
+    };
+    let moment = match (text.strip_suffix('d'), text.strip_suffix('h')) {
+        (Some(days), _) => seconds(days, 86_400),
+        (_, Some(hours)) => seconds(hours, 3600),
+        _ => text.parse().ok(),
+    };
+    moment.filter(|moment| *moment > now).ok_or_else(|| {
+        format!(
+            "{text:?} is no moment ahead; give a time, like 90d or 12h, or a moment, like \
+             2027-01-31T00:00:00Z"
+        )
+    })
+}
+
 fn table(tokens: &[(Token, u64)]) -> String {
     let mut lines = vec![format!(
-        "{:36}  {:16}  {:6}  {:>14}  {:>14}  {:24}  {:24}  note",
-        "id", "lab", "role", "bytes", "limit", "made", "revoked"
+        "{:36}  {:16}  {:6}  {:6}  {:>14}  {:>14}  {:24}  {:24}  {:24}  {:24}  note",
+        "id", "lab", "role", "labs", "bytes", "limit", "made", "last used", "expires", "revoked"
     )];
     for (token, bytes) in tokens {
         let limit = token.max_bytes.map_or_else(|| "none".into(), |limit| limit.to_string());
-        let revoked = token.revoked_at.map_or_else(|| "no".into(), |at| at.to_string());
+        let moment =
+            |at: Option<Timestamp>, none: &str| at.map_or(none.into(), |at| at.to_string());
         lines.push(format!(
-            "{:36}  {:16}  {:6}  {bytes:>14}  {limit:>14}  {:24}  {revoked:24}  {}",
+            "{:36}  {:16}  {:6}  {:6}  {bytes:>14}  {limit:>14}  {:24}  {:24}  {:24}  {:24}  {}",
             token.id.to_string(),
             token.lab.as_str(),
             token.role.into_str(),
+            if token.all_labs { "all" } else { "own" },
             token.created_at.to_string(),
+            moment(token.used_at, "never"),
+            moment(token.expires_at, "never"),
+            moment(token.revoked_at, "no"),
             token.note.as_ref().map_or("", Label::as_str),
         ));
     }
@@ -138,8 +169,32 @@ fn table(tokens: &[(Token, u64)]) -> String {
 impl From<StoreError> for CliError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::NotFound { .. } | StoreError::NoFolder(_) => Self::Input(error.to_string()),
+            StoreError::NotFound { .. }
+            | StoreError::NoFolder(_)
+            | StoreError::State(_)
+            | StoreError::NotFinal(_)
+            | StoreError::Ended(_)
+            | StoreError::FileInUse(_) => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::expiry;
+    use crate::job::Timestamp;
+
+    #[test]
+    fn a_token_ends_at_a_moment_ahead() {
+        let now = Timestamp::now();
+        let days = expiry("90d").unwrap().seconds_since(now) / 86_400.0;
+        assert!((89.9..90.1).contains(&days), "{days}");
+        assert!(expiry("12h").unwrap() > now);
+        assert_eq!(expiry("2999-01-31T00:00:00Z").unwrap().to_string(), "2999-01-31T00:00:00.000Z");
+        for bad in ["", "d", "0d", "-1d", "90", "99999999999d", "2001-01-31T00:00:00Z", "tomorrow"]
+        {
+            assert!(expiry(bad).unwrap_err().contains("90d"), "{bad}");
         }
     }
 }

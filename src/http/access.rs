@@ -1,46 +1,64 @@
-//! Who may come in: bearer tokens, each with a lab and a role.
+//! Who may come in: bearer tokens, each with a lab and a role, and the sessions of browsers that stand for them.
 //!
 //! A service for which no token was ever made is open; all data are the lab `local`'s then.
 
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
+use axum::body::{Body, HttpBody};
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::request::Parts;
-use axum::http::uri::Authority;
+use axum::http::uri::{Authority, Uri};
 use axum::http::{HeaderMap, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use futures_util::StreamExt;
 use headers::authorization::{Authorization, Bearer};
 use headers::{Cookie, HeaderMapExt};
 use rustix::system::uname;
 
 use super::error::{ApiError, Code, Result};
-use crate::job::{Lab, Role, Secret, TokenId};
+use crate::job::{Lab, Role, Secret, Timestamp, TokenId};
 use crate::store::{Store, Token};
 
+/// The cookie of a session, which `POST /v1/session` sets.
+pub(super) const SESSION: &str = "sci_recon_session";
 /// A page that can't set headers of its requests (for pictures and events, say) keeps the token in
 /// this cookie. It opens only what changes nothing, so that no foreign page can use it to do harm.
 const COOKIE: &str = "sci_recon_token";
+/// What changes something by a session has this header: a page of another site can't set it.
+const CHANGES: &str = "x-requested-with";
+
+/// Time between two looks at whether an answer that goes on may go on.
+const LOOK: Duration = Duration::from_secs(3);
 
 /// Who may use a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Rule {
     /// Everyone.
     Public,
+    /// Everyone with a token, for themselves.
+    Own,
     /// Those who may read, for what changes nothing; those who may submit, for the rest.
     ByMethod,
+    /// As by method, for one lab or for all of them.
+    AcrossLabs,
     /// Those who look after the service.
     Admin,
+    /// Those who look after all labs: with the role admin, for what changes something.
+    AllLabs,
 }
 
 impl Rule {
     fn role(self, method: &Method) -> Option<Role> {
         match self {
             Self::Public => None,
+            Self::Own => Some(Role::Read),
             Self::Admin => Some(Role::Admin),
-            Self::ByMethod if method.is_safe() => Some(Role::Read),
-            Self::ByMethod => Some(Role::Submit),
+            Self::AllLabs if !method.is_safe() => Some(Role::Admin),
+            _ if method.is_safe() => Some(Role::Read),
+            _ => Some(Role::Submit),
         }
     }
 }
@@ -51,9 +69,44 @@ pub(super) struct Access {
     /// Whose data are seen.
     pub(super) lab: Lab,
     pub(super) role: Role,
+    /// True if the data of every lab may be asked for.
+    pub(super) all_labs: bool,
+    /// True if they were, on a route that shows them together.
+    pub(super) across: bool,
     pub(super) token: Option<TokenId>,
     /// Bytes of uploads, and of what is prepared of them, that the token may keep here.
     pub(super) max_bytes: Option<u64>,
+    /// From when on the token is worth nothing.
+    pub(super) expires_at: Option<Timestamp>,
+    /// The session that stood for the token.
+    pub(super) session: Option<Secret>,
+}
+
+impl Access {
+    /// On a service without tokens.
+    fn open() -> Self {
+        Self {
+            lab: Lab::local(),
+            role: Role::Admin,
+            all_labs: true,
+            across: false,
+            token: None,
+            max_bytes: None,
+            expires_at: None,
+            session: None,
+        }
+    }
+
+    fn of(token: Token, session: Option<Secret>) -> Self {
+        let Token { id, lab, role, all_labs, max_bytes, expires_at, .. } = token;
+        let token = Some(id);
+        Self { lab, role, all_labs, across: false, token, max_bytes, expires_at, session }
+    }
+
+    /// The lab whose data are to be shown; none for those of all labs.
+    pub(super) fn shown(&self) -> Option<&Lab> {
+        (!self.across).then_some(&self.lab)
+    }
 }
 
 impl<S: Send + Sync> FromRequestParts<S> for Access {
@@ -65,19 +118,26 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
     }
 }
 
-/// Lets a request pass if its token may do what it wants.
+/// Lets a request pass if its token may do what it wants. What is answered bit by bit ends when the token
+/// does.
 pub(super) async fn guard(
     State((store, hosts, rule)): State<(Store, Arc<[String]>, Rule)>,
     mut request: Request,
     next: Next,
 ) -> Response {
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
-    let secret = secret(request.method(), request.headers());
-    match admit((&store, &hosts), secret, role, (request.method(), request.headers())).await {
+    match admit((&store, &hosts), (rule, role), &mut request).await {
         Ok(access) => {
             tracing::Span::current().record("lab", access.lab.as_str());
-            request.extensions_mut().insert(access);
-            next.run(request).await
+            request.extensions_mut().insert(access.clone());
+            let response = next.run(request).await;
+            if response.body().size_hint().exact().is_some() {
+                return response;
+            }
+            response.map(|body| {
+                let parts = body.into_data_stream();
+                Body::from_stream(parts.take_until(end_of_access(store, access)))
+            })
         }
         Err(refusal) => refusal.into_response(),
     }
@@ -85,52 +145,157 @@ pub(super) async fn guard(
 
 async fn admit(
     (store, hosts): (&Store, &[String]),
-    secret: Option<Secret>,
-    role: Role,
-    (method, headers): (&Method, &HeaderMap),
+    (rule, role): (Rule, Role),
+    request: &mut Request,
 ) -> Result<Access> {
-    let token = match &secret {
-        Some(secret) => store.token(secret).await?,
+    let (method, headers) = (request.method(), request.headers());
+    let found = match credential(method, headers) {
+        Some(Credential::Token(secret)) => store.token(&secret).await?.map(|token| (token, None)),
+        Some(Credential::Session(secret)) => {
+            let token = store.token_of_session(&secret).await?;
+            token.map(|token| (token, Some(secret)))
+        }
         None => None,
     };
-    let Some(token) = token else {
+    let Some((token, session)) = found else {
         if store.is_open().await? {
-            check_site(method, headers, hosts)?;
-            let (lab, role) = (Lab::local(), Role::Admin);
-            return Ok(Access { lab, role, token: None, max_bytes: None });
+            check_name(headers, hosts)?;
+            check_site(method, headers)?;
+            let access = Access::open();
+            return choose_lab(store, rule, access, request).await;
         }
         return Err(missing());
     };
+    if session.is_some() && !method.is_safe() {
+        check_site(method, headers)?;
+        if !headers.contains_key(CHANGES) {
+            let detail = "what changes something by a session has the header X-Requested-With";
+            return Err(ApiError::new(Code::ForeignSite, detail));
+        }
+    }
     if token.role < role {
         let detail = format!("this needs the role {role}; the token has {}", token.role);
         return Err(ApiError::new(Code::Forbidden, detail));
     }
-    let Token { id, lab, role, max_bytes, .. } = token;
-    Ok(Access { lab, role, token: Some(id), max_bytes })
+    if rule == Rule::AllLabs && !token.all_labs {
+        let detail = "this needs a token for all labs (sci-recon token create --all-labs)";
+        return Err(ApiError::new(Code::Forbidden, detail));
+    }
+    note_use(store, &token);
+    choose_lab(store, rule, Access::of(token, session), request).await
 }
 
-/// Refuses what a page of another site may have had a browser send: without tokens nothing else tells
-/// it from what the user wants. A name that was made to point here is known by the `Host` (DNS
-/// rebinding), a form or a script by the `Origin` or by `Sec-Fetch-Site`.
-fn check_site(method: &Method, headers: &HeaderMap, names: &[String]) -> Result<()> {
-    let foreign = |detail: String| Err(ApiError::new(Code::ForeignSite, detail));
-    let text = |name: &str| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
-    let host = text("host").unwrap_or("localhost");
-    if !is_own_name(host, names) {
-        return foreign(format!(
-            "there are no tokens, so this service answers only to its own names, and {host} is none \
-             of them; ask at its address, make a token, or start it with --host NAME"
-        ));
+/// Notes the use of a token, for which no request waits.
+fn note_use(store: &Store, token: &Token) {
+    if !token.is_use_due() {
+        return;
     }
+    let (store, token) = (store.clone(), token.id);
+    tokio::spawn(async move {
+        if let Err(error) = store.note_use(token).await {
+            tracing::warn!(%error, "the use of a token was not noted");
+        }
+    });
+}
+
+/// Takes the parameter `lab` from the query: whose data are asked for, if not those of the token's lab. `*`
+/// stands for all labs.
+async fn choose_lab(
+    store: &Store,
+    rule: Rule,
+    mut access: Access,
+    request: &mut Request,
+) -> Result<Access> {
+    let (wanted, rest) = without_lab(request.uri());
+    let Some(wanted) = wanted else { return Ok(access) };
+    *request.uri_mut() = rest;
+    if wanted == access.lab.as_str() {
+        return Ok(access);
+    }
+    if !access.all_labs {
+        let detail = format!("the token is for the lab {} alone", access.lab);
+        return Err(ApiError::new(Code::Forbidden, detail));
+    }
+    if wanted == "*" && rule == Rule::AcrossLabs {
+        access.across = true;
+        return Ok(access);
+    }
+    let lab = wanted.parse::<Lab>().ok();
+    match lab {
+        Some(lab) if store.knows_lab(&lab).await? => Ok(Access { lab, ..access }),
+        _ => {
+            let wanted: String = wanted.chars().take(80).collect();
+            Err(ApiError::new(Code::NotFound, format!("there is no lab {wanted:?}")))
+        }
+    }
+}
+
+/// The parameter `lab`, and the address without it.
+fn without_lab(uri: &Uri) -> (Option<String>, Uri) {
+    let pairs = || uri.query().unwrap_or_default().split('&');
+    let lab = pairs().find_map(|pair| pair.strip_prefix("lab="));
+    let Some(lab) = lab.map(|lab| lab.replace("%2A", "*").replace("%2a", "*")) else {
+        return (None, uri.clone());
+    };
+    let rest: Vec<_> = pairs().filter(|pair| !pair.starts_with("lab=")).collect();
+    let rest = format!("{}?{}", uri.path(), rest.join("&"));
+    (Some(lab), rest.parse().unwrap_or_else(|_| uri.clone()))
+}
+
+/// Waits until a token, or the session that stands for it, opens nothing any more; without a token, until the
+/// service is not open any more.
+async fn end_of_access(store: Store, access: Access) {
+    loop {
+        tokio::time::sleep(LOOK).await;
+        let holds = match (&access.session, access.token) {
+            (Some(session), _) => {
+                store.token_of_session(session).await.map(|token| token.is_some())
+            }
+            (None, Some(token)) => store.token_holds(token).await,
+            (None, None) => store.is_open().await,
+        };
+        // A failing database shows in every other answer, too.
+        if matches!(holds, Ok(false)) {
+            return;
+        }
+    }
+}
+
+fn text<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
+    headers.get(name).map(|value| value.to_str().unwrap_or("?"))
+}
+
+/// Refuses a name that may have been made to point here (DNS rebinding): without tokens nothing else tells a
+/// page of another site from the user.
+fn check_name(headers: &HeaderMap, names: &[String]) -> Result<()> {
+    let host = text(headers, "host").unwrap_or("localhost");
+    if is_own_name(host, names) {
+        return Ok(());
+    }
+    let detail = format!(
+        "there are no tokens, so this service answers only to its own names, and {host} is none \
+         of them; ask at its address, make a token, or start it with --host NAME"
+    );
+    Err(ApiError::new(Code::ForeignSite, detail))
+}
+
+/// Refuses a change that a page of another site may have had a browser send, which tells by
+/// `Sec-Fetch-Site` or by the `Origin`.
+fn check_site(method: &Method, headers: &HeaderMap) -> Result<()> {
     if method.is_safe() {
         return Ok(());
     }
+    let text = |name| text(headers, name);
+    let host = text("host").unwrap_or("localhost");
     let origin = text("origin").filter(|origin| {
         origin.split_once("://").is_none_or(|(_, place)| !place.eq_ignore_ascii_case(host))
     });
     let site = text("sec-fetch-site").filter(|site| !["same-origin", "none"].contains(site));
     match origin.or(site) {
-        Some(from) => foreign(format!("a page of {from} may not change anything here")),
+        Some(from) => {
+            let detail = format!("a page of {from} may not change anything here");
+            Err(ApiError::new(Code::ForeignSite, detail))
+        }
         None => Ok(()),
     }
 }
@@ -148,16 +313,27 @@ fn is_own_name(host: &str, names: &[String]) -> bool {
         || names.iter().any(|own| name.eq_ignore_ascii_case(own))
 }
 
-fn secret(method: &Method, headers: &HeaderMap) -> Option<Secret> {
-    match headers.typed_try_get::<Authorization<Bearer>>() {
-        Ok(Some(bearer)) => Secret::parse(bearer.token().trim()),
-        Ok(None) if method.is_safe() => Secret::parse(headers.typed_get::<Cookie>()?.get(COOKIE)?),
-        _ => None,
+/// What a request shows to be let in.
+#[derive(Debug, PartialEq, Eq)]
+enum Credential {
+    Token(Secret),
+    Session(Secret),
+}
+
+fn credential(method: &Method, headers: &HeaderMap) -> Option<Credential> {
+    if let Some(bearer) = headers.typed_try_get::<Authorization<Bearer>>().transpose() {
+        return Secret::parse(bearer.ok()?.token().trim()).map(Credential::Token);
     }
+    let cookies = headers.typed_get::<Cookie>()?;
+    if let Some(session) = cookies.get(SESSION) {
+        return Secret::parse(session).map(Credential::Session);
+    }
+    let token = cookies.get(COOKIE).filter(|_| method.is_safe())?;
+    Secret::parse(token).map(Credential::Token)
 }
 
 /// The same for a token that is missing, unknown, misspelled or revoked.
-fn missing() -> ApiError {
+pub(super) fn missing() -> ApiError {
     let detail = "a valid token is needed, as the header Authorization: Bearer sci_...";
     ApiError::new(Code::Unauthorized, detail).with_header(
         header::WWW_AUTHENTICATE,
@@ -169,7 +345,7 @@ fn missing() -> ApiError {
 mod tests {
     use axum::http::{HeaderMap, HeaderValue, Method};
 
-    use super::{Secret, check_site, secret};
+    use super::{Credential, SESSION, Secret, check_name, check_site, credential, without_lab};
 
     fn headers(name: &'static str, value: &str) -> HeaderMap {
         HeaderMap::from_iter([(name.parse().unwrap(), HeaderValue::from_str(value).unwrap())])
@@ -181,7 +357,7 @@ mod tests {
             let lines = lines.iter().map(|(name, value)| headers(name, value));
             let all: HeaderMap =
                 lines.flatten().map(|(name, value)| (name.unwrap(), value)).collect();
-            check_site(&method, &all, &["bench.example".into()]).is_ok()
+            check_name(&all, &["bench.example".into()]).is_ok() && check_site(&method, &all).is_ok()
         };
         for host in ["127.0.0.1:8080", "[::1]:8080", "LOCALHOST", "bench.example:80", "10.1.2.3"] {
             assert!(check(Method::POST, &[("host", host)]), "{host}");
@@ -207,15 +383,35 @@ mod tests {
 
     #[test]
     fn a_token_comes_as_a_header_or_for_looking_as_a_cookie() {
-        let wanted = Secret::from_bytes([1; 32]);
-        let text = wanted.reveal().to_owned();
+        let [token, session] = [Secret::random().unwrap(), Secret::random().unwrap()];
+        let text = token.reveal();
+        let shown = |method, headers: &HeaderMap| credential(&method, headers);
         let bearer = headers("authorization", &format!("bearer {text}"));
-        assert_eq!(secret(&Method::DELETE, &bearer), Some(wanted.clone()));
+        assert_eq!(shown(Method::DELETE, &bearer), Some(Credential::Token(token.clone())));
         let cookie = headers("cookie", &format!("a=b; sci_recon_token={text}; c=d"));
-        assert_eq!(secret(&Method::GET, &cookie), Some(wanted));
-        assert_eq!(secret(&Method::POST, &cookie), None);
-        for bad in [format!("Basic {text}"), text.to_owned(), "Bearer".into(), "Bearer x".into()] {
-            assert_eq!(secret(&Method::GET, &headers("authorization", &bad)), None, "{bad}");
+        assert_eq!(shown(Method::GET, &cookie), Some(Credential::Token(token.clone())));
+        assert_eq!(shown(Method::POST, &cookie), None);
+        let both = format!("sci_recon_token={text}; {SESSION}={}", session.reveal());
+        let mut both = headers("cookie", &both);
+        for method in [Method::GET, Method::POST] {
+            assert_eq!(shown(method, &both), Some(Credential::Session(session.clone())));
         }
+        both.extend(bearer);
+        assert_eq!(shown(Method::POST, &both), Some(Credential::Token(token.clone())));
+        for bad in [format!("Basic {text}"), text.to_owned(), "Bearer".into(), "Bearer x".into()] {
+            assert_eq!(shown(Method::GET, &headers("authorization", &bad)), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn the_lab_is_taken_out_of_the_query() {
+        let of = |text: &str| {
+            let (lab, rest) = without_lab(&text.parse().unwrap());
+            (lab.unwrap_or_default(), rest.to_string())
+        };
+        assert_eq!(of("/v1/jobs?limit=2&lab=a&x=1"), ("a".into(), "/v1/jobs?limit=2&x=1".into()));
+        assert_eq!(of("/v1/jobs?lab=%2A").0, "*");
+        assert_eq!(of("/v1/jobs?label=a"), (String::new(), "/v1/jobs?label=a".into()));
+        assert_eq!(of("/v1/jobs"), (String::new(), "/v1/jobs".into()));
     }
 }

@@ -18,6 +18,8 @@ use crate::formats::Limits;
 use crate::job::{Timestamp, without_paths};
 use crate::store::Store;
 
+/// Labs of which a file is checked at the same time, so that a slow one keeps no other lab waiting.
+const CHECKS_AT_ONCE: usize = 4;
 /// Files of a lab that may wait to be checked.
 const CHECKS: usize = 32;
 
@@ -33,7 +35,7 @@ pub struct Services {
     pub(super) started_at: Timestamp,
     pub(super) limits: Limits,
     pub(super) admission: Admission,
-    /// One file is checked at a time: each takes a core and a frame of memory.
+    /// Each check takes a core and a frame of memory; of a lab there is one at a time.
     pub(super) intake: Turns,
     /// When it was last tried whether files can be written, and what came of it.
     pub(super) disk_tried: Mutex<Option<(Instant, std::result::Result<(), String>)>>,
@@ -61,7 +63,7 @@ impl App {
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
-            intake: Turns::new(1, CHECKS),
+            intake: Turns::new(CHECKS_AT_ONCE, CHECKS),
             disk_tried: Mutex::default(),
             checker: Checker::new(settings),
             metrics,

@@ -13,10 +13,11 @@ use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
 use super::intake::{self, Prepared};
 use super::page::{Limit, PageBody, Renaming};
 use crate::formats::validate::MaskStatistics;
-use crate::intake::check_sizes;
+use crate::intake::plan;
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
 use crate::store::{
-    Calibration, Filter, Inserted, Made, NewCalibration, Page, RequestKey, Span, Unready,
+    Calibration, Filter, Inserted, Made, NewCalibration, NewCaptures, Page, RequestKey, Span,
+    Unready,
 };
 
 /// The body of `POST /v1/calibrations`: masks, or the captures to make them of.
@@ -211,15 +212,21 @@ async fn of_captures(
         intake::upload(app, upload).await.map_err(|error| error.at(&place))?;
     }
     let store = app.store.clone();
-    let (captures, bytes) = intake::run(app, access, move |desk| {
+    let (captures, plan) = intake::run(app, access, move |desk| {
         let files = captures.map(|upload| store.dir().blob(upload));
-        let bytes = check_sizes(&files, desk.limits())?;
-        Ok((captures, bytes))
+        let plan = plan(&files, desk.limits())?;
+        Ok((captures, plan))
     })
     .await?;
-    let add = app.store.add_captures((lab, token), name.as_ref(), (&captures, bytes), key);
+    let asked = NewCaptures {
+        name: name.as_ref(),
+        captures: &captures,
+        bytes: plan.bytes,
+        cost: plan.seconds,
+    };
+    let add = app.store.add_captures((lab, token), asked, key);
     // Twice: as they are measured, and on their scale.
-    app.admission.with_room("the calibration", 2 * bytes, add).await
+    app.admission.with_room("the calibration", 2 * plan.bytes, add).await
 }
 
 async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody> {

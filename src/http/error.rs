@@ -1,5 +1,6 @@
 //! Errors as the user sees them: problem+json (RFC 9457).
 
+use std::io::ErrorKind;
 use std::sync::LazyLock;
 
 use axum::Json;
@@ -237,10 +238,23 @@ impl From<StoreError> for ApiError {
     }
 }
 
+/// A check of a file that has taken longer than it may.
+pub(super) fn too_slow() -> ApiError {
+    tracing::warn!("the check of a file took too long");
+    let detail = "the check of the file took longer than --check-seconds allows: try again when less is going \
+                  on, or send it in a format that is quicker to read, such as npy";
+    ApiError::new(Code::TimedOut, detail)
+}
+
 impl From<FormatError> for ApiError {
     fn from(error: FormatError) -> Self {
         if error.is_disk_full() {
             return disk_full(&error);
+        }
+        if let FormatError::Io { source, .. } = &error
+            && source.kind() == ErrorKind::TimedOut
+        {
+            return too_slow();
         }
         if !error.is_callers_fault() {
             return Self::internal(&error);

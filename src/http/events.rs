@@ -1,10 +1,11 @@
-//! `/v1/events`: says which jobs have changed, for those who would poll otherwise.
+//! `/v1/events`: says which jobs and calibrations have changed, for those who would poll otherwise.
 //!
 //! Workers are other processes, so the server looks at the database once a second, as long as
 //! somebody listens, and compares what it sees with what it saw before.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::convert::Infallible;
+use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -15,21 +16,18 @@ use axum::response::{IntoResponse, Response};
 use futures_util::stream;
 use serde::Serialize;
 use tokio::sync::broadcast;
-use tokio::time::Interval;
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use crate::job::{JobId, Lab, TokenId};
-use crate::store::{JobMark, Store};
+use crate::job::{CalibrationId, JobId, Lab};
+use crate::store::{CalibrationMark, JobMark, Store};
 
 /// The longest time between two looks at all jobs.
 const LOOK: Duration = Duration::from_secs(1);
 /// The shortest. Where looking takes long, a fifth of the time is spent on it at most.
 const SPACING: Duration = Duration::from_millis(40);
-/// Time between two looks at whether a listener may still listen.
-const TOKEN_LOOK: Duration = Duration::from_secs(3);
 /// Listeners at the same time: each holds a connection.
 const LISTENERS: usize = 128;
 /// The most jobs that an event names; beyond that a list is cheaper to read again.
@@ -41,24 +39,31 @@ const WAITERS: usize = 64;
 const MORE: &str = "\"more\":true";
 
 /// What listeners are told.
-#[derive(Debug, Default, Serialize)]
-struct Change {
-    changed: Vec<JobId>,
-    deleted: Vec<JobId>,
+#[derive(Debug, Serialize)]
+struct Change<Id> {
+    changed: Vec<Id>,
+    deleted: Vec<Id>,
     /// True if there are more than are named: read the list again.
     more: bool,
 }
 
-type Versions = HashMap<(Lab, JobId), JobMark>;
+/// A mark of each thing that may change.
+type Versions<Id, Mark> = HashMap<(Lab, Id), Mark>;
 
-type Changes = Arc<HashMap<Lab, String>>;
+/// What each lab is told.
+#[derive(Debug, Default)]
+struct Told {
+    jobs: HashMap<Lab, String>,
+    calibrations: HashMap<Lab, String>,
+}
+
+type Changes = Arc<Told>;
 
 /// The stream of changes to which listeners subscribe.
 #[derive(Debug, Clone)]
 pub(super) struct Events {
     sender: broadcast::Sender<Changes>,
     places: Places,
-    store: Store,
     waiters: Waiters,
     closing: CancellationToken,
 }
@@ -67,10 +72,10 @@ impl Events {
     /// Begins to look, until `closing`.
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
-        let looking = look(store.clone(), sender.clone());
+        let looking = look(store, sender.clone());
         tokio::spawn(closing.clone().run_until_cancelled_owned(looking));
         let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
-        Self { sender, places, store, waiters, closing }
+        Self { sender, places, waiters, closing }
     }
 }
 
@@ -93,7 +98,7 @@ impl Events {
                 loop {
                     match receiver.recv().await {
                         Ok(changes) => {
-                            let text = changes.get(lab);
+                            let text = changes.jobs.get(lab);
                             if text.is_some_and(|text| text.contains(&name) || text.contains(MORE))
                             {
                                 break;
@@ -148,7 +153,8 @@ impl Drop for Waiter {
 }
 
 async fn look(store: Store, sender: broadcast::Sender<Changes>) {
-    let mut before: Option<Versions> = None;
+    let mut before: Option<(Versions<JobId, JobMark>, Versions<CalibrationId, CalibrationMark>)> =
+        None;
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
@@ -167,46 +173,62 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             continue;
         }
         // A failing database shows in every other answer, too.
-        let Ok(now) = store.job_marks().await else { continue };
-        let changes = match &before {
-            Some(before) => changes(before, &now),
+        let Ok(jobs) = store.job_marks().await else { continue };
+        let Ok(calibrations) = store.calibration_marks().await else { continue };
+        let told = match &before {
+            Some(before) => Told {
+                jobs: changes(&before.0, &jobs),
+                calibrations: changes(&before.1, &calibrations),
+            },
             // What changed between the greeting and this first look is not known.
-            None => everything(&now),
+            None => Told { jobs: everything(&jobs), calibrations: everything(&calibrations) },
         };
-        if !changes.is_empty() {
+        if !told.jobs.is_empty() || !told.calibrations.is_empty() {
             // Fails only if the last listener has just gone.
-            let _ = sender.send(changes.into());
+            let _ = sender.send(told.into());
         }
-        before = Some(now);
+        before = Some((jobs, calibrations));
         tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;
     }
 }
 
 /// What differs, for each lab for which anything does.
-fn changes(before: &Versions, now: &Versions) -> HashMap<Lab, String> {
-    let mut changes: HashMap<&Lab, Change> = HashMap::new();
-    for ((lab, job), _) in now.iter().filter(|(id, version)| before.get(id) != Some(version)) {
-        changes.entry(lab).or_default().changed.push(*job);
+fn changes<Id: Copy + Ord + Hash + Serialize, Mark: PartialEq>(
+    before: &Versions<Id, Mark>,
+    now: &Versions<Id, Mark>,
+) -> HashMap<Lab, String> {
+    let mut changes: HashMap<&Lab, Change<Id>> = HashMap::new();
+    for ((lab, id), _) in now.iter().filter(|(id, version)| before.get(id) != Some(version)) {
+        changes.entry(lab).or_default().changed.push(*id);
     }
-    for (lab, job) in before.keys().filter(|id| !now.contains_key(id)) {
-        changes.entry(lab).or_default().deleted.push(*job);
+    for (lab, id) in before.keys().filter(|id| !now.contains_key(id)) {
+        changes.entry(lab).or_default().deleted.push(*id);
     }
     told(changes.into_iter().map(|(lab, change)| (lab, change.cut())))
 }
 
-/// Has every lab that has jobs read its list again.
-fn everything(now: &Versions) -> HashMap<Lab, String> {
+/// Has every lab that has such things read its list again.
+fn everything<Id: Serialize, Mark>(now: &Versions<Id, Mark>) -> HashMap<Lab, String> {
     let labs: HashSet<&Lab> = now.keys().map(|(lab, _)| lab).collect();
-    told(labs.into_iter().map(|lab| (lab, Change { more: true, ..Change::default() })))
+    told(labs.into_iter().map(|lab| (lab, Change::<Id> { more: true, ..Change::default() })))
 }
 
-fn told<'a>(changes: impl Iterator<Item = (&'a Lab, Change)>) -> HashMap<Lab, String> {
-    let text =
-        |(lab, change): (&Lab, Change)| Some((lab.clone(), serde_json::to_string(&change).ok()?));
+fn told<'a, Id: Serialize>(
+    changes: impl Iterator<Item = (&'a Lab, Change<Id>)>,
+) -> HashMap<Lab, String> {
+    let text = |(lab, change): (&Lab, Change<Id>)| {
+        Some((lab.clone(), serde_json::to_string(&change).ok()?))
+    };
     changes.filter_map(text).collect()
 }
 
-impl Change {
+impl<Id> Default for Change<Id> {
+    fn default() -> Self {
+        Self { changed: Vec::new(), deleted: Vec::new(), more: false }
+    }
+}
+
+impl<Id: Ord> Change<Id> {
     /// Newest first, and no more than are named.
     fn cut(mut self) -> Self {
         self.more = self.changed.len() > NAMED || self.deleted.len() > NAMED;
@@ -223,16 +245,11 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
         let detail = "all places for listeners are taken, or this lab has its share; poll instead";
         ApiError::new(Code::Unavailable, detail)
     })?;
-    let mut look = tokio::time::interval(TOKEN_LOOK);
-    look.reset();
     let listener = Listener {
         lab: access.lab,
-        token: access.token,
-        store: events.store.clone(),
-        look,
         receiver: events.sender.subscribe(),
         closing: events.closing.clone(),
-        greeted: false,
+        waiting: VecDeque::from([hello()]),
         _place: place,
     };
     let events = stream::unfold(listener, Listener::next);
@@ -243,56 +260,43 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
 
 struct Listener {
     lab: Lab,
-    /// It ends when this is revoked.
-    token: Option<TokenId>,
-    store: Store,
-    look: Interval,
     receiver: broadcast::Receiver<Changes>,
     closing: CancellationToken,
-    greeted: bool,
+    /// What it is told next.
+    waiting: VecDeque<Event>,
     _place: Place,
 }
 
 impl Listener {
-    /// True if its token was revoked, or the service, which was open, is not any more.
-    async fn has_left(&self) -> bool {
-        let may = match self.token {
-            Some(token) => self.store.token_holds(token).await,
-            None => self.store.is_open().await,
-        };
-        // A failing database shows in every other answer, too.
-        matches!(may, Ok(false))
-    }
-
     async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
-        if !self.greeted {
-            self.greeted = true;
-            return Some((Ok(Event::default().event("hello").data("{}")), self));
-        }
-        let event = loop {
+        loop {
+            if let Some(event) = self.waiting.pop_front() {
+                return Some((Ok(event), self));
+            }
             let received = tokio::select! {
                 received = self.receiver.recv() => received,
                 () = self.closing.cancelled() => return None,
-                _ = self.look.tick() => {
-                    if self.has_left().await {
-                        return None;
-                    }
-                    continue;
-                }
             };
             match received {
                 Ok(changes) => {
-                    if let Some(text) = changes.get(&self.lab) {
-                        break Event::default().event("jobs").data(text);
+                    let both = [("jobs", &changes.jobs), ("calibrations", &changes.calibrations)];
+                    for (name, told) in both {
+                        let text = told.get(&self.lab);
+                        self.waiting
+                            .extend(text.map(|text| Event::default().event(name).data(text)));
                     }
                 }
                 // A slow listener has missed some: it must read the list again.
                 Err(broadcast::error::RecvError::Lagged(_)) => {
-                    break Event::default().event("hello").data("{}");
+                    self.waiting.push_back(hello());
                 }
                 Err(broadcast::error::RecvError::Closed) => return None,
             }
-        };
-        Some((Ok(event), self))
+        }
     }
+}
+
+/// Has a listener read the lists.
+fn hello() -> Event {
+    Event::default().event("hello").data("{}")
 }

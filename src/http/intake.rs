@@ -1,18 +1,20 @@
 //! Uploads on their way to a calibration or measurement: what passes the checks of [`crate::intake`] is
-//! written as a prepared array. Blocks; one at a time runs, where blocking is allowed, and labs take
-//! turns.
+//! written as a prepared array. Blocks; of each lab one at a time runs, where blocking is allowed, and no longer
+//! than `--check-seconds`.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use tokio::runtime::Handle;
 
 use super::access::Access;
 use super::admission::Reservation;
 use super::app::App;
-use super::error::{ApiError, Code, Result};
+use super::error::{ApiError, Code, Result, too_slow};
 use crate::formats::mat::SceneArray;
 use crate::formats::validate::MaskStatistics;
-use crate::formats::{Limits, StackInfo, StackWriter, planar};
+use crate::formats::{FormatError, Limits, StackInfo, StackWriter, planar};
 use crate::intake::{self, Exposure, Source};
 use crate::job::{Finding, Label, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store, StoreError};
@@ -32,22 +34,28 @@ pub(super) struct Desk {
     app: App,
     access: Access,
     runtime: Handle,
+    /// When the check is to give up.
+    deadline: Instant,
 }
 
 /// Runs a check where it may block, when it is the lab's turn.
+/// Errors: 503 if it takes too long; it ends with its next frame then, and so does the lab's turn.
 pub(super) async fn run<T, F>(app: &App, access: &Access, check: F) -> Result<T>
 where
     T: Send + 'static,
     F: FnOnce(&Desk) -> Result<T> + Send + 'static,
 {
     let turn = app.intake.take(&access.lab).await?;
-    let desk = Desk { app: app.clone(), access: access.clone(), runtime: Handle::current() };
+    let (time, runtime) = (app.settings.check_time(), Handle::current());
+    let (app, access, deadline) = (app.clone(), access.clone(), Instant::now() + time);
+    let desk = Desk { app, access, runtime, deadline };
     let checked = tokio::task::spawn_blocking(move || {
         // Held until the check ends, also if the user does not wait for it.
         let _turn = turn;
         check(&desk)
     });
-    checked.await.map_err(|error| ApiError::internal(&error))?
+    let checked = tokio::time::timeout(time, checked).await.map_err(|_| too_slow())?;
+    checked.map_err(|error| ApiError::internal(&error))?
 }
 
 impl Desk {
@@ -57,6 +65,14 @@ impl Desk {
 
     pub(super) fn limits(&self) -> &Limits {
         &self.app.limits
+    }
+
+    /// Ends a check that has taken too long. Who waited for it has been told.
+    fn go_on(&self) -> Result<(), FormatError> {
+        if Instant::now() < self.deadline {
+            return Ok(());
+        }
+        Err(FormatError::io("check the file in time")(ErrorKind::TimedOut.into()))
     }
 
     /// A prepared array to be written, if the disk has room for it, and the lab and its token may keep it.
@@ -91,7 +107,10 @@ pub(super) fn masks(
     let opened = source.named(array.map(Label::to_string)).open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
     let (mut writer, room) = desk.writer(&info)?;
-    let found = intake::masks(opened, |mask| writer.write_frame(mask))?;
+    let found = intake::masks(opened, |mask| {
+        desk.go_on()?;
+        writer.write_frame(mask)
+    })?;
     Ok(Prepared { info, full_scale, found, file: writer.finish()?.finish()?, room })
 }
 
@@ -117,7 +136,10 @@ pub(super) fn measurement(
     }
     let (mut writer, room) = desk.writer(&info)?;
     let limits = desk.limits();
-    let saturated = intake::measurement(opened, exposure, limits, |y| writer.write_frame(y))?;
+    let saturated = intake::measurement(opened, exposure, limits, |y| {
+        desk.go_on()?;
+        writer.write_frame(y)
+    })?;
     let file = writer.finish()?.finish()?;
     let masks = desk.app.store.dir().blob(&calibration.prepared);
     let darkened = !exposure.dark.is_empty();

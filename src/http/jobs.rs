@@ -27,6 +27,7 @@ use crate::store::{
 #[derive(Debug, Serialize)]
 pub(super) struct JobBody {
     id: JobId,
+    lab: Lab,
     state: JobState,
     label: Option<Label>,
     calibration: CalibrationId,
@@ -59,6 +60,7 @@ impl JobBody {
         let spec = job.spec;
         Self {
             id: job.id,
+            lab: job.lab,
             state: job.state,
             label: spec.label,
             calibration: spec.calibration,
@@ -287,7 +289,7 @@ async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody> {
     Ok(JobBody::new(job, progress))
 }
 
-/// `GET /v1/jobs`, with an ETag, so that watching costs little.
+/// `GET /v1/jobs`, of one lab or of all of them, with an ETag, so that watching costs little.
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
@@ -302,7 +304,7 @@ pub(super) async fn list(
         created: Span { from: query.created_after, before: query.created_before },
         after: query.cursor,
     };
-    let page = app.store.jobs(&access.lab, &filter, query.limit.get()).await?;
+    let page = app.store.jobs(access.shown(), &filter, query.limit.get()).await?;
     let progress = app.store.progress_of(&page.items).await?;
     let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
     let page = Page { items: items.collect(), more: page.more };

@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::error::Result;
 use super::extract::Caller;
-use crate::job::{Lab, Role, TokenId};
+use crate::job::{Lab, Role, Timestamp, TokenId};
 use crate::store::LabUse;
 
 #[derive(Debug, Serialize)]
@@ -14,6 +14,10 @@ pub(super) struct MeBody {
     role: Role,
     /// None on a service without tokens.
     token: Option<TokenId>,
+    /// From when on the token is worth nothing; none: never.
+    expires_at: Option<Timestamp>,
+    /// True if the data of every lab may be asked for.
+    all_labs: bool,
     limits: LimitsBody,
     #[serde(rename = "use")]
     taken: UseBody,
@@ -25,6 +29,10 @@ struct LimitsBody {
     upload_bytes: u64,
     /// Of uploads that the token may keep; none: no limit.
     token_bytes: Option<u64>,
+    /// That the lab may keep; none: no limit.
+    lab_bytes: Option<u64>,
+    /// Jobs of the lab that may wait and run; none: no limit of its own.
+    lab_jobs: Option<u64>,
     /// Memory of a worker: jobs that need more are refused.
     worker_memory_bytes: u64,
 }
@@ -43,13 +51,18 @@ pub(super) async fn show(Caller(app, access): Caller) -> Result<Json<MeBody>> {
         None => None,
     };
     let lab = app.store.lab_use(&access.lab).await?;
+    let entitled = app.store.entitlement(&access.lab).await?;
     Ok(Json(MeBody {
         lab: access.lab,
         role: access.role,
         token: access.token,
+        expires_at: access.expires_at,
+        all_labs: access.all_labs,
         limits: LimitsBody {
             upload_bytes: app.settings.max_upload_bytes,
             token_bytes: access.max_bytes,
+            lab_bytes: entitled.max_bytes.flatten(),
+            lab_jobs: entitled.max_jobs.flatten(),
             worker_memory_bytes: app.settings.worker_memory_bytes,
         },
         taken: UseBody { token_bytes, lab },

@@ -13,10 +13,11 @@ use tower_http::catch_panic::CatchPanicLayer;
 
 use super::access::{self, Rule};
 use super::app::App;
-use super::pictures::{OfCalibration, OfJob, OfMeasurement};
+use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
-    algorithms, blobs, calibrations, dashboard, events, exports, jobs, layers, me, measurements,
-    models, pictures, problems, quality, reports, results, samples, system, tiles, tus,
+    algorithms, blobs, calibrations, dashboard, events, exports, jobs, labs, layers, me,
+    measurements, models, pictures, problems, quality, reports, results, samples, session, system,
+    tiles, tus,
 };
 
 /// The largest JSON body.
@@ -27,9 +28,13 @@ pub fn routes() -> Vec<Route> {
     use Route as R;
     vec![
         R::at("/v1/me").get(me::show),
+        R::at("/v1/session").post(session::create).delete(session::delete).only(Rule::Own),
+        R::at("/v1/labs").get(labs::list).only(Rule::AllLabs),
+        R::at("/v1/labs/{lab}").get(labs::show).patch(labs::change).only(Rule::AllLabs),
         R::at("/v1/blobs").get(blobs::list).post(blobs::create).uploads(),
         R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).delete(blobs::delete).uploads(),
         R::at("/v1/blobs/{sha256}/content").get(blobs::content),
+        R::at("/v1/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>),
         R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
@@ -42,7 +47,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/models").get(models::list).post(models::create).slow(),
         R::at("/v1/models/{model}").get(models::show).patch(models::rename).delete(models::delete),
         R::at("/v1/algorithms").get(algorithms::list),
-        R::at("/v1/jobs").get(jobs::list).post(jobs::create),
+        R::at("/v1/jobs").get(jobs::list).post(jobs::create).only(Rule::AcrossLabs),
         R::at("/v1/samples").post(samples::create),
         R::at("/v1/jobs/estimate").post(jobs::estimate),
         R::at("/v1/jobs/{job}").get(jobs::show).patch(jobs::change).delete(jobs::delete),

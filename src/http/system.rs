@@ -13,6 +13,8 @@ use serde::Serialize;
 
 use super::app::App;
 use super::error::Result;
+use super::extract::Caller;
+use super::metrics::Figures;
 use crate::config::VERSION;
 use crate::job::{JobState, TaskState, Timestamp};
 use crate::store::{StoreError, WorkerRow};
@@ -187,19 +189,19 @@ async fn workers_live(app: &App) -> Result<(), String> {
     if live == 0 { Err("no worker lives".to_owned()) } else { Ok(()) }
 }
 
+/// `GET /metrics`. What labs do is shown to those who look after all of them; to the others, of their own.
 #[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
-pub(super) async fn metrics(State(app): State<App>) -> Result<Response> {
+pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
     for (state, count) in jobs(&app).await? {
         gauge!("sci_recon_jobs", "state" => state).set(count as f64);
     }
     for ((kind, state), count) in app.store.task_counts().await? {
         gauge!("sci_recon_tasks", "kind" => kind, "state" => state.into_str()).set(count as f64);
     }
-    for done in app.store.totals().await? {
+    let totals = app.store.totals().await?;
+    for done in &totals {
         let kind = || done.kind.clone();
         counter!("sci_recon_tasks_done_total", "kind" => kind()).absolute(done.tasks);
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // whole seconds will do
-        counter!("sci_recon_task_seconds_total", "kind" => kind()).absolute(done.seconds as u64);
         if done.kind == "tile" {
             counter!("sci_recon_solver_iterations_total").absolute(done.iterations);
             counter!("sci_recon_denoiser_passes_total").absolute(done.passes);
@@ -216,7 +218,12 @@ pub(super) async fn metrics(State(app): State<App>) -> Result<Response> {
     gauge!("sci_recon_disk_free_bytes").set(free as f64);
     gauge!("sci_recon_disk_size_bytes").set(size as f64);
     let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
-    Ok((kind, app.metrics.render()).into_response())
+    let mut figures = Figures::default();
+    figures.add_tasks(&totals);
+    let mut labs = app.store.lab_figures().await?;
+    labs.retain(|figures| access.all_labs || figures.lab == access.lab);
+    figures.add_labs(&labs);
+    Ok((kind, app.metrics.render() + &figures.into_text()).into_response())
 }
 
 pub(super) async fn contract() -> Response {

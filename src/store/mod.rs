@@ -57,13 +57,13 @@ pub use queue::{
 };
 pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
-pub use submit::NewJob;
+pub use submit::{NewCaptures, NewJob};
 pub use tables::{
-    Blob, BlobRow, Calibration, Entitlement, FIRST_RESERVE, FoundPartial, Inserted, Job,
-    JobChanges, JobFilter, LabRow, LabUse, Made, Measurement, Model, NewCalibration,
-    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey, TaskCounts,
-    TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready, WorkerPlace,
-    WorkerRow, WorkerTask,
+    Blob, BlobRow, Calibration, CalibrationMark, Entitlement, FIRST_RESERVE, FoundPartial,
+    Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model,
+    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey,
+    TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready,
+    WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

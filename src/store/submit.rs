@@ -14,6 +14,7 @@ use super::tables::measurements::{self, Measurement, NewMeasurement};
 use super::tables::{jobs, quota};
 use crate::job::{
     CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp, TokenId,
+    planned_seconds,
 };
 
 #[derive(Debug, Clone)]
@@ -26,6 +27,17 @@ pub struct NewJob {
     pub request: Sha256,
     /// The user's key against double submission.
     pub idempotency_key: Option<String>,
+}
+
+/// Captures of which a calibration is to be made.
+#[derive(Debug, Clone, Copy)]
+pub struct NewCaptures<'a> {
+    pub name: Option<&'a Label>,
+    pub captures: &'a Captures,
+    /// Of the masks.
+    pub bytes: u64,
+    /// Planned processor seconds.
+    pub cost: f64,
 }
 
 impl Store {
@@ -91,19 +103,19 @@ impl Store {
         calibrations::insert(&mut transaction, (lab, token), &calibration).await?;
         let asked = Asked { id, token, name: facts.name.as_ref(), captures: None, bytes: 0 };
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
-        graph::insert_calibration(&mut transaction, lab, id).await?;
+        let cost = planned_seconds(0, facts.frames, facts.height * facts.width);
+        graph::insert_calibration(&mut transaction, lab, id, cost).await?;
         keys::insert(&mut transaction, lab, Made::Calibration, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
 
-    /// Records a calibration whose masks, of so many bytes, and their report, are to be made of captures.
+    /// Records a calibration whose masks, and their report, are to be made of captures.
     /// Errors: [`StoreError::KeyReused`]; [`StoreError::Quota`].
     pub async fn add_captures(
         &self,
         (lab, token): (&Lab, Option<TokenId>),
-        name: Option<&Label>,
-        (captures, bytes): (&Captures, u64),
+        NewCaptures { name, captures, bytes, cost }: NewCaptures<'_>,
         key: Option<&RequestKey>,
     ) -> Result<Inserted<CalibrationId>> {
         let id = CalibrationId::new();
@@ -114,7 +126,7 @@ impl Store {
         quota::check(&mut transaction, lab, token, bytes).await?;
         let asked = Asked { id, token, name, captures: Some(captures), bytes };
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
-        graph::insert_calibration(&mut transaction, lab, id).await?;
+        graph::insert_calibration(&mut transaction, lab, id, cost).await?;
         keys::insert(&mut transaction, lab, Made::Calibration, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))

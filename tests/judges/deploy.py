@@ -113,16 +113,31 @@ def caddy(root, wrong):
     return None
 
 
-def dashboard(root, wrong):
+def figures(root, wrong):
     board = json.loads((root / "deploy/grafana/sci-recon.json").read_text())
-    names = {name for panel in board["panels"] for target in panel.get("targets", [])
-             for name in words(target["expr"])}
+    known(root, wrong, "sci-recon.json", [target["expr"] for panel in board["panels"]
+                                          for target in panel.get("targets", [])])
+    groups = yaml.safe_load((root / "deploy/prometheus/alerts.yml").read_text())["groups"]
+    known(root, wrong, "alerts.yml", [rule["expr"] for group in groups for rule in group["rules"]])
+
+
+def promtool(root, wrong):
+    if not shutil.which("promtool"):
+        return "promtool"
+    status, told = run("promtool", "check", "rules", str(root / "deploy/prometheus/alerts.yml"))
+    if status:
+        wrong.append(f"promtool check rules: {told}")
+    return None
+
+
+def known(root, wrong, file_name, expressions):
+    names = {name for expression in expressions for name in words(expression)}
     described = set()
     for file in (root / "src").rglob("*.rs"):
         described |= words(file.read_text())
     missing = {name for name in names if name.removesuffix("_bucket") not in described}
     if missing or not names:
-        wrong.append(f"sci-recon.json asks for figures that the service does not have: {sorted(missing)}")
+        wrong.append(f"{file_name} asks for figures that the service does not have: {sorted(missing)}")
 
 
 def words(text):
@@ -133,8 +148,8 @@ def words(text):
 def main():
     root, wrong = pathlib.Path(sys.argv[1]), []
     kubernetes(root, wrong)
-    dashboard(root, wrong)
-    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd, nginx, caddy)) if name]
+    figures(root, wrong)
+    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd, nginx, caddy, promtool)) if name]
     if absent:
         print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
     for reason in wrong:

@@ -4,6 +4,7 @@
 
 mod access;
 mod adaptive;
+mod all_labs;
 mod app;
 mod calibration;
 mod cli;
@@ -32,10 +33,12 @@ mod load;
 mod measurement_check;
 mod pictures;
 mod pipeline;
+mod recipes;
 mod resumable;
 mod samples;
 mod sequences;
 mod storm;
 mod upgrade;
 mod uploads;
+mod watching;
 mod work;

@@ -17,7 +17,7 @@ use crate::formats::{
     read_stack,
 };
 use crate::intake::error::Result;
-use crate::job::{CalibrationReport, Captures, Finding};
+use crate::job::{CalibrationReport, Captures, Finding, MOST_SECONDS, planned_seconds};
 use crate::optics::{
     Average, Calibrator, CaptureFigures, MaskFigures, MaskStudy, PatternFigures, References,
     Repeats, check_patterns, judge_captures, judge_masks,
@@ -83,11 +83,20 @@ pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
     tell(&study(masks, 1.0, progress)?, None, None)
 }
 
-/// Looks at the headers of captures: they must be stacks of one size, before hours of averaging. Gives the bytes
-/// of the masks that are made of them.
-/// Errors: files that can't be read, or differ in size, by their place in a request.
-pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<u64> {
-    let mut first = None;
+/// What a calibration of captures will take.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plan {
+    /// Of the masks that are made.
+    pub bytes: u64,
+    /// Of processor time.
+    pub seconds: f64,
+}
+
+/// Looks at the headers of captures: they must be stacks of one size, and not more than can be averaged in
+/// [`MOST_SECONDS`].
+/// Errors: files that can't be read, or differ in size, by their place in a request; too many of them.
+pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
+    let (mut first, mut captured) = (None, 0);
     for (place, paths) in files.lists() {
         for (index, path) in paths.iter().enumerate() {
             let place = format!("{place}/{index}");
@@ -101,10 +110,20 @@ pub fn check_sizes(files: &CaptureFiles, limits: &Limits) -> Result<u64> {
                 );
                 return Err(IntakeError::Size { place, detail });
             }
+            captured += info.frames as u64;
         }
     }
     let (height, width) = first.unwrap_or_default();
-    Ok((files.masks.len() * height * width * size_of::<f32>()) as u64)
+    let (masks, pixels) = (files.masks.len(), height * width);
+    let seconds = planned_seconds(captured * pixels as u64, masks, pixels);
+    if seconds > MOST_SECONDS {
+        let detail = format!(
+            "{captured} captures of {height}x{width} pixels would take {seconds:.0} s of a core, and may take \
+             {MOST_SECONDS}: take fewer repeats of each"
+        );
+        return Err(IntakeError::Size { place: "/captures".into(), detail });
+    }
+    Ok(Plan { bytes: (masks * pixels * size_of::<f32>()) as u64, seconds })
 }
 
 /// What the captures of masks have told.
@@ -292,4 +311,41 @@ fn picture(map: &Array2<f32>) -> Result<Vec<u8>, FormatError> {
     });
     let largest = small.fold(0.0f32, |largest, &value| largest.max(value));
     png::encode_u8(small.view(), 0.0, if largest > 0.0 { largest } else { 1.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::{CaptureFiles, plan};
+    use crate::formats::Limits;
+    use crate::job::MOST_SECONDS;
+
+    #[test]
+    fn what_takes_too_long_is_refused_before_it_begins() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("repeats.npy");
+        let mut header = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
+        header.extend(b"{'descr': '|u1', 'fortran_order': False, 'shape': (20, 3000, 3000), }");
+        header.resize(127, b' ');
+        header.push(b'\n');
+        let mut file = std::fs::File::create(&path).unwrap();
+        file.write_all(&header).unwrap();
+        // A hole: nothing of it is read.
+        file.set_len(128 + 20 * 3000 * 3000).unwrap();
+        let files = |masks: usize, repeats: usize| CaptureFiles {
+            masks: vec![vec![path.clone(); repeats]; masks],
+            white: vec![path.clone()],
+            black: vec![path.clone()],
+            black_with_mask: Vec::new(),
+            patterns: None,
+            saturation: None,
+        };
+        let planned = plan(&files(10, 2), &Limits::default()).unwrap();
+        assert_eq!(planned.bytes, 10 * 3000 * 3000 * 4);
+        assert!((20.0..60.0).contains(&planned.seconds), "{planned:?}");
+        let refused = plan(&files(64, 60), &Limits::default()).unwrap_err().to_string();
+        assert!(refused.contains("76840 captures"), "{refused}");
+        assert!(refused.contains(&format!("may take {MOST_SECONDS}")), "{refused}");
+    }
 }

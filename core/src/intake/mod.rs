@@ -11,7 +11,7 @@ mod read;
 mod report_page;
 mod sample;
 
-pub use captures::{Calibrated, CaptureFiles, Progress, Report, calibrate, check_sizes, report};
+pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
 pub use check::{Exposure, judge, masks, measurement};
 pub use error::IntakeError;
 pub use open::{Opened, Source};

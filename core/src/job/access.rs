@@ -3,6 +3,9 @@
 use std::fmt;
 use std::str::FromStr;
 
+use rand::TryRngCore;
+use rand::rand_core::OsError;
+use rand::rngs::OsRng;
 use serde::Serialize;
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
@@ -70,7 +73,7 @@ fn no_role(text: &str) -> InvalidText {
     InvalidText::new(format!("{text:?} is not a role; roles are read, submit and admin"))
 }
 
-/// A token as its holder has it. It shows itself to nobody who only prints it for debugging.
+/// A token or session as its holder has it. It shows itself to nobody who only prints it for debugging.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 
@@ -78,8 +81,16 @@ pub struct Secret(String);
 const PREFIX: &str = "sci_";
 
 impl Secret {
+    /// A new one.
+    /// Errors: if the system gives no random numbers.
+    pub fn random() -> Result<Self, OsError> {
+        let mut bytes = [0; 32];
+        OsRng.try_fill_bytes(&mut bytes)?;
+        Ok(Self::from_bytes(bytes))
+    }
+
     /// The token of 256 random bits.
-    pub fn from_bytes(bytes: [u8; 32]) -> Self {
+    fn from_bytes(bytes: [u8; 32]) -> Self {
         Self(format!("{PREFIX}{}", Sha256::new(bytes)))
     }
 

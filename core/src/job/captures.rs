@@ -9,6 +9,17 @@ const MOST: usize = 4096;
 /// Masks of a calibration. Published systems have up to 50.
 pub const MOST_MASKS: usize = 64;
 
+/// The most processor time that a calibration is planned to take, in seconds: 36,000 captures of 3200x3200 take it.
+pub const MOST_SECONDS: f64 = 3600.0;
+
+/// Planned processor seconds of a calibration: `captured` samples to average, and `frames` masks of `pixels`
+/// each to look at. Measured on one core.
+#[allow(clippy::cast_precision_loss)] // samples far below 2^53
+pub fn planned_seconds(captured: u64, frames: usize, pixels: usize) -> f64 {
+    let masks = frames as f64 * pixels as f64;
+    6e-9 * captured as f64 + masks * (25e-9 + 0.2e-9 * frames as f64)
+}
+
 /// Files by what they show, as uploads or as paths. Each has one frame or several: all are repeats of
 /// the same.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -19,7 +19,7 @@ mod text;
 pub use crate::recon::schedule::Schedule;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
-pub use captures::{Captures, MOST_MASKS};
+pub use captures::{Captures, MOST_MASKS, MOST_SECONDS, planned_seconds};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };

@@ -4,6 +4,7 @@
 use std::fmt;
 use std::io::{self, BufReader, Read};
 use std::str::FromStr;
+use std::time::Duration;
 
 use derive_more::Display;
 use serde::Serialize;
@@ -171,6 +172,11 @@ impl Timestamp {
         let printer = jiff::fmt::rfc2822::DateTimePrinter::new();
         // Fails only before the year 0.
         printer.timestamp_to_rfc9110_string(&self.moment()).unwrap_or_default()
+    }
+
+    /// The moment that is so much later.
+    pub fn after(self, time: Duration) -> Self {
+        Self(self.0.saturating_add(i64::try_from(time.as_millis()).unwrap_or(i64::MAX)))
     }
 
     /// Seconds from `earlier` to this moment, not below zero.

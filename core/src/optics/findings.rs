@@ -150,6 +150,7 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
             "look for hot pixels of the sensor and for saturation",
         ));
     }
+    findings.extend(one_dimensional(figures));
     findings.extend(dark_patterns(figures));
     findings.extend(alike(figures));
     if let Some((mean, _)) = figures.correlations().filter(|(mean, _)| *mean > 0.75) {
@@ -198,6 +199,25 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
     }
     findings.extend(order(figures, patterns));
     findings
+}
+
+/// Masks that code one direction of the picture and not the other.
+fn one_dimensional(figures: &MaskFigures) -> Option<Finding> {
+    let (rows, columns) = figures.along;
+    let (share, same) = if rows > columns { (rows, "row") } else { (columns, "column") };
+    (share > 0.8).then(|| {
+        Finding::new(
+            "one_dimensional",
+            Severity::Warning,
+            format!(
+                "{:.0} % of the masks' variance is between {same}s: the pixels of a {same} are nearly the \
+                 same, and frames can't be told apart along it",
+                share * 100.0
+            ),
+            "check the axes of the file and that the lithography mask is in place; masks are \
+             [frame, row, column] and vary along both",
+        )
+    })
 }
 
 /// Patterns much darker or brighter than the others.

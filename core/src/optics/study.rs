@@ -15,6 +15,10 @@ pub struct MaskStudy {
     next_row: usize,
     products: Array2<f64>,
     sums: Vec<f64>,
+    /// Of each mask, the sum over its rows of the squared sum of a row.
+    row_squares: Vec<f64>,
+    /// Sums \[B,W\] of the columns of each mask.
+    columns: Array2<f64>,
     mean: Array2<f32>,
     deviation: Array2<f32>,
     gram: Array2<f32>,
@@ -30,6 +34,9 @@ pub struct MaskFigures {
     pub frame_means: Vec<f64>,
     /// Correlation \[B,B\] of each mask with each other, over the pixels.
     pub correlation: Array2<f64>,
+    /// The share of the masks' variance over the pixels that is between rows, and between columns: 1 where
+    /// all pixels of a row (of a column) are the same.
+    pub along: (f64, f64),
     /// Mean over the frames of each pixel \[H,W\].
     pub mean: Array2<f32>,
     /// Standard deviation over the frames of each pixel \[H,W\].
@@ -77,6 +84,8 @@ impl MaskStudy {
             next_row: 0,
             products: Array2::zeros((frames, frames)),
             sums: vec![0.0; frames],
+            row_squares: vec![0.0; frames],
+            columns: Array2::zeros((frames, width)),
             mean: map(),
             deviation: map(),
             gram: map(),
@@ -103,9 +112,12 @@ impl MaskStudy {
             let line = band.slice(s![.., row, ..]);
             // Sums of one row in f32, of all rows in f64.
             self.products += &line.dot(&line.t()).mapv(f64::from);
-            for (sum, mask) in self.sums.iter_mut().zip(line.outer_iter()) {
-                *sum += f64::from(mask.sum());
+            for (frame, mask) in line.outer_iter().enumerate() {
+                let sum = f64::from(mask.sum());
+                self.sums[frame] += sum;
+                self.row_squares[frame] += sum * sum;
             }
+            ndarray::azip!((sum in &mut self.columns, &value in &line) *sum += f64::from(value));
             for &value in line {
                 self.zeros += u64::from(value <= 0.0);
                 self.histogram[bin(value)] += 1;
@@ -147,7 +159,18 @@ impl MaskStudy {
             let norm = (covariance(k, k) * covariance(l, l)).sqrt();
             if norm > 0.0 { (covariance(k, l) / norm).clamp(-1.0, 1.0) } else { 0.0 }
         });
+        // Between rows: of the rows' means; each stands for a row of pixels.
+        let squared = |sum: f64| sum * sum / (pixels * pixels);
+        let (mut whole, mut rows, mut columns) = (0.0, 0.0, 0.0);
+        for (k, &sum) in self.sums.iter().enumerate() {
+            let lines = self.columns.row(k).iter().map(|sum| sum * sum).sum::<f64>();
+            whole += covariance(k, k);
+            rows += self.row_squares[k] / (width * width * height) as f64 - squared(sum);
+            columns += lines / (height * height * width) as f64 - squared(sum);
+        }
+        let share = |part: f64| if whole > 0.0 { (part / whole).clamp(0.0, 1.0) } else { 0.0 };
         Ok(MaskFigures {
+            along: (share(rows), share(columns)),
             frame_means: self.sums.iter().map(|sum| sum / pixels).collect(),
             correlation,
             dead: self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64,
@@ -249,5 +272,26 @@ mod tests {
         let half = Array2::from_shape_fn((64, 64), |(_, j)| if j < 32 { 1.0 } else { 2.0 });
         assert_eq!(flatness(&half.view()), Some(0.5));
         assert_eq!(flatness(&Array2::zeros((4, 4)).view()), None);
+    }
+
+    #[test]
+    fn variance_along_one_axis_is_told() {
+        let noise = |i: usize| (i * 7919 % 101) as f32 / 100.0;
+        let along = |height: usize, width: usize, value: &dyn Fn(usize, usize) -> f32| {
+            let masks =
+                Array3::from_shape_fn((3, height, width), |(k, i, j)| value(i + 13 * k, j + 5 * k));
+            let mut study = MaskStudy::new(3, height, width);
+            study.add(masks.slice(s![.., ..height / 2, ..])).unwrap();
+            study.add(masks.slice(s![.., height / 2.., ..])).unwrap();
+            study.finish().unwrap().along
+        };
+        let (rows, columns) = along(40, 30, &|i, _| noise(i));
+        assert!(rows > 0.999 && columns < 1e-6, "{rows} {columns}");
+        let (rows, columns) = along(40, 30, &|_, j| noise(j));
+        assert!(rows < 1e-6 && columns > 0.999, "{rows} {columns}");
+        let (rows, columns) = along(40, 30, &|i, j| noise(31 * i + 17 * j * j));
+        assert!(rows < 0.3 && columns < 0.3, "{rows} {columns}");
+        assert!(along(1, 900, &|_, j| noise(j)).1 > 0.999);
+        assert_eq!(along(8, 8, &|_, _| 1.0), (0.0, 0.0));
     }
 }

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 pub(super) use cache::Pictures;
 use names::Named;
-pub(super) use names::{OfCalibration, OfJob, OfMeasurement};
+pub(super) use names::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use render::{Picture, Region, TILE};
 
 use super::app::App;

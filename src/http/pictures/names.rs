@@ -6,9 +6,11 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::render::Picture;
-use super::source::{DoneTile, Files, Stack, Unfinished};
+use super::source::{DoneTile, Files, Stack, Unfinished, sent};
+use crate::formats;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
+use crate::http::intake;
 use crate::http::jobs::with_snapshot;
 use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
 use crate::pipeline::records::TileTaskRecord;
@@ -26,6 +28,11 @@ enum JobPicture {
     /// `slice-0`: all frames at row 0.
     Slice(usize),
 }
+
+/// A picture of a file that was sent: `frame-1` and so on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+struct BlobPicture(usize);
 
 /// A picture of a measurement: `snapshot-0` and so on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -66,6 +73,14 @@ impl TryFrom<String> for JobPicture {
     }
 }
 
+impl TryFrom<String> for BlobPicture {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        numbered(&text, "frame").map(Self).ok_or_else(|| "pictures are frame-N".into())
+    }
+}
+
 impl TryFrom<String> for MeasurementPicture {
     type Error = String;
 
@@ -103,6 +118,12 @@ pub(in crate::http) struct OfJob {
 }
 
 #[derive(Debug, Deserialize)]
+pub(in crate::http) struct OfBlob {
+    sha256: Sha256,
+    picture: BlobPicture,
+}
+
+#[derive(Debug, Deserialize)]
 pub(in crate::http) struct OfMeasurement {
     measurement: MeasurementId,
     picture: MeasurementPicture,
@@ -136,6 +157,22 @@ impl Named for OfJob {
                 height.saturating_sub(1)
             ))),
         }
+    }
+}
+
+impl Named for OfBlob {
+    async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
+        let Self { sha256, picture: BlobPicture(frame) } = self;
+        app.store.upload(lab, sha256).await?;
+        let path = intake::upload(app, sha256).await?;
+        let (limits, opened) = (app.limits, path.clone());
+        let opening = move || formats::open_stack(&opened, &limits).map(|reader| *reader.info());
+        let info = tokio::task::spawn_blocking(opening).await;
+        let info = info.map_err(|error| ApiError::internal(&error))??;
+        if !(1..=info.frames).contains(&frame) {
+            return Err(outside(format!("frames are counted from 1 to {}", info.frames)));
+        }
+        Ok(sent(path, limits, &info, (sha256, frame)))
     }
 }
 

@@ -1,14 +1,16 @@
 //! Where pictures come from: prepared arrays, result files, and tiles that are done while others
 //! are not.
 
+use std::io::ErrorKind;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use ndarray::{Array2, Array3, Axis, s};
 
 use super::render::Picture;
-use crate::formats::{FormatError, Limits, npy, planar};
+use crate::formats::{self, FormatError, Limits, StackInfo, npy, planar};
+use crate::job::Sha256;
 
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
@@ -156,6 +158,42 @@ impl Stack {
             Ok(rest)
         })
     }
+}
+
+/// A frame, counted from 1, of a file as it was sent. Such files are read from their beginning, so the frame is read
+/// once and kept as long as the picture.
+pub(super) fn sent(
+    path: PathBuf,
+    limits: Limits,
+    info: &StackInfo,
+    (sha256, frame): (Sha256, usize),
+) -> Picture {
+    let kept: Mutex<Option<Array2<f32>>> = Mutex::default();
+    Picture {
+        height: info.height,
+        width: info.width,
+        identity: format!("{sha256} sent {frame}"),
+        settled: true,
+        depth: 1,
+        read: Box::new(move |rows, columns| {
+            let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+            let whole = match &mut *kept {
+                Some(whole) => whole,
+                none => none.insert(nth_frame(&path, &limits, frame)?),
+            };
+            Ok(whole.slice(s![rows, columns]).to_owned())
+        }),
+    }
+}
+
+fn nth_frame(path: &Path, limits: &Limits, frame: usize) -> Result<Array2<f32>, FormatError> {
+    let mut reader = formats::open_stack(path, limits)?;
+    let mut found = reader.next_frame()?;
+    for _ in 1..frame {
+        found = reader.next_frame()?;
+    }
+    let gone = || FormatError::io("read the frame")(ErrorKind::UnexpectedEof.into());
+    found.ok_or_else(gone)
 }
 
 fn first(window: Array3<f32>) -> Array2<f32> {

@@ -30,7 +30,7 @@ pub struct ClaimedTask {
     /// The right to it, to be shown with every message about it.
     pub lease: Lease,
     pub kind: TaskKind,
-    /// Its planned processor time in seconds; 0 for a calibration.
+    /// Its planned processor time in seconds.
     pub cost: f64,
     pub work: Work,
 }

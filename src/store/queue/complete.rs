@@ -179,5 +179,14 @@ async fn finish(
     )
     .execute(&mut *connection)
     .await?;
+    // Of tiles the processor's time is known; the others are short and run on one core.
+    sql!(
+        "INSERT INTO lab_totals (lab, cpu_seconds)
+             SELECT lab, coalesce(record ->> '$.cpu_seconds', seconds, 0.0) FROM tasks WHERE id = ?
+         ON CONFLICT (lab) DO UPDATE SET cpu_seconds = cpu_seconds + excluded.cpu_seconds",
+        [lease.task]
+    )
+    .execute(&mut *connection)
+    .await?;
     lease::end_attempt(connection, lease.task, Outcome::Done, None).await
 }

@@ -53,22 +53,24 @@ pub async fn insert(
     sums::recount(connection, job).await
 }
 
-/// Writes the task of a calibration. Its cost is not planned: nothing is forecast from it.
+/// Writes the task of a calibration, with its planned processor seconds.
 pub async fn insert_calibration(
     connection: &mut SqliteConnection,
     lab: &Lab,
     calibration: CalibrationId,
+    cost: f64,
 ) -> Result<()> {
     sql!(
         "INSERT INTO tasks (id, calibration, lab, ordinal, kind, state, priority, cost)
-         VALUES (?, ?, ?, 0, ?, ?, ?, 0)",
+         VALUES (?, ?, ?, 0, ?, ?, ?, ?)",
         [
             TaskId::new(),
             calibration,
             lab,
             TaskKind::Calibration.into_str(),
             first_state(TaskKind::Calibration),
-            CALIBRATION_PRIORITY
+            CALIBRATION_PRIORITY,
+            cost
         ]
     )
     .execute(&mut *connection)

@@ -3,6 +3,8 @@
 //! Every calibration has a row of what was asked for, captures or only a report, and a task that does
 //! it. It has one in `calibrations` from when its masks are there.
 
+use std::collections::HashMap;
+
 use serde::Serialize;
 use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
@@ -59,6 +61,14 @@ pub struct Unready {
     /// Why there will be no masks; none while they are made.
     pub error: Option<String>,
     pub created_at: Timestamp,
+}
+
+/// What of a calibration changes; its report is there when its task is done.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CalibrationMark {
+    state: TaskState,
+    fraction: f64,
+    name: Option<Label>,
 }
 
 impl Store {
@@ -151,6 +161,22 @@ impl Store {
         .fetch_all(&self.readers)
         .await?;
         Ok(Page::cut(items, limit))
+    }
+
+    /// A mark of each calibration that changes when it does, and whose they are.
+    pub async fn calibration_marks(
+        &self,
+    ) -> Result<HashMap<(Lab, CalibrationId), CalibrationMark>> {
+        let rows: Vec<(Lab, CalibrationId, TaskState, f64, Option<Label>)> = sqlx::query_as(
+            "SELECT asked.lab, calibration, state, fraction, name
+             FROM calibration_requests AS asked JOIN tasks USING (calibration)",
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        let mark = |(lab, id, state, fraction, name)| {
+            ((lab, id), CalibrationMark { state, fraction, name })
+        };
+        Ok(rows.into_iter().map(mark).collect())
     }
 
     /// Gives a calibration another name, or none.

@@ -1,7 +1,7 @@
 //! Table `jobs`. What becomes of a job is the queue's business.
 
 use sqlx::types::Json;
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::{AssertSqlSafe, FromRow, SqliteConnection};
 
 use crate::job::{
     CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, Timestamp,
@@ -52,16 +52,33 @@ impl Store {
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
-    pub async fn jobs(&self, lab: &Lab, filter: &JobFilter, limit: u32) -> Result<Page<Job>> {
-        let items = sql_as!(
+    /// A job, whosever it is.
+    pub async fn job_of_any_lab(&self, id: JobId) -> Result<Job> {
+        let job = sql_as!("SELECT * FROM jobs WHERE id = ?", [id]);
+        job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
+    }
+
+    /// The jobs of a lab, or of all labs, newest first.
+    pub async fn jobs(
+        &self,
+        lab: Option<&Lab>,
+        filter: &JobFilter,
+        limit: u32,
+    ) -> Result<Page<Job>> {
+        // Not one text for both: the index by lab would not be used.
+        let of = if lab.is_some() { "lab = ?8" } else { "?8 IS NULL" };
+        let text = format!(
             "SELECT * FROM jobs
              WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
                AND (?5 IS NULL OR label = ?5)
                AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
                AND (?9 IS NULL OR created_at >= ?9) AND (?10 IS NULL OR created_at < ?10)
-             AND lab = ?8
-             ORDER BY id DESC LIMIT ?7",
+             AND {of}
+             ORDER BY id DESC LIMIT ?7"
+        );
+        let items = sql_as!(
+            AssertSqlSafe(text),
             [
                 filter.after,
                 filter.states.as_ref().map(Json),
@@ -139,6 +156,19 @@ pub async fn set_state(
 ) -> Result<()> {
     let to = state(connection, id).await?.step(to)?;
     let now = Timestamp::now();
+    if to == JobState::Running {
+        // Before `started_at` is set: a job that is taken up again has waited once.
+        sql!(
+            "INSERT INTO lab_totals (lab, jobs_begun, wait_seconds)
+                 SELECT lab, 1, max(?1 - created_at, 0) / 1000.0 FROM jobs
+                 WHERE id = ?2 AND started_at IS NULL
+             ON CONFLICT (lab) DO UPDATE SET jobs_begun = jobs_begun + 1,
+                 wait_seconds = wait_seconds + excluded.wait_seconds",
+            [now, id]
+        )
+        .execute(&mut *connection)
+        .await?;
+    }
     sql!(
         "UPDATE jobs SET state = ?1, error = ?2,
              started_at = coalesce(started_at, ?3),

@@ -1,9 +1,12 @@
 //! Table `labs`: the share of the machine that each has, and its limits.
 
+use std::collections::HashMap;
+
 use serde::Serialize;
 use sqlx::{FromRow, SqliteConnection};
+use strum::VariantArray;
 
-use crate::job::Lab;
+use crate::job::{JobState, Lab, Timestamp};
 use crate::store::Store;
 use crate::store::error::Result;
 use crate::store::rows::{integer, sql, sql_as};
@@ -33,6 +36,21 @@ pub struct LabUse {
     pub result_bytes: u64,
     /// Jobs that wait and run.
     pub jobs: u64,
+}
+
+/// Figures of a lab for what watches the service.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabFigures {
+    pub lab: Lab,
+    pub jobs: HashMap<JobState, u64>,
+    /// Jobs that have begun, in all, and the seconds that they waited.
+    pub jobs_begun: u64,
+    pub wait_seconds: f64,
+    /// For how long its oldest job waits that has not begun; 0 if none waits.
+    pub longest_wait: f64,
+    /// Of tasks that are done, in all.
+    pub cpu_seconds: f64,
+    pub result_bytes: u64,
 }
 
 /// What a lab is to be entitled to; what is none stays as it is.
@@ -73,6 +91,61 @@ impl Store {
         Ok(rows.fetch_all(&self.readers).await?)
     }
 
+    /// Figures of all labs, by name.
+    pub async fn lab_figures(&self) -> Result<Vec<LabFigures>> {
+        let rows: Vec<(Lab, u64, f64, f64, u64, Option<Timestamp>)> = sqlx::query_as(
+            "SELECT labs.lab, coalesce(jobs_begun, 0), coalesce(wait_seconds, 0.0),
+                 coalesce(cpu_seconds, 0.0), coalesce(bytes, 0),
+                 (SELECT min(created_at) FROM jobs
+                  WHERE jobs.lab = labs.lab AND finished_at IS NULL AND started_at IS NULL)
+             FROM labs LEFT JOIN lab_totals USING (lab)
+             LEFT JOIN (SELECT jobs.lab AS lab, sum(size) AS bytes
+                        FROM result_files JOIN jobs ON jobs.id = job GROUP BY jobs.lab)
+                 USING (lab)
+             ORDER BY labs.lab",
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        let counted: Vec<(Lab, JobState, u64)> =
+            sqlx::query_as("SELECT lab, state, count(*) FROM jobs GROUP BY lab, state")
+                .fetch_all(&self.readers)
+                .await?;
+        let now = Timestamp::now();
+        let figures = rows.into_iter().map(|row| {
+            let (lab, jobs_begun, wait_seconds, cpu_seconds, result_bytes, oldest) = row;
+            let longest_wait = oldest.map_or(0.0, |oldest| now.seconds_since(oldest));
+            let mut jobs: HashMap<_, _> = JobState::VARIANTS.iter().map(|s| (*s, 0)).collect();
+            let own = counted.iter().filter(|(whose, ..)| *whose == lab);
+            jobs.extend(own.map(|(_, state, count)| (*state, *count)));
+            LabFigures {
+                lab,
+                jobs,
+                jobs_begun,
+                wait_seconds,
+                longest_wait,
+                cpu_seconds,
+                result_bytes,
+            }
+        });
+        Ok(figures.collect())
+    }
+
+    /// Whether a lab is on record: it has a token, something in the queue, or limits.
+    pub async fn knows_lab(&self, lab: &Lab) -> Result<bool> {
+        let found = sql!("SELECT 1 FROM labs WHERE lab = ?", [lab]);
+        Ok(found.fetch_optional(&self.readers).await?.is_some())
+    }
+
+    /// What a lab is entitled to.
+    pub async fn entitlement(&self, lab: &Lab) -> Result<Entitlement> {
+        let found = sql_as!("SELECT share, max_bytes, max_jobs FROM labs WHERE lab = ?", [lab]);
+        let found: Option<(f64, Option<u64>, Option<u64>)> =
+            found.fetch_optional(&self.readers).await?;
+        let (share, max_bytes, max_jobs) = found.unwrap_or((1.0, None, None));
+        let (max_bytes, max_jobs) = (Some(max_bytes), Some(max_jobs));
+        Ok(Entitlement { share: Some(share), max_bytes, max_jobs })
+    }
+
     /// Sets what a lab is entitled to. A lab that is not on record yet is put there.
     pub async fn entitle(&self, lab: &Lab, to: Entitlement) -> Result<()> {
         let mut transaction = self.write().await?;
@@ -94,6 +167,12 @@ impl Store {
         .await?;
         Ok(transaction.commit().await?)
     }
+}
+
+/// What is wrong with a share, if something is.
+pub fn share_error(share: f64) -> Option<&'static str> {
+    let fits = (0.001..=1000.0).contains(&share);
+    (!fits).then_some("a share is a number from 0.001 to 1000")
 }
 
 /// Puts a lab on record, if it is not there.

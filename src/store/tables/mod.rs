@@ -17,10 +17,10 @@ mod tokens;
 pub(super) mod workers;
 
 pub use blobs::{Blob, BlobRow, Origin};
-pub use calibrations::{Calibration, NewCalibration, Unready};
+pub use calibrations::{Calibration, CalibrationMark, NewCalibration, Unready};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
-pub use labs::{Entitlement, LabRow, LabUse};
+pub use labs::{Entitlement, LabFigures, LabRow, LabUse, share_error};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};

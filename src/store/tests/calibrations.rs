@@ -7,8 +7,8 @@ use serde_json::json;
 use super::{LEASE, Lab};
 use crate::job::{CalibrationId, Captures, TaskKind, TaskProgress, TaskState};
 use crate::store::{
-    CalibrationDone, ClaimedTask, Completion, Heartbeat, MAX_FAILURES, NewCalibration, Product,
-    StoreError, Unready, Work, WorkerEnd,
+    CalibrationDone, ClaimedTask, Completion, Heartbeat, MAX_FAILURES, NewCalibration, NewCaptures,
+    Product, StoreError, Unready, Work, WorkerEnd,
 };
 
 /// What a worker makes of masks that are there.
@@ -46,8 +46,8 @@ impl Lab {
         };
         let lab = crate::job::Lab::local();
         let name = "optics of May".parse().unwrap();
-        let captures = (&captures, 1);
-        self.store.add_captures((&lab, None), Some(&name), captures, None).await.unwrap().id()
+        let asked = NewCaptures { name: Some(&name), captures: &captures, bytes: 1, cost: 2.5 };
+        self.store.add_captures((&lab, None), asked, None).await.unwrap().id()
     }
 
     async fn unready(&self, id: CalibrationId) -> Option<Unready> {
@@ -91,6 +91,7 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     let task = lab.claim().await.unwrap();
     let Work::Calibration(calibration) = &task.work else { panic!() };
     assert_eq!((task.kind, calibration.calibration), (TaskKind::Calibration, first));
+    assert_eq!(task.cost, 2.5);
     assert_eq!(calibration.captures.as_ref().unwrap().masks.len(), 2);
     let worker = lab.store.live_workers(LEASE).await.unwrap().remove(0).task.unwrap();
     assert_eq!((worker.job, worker.calibration), (None, Some(first)));
@@ -200,7 +201,8 @@ async fn captures_that_are_gone_are_named() {
         saturation: None,
     };
     let whose = (&crate::job::Lab::local(), None);
-    let refused = lab.store.add_captures(whose, None, (&captures, 1), None).await;
+    let asked = NewCaptures { name: None, captures: &captures, bytes: 1, cost: 1.0 };
+    let refused = lab.store.add_captures(whose, asked, None).await;
     assert!(matches!(refused, Err(StoreError::NotFound { what: "blob", id })
         if id == gone.to_string()));
     assert!(lab.claim().await.is_none());

@@ -15,7 +15,7 @@ async fn a_key_makes_one_job() {
     assert!(matches!(other, Err(StoreError::KeyReused { id, .. }) if id == first.to_string()));
     assert_eq!(
         lab.store
-            .jobs(&crate::job::Lab::local(), &JobFilter::default(), 10)
+            .jobs(Some(&crate::job::Lab::local()), &JobFilter::default(), 10)
             .await
             .unwrap()
             .items
@@ -35,7 +35,7 @@ async fn pages_join_without_gaps() {
     let mut filter = JobFilter::default();
     let mut seen = Vec::new();
     loop {
-        let page = lab.store.jobs(&crate::job::Lab::local(), &filter, 2).await.unwrap();
+        let page = lab.store.jobs(Some(&crate::job::Lab::local()), &filter, 2).await.unwrap();
         seen.extend(page.items.iter().map(|job| job.id));
         filter.after = seen.last().copied();
         if !page.more {

@@ -1,0 +1,130 @@
+//! `sci-recon job`: the jobs of all labs, for those who look after the machine.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+
+use super::CliError;
+use super::wait::wait;
+use crate::cli::error::Result;
+use crate::job::{JobId, JobState, Lab, Label, priority_error};
+use crate::store::{Job, JobChanges, JobFilter, JobProgress, Purpose, Store};
+
+/// Lists the jobs of all labs, cancels them, deletes them, and changes their priority. The service may be running.
+#[derive(Debug, Args)]
+pub struct Arguments {
+    /// Folder of the service's data.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    data: PathBuf,
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// Shows jobs, newest first.
+    List {
+        /// Only those of this lab.
+        #[arg(long, value_name = "NAME")]
+        lab: Option<Lab>,
+        /// Only those in these states [default: all].
+        #[arg(long, value_name = "STATE", value_delimiter = ',')]
+        state: Vec<JobState>,
+        /// So many at most.
+        #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+        limit: u32,
+    },
+    /// Cancels a job that waits or runs.
+    Cancel {
+        /// The job's identifier.
+        job: JobId,
+    },
+    /// Takes up a job again that has failed or was cancelled.
+    Retry {
+        /// The job's identifier.
+        job: JobId,
+    },
+    /// Changes the priority of a job that waits or runs.
+    Priority {
+        /// The job's identifier.
+        job: JobId,
+        /// From -100 to 100; those of higher priority go first.
+        #[arg(value_name = "N", allow_negative_numbers = true, value_parser = priority)]
+        priority: i32,
+    },
+    /// Deletes a job that has ended, and its results.
+    Delete {
+        /// The job's identifier.
+        job: JobId,
+    },
+}
+
+fn priority(text: &str) -> Result<i32, String> {
+    let priority = text.parse().map_err(|_| format!("{text:?} is no whole number"))?;
+    priority_error(priority).map_or(Ok(priority), |error| Err(error.detail))
+}
+
+pub fn run(arguments: &Arguments) -> Result<()> {
+    wait(async {
+        let store = Store::open(&arguments.data, Purpose::Use).await?;
+        let acted = act(&store, &arguments.action).await;
+        store.close().await;
+        let text = acted?;
+        let mut stdout = std::io::stdout();
+        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
+    })
+}
+
+async fn act(store: &Store, action: &Action) -> Result<String> {
+    let id = match action {
+        Action::List { lab, state, limit } => {
+            let states = (!state.is_empty()).then(|| state.clone());
+            let filter = JobFilter { states, ..JobFilter::default() };
+            let jobs = store.jobs(lab.as_ref(), &filter, *limit).await?.items;
+            let progress = store.progress_of(&jobs).await?;
+            return Ok(table(&jobs, &progress));
+        }
+        Action::Cancel { job }
+        | Action::Retry { job }
+        | Action::Priority { job, .. }
+        | Action::Delete { job } => *job,
+    };
+    let lab = store.job_of_any_lab(id).await?.lab;
+    match action {
+        Action::Cancel { .. } => store.cancel_job(&lab, id).await?,
+        Action::Retry { .. } => store.retry_job(&lab, id).await?,
+        Action::Priority { priority, .. } => {
+            let changes = JobChanges { priority: Some(*priority), ..JobChanges::default() };
+            store.change_job(&lab, id, &changes).await?;
+        }
+        Action::Delete { .. } => {
+            store.delete_job(&lab, id).await?;
+            return Ok(format!("deleted {id} of {lab}"));
+        }
+        Action::List { .. } => {}
+    }
+    let jobs = [store.job_of_any_lab(id).await?];
+    Ok(table(&jobs, &store.progress_of(&jobs).await?))
+}
+
+fn table(jobs: &[Job], progress: &[JobProgress]) -> String {
+    let mut lines = vec![format!(
+        "{:36}  {:16}  {:10}  {:>8}  {:>5}  {:24}  {:20}  label",
+        "id", "lab", "state", "priority", "done", "made", "algorithm"
+    )];
+    for (job, progress) in jobs.iter().zip(progress) {
+        lines.push(format!(
+            "{:36}  {:16}  {:10}  {:>8}  {:>4.0}%  {:24}  {:20}  {}",
+            job.id.to_string(),
+            job.lab.as_str(),
+            job.state.into_str(),
+            job.spec.priority,
+            progress.percent,
+            job.created_at.to_string(),
+            job.spec.algorithm.into_str(),
+            job.spec.label.as_ref().map_or("", Label::as_str),
+        ));
+    }
+    lines.join("\n")
+}

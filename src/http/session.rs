@@ -1,0 +1,59 @@
+//! `/v1/session`: a browser shows its token once, and from then on a cookie that no script can read.
+
+use std::time::Duration;
+
+use axum::Json;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+
+use super::access::{SESSION, missing};
+use super::error::{ApiError, Code, Result};
+use super::extract::Caller;
+use crate::job::{Secret, Timestamp, TokenId};
+
+/// How long a session lasts, if its token lasts as long.
+const LIFE: Duration = Duration::from_secs(7 * 86_400);
+
+#[derive(Debug, Serialize)]
+pub(super) struct SessionBody {
+    token: TokenId,
+    expires_at: Timestamp,
+}
+
+pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
+    let Some(token) = access.token else {
+        let detail = "there are no tokens, so that nobody needs a session";
+        return Err(ApiError::new(Code::IllegalState, detail));
+    };
+    // A session that made others would outlive every one of them.
+    if access.session.is_some() {
+        return Err(missing());
+    }
+    let secret = Secret::random().map_err(|error| ApiError::internal(&error))?;
+    let now = Timestamp::now();
+    let end = now.after(LIFE);
+    let expires_at = access.expires_at.map_or(end, |expires| expires.min(end));
+    app.store.add_session(token, &secret, expires_at).await?;
+    let seconds = (expires_at.0 - now.0).max(0) / 1000;
+    let cookie = cookie(&headers, secret.reveal(), seconds);
+    let body = Json(SessionBody { token, expires_at });
+    Ok((StatusCode::CREATED, [(header::SET_COOKIE, cookie)], body).into_response())
+}
+
+/// Ends the session, if one was shown.
+pub(super) async fn delete(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
+    if let Some(secret) = &access.session {
+        app.store.end_session(secret).await?;
+    }
+    let cookie = cookie(&headers, "", 0);
+    Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
+}
+
+fn cookie(headers: &HeaderMap, value: &str, seconds: i64) -> String {
+    // TLS ends at a proxy; the browser says what it sees.
+    let origin = headers.get(header::ORIGIN).and_then(|origin| origin.to_str().ok());
+    let secure = origin.is_some_and(|origin| origin.starts_with("https://"));
+    let secure = if secure { "; Secure" } else { "" };
+    format!("{SESSION}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}")
+}

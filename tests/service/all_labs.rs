@@ -1,0 +1,229 @@
+//! Tokens for all labs, tokens that end, and the sessions of browsers.
+
+use std::time::Duration;
+
+use reqwest::{Method, RequestBuilder};
+use serde_json::{Value, json};
+
+use crate::app::{Answer, TestApp, id};
+use crate::samples::Scene;
+
+/// A service with a job of the lab `a`, a token of the lab `b`, and one for all labs; and the job.
+async fn three_tokens() -> (TestApp, [String; 3], String) {
+    let app = TestApp::start().await;
+    let a = app.token(&["create", "--lab", "a"]);
+    let b = app.token(&["create", "--lab", "b", "--role", "admin"]);
+    let all = app.token(&["create", "--lab", "ops", "--role", "admin", "--all-labs"]);
+    app.sign_in(&a);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let job = id(&app.post("/v1/jobs", &body).await.expect(201));
+    (app, [a, b, all], job)
+}
+
+#[tokio::test]
+async fn who_looks_after_all_labs_sees_and_helps_each_and_nobody_else_does() {
+    let (app, [a, b, all], job) = three_tokens().await;
+    app.sign_in(&all);
+    assert_eq!(app.get("/v1/jobs").await.json()["items"], json!([]), "its own lab has none");
+    let listed = app.get("/v1/jobs?lab=*").await.expect(200).json();
+    assert_eq!(listed["items"][0]["id"], job.as_str());
+    assert_eq!(listed["items"][0]["lab"], "a");
+    assert_eq!(app.get("/v1/jobs?state=queued&lab=%2A").await.json(), listed);
+    assert_eq!(app.get("/v1/jobs?lab=a&limit=5").await.json(), listed);
+    assert_eq!(app.get("/v1/jobs?lab=b").await.json()["items"], json!([]));
+    app.get("/v1/jobs?lab=nowhere").await.problem(404, "not_found");
+    app.get("/v1/blobs?lab=*").await.problem(404, "not_found");
+    assert_eq!(app.get("/v1/blobs?lab=a").await.json()["items"].as_array().unwrap().len(), 2);
+    // It helps: a priority, a cancel, a limit.
+    let place = format!("/v1/jobs/{job}");
+    app.get(&place).await.problem(404, "not_found");
+    let change = app.request(Method::PATCH, &format!("{place}?lab=a"));
+    let changed = app.send(change.json(&json!({"priority": 7}))).await.expect(200);
+    assert_eq!(changed.json()["priority"], 7);
+    app.post(&format!("{place}/cancel?lab=a"), &json!({})).await.expect(202);
+    assert_eq!(app.get(&format!("{place}?lab=a")).await.json()["state"], "cancelled");
+    let set = |body: Value| app.send(app.request(Method::PATCH, "/v1/labs/a").json(&body));
+    let lab =
+        set(json!({"share": 2.5, "bytes": 1_000_000_000, "jobs": 3})).await.expect(200).json();
+    assert_eq!(lab["share"], 2.5);
+    assert_eq!(lab["limits"], json!({"bytes": 1_000_000_000, "jobs": 3}));
+    assert!(lab["use"]["bytes"].as_u64().unwrap() > 0, "{lab}");
+    let lab = set(json!({"bytes": null})).await.expect(200).json();
+    assert_eq!(lab["limits"], json!({"bytes": null, "jobs": 3}));
+    set(json!({"share": 0})).await.problem(422, "invalid_request");
+    let names = |answer: Answer| -> Vec<String> {
+        let items = answer.json()["items"].as_array().unwrap().clone();
+        items.iter().map(|lab| lab["lab"].as_str().unwrap().to_owned()).collect()
+    };
+    assert_eq!(names(app.get("/v1/labs").await.expect(200)), ["a", "b", "ops"]);
+    app.get("/v1/labs/nowhere").await.problem(404, "not_found");
+    // The one that may only look for all labs changes nothing.
+    app.sign_in(&app.token(&["create", "--lab", "ops", "--role", "read", "--all-labs"]));
+    app.get("/v1/labs").await.expect(200);
+    set(json!({"share": 9})).await.problem(403, "forbidden");
+    app.delete(&format!("{place}?lab=a")).await.problem(403, "forbidden");
+    // For an admin of one lab there are no others, whatever is asked.
+    app.sign_in(&b);
+    for path in
+        ["/v1/jobs?lab=a", "/v1/jobs?lab=*", "/v1/jobs?lab=nowhere", "/v1/labs", "/v1/labs/a"]
+    {
+        app.get(path).await.problem(403, "forbidden");
+    }
+    assert_eq!(app.get("/v1/jobs?lab=b").await.json()["items"], json!([]));
+    app.delete(&format!("{place}?lab=a")).await.problem(403, "forbidden");
+    app.sign_in(&a);
+    assert_eq!(app.get("/v1/me").await.json()["limits"]["lab_jobs"], 3);
+}
+
+#[tokio::test]
+async fn the_command_line_sees_and_helps_all_labs() {
+    let (app, [a, ..], job) = three_tokens().await;
+    let command = |arguments: &[&str]| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        let output = command.args(arguments).env("SCI_RECON_DATA", app.data()).output().unwrap();
+        let text = [output.stdout, output.stderr].concat();
+        (output.status.code().unwrap(), String::from_utf8(text).unwrap())
+    };
+    let (code, listed) = command(&["job", "list"]);
+    assert!(code == 0 && listed.contains(&job) && listed.contains("queued"), "{listed}");
+    assert_eq!(command(&["job", "list", "--lab", "b"]).1.lines().count(), 1);
+    assert_eq!(command(&["job", "list", "--state", "running,failed"]).1.lines().count(), 1);
+    assert_eq!(command(&["job", "priority", &job, "-5"]).0, 0);
+    assert_eq!(command(&["job", "priority", &job, "500"]).0, 2);
+    app.sign_in(&a);
+    let place = format!("/v1/jobs/{job}");
+    assert_eq!(app.get(&place).await.json()["priority"], -5);
+    assert_eq!(command(&["job", "delete", &job]).0, 2, "it has not ended");
+    assert!(command(&["job", "cancel", &job]).1.contains("cancelled"));
+    assert_eq!(app.get(&place).await.json()["state"], "cancelled");
+    assert!(command(&["job", "retry", &job]).1.contains("queued"));
+    command(&["job", "cancel", &job]);
+    assert_eq!(command(&["job", "delete", &job]).0, 0);
+    app.get(&place).await.problem(404, "not_found");
+    assert_eq!(command(&["job", "cancel", &job]).0, 2);
+    let unused = app.upload(vec![7; 5000]).await;
+    let (_, uploads) = command(&["lab", "uploads", "a"]);
+    let of = |sha256: &str| uploads.lines().find(|line| line.starts_with(sha256)).unwrap();
+    assert!(of(&unused).ends_with("no"), "{uploads}");
+    assert_eq!(uploads.lines().filter(|line| line.ends_with("yes")).count(), 2, "{uploads}");
+    assert_eq!(command(&["lab", "delete-upload", "a", &unused]).0, 0);
+    app.get(&format!("/v1/blobs/{unused}")).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn a_token_ends_at_its_time_and_says_so_and_its_last_use_is_known() {
+    let app = TestApp::start().await;
+    let soon = jiff_now(3);
+    let token = app.token(&["create", "--lab", "a", "--expires", &soon]);
+    let lasting = app.token(&["create", "--lab", "a", "--expires", "90d"]);
+    app.sign_in(&token);
+    let me = app.get("/v1/me").await.expect(200).json();
+    assert_eq!(me["expires_at"].as_str().unwrap()[..19], soon[..19]);
+    let session = app.send(app.request(Method::POST, "/v1/session")).await.expect(201);
+    assert_eq!(session.json()["expires_at"], me["expires_at"], "it lasts no longer than its token");
+    let session = session.header("set-cookie").split(';').next().unwrap().to_owned();
+    let mut events = app.request(Method::GET, "/v1/events").send().await.unwrap();
+    assert_eq!(events.status(), 200);
+    let mut used = false;
+    for _ in 0..50 {
+        let listed = app.token(&["list"]);
+        used = listed.lines().nth(1).unwrap().matches("never").count() == 0;
+        if used {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    assert!(used, "the last use is not known");
+    // The stream of events ends with the token.
+    let rest = async { while events.chunk().await.unwrap().is_some() {} };
+    tokio::time::timeout(Duration::from_secs(20), rest).await.expect("the stream ends");
+    app.get("/v1/me").await.problem(401, "unauthorized");
+    app.sign_out();
+    let asked = app.request(Method::GET, "/v1/jobs").header("cookie", session);
+    app.send(asked).await.problem(401, "unauthorized");
+    app.sign_in(&lasting);
+    app.get("/v1/me").await.expect(200);
+}
+
+/// The moment in so many seconds, as text.
+fn jiff_now(seconds: i64) -> String {
+    let now = sci_recon::job::Timestamp::now();
+    sci_recon::job::Timestamp(now.0 + 1000 * seconds).to_string()
+}
+
+#[tokio::test]
+async fn a_browser_shows_its_token_once_and_pages_of_others_do_no_harm() {
+    let (app, [a, ..], job) = three_tokens().await;
+    app.sign_in(&a);
+    let begin = || app.request(Method::POST, "/v1/session");
+    let begun = app.send(begin().header("origin", "https://bench.example")).await.expect(201);
+    let cookie = begun.header("set-cookie").to_owned();
+    for part in ["; HttpOnly", "; SameSite=Strict", "; Secure", "; Path=/", "; Max-Age=60480"] {
+        assert!(cookie.contains(part), "{part}: {cookie}");
+    }
+    assert!(!app.send(begin()).await.header("set-cookie").contains("Secure"));
+    app.sign_out();
+    let session = cookie.split(';').next().unwrap().to_owned();
+    assert!(!session.contains(a.trim_start_matches("sci_")));
+    let ask = |method: Method, path: &str, lines: &[(&str, &str)]| -> RequestBuilder {
+        let request = app.request(method, path).header("cookie", &session);
+        lines.iter().fold(request, |request, (name, value)| request.header(*name, *value))
+    };
+    let jobs = app.send(ask(Method::GET, "/v1/jobs", &[])).await.expect(200);
+    assert_eq!(jobs.json()["items"][0]["id"], job.as_str());
+    let cancel = format!("/v1/jobs/{job}/cancel");
+    let own = ("x-requested-with", "page");
+    for lines in [
+        &[][..],
+        &[own, ("origin", "http://evil.example")],
+        &[own, ("sec-fetch-site", "cross-site")],
+        &[("sec-fetch-site", "same-origin")],
+    ] {
+        let refused = app.send(ask(Method::POST, &cancel, lines)).await;
+        refused.problem(403, "foreign_site");
+    }
+    app.send(ask(Method::POST, "/v1/session", &[own])).await.problem(401, "unauthorized");
+    let same = [own, ("sec-fetch-site", "same-origin")];
+    app.send(ask(Method::POST, &cancel, &same)).await.expect(202);
+    let other = app.send(app.request(Method::POST, "/v1/session").bearer_auth(&a)).await;
+    let ended = app.send(ask(Method::DELETE, "/v1/session", &same)).await.expect(204);
+    assert!(ended.header("set-cookie").contains("sci_recon_session=; "));
+    app.send(ask(Method::GET, "/v1/jobs", &[])).await.problem(401, "unauthorized");
+    // A token that is revoked takes its sessions with it.
+    let session = other.header("set-cookie").split(';').next().unwrap().to_owned();
+    let look = || app.request(Method::GET, "/v1/jobs").header("cookie", &session);
+    app.send(look()).await.expect(200);
+    let listed = app.token(&["list"]);
+    let row = listed.lines().find(|line| line.contains("submit")).unwrap();
+    app.token(&["revoke", row.split(' ').next().unwrap()]);
+    app.send(look()).await.problem(401, "unauthorized");
+}
+
+#[tokio::test]
+async fn a_service_without_tokens_needs_no_session() {
+    let app = TestApp::start().await;
+    let asked = app.send(app.request(Method::POST, "/v1/session")).await;
+    asked.problem(409, "illegal_state");
+    assert_eq!(app.get("/v1/me").await.json()["all_labs"], true);
+    app.send(app.request(Method::DELETE, "/v1/session")).await.expect(204);
+}
+
+#[tokio::test]
+async fn a_download_ends_with_its_token() {
+    let app = TestApp::start().await;
+    app.sign_in(&app.token(&["create", "--lab", "a"]));
+    // More than the buffers of a connection hold.
+    let sha256 = app.upload(vec![3; 40_000_000]).await;
+    let path = format!("/v1/blobs/{sha256}/content");
+    let mut download = app.request(Method::GET, &path).send().await.unwrap();
+    assert_eq!(download.status(), 200);
+    let mut got = download.chunk().await.unwrap().unwrap().len();
+    let listed = app.token(&["list"]);
+    app.token(&["revoke", listed.lines().nth(1).unwrap().split(' ').next().unwrap()]);
+    tokio::time::sleep(Duration::from_secs(4)).await;
+    while let Ok(Some(bytes)) = download.chunk().await {
+        got += bytes.len();
+    }
+    assert!(got < 40_000_000, "{got} bytes came");
+}

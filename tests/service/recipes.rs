@@ -1,0 +1,67 @@
+//! The recipes of the documentation do what they say, pasted one after the other into one shell.
+
+use std::path::Path;
+use std::process::Command;
+
+/// The shell's blocks of a document that can be run here, with this address and this folder instead of theirs.
+fn recipes(document: &str, port: u16, folder: &Path) -> Vec<String> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let text = std::fs::read_to_string(root.join(document)).unwrap();
+    let blocks = text.split("```sh\n").skip(1).map(|rest| rest.split("```").next().unwrap());
+    // Those of the makefile build and test all there is.
+    let blocks = blocks.filter(|block| !block.contains("make "));
+    let here = folder.to_str().unwrap();
+    let ours = blocks.map(|block| {
+        let block = block.replace("127.0.0.1:8080", &format!("127.0.0.1:{port}"));
+        // The default takes half a minute.
+        block.replace("/tmp/", &format!("{here}/")).replace("pnp-tv-fastdvdnet", "gap-tv")
+    });
+    ours.collect()
+}
+
+/// Runs all recipes of a document where they find what they need, and gives what they print.
+fn pasted(document: &str, least: usize) -> String {
+    for program in ["curl", "jq"] {
+        if Command::new(program).arg("--version").output().is_err() {
+            eprintln!("SKIPPED: there is no {program}");
+            return String::new();
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for name in ["demo", "runtime"] {
+        std::os::unix::fs::symlink(root.join(name), folder.path().join(name)).unwrap();
+    }
+    let place = folder.path().join("target/release");
+    std::fs::create_dir_all(&place).unwrap();
+    let program = env!("CARGO_BIN_EXE_sci-recon");
+    std::os::unix::fs::symlink(program, place.join("sci-recon")).unwrap();
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let recipes = recipes(document, port, folder.path());
+    assert!(recipes.len() >= least, "{recipes:#?}");
+    // Job control, as in a shell that somebody types into; whatever is left of it ends with the script.
+    let script = format!(
+        "set -e -m -o pipefail\ntrap 'kill $(jobs -p) 2> /dev/null || true; wait' EXIT\n{}",
+        recipes.join("\n")
+    );
+    let mut shell = Command::new("bash");
+    shell.args(["-c", &script]).current_dir(folder.path()).env_remove("SCI_RECON_DATA");
+    let output = shell.output().unwrap();
+    let told = String::from_utf8_lossy(&output.stdout).into_owned();
+    let log = std::fs::read_to_string(folder.path().join("serve.log")).unwrap_or_default();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{told}\n{errors}\n{log}\n{script}");
+    told
+}
+
+#[test]
+fn the_job_of_the_readme_succeeds() {
+    let told = pasted("README.md", 3);
+    assert!(told.is_empty() || told.contains("succeeded"), "{told}");
+}
+
+#[test]
+fn the_recipes_of_operations_work_in_their_order() {
+    let told = pasted("docs/operations.md", 7);
+    assert!(told.is_empty() || told.contains("succeeded"), "{told}");
+}

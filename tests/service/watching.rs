@@ -1,0 +1,137 @@
+//! What is seen of labs, calibrations and files while the service runs.
+
+use std::time::Duration;
+
+use futures_util::StreamExt;
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use crate::app::{TestApp, id};
+use crate::samples::{Scene, npy};
+
+/// The value of a figure with these labels.
+fn figure(text: &str, name: &str) -> f64 {
+    let line = text.lines().find(|line| line.split(' ').next() == Some(name));
+    let line = line.unwrap_or_else(|| panic!("no {name} in {text}"));
+    line.rsplit(' ').next().unwrap().parse().unwrap()
+}
+
+#[tokio::test]
+async fn figures_of_labs_are_for_those_who_look_after_all_of_them() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let a = app.token(&["create", "--lab", "a", "--role", "admin"]);
+    let b = app.token(&["create", "--lab", "b", "--role", "admin"]);
+    let all = app.token(&["create", "--lab", "ops", "--role", "admin", "--all-labs"]);
+    app.sign_in(&a);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
+    let read = async || String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
+    app.sign_in(&all);
+    let text = read().await;
+    assert_eq!(figure(&text, "sci_recon_lab_jobs{lab=\"a\",state=\"succeeded\"}"), 1.0);
+    assert_eq!(figure(&text, "sci_recon_lab_jobs{lab=\"b\",state=\"succeeded\"}"), 0.0);
+    assert_eq!(figure(&text, "sci_recon_lab_jobs_begun_total{lab=\"a\"}"), 1.0);
+    assert!(figure(&text, "sci_recon_lab_cpu_seconds_total{lab=\"a\"}") > 0.0);
+    assert!(figure(&text, "sci_recon_lab_wait_seconds_total{lab=\"a\"}") >= 0.0);
+    assert!(figure(&text, "sci_recon_lab_result_bytes{lab=\"a\"}") > 10_000.0);
+    assert_eq!(figure(&text, "sci_recon_lab_longest_wait_seconds{lab=\"a\"}"), 0.0);
+    let seconds = figure(&text, "sci_recon_task_seconds_total{kind=\"tile\"}");
+    assert!(seconds > 0.0 && seconds.fract() > 0.0, "{seconds} is cut to whole seconds");
+    app.sign_in(&b);
+    let text = read().await;
+    assert!(!text.contains("lab=\"a\"") && text.contains("lab=\"b\""), "{text}");
+}
+
+#[tokio::test]
+async fn listeners_hear_of_calibrations() {
+    let app = TestApp::start().await;
+    let response = app.request(Method::GET, "/v1/events").send().await.unwrap();
+    let mut stream = response.bytes_stream();
+    let mut text = String::new();
+    let mut heard = async |mark: &str| -> Value {
+        while !text.contains(mark) || !text.ends_with("\n\n") {
+            text += std::str::from_utf8(&stream.next().await.unwrap().unwrap()).unwrap();
+        }
+        let data = text.split(mark).nth(1).unwrap().to_owned();
+        text.clear();
+        serde_json::from_str(data.lines().next().unwrap_or("null")).unwrap_or(Value::Null)
+    };
+    heard("event: hello").await;
+    // The first look is what later ones are compared with.
+    tokio::time::sleep(Duration::from_millis(2500)).await;
+    let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
+    let told = heard("event: calibrations\ndata: ").await;
+    assert_eq!(told, json!({"changed": [calibration], "deleted": [], "more": false}));
+    let place = format!("/v1/calibrations/{calibration}");
+    let rename = app.request(Method::PATCH, &place).json(&json!({"name": "May"}));
+    app.send(rename).await.expect(200);
+    let told = heard("event: calibrations\ndata: ").await;
+    assert_eq!(told["changed"], json!([calibration]));
+    app.delete(&place).await.expect(204);
+    let told = heard("event: calibrations\ndata: ").await;
+    assert_eq!(told["deleted"], json!([calibration]));
+}
+
+#[tokio::test]
+async fn a_file_can_be_looked_at_before_anything_is_made_of_it() {
+    let app = TestApp::start().await;
+    let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
+    app.sign_in(&a);
+    let frame = |k: usize, at: usize| if k == 1 { at as f32 / 6000.0 } else { 0.0 };
+    let values = (0..3).flat_map(|k| (0..60 * 100).map(move |at| frame(k, at)));
+    let sha256 = app.upload(npy(&[3, 60, 100], values)).await;
+    let place = format!("/v1/blobs/{sha256}/pictures");
+    let picture = app.get(&format!("{place}/frame-2?size=64&black=0&white=1")).await.expect(200);
+    let shown = image::load_from_memory(&picture.bytes).unwrap().to_luma8();
+    assert_eq!(shown.dimensions(), (50, 30), "no side above 64");
+    assert!(shown.get_pixel(0, 0).0[0] < 5 && shown.get_pixel(49, 29).0[0] > 250);
+    let tag = picture.header("etag").to_owned();
+    let again = app.request(Method::GET, &format!("{place}/frame-2?size=64&black=0&white=1"));
+    app.send(again.header("if-none-match", tag)).await.expect(304);
+    app.get(&format!("{place}/frame-1")).await.expect(200);
+    let outside = app.get(&format!("{place}/frame-4")).await.problem(404, "not_found");
+    assert!(outside.contains("1 to 3"), "{outside}");
+    app.get(&format!("{place}/frame-0")).await.problem(404, "not_found");
+    let text = app.upload(b"no picture at all".to_vec()).await;
+    let refused = app.get(&format!("/v1/blobs/{text}/pictures/frame-1")).await;
+    refused.problem(422, "invalid_content");
+    app.sign_in(&b);
+    app.get(&format!("{place}/frame-2")).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn a_check_that_takes_too_long_ends_and_the_lab_goes_on() {
+    let app = TestApp::with(&["--workers", "0", "--check-seconds", "0.000001"]).await;
+    let masks = app.upload(Scene::SMALL.masks()).await;
+    for _ in 0..3 {
+        let late = app.post("/v1/calibrations", &json!({"masks": masks})).await;
+        let detail = late.problem(503, "timed_out");
+        assert!(detail.contains("--check-seconds"), "{detail}");
+    }
+    let app = app.again(&["--workers", "0"]).await;
+    app.post("/v1/calibrations", &json!({"masks": masks})).await.expect(201);
+}
+
+#[tokio::test]
+async fn masks_that_code_one_direction_alone_are_not_good() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let noise = |k: usize, i: usize| ((k * 7919 + i * 104_729 + i * i * 31) % 97) as f32 / 96.0;
+    let values = (0..8).flat_map(|k| (0..64 * 80).map(move |at| noise(k, at / 80)));
+    let calibration = id(&app.calibrate(npy(&[8, 64, 80], values)).await.expect(201));
+    let place = format!("/v1/calibrations/{calibration}/report.json");
+    let mut report = app.get(&place).await;
+    for _ in 0..200 {
+        if report.status == 200 {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        report = app.get(&place).await;
+    }
+    let report = report.expect(200).json();
+    assert_ne!(report["grade"], "good");
+    let findings = report["findings"].as_array().unwrap();
+    let found = findings.iter().find(|finding| finding["code"] == "one_dimensional");
+    let detail = found.unwrap_or_else(|| panic!("{report:#}"))["detail"].as_str().unwrap();
+    assert!(detail.contains("between rows"), "{detail}");
+}
