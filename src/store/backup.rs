@@ -22,8 +22,6 @@ use crate::job::{PartialId, Sha256};
 /// So often the database is written out, at most: what is made and deleted within the moment that one
 /// writing takes makes another one necessary.
 const ROUNDS: u32 = 50;
-/// What stands in the place of the marker until a copy is whole: no service starts with it.
-const UNFINISHED: &str = "a copy that is not finished";
 
 #[derive(Debug, Default)]
 pub struct Backup {
@@ -184,7 +182,7 @@ struct Draft {
 impl Draft {
     fn new(to: &Path) -> Result<Self> {
         let mut name = to.file_name().unwrap_or_default().to_owned();
-        name.push(".unfinished");
+        name.push(identity::UNFINISHED_NAME);
         let path = to.with_file_name(name);
         let marker = path.join("sci-recon.json");
         if let Ok(lock) = File::open(&path) {
@@ -202,7 +200,7 @@ impl Draft {
         fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
         let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
         lock.lock().map_err(StoreError::io("lock", &path))?;
-        fs::write(&marker, UNFINISHED).map_err(StoreError::io("write", &marker))?;
+        fs::write(&marker, identity::UNFINISHED).map_err(StoreError::io("write", &marker))?;
         dir::restrict(&path)?;
         let folder = DataDir::find(&path)?;
         folder.fill()?;
@@ -227,14 +225,15 @@ impl Draft {
     }
 }
 
-/// Whether a folder is a copy that was broken off, perhaps before its mark was written.
+/// Whether a folder of such a name is a copy that was broken off, perhaps before its mark was written, or just
+/// before it got its own name.
 fn is_draft(folder: &Path, marker: &Path) -> Result<bool> {
     let mark = fs::read(marker).unwrap_or_default();
-    if mark == UNFINISHED.as_bytes() {
+    if mark == identity::UNFINISHED.as_bytes() || identity::is_marker(&mark) {
         return Ok(true);
     }
     let alone = dir::children(folder)?.iter().all(|path| path == marker);
-    Ok(alone && UNFINISHED.as_bytes().starts_with(&mark))
+    Ok(alone && identity::UNFINISHED.as_bytes().starts_with(&mark))
 }
 
 /// Gives every file below a folder a second name below another one. What goes meanwhile is let go.

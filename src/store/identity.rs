@@ -8,6 +8,7 @@
 
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
+use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 use std::time::Duration;
 
@@ -244,10 +245,30 @@ pub(super) fn write(folder: &Path, draft: &Path, marker: &Marker) -> Result<()> 
     dir::rename_durably(draft, &folder.join("sci-recon.json"))
 }
 
+/// What stands in the place of the marker until a copy is whole: no service starts with it, whatever it accepts.
+pub(super) const UNFINISHED: &str = "a copy that is not finished";
+/// What the name of its folder ends with until then. It has the marker a moment before its own name.
+pub(super) const UNFINISHED_NAME: &str = ".unfinished";
+
+fn is_unfinished(folder: &Path) -> bool {
+    folder.file_name().is_some_and(|name| name.as_bytes().ends_with(UNFINISHED_NAME.as_bytes()))
+}
+
+pub(super) fn is_marker(bytes: &[u8]) -> bool {
+    serde_json::from_slice::<Marker>(bytes).is_ok()
+}
+
 fn read(dir: &DataDir) -> Result<Option<Result<Marker, String>>> {
     let path = dir.root().join("sci-recon.json");
     match fs::read(&path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Ok(bytes) if bytes == UNFINISHED.as_bytes() || is_unfinished(dir.root()) => {
+            Err(StoreError::Refused {
+                folder: dir.root().to_owned(),
+                found: "this is a copy that was not finished".into(),
+                remedy: "make it again, or serve another one",
+            })
+        }
         bytes => {
             let bytes = bytes.map_err(StoreError::io("read", &path))?;
             Ok(Some(serde_json::from_slice(&bytes).map_err(|error| error.to_string())))

@@ -64,7 +64,7 @@ export async function job(root, [id], signal) {
     shown = now;
   };
   const results = async (now) => {
-    const written = await showFiles(files, id, snapshot.value(), signal);
+    const written = await showFiles(files, now, snapshot.value(), signal);
     viewer.stand(now, written);
     await Promise.all([verdict.show(now, written, snapshot.value()), made.show(now, snapshot.value())]);
   };
@@ -119,14 +119,19 @@ const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "manifest
 
 const ORDER = Object.keys(NAMES);
 
-/** Shows the files of a snapshot; true if they are written. */
-async function showFiles(element, id, snapshot, signal) {
+/** Shows the files of a snapshot, and all of the job's once it has ended well; true if they are written. */
+async function showFiles(element, { id, state }, snapshot, signal) {
   const { ready, files } = await get(`/v1/jobs/${id}/snapshots/${snapshot}`, signal);
   const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
   const whole = files.filter((file) => !file.name.includes("/")).sort((one, other) => ORDER.indexOf(one.name) - ORDER.indexOf(other.name));
   const single = files.filter((file) => file.name.includes("/"));
   element.hidden = !ready;
+  // Made as they are read: their sizes are not known beforehand.
+  const made = (href, text) => h("a", { class: "button small", href, download: true }, text);
+  const stack = whole.find((file) => file.name === "stack.exr")?.href;
   put(element, h("b", null, "Download"), whole.map((file) => link(file, file.name === "stack.exr")),
+    stack && made(stack.replace(/exr$/, "tif"), "TIFF stack"),
+    stack && state === "succeeded" && made(stack.replace(/snapshots\/.*/, "results.zip"), "All as ZIP"),
     h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;
 }
