@@ -152,7 +152,10 @@ export async function view(page, checks, frames) {
     await checks.look(page, `job-${mode}`);
   }
   await page.selectOption("#mode", "frame");
-  checks.that((await page.$$eval(".downloads a[download]", (links) => links.length)) === 2 * frames + 3, "all files can be downloaded");
+  // EXR and PNG of each frame; stack, array, manifest, TIFF and ZIP.
+  const status = (links) => Promise.all(links.map((link) => fetch(link.href, { method: "HEAD" }).then((answer) => answer.status)));
+  const answers = await page.$$eval(".downloads a[download]", status);
+  checks.that(answers.length === 2 * frames + 5 && answers.every((code) => code === 200), "all files can be downloaded");
   const line = await page.textContent("pre.line");
   checks.that(line.startsWith("curl -sS http") && line.includes("admm-tv"), "the line repeats the job");
   await page.uncheck("#loop");
