@@ -1,17 +1,26 @@
 //! Whether anything in the database has changed, without asking it.
 
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures_util::{FutureExt, StreamExt};
 use inotify::{EventStream, Inotify, WatchMask};
 
 use super::Store;
 
+/// A commit is written, synced, and only then seen by others, of which the kernel tells nothing: for `ECHO`
+/// after a write a look every `LOOK` finds it.
+const ECHO: Duration = Duration::from_millis(60);
+const LOOK: Duration = Duration::from_millis(6);
+
 /// Sees when any process writes to the database: each commit goes through a file beside it, of which the
 /// kernel tells.
 #[derive(Debug)]
-pub struct Watcher(EventStream<Vec<u8>>);
+pub struct Watcher {
+    events: EventStream<Vec<u8>>,
+    /// When the last write was seen.
+    written: Option<Instant>,
+}
 
 impl Store {
     /// A watcher of this store.
@@ -22,21 +31,24 @@ impl Store {
         let inotify = Inotify::init()?;
         // The folder, since SQLite makes and removes its files. Blobs and results are in folders of their own.
         inotify.watches().add(self.dir.root(), WatchMask::MODIFY)?;
-        Ok(Watcher(inotify.into_event_stream(vec![0; 4096])?))
+        Ok(Watcher { events: inotify.into_event_stream(vec![0; 4096])?, written: None })
     }
 }
 
 impl Watcher {
-    /// Waits for a change since the last call, at most for `time`.
+    /// Waits until there may be a change since the last call, at most for `time`.
     ///
     /// # Errors
     /// If the kernel's queue can't be read.
     pub async fn changed(&mut self, time: Duration) -> io::Result<()> {
-        let mut event = tokio::time::timeout(time, self.0.next()).await.ok().flatten();
+        let echo = self.written.is_some_and(|written| written.elapsed() < ECHO);
+        let time = if echo { time.min(LOOK) } else { time };
+        let mut event = tokio::time::timeout(time, self.events.next()).await.ok().flatten();
         while let Some(seen) = event {
             seen?;
+            self.written = Some(Instant::now());
             // All that have come meanwhile are one.
-            event = self.0.next().now_or_never().flatten();
+            event = self.events.next().now_or_never().flatten();
         }
         Ok(())
     }
