@@ -1,15 +1,13 @@
 //! `sci-recon job`: the jobs of all labs, for those who look after the machine.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
-use super::CliError;
-use super::wait::wait;
+use super::wait::print_of_store;
 use crate::cli::error::Result;
 use crate::job::{JobId, JobState, Lab, Label, priority_error};
-use crate::store::{Job, JobChanges, JobFilter, JobProgress, Purpose, Store};
+use crate::store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
 
 /// Lists the jobs of all labs, cancels them, deletes them, and changes their priority. The service may be running.
 #[derive(Debug, Args)]
@@ -66,44 +64,37 @@ fn priority(text: &str) -> Result<i32, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    wait(async {
-        let store = Store::open(&arguments.data, Purpose::Use).await?;
-        let acted = act(&store, &arguments.action).await;
-        store.close().await;
-        let text = acted?;
-        let mut stdout = std::io::stdout();
-        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
-    })
+    print_of_store(&arguments.data, async |store| act(store, &arguments.action).await)
 }
 
 async fn act(store: &Store, action: &Action) -> Result<String> {
-    let id = match action {
-        Action::List { lab, state, limit } => {
+    let of = async |id| Ok::<_, StoreError>(store.job_of_any_lab(id).await?.lab);
+    let id = match *action {
+        Action::List { ref lab, ref state, limit } => {
             let states = (!state.is_empty()).then(|| state.clone());
             let filter = JobFilter { states, ..JobFilter::default() };
-            let jobs = store.jobs(lab.as_ref(), &filter, *limit).await?.items;
-            let progress = store.progress_of(&jobs).await?;
-            return Ok(table(&jobs, &progress));
+            let jobs = store.jobs(lab.as_ref(), &filter, limit).await?.items;
+            return Ok(table(&jobs, &store.progress_of(&jobs).await?));
         }
-        Action::Cancel { job }
-        | Action::Retry { job }
-        | Action::Priority { job, .. }
-        | Action::Delete { job } => *job,
+        Action::Delete { job } => {
+            let lab = of(job).await?;
+            store.delete_job(&lab, job).await?;
+            return Ok(format!("deleted {job} of {lab}"));
+        }
+        Action::Cancel { job } => {
+            store.cancel_job(&of(job).await?, job).await?;
+            job
+        }
+        Action::Retry { job } => {
+            store.retry_job(&of(job).await?, job).await?;
+            job
+        }
+        Action::Priority { job, priority } => {
+            let changes = JobChanges { priority: Some(priority), ..JobChanges::default() };
+            store.change_job(&of(job).await?, job, &changes).await?;
+            job
+        }
     };
-    let lab = store.job_of_any_lab(id).await?.lab;
-    match action {
-        Action::Cancel { .. } => store.cancel_job(&lab, id).await?,
-        Action::Retry { .. } => store.retry_job(&lab, id).await?,
-        Action::Priority { priority, .. } => {
-            let changes = JobChanges { priority: Some(*priority), ..JobChanges::default() };
-            store.change_job(&lab, id, &changes).await?;
-        }
-        Action::Delete { .. } => {
-            store.delete_job(&lab, id).await?;
-            return Ok(format!("deleted {id} of {lab}"));
-        }
-        Action::List { .. } => {}
-    }
     let jobs = [store.job_of_any_lab(id).await?];
     Ok(table(&jobs, &store.progress_of(&jobs).await?))
 }

@@ -1,15 +1,13 @@
 //! `sci-recon lab`: the labs that a service has, their shares of the machine, their limits, and their files.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
-use super::CliError;
-use super::wait::wait;
+use super::wait::print_of_store;
 use crate::cli::error::Result;
 use crate::job::{Lab, Sha256};
-use crate::store::{Blob, BlobRow, Entitlement, LabRow, Purpose, Store, share_error};
+use crate::store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 
 /// Lists labs and their files, and sets their shares of the machine and their limits. The service may be running.
 ///
@@ -74,14 +72,7 @@ fn share(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    wait(async {
-        let store = Store::open(&arguments.data, Purpose::Use).await?;
-        let acted = act(&store, &arguments.action).await;
-        store.close().await;
-        let text = acted?;
-        let mut stdout = std::io::stdout();
-        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
-    })
+    print_of_store(&arguments.data, async |store| act(store, &arguments.action).await)
 }
 
 async fn act(store: &Store, action: &Action) -> Result<String> {

@@ -1,10 +1,28 @@
 //! Commands that wait for asynchronous work, without a pool of threads.
 
+use std::io::Write;
+use std::path::Path;
+
 use super::CliError;
+use crate::store::{Purpose, Store};
 
 /// Runs `work` to its end on this thread.
 pub fn wait<T, E: Into<CliError>>(work: impl Future<Output = Result<T, E>>) -> Result<T, CliError> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
     runtime.block_on(work).map_err(Into::into)
+}
+
+/// Prints what `act` answers of the store in `data`.
+pub fn print_of_store(
+    data: &Path,
+    act: impl AsyncFnOnce(&Store) -> Result<String, CliError>,
+) -> Result<(), CliError> {
+    wait(async {
+        let store = Store::open(data, Purpose::Use).await?;
+        let acted = act(&store).await;
+        store.close().await;
+        let text = acted?;
+        writeln!(std::io::stdout(), "{text}").map_err(|error| CliError::Failure(error.to_string()))
+    })
 }

@@ -67,8 +67,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
         let ledger = Ledger::open(ledger::place(&folder))?;
-        let masks = arguments.submission.masks().map(Path::canonicalize).transpose();
-        let masks = masks.map_err(|error| CliError::file("read", &folder, &error))?;
+        let masks = arguments.submission.masks().map(|masks| {
+            masks.canonicalize().map_err(|error| CliError::file("read", masks, &error))
+        });
+        let masks = masks.transpose()?;
         let mut watch =
             Watch { arguments, client, folder, masks, settle, ledger, seen: HashMap::new() };
         watch.run().await
