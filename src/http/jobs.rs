@@ -10,15 +10,16 @@ use serde::{Deserialize, Serialize};
 use serde_with::DeserializeFromStr;
 use strum::VariantArray;
 
+use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, idempotency_key};
 use super::page::{Limit, PageBody};
 use crate::job::{
-    Algorithm, CalibrationId, Finding, JobId, JobRequest, JobSpec, JobState, Lab, Label,
-    MeasurementId, ModelId, RunSpec, SceneShape, Schedule, Sequence, Sha256, SnapshotRange,
-    TileSpec, Timestamp, priority_error,
+    Algorithm, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec, JobState, Lab,
+    Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule, Sequence, Sha256,
+    SnapshotRange, TileSpec, Timestamp, priority_error,
 };
 use crate::store::{
     Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob, Page, Span, StoreError,
@@ -180,7 +181,7 @@ pub(super) async fn create(
     Body(request): Body<JobRequest>,
 ) -> Result<Response> {
     let key = idempotency_key(&headers)?;
-    let (status, body) = make(&app, &access.lab, request, key).await?;
+    let (status, body) = make(&app, &access, request, key).await?;
     let location = [(header::LOCATION, body.place())];
     Ok((status, location, Json(body)).into_response())
 }
@@ -188,38 +189,41 @@ pub(super) async fn create(
 /// Makes a job, or finds the one that was made with the same key.
 pub(super) async fn make(
     app: &App,
-    lab: &Lab,
+    access: &Access,
     request: JobRequest,
     idempotency_key: Option<String>,
 ) -> Result<(StatusCode, JobBody)> {
     // Hashed as it was understood, so that white space and the order of fields do not matter.
     let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
-    let inserted = insert(app, lab.clone(), request, Sha256::of(&text), idempotency_key);
+    let inserted = insert(app, access, request, Sha256::of(&text), idempotency_key);
     let (status, id) = created(inserted.await?);
-    Ok((status, body(app, lab, id).await?))
+    Ok((status, body(app, &access.lab, id).await?))
 }
 
 /// Accepts a job, unless it was accepted before, if there is room for it.
 async fn insert(
     app: &App,
-    lab: Lab,
+    access: &Access,
     request: JobRequest,
     hash: Sha256,
     idempotency_key: Option<String>,
 ) -> Result<Inserted> {
     if let Some(key) = &idempotency_key
-        && let Some(job) = app.store.job_with_key(&lab, key, hash).await?
+        && let Some(job) = app.store.job_with_key(&access.lab, key, hash).await?
     {
         return Ok(Inserted::Before(job));
     }
-    let spec = resolve(app, &lab, request).await?;
+    let spec = resolve(app, access, request).await?;
+    let lab = access.lab.clone();
     let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
     let new = NewJob { most_jobs, lab, spec, request: hash, idempotency_key };
     app.admission.with_room("the job", needed, app.store.add_job(new)).await
 }
 
 /// Checks a request against the measurement that it names.
-async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec> {
+async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobSpec> {
+    let lab = &access.lab;
+    let beyond_role = role_error(access, request.priority);
     let measurement = app.store.measurement(lab, request.measurement).await;
     let measurement =
         measurement.map_err(|error| ApiError::reference("/measurement", error))?.facts;
@@ -239,6 +243,7 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec> {
         }
     };
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
+    let resolved = beyond_role.map_or(resolved, |error| Err(vec![error]));
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
     // If the report is not made yet, its end adds the warning.
@@ -247,6 +252,18 @@ async fn resolve(app: &App, lab: &Lab, request: JobRequest) -> Result<JobSpec> {
     check_memory(app, &spec)?;
     check_networks(app, &spec)?;
     Ok(spec)
+}
+
+/// What is wrong with a priority that would put a lab's job before those of all others.
+fn role_error(access: &Access, priority: i32) -> Option<InvalidField> {
+    let role = access.role;
+    (priority > 0 && role < Role::Admin).then(|| {
+        let detail = format!(
+            "priority is {priority}; with a token of role {role} it must be from -100 to 0: only an \
+             admin puts a job before those of other labs"
+        );
+        InvalidField::new("/priority", detail)
+    })
 }
 
 /// The warnings about the snapshots of a job.
@@ -336,7 +353,8 @@ pub(super) async fn change(
     Body(changes): Body<Changes>,
 ) -> Result<Json<JobBody>> {
     let Changes { label, priority } = changes;
-    if let Some(error) = priority.and_then(priority_error) {
+    let wrong = priority.and_then(|to| priority_error(to).or_else(|| role_error(&access, to)));
+    if let Some(error) = wrong {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
     app.store.change_job(&access.lab, id, &JobChanges { label, priority }).await?;
@@ -348,7 +366,7 @@ pub(super) async fn estimate(
     Caller(app, access): Caller,
     Body(request): Body<JobRequest>,
 ) -> Result<Json<EstimateBody>> {
-    let spec = resolve(&app, &access.lab, request).await?;
+    let spec = resolve(&app, &access, request).await?;
     let tasks = spec.tasks().map_err(|error| ApiError::internal(&error))?;
     let tiles = tasks.iter().filter(|(kind, _)| kind.tile().is_some()).count() as u64;
     Ok(Json(EstimateBody {

@@ -71,7 +71,7 @@ pub(super) async fn create(
         priority: 0,
         label: request.label,
     };
-    let (status, job) = jobs::make(&app, &access.lab, job, key).await?;
+    let (status, job) = jobs::make(&app, &access, job, key).await?;
     let location = [(header::LOCATION, job.place())];
     Ok((status, location, Json(SampleBody { masks, data, truth, job })).into_response())
 }

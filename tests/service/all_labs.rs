@@ -22,6 +22,29 @@ async fn three_tokens() -> (TestApp, [String; 3], String) {
 }
 
 #[tokio::test]
+async fn no_lab_puts_its_job_before_those_of_others_unless_its_role_allows() {
+    let (app, [a, _, all], job) = three_tokens().await;
+    app.sign_in(&a);
+    let place = format!("/v1/jobs/{job}");
+    let measurement = app.get(&place).await.json()["measurement"].clone();
+    let with = |priority: i32| json!({"measurement": measurement, "algorithm": "gap-tv", "priority": priority});
+    for priority in [1, 100] {
+        for refused in [
+            app.post("/v1/jobs", &with(priority)).await,
+            app.post("/v1/jobs/estimate", &with(priority)).await,
+            app.send(app.request(Method::PATCH, &place).json(&json!({"priority": priority}))).await,
+        ] {
+            let detail = refused.problem(422, "invalid_request");
+            assert!(detail.contains("-100 to 0"), "{detail}");
+            assert_eq!(refused.json()["pointer"], "/priority");
+        }
+    }
+    app.post("/v1/jobs", &with(-3)).await.expect(201);
+    app.sign_in(&all);
+    app.post("/v1/jobs/estimate?lab=a", &with(100)).await.expect(200);
+}
+
+#[tokio::test]
 async fn who_looks_after_all_labs_sees_and_helps_each_and_nobody_else_does() {
     let (app, [a, b, all], job) = three_tokens().await;
     app.sign_in(&all);

@@ -51,6 +51,8 @@ pub struct Core {
     windows: Mutex<HashMap<(Sha256, Tile), Input>>,
     /// Tiles that wait though workers of their pool wait, too; see `sweep.rs`.
     pub undelivered: Mutex<HashMap<TaskId, Undelivered>>,
+    /// Messages of no tile that is out, by the last sweep.
+    pub strays: Mutex<HashSet<i64>>,
     /// The snapshots' window of a tile that is out, which no other tile needs.
     snapshots: Mutex<HashMap<TaskId, (Pool, Sha256)>>,
 }
@@ -71,6 +73,7 @@ impl Core {
             put: Mutex::default(),
             windows: Mutex::default(),
             undelivered: Mutex::default(),
+            strays: Mutex::default(),
             snapshots: Mutex::default(),
         }
     }

@@ -111,6 +111,7 @@ impl Core {
             }
         }
         self.deliver(&out).await?;
+        self.drop_strays(messages).await?;
         // 4. When nothing is out, nothing needs the files.
         if out.is_empty() && lock(&self.sending).is_empty() {
             self.empty_files().await?;
@@ -156,6 +157,28 @@ impl Core {
             tracing::warn!(%pool, "messages are not delivered: their consumer is made anew");
             self.connection.drop_consumer(names::TASKS, pool.as_str()).await;
             self.connection.make_pool(&pool, self.ack_wait).await?;
+        }
+        Ok(())
+    }
+
+    /// Removes messages that belong to no tile that is out, in this sweep as in the one before. A message
+    /// server that was killed may have messages again that it had removed, and its consumer, which knows
+    /// that they were acknowledged, never delivers them.
+    async fn drop_strays(&self, mut messages: HashSet<i64>) -> Result<(), StoreError> {
+        // What is on its way has no place yet; looked at first, because it has one when it has arrived.
+        let on_their_way = !lock(&self.sending).is_empty();
+        for remote in self.store.remote_tasks().await? {
+            if let Some(place) = &remote.place {
+                messages.remove(&place.seq);
+            }
+        }
+        if on_their_way {
+            messages.clear();
+        }
+        let before = std::mem::replace(&mut *lock(&self.strays), messages.clone());
+        for seq in messages.intersection(&before) {
+            tracing::warn!(seq, "a message of no tile that is out is removed");
+            self.connection.drop_task(*seq).await;
         }
         Ok(())
     }

@@ -227,7 +227,7 @@ function fits(item) {
 function jobStep(algorithms, form, signal) {
   const select = h("select", { id: "algorithm" }, algorithms.map((item) => h("option", { value: item.name, selected: item.name === "pnp-tv-fastdvdnet" }, item.name)));
   const label = textField("label", "Name of the job", "drop of milk, first try");
-  const priority = numberField("priority", "Priority (−100 to 100)", 1);
+  const priority = numberField("priority", "Priority (−100 to 0; admins up to 100)", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
   const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value() }) });

@@ -40,6 +40,21 @@ async fn what_the_message_server_loses_is_handed_out_again() {
 }
 
 #[tokio::test]
+async fn messages_of_no_tile_are_removed() {
+    let Some(nats) = Nats::start(1) else { return };
+    let _app = served(&nats, "2").await;
+    let context = async_nats::jetstream::new(nats.client().await);
+    until("a message is taken by the stream of tiles", async || {
+        let Ok(sent) = context.publish("sci.v1.task.test", "of no tile".into()).await else {
+            return false;
+        };
+        sent.await.is_ok()
+    })
+    .await;
+    nats.emptied().await;
+}
+
+#[tokio::test]
 async fn a_worker_without_a_message_server_ends_when_it_is_told_to() {
     let Some(mut nats) = Nats::start(1) else { return };
     let app = served(&nats, "5").await;

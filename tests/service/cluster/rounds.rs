@@ -283,12 +283,18 @@ async fn local(plan: &Plan) -> BTreeMap<String, String> {
     frames(&app, &job).await
 }
 
-/// Tiles that were not accepted once, by the records.
-async fn not_once(data: &Path, job: &str) -> i64 {
-    use sqlx::{Connection, Row};
+/// The service's records, to read.
+pub async fn database(data: &Path) -> sqlx::SqliteConnection {
+    use sqlx::Connection;
     let path = data.join("sci-recon.db");
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(path).read_only(true);
-    let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    sqlx::SqliteConnection::connect_with(&options).await.unwrap()
+}
+
+/// Tiles that were not accepted once, by the records.
+async fn not_once(data: &Path, job: &str) -> i64 {
+    use sqlx::Row;
+    let mut connection = database(data).await;
     let row = sqlx::query(
         "SELECT count(*) AS n FROM tasks WHERE job = ? AND kind = 'tile' AND
              (SELECT count(*) FROM attempts WHERE task = id AND outcome = 'done') <> 1",
