@@ -115,6 +115,23 @@ impl Core {
         // 4. When nothing is out, nothing needs the files.
         if out.is_empty() && lock(&self.sending).is_empty() {
             self.empty_files().await?;
+            self.empty_events(reported).await?;
+        }
+        Ok(())
+    }
+
+    /// Removes events up to this one when nothing is out and no more of them are to come: those that a killed
+    /// message server has again.
+    async fn empty_events(&self, last: u64) -> Result<(), ClusterError> {
+        let stream = self.connection.context.get_stream(names::EVENTS).await;
+        let stream = stream.map_err(ClusterError::nats("find the stream of events"))?;
+        let there = stream.cached_info().state.messages;
+        if there > 0 && self.is_dealt_with(last).await? {
+            let purged = stream.purge().sequence(last + 1).await;
+            let purged = purged.map_err(ClusterError::nats("empty the stream of events"))?.purged;
+            if purged > 0 {
+                tracing::warn!(purged, "events that were dealt with are removed");
+            }
         }
         Ok(())
     }

@@ -353,7 +353,9 @@ impl Nats {
             if messages.iter().all(|(_, count)| *count == 0) {
                 return;
             }
-            assert!(start.elapsed() < Duration::from_secs(75), "streams keep {messages:?}");
+            if start.elapsed() > Duration::from_secs(75) {
+                panic!("streams keep {messages:?}\n{}", self.state().await);
+            }
             tokio::time::sleep(Duration::from_millis(300)).await;
         }
     }
