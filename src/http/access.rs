@@ -24,9 +24,6 @@ use crate::store::{Store, Token};
 
 /// The cookie of a session, which `POST /v1/session` sets.
 pub(super) const SESSION: &str = "sci_recon_session";
-/// A page that can't set headers of its requests (for pictures and events, say) keeps the token in
-/// this cookie. It opens only what changes nothing, so that no foreign page can use it to do harm.
-const COOKIE: &str = "sci_recon_token";
 /// What changes something by a session has this header: a page of another site can't set it.
 const CHANGES: &str = "x-requested-with";
 
@@ -149,7 +146,7 @@ async fn admit(
     request: &mut Request,
 ) -> Result<Access> {
     let (method, headers) = (request.method(), request.headers());
-    let found = match credential(method, headers) {
+    let found = match credential(headers) {
         Some(Credential::Token(secret)) => store.token(&secret).await?.map(|token| (token, None)),
         Some(Credential::Session(secret)) => {
             let token = store.token_of_session(&secret).await?;
@@ -320,16 +317,12 @@ enum Credential {
     Session(Secret),
 }
 
-fn credential(method: &Method, headers: &HeaderMap) -> Option<Credential> {
+fn credential(headers: &HeaderMap) -> Option<Credential> {
     if let Some(bearer) = headers.typed_try_get::<Authorization<Bearer>>().transpose() {
         return Secret::parse(bearer.ok()?.token().trim()).map(Credential::Token);
     }
     let cookies = headers.typed_get::<Cookie>()?;
-    if let Some(session) = cookies.get(SESSION) {
-        return Secret::parse(session).map(Credential::Session);
-    }
-    let token = cookies.get(COOKIE).filter(|_| method.is_safe())?;
-    Secret::parse(token).map(Credential::Token)
+    Secret::parse(cookies.get(SESSION)?).map(Credential::Session)
 }
 
 /// The same for a token that is missing, unknown, misspelled or revoked.
@@ -382,24 +375,17 @@ mod tests {
     }
 
     #[test]
-    fn a_token_comes_as_a_header_or_for_looking_as_a_cookie() {
+    fn a_token_comes_as_a_header_and_a_session_as_a_cookie() {
         let [token, session] = [Secret::random().unwrap(), Secret::random().unwrap()];
         let text = token.reveal();
-        let shown = |method, headers: &HeaderMap| credential(&method, headers);
         let bearer = headers("authorization", &format!("bearer {text}"));
-        assert_eq!(shown(Method::DELETE, &bearer), Some(Credential::Token(token.clone())));
-        let cookie = headers("cookie", &format!("a=b; sci_recon_token={text}; c=d"));
-        assert_eq!(shown(Method::GET, &cookie), Some(Credential::Token(token.clone())));
-        assert_eq!(shown(Method::POST, &cookie), None);
-        let both = format!("sci_recon_token={text}; {SESSION}={}", session.reveal());
-        let mut both = headers("cookie", &both);
-        for method in [Method::GET, Method::POST] {
-            assert_eq!(shown(method, &both), Some(Credential::Session(session.clone())));
-        }
+        assert_eq!(credential(&bearer), Some(Credential::Token(token.clone())));
+        let mut both = headers("cookie", &format!("a=b; {SESSION}={}; c=d", session.reveal()));
+        assert_eq!(credential(&both), Some(Credential::Session(session)));
         both.extend(bearer);
-        assert_eq!(shown(Method::POST, &both), Some(Credential::Token(token.clone())));
+        assert_eq!(credential(&both), Some(Credential::Token(token.clone())));
         for bad in [format!("Basic {text}"), text.to_owned(), "Bearer".into(), "Bearer x".into()] {
-            assert_eq!(shown(Method::GET, &headers("authorization", &bad)), None, "{bad}");
+            assert_eq!(credential(&headers("authorization", &bad)), None, "{bad}");
         }
     }
 

@@ -1,19 +1,44 @@
 // The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
 
 import { place } from "./dom.js";
-import { authorization } from "./token.js";
 
-/** As `fetch`, with the token that is kept. Who is not let in is told by the event `signed-out`. */
+// A session is a cookie that no script can read. What changes something by it shows this header, which no
+// page of another site can send.
+const OWN = { "X-Requested-With": "sci-recon" };
+let session = 0;
+
+/** As `fetch`. Who is not let in is told by the event `signed-out`. */
 export async function ask(path, options = {}) {
-  const token = authorization();
-  const response = await fetch(place(path), { ...options, headers: { ...options.headers, ...token } });
-  if (response.status === 401) signedOut(token);
+  const during = session;
+  const response = await fetch(place(path), { ...options, headers: { ...OWN, ...options.headers } });
+  if (response.status === 401) signedOut(during);
   return response;
 }
 
-/** An answer to a token that was replaced meanwhile says nothing. */
-function signedOut(tried) {
-  if (authorization().Authorization === tried.Authorization) dispatchEvent(new Event("signed-out"));
+/** An answer to a session that has ended meanwhile says nothing. */
+function signedOut(during) {
+  if (during === session) dispatchEvent(new Event("signed-out"));
+}
+
+/** Shows a token once, for a session; throws `Refused` for one that is not taken. */
+export async function signIn(token) {
+  const headers = { ...OWN, Authorization: `Bearer ${token}` };
+  const response = await fetch(place("/v1/session"), { method: "POST", headers });
+  if (!response.ok) throw await refused(response);
+  renew();
+}
+
+/** Ends the session. */
+export async function signOut() {
+  const response = await fetch(place("/v1/session"), { method: "DELETE", headers: OWN });
+  // One that is not known any more has ended.
+  if (!response.ok && response.status !== 401) throw await refused(response);
+  renew();
+}
+
+function renew() {
+  session += 1;
+  known.clear();
 }
 
 /** A refused or failed request. */
@@ -74,8 +99,8 @@ export function upload(file, progress, signal) {
     const request = new XMLHttpRequest();
     request.open("POST", place("/v1/blobs"));
     request.setRequestHeader("Content-Type", "application/octet-stream");
-    const token = authorization();
-    for (const [name, value] of Object.entries(token)) request.setRequestHeader(name, value);
+    for (const [name, value] of Object.entries(OWN)) request.setRequestHeader(name, value);
+    const during = session;
     request.upload.onprogress = (event) => progress(event.loaded, event.total || file.size);
     request.onload = () => {
       let body = {};
@@ -84,7 +109,7 @@ export function upload(file, progress, signal) {
       } catch {
         // As above.
       }
-      if (request.status === 401) signedOut(token);
+      if (request.status === 401) signedOut(during);
       if (request.status >= 200 && request.status < 300) resolve(body);
       else reject(new Refused(request.status, body));
     };

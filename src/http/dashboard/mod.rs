@@ -63,7 +63,6 @@ const FILES: &[(&str, &[u8])] = &files![
     "system.js",
     "thumb.js",
     "tilemap.js",
-    "token.js",
     "verdict.js",
     "view.js",
     "viewer.js",

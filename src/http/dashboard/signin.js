@@ -1,9 +1,8 @@
 // The page on which one signs in, what one may do, and signing out.
 
-import { announce, facts, h, place, put, say } from "./dom.js";
-import { authorization, forget, keep } from "./token.js";
+import { announce, facts, h, put, say } from "./dom.js";
 import { bytes } from "./format.js";
-import { get, known } from "./api.js";
+import { get, unanswered, signIn as beginSession, signOut as endSession } from "./api.js";
 
 export const WHAT = "sci-recon turns the coded pictures of a snapshot compressive camera back into video.";
 
@@ -20,20 +19,14 @@ export function signIn(root, done) {
     const token = input.value.trim();
     button.disabled = true;
     put(status);
-    try {
-      const wrong = await refusal(token);
-      if (wrong) {
-        put(status, h("p", { class: "trouble", role: "alert" }, wrong));
-        input.setAttribute("aria-invalid", "true");
-        input.select();
-      } else {
-        keep(token);
-        known.clear();
-        announce("You are signed in");
-        done();
-      }
-    } catch {
-      put(status, h("p", { class: "trouble", role: "alert" }, "The service does not answer. Try again in a moment."));
+    const wrong = await refusal(token);
+    if (wrong) {
+      put(status, h("p", { class: "trouble", role: "alert" }, wrong));
+      input.setAttribute("aria-invalid", "true");
+      input.select();
+    } else {
+      announce("You are signed in");
+      done();
     }
     button.disabled = false;
   });
@@ -42,14 +35,17 @@ export function signIn(root, done) {
   input.focus();
 }
 
-/** What is wrong with a token; null for one that the service takes. */
+/** Signs in; says what is wrong with the token, or null for one that the service takes. */
 async function refusal(token) {
   if (!/^[\x21-\x7e]+$/.test(token)) return "A token has no spaces and no special characters. Copy all of it.";
-  const response = await fetch(place("/v1/me"), { headers: authorization(token), cache: "no-store" });
-  if (response.ok) return null;
-  if (response.status === 401) return "The service does not know this token. It may have been revoked, or a part of it is missing.";
-  const problem = await response.json().catch(() => ({}));
-  return problem.detail ?? `The service answered ${response.status}.`;
+  try {
+    await beginSession(token);
+    return null;
+  } catch (error) {
+    if (unanswered(error)) return "The service does not answer. Try again in a moment.";
+    if (error.status === 401) return "The service does not know this token. It may have been revoked, or a part of it is missing.";
+    return error.message;
+  }
 }
 
 /** What a role may do, in words. */
@@ -81,11 +77,14 @@ export async function account(root, _, signal) {
 }
 
 function signOut() {
-  const leave = () => {
-    forget();
-    known.clear();
-    announce("You are signed out");
-    dispatchEvent(new Event("signed-out"));
+  const leave = async () => {
+    try {
+      await endSession();
+      announce("You are signed out");
+      dispatchEvent(new Event("signed-out"));
+    } catch {
+      announce("The service does not answer: you are still signed in");
+    }
   };
   return h("button", { type: "button", id: "sign-out", onclick: leave }, "Sign out");
 }
