@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant};
 
 use crate::cluster::message::TileBeat;
-use crate::job::{Pool, WorkerId};
+use crate::job::{Pool, TaskId, WorkerId};
 
 /// A worker that was silent for longer is not counted on.
 const SILENCE: Duration = Duration::from_secs(15);
@@ -24,8 +24,8 @@ struct Sign {
     at: Instant,
     /// Not yet on record.
     fresh: bool,
-    /// Whether it had a tile then.
-    busy: bool,
+    /// The tile that it had then.
+    holds: Option<TaskId>,
     tile: Option<TileBeat>,
 }
 
@@ -37,7 +37,7 @@ impl Presence {
             return;
         }
         let sign =
-            Sign { pool: pool.clone(), at: Instant::now(), fresh: true, busy: false, tile: None };
+            Sign { pool: pool.clone(), at: Instant::now(), fresh: true, holds: None, tile: None };
         self.workers.insert(worker, sign);
         self.pools.insert(pool.clone(), Instant::now());
     }
@@ -46,7 +46,8 @@ impl Presence {
     pub fn sign(&mut self, worker: WorkerId, pool: &Pool, tile: Option<TileBeat>) -> bool {
         let known = self.workers.get_mut(&worker).filter(|sign| sign.pool == *pool);
         let Some(sign) = known else { return false };
-        (sign.at, sign.fresh, sign.busy) = (Instant::now(), true, tile.is_some());
+        (sign.at, sign.fresh) = (Instant::now(), true);
+        sign.holds = tile.as_ref().map(|tile| tile.task);
         self.pools.insert(sign.pool.clone(), sign.at);
         if let Some(mut tile) = tile {
             // News that are not on record yet stay news.
@@ -60,6 +61,13 @@ impl Presence {
         true
     }
 
+    /// A worker has begun with a tile.
+    pub fn begin(&mut self, worker: WorkerId, task: TaskId) {
+        if let Some(sign) = self.workers.get_mut(&worker) {
+            (sign.at, sign.fresh, sign.holds) = (Instant::now(), true, Some(task));
+        }
+    }
+
     /// A worker of a pool has said goodbye; false if there is none.
     pub fn leave(&mut self, worker: WorkerId, pool: &Pool) -> bool {
         let known = self.workers.get(&worker).is_some_and(|sign| sign.pool == *pool);
@@ -71,10 +79,16 @@ impl Presence {
         self.workers.get(&worker).is_some_and(|sign| sign.at.elapsed() < SILENCE)
     }
 
+    /// Whether a living worker has a tile in hand, as far as is known.
+    pub fn holds(&self, worker: WorkerId, task: TaskId) -> bool {
+        let sign = self.workers.get(&worker);
+        sign.is_some_and(|sign| sign.holds == Some(task) && sign.at.elapsed() < SILENCE)
+    }
+
     /// Whether a living worker of a pool waits for a tile.
     pub fn waits(&self, pool: &Pool) -> bool {
-        let waits = |sign: &Sign| sign.pool == *pool && !sign.busy && sign.at.elapsed() < SILENCE;
-        self.workers.values().any(waits)
+        let waits = |sign: &Sign| sign.pool == *pool && sign.holds.is_none();
+        self.workers.values().any(|sign| waits(sign) && sign.at.elapsed() < SILENCE)
     }
 
     /// The number of living workers of each pool that ever had one, and since when a pool has none.

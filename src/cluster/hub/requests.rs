@@ -163,6 +163,7 @@ impl Core {
         let begun = self.store.remote_begin(task, (attempt, seq), delivery, worker).await?;
         Ok(match begun {
             Begun::Go(attempt, redelivered) => {
+                lock(&self.presence).begin(worker, task.0);
                 figures::redelivered(u64::from(redelivered));
                 BeginAnswer::Go(attempt)
             }

@@ -80,7 +80,7 @@ impl Core {
         let mut missing = Vec::new();
         for remote in &out {
             let Ok(pool) = remote.pool.parse::<Pool>() else { continue };
-            let worker_lives = remote.delivery > 0 && lock(&self.presence).lives(remote.worker);
+            let held = self.is_held(remote);
             let empty = match pools.get(&pool) {
                 Some((0, last)) => last.elapsed() > EMPTY,
                 Some(_) => false,
@@ -97,8 +97,8 @@ impl Core {
                     let (hub, pool) = (self.clone(), pool);
                     tokio::spawn(async move { hub.send(&pool, claimed).await });
                 }
-                Some(place) if !there(place) && !worker_lives => missing.push(remote),
-                Some(place) if empty && !worker_lives => {
+                Some(place) if !there(place) && !held => missing.push(remote),
+                Some(place) if empty && !held => {
                     self.connection.drop_task(place.seq).await;
                     self.mend(remote, "its pool has no worker any more").await?;
                 }
@@ -136,7 +136,7 @@ impl Core {
         Ok(())
     }
 
-    /// Looks for messages that are not delivered though workers wait for them: a consumer that is moved from
+    /// Looks for messages of tiles that nobody holds though workers wait for them: a consumer that is moved from
     /// node to node may forget some, or stand still (nats-server 6905, 7680). It is made anew first; if that
     /// does not help, the tile is handed out again.
     async fn deliver(&self, out: &[RemoteTask]) -> Result<(), SweepError> {
@@ -144,7 +144,7 @@ impl Core {
         {
             let mut undelivered = lock(&self.undelivered);
             let before = std::mem::take(&mut *undelivered);
-            for remote in out.iter().filter(|remote| remote.delivery == 0) {
+            for remote in out.iter().filter(|remote| !self.is_held(remote)) {
                 let (Some(place), Ok(pool)) = (&remote.place, remote.pool.parse::<Pool>()) else {
                     continue;
                 };
@@ -198,6 +198,11 @@ impl Core {
             self.connection.drop_task(*seq).await;
         }
         Ok(())
+    }
+
+    /// Whether a worker has a tile in hand. One that has reported it has not: if the report is lost, the tile is.
+    fn is_held(&self, remote: &RemoteTask) -> bool {
+        remote.delivery > 0 && lock(&self.presence).holds(remote.worker, remote.task)
     }
 
     /// Takes a tile back that is still out as it was when the sweep began.

@@ -1,5 +1,6 @@
 //! What is not there, or gets lost on the side of the message server.
 
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 use super::nodes::Nats;
@@ -37,6 +38,25 @@ async fn what_the_message_server_loses_is_handed_out_again() {
     assert_eq!(results(&app, &id).await, *expected);
     eprintln!("{} tiles were handed out again", repaired(&app).await);
     nats.emptied().await;
+}
+
+#[tokio::test]
+async fn a_tile_whose_report_is_lost_is_handed_out_again_though_its_worker_lives() {
+    let Some(mut nats) = Nats::start(1) else { return };
+    let app = served(&nats, "2").await;
+    let _worker = worker(&nats, &[]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&with_iterations(&measurement, 1000)).await;
+    busy(&app).await;
+    // The worker reports to a message server whose disk is lost before the server hears of it.
+    let server = Pid::from_raw(app.pid() as i32).unwrap();
+    kill_process(server, Signal::STOP).unwrap();
+    until("a report waits", || async { nats.messages().await[1].1 > 0 }).await;
+    nats.end(0);
+    nats.wipe(0);
+    nats.begin(0);
+    kill_process(server, Signal::CONT).unwrap();
+    assert_eq!(app.ended(&id).await["state"], "succeeded");
 }
 
 #[tokio::test]
