@@ -19,8 +19,8 @@ fn recipes(document: &str, port: u16, folder: &Path) -> Vec<String> {
     ours.collect()
 }
 
-/// Runs all recipes of a document where they find what they need, and gives what they print.
-fn pasted(document: &str, least: usize) -> String {
+/// Runs all recipes of some documents, in their order, where they find what they need, and gives what they print.
+fn pasted(documents: &[&str], least: usize) -> String {
     for program in ["curl", "jq"] {
         if Command::new(program).arg("--version").output().is_err() {
             eprintln!("SKIPPED: there is no {program}");
@@ -37,7 +37,8 @@ fn pasted(document: &str, least: usize) -> String {
     let program = env!("CARGO_BIN_EXE_sci-recon");
     std::os::unix::fs::symlink(program, place.join("sci-recon")).unwrap();
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    let recipes = recipes(document, port, folder.path());
+    let recipes: Vec<_> =
+        documents.iter().flat_map(|document| recipes(document, port, folder.path())).collect();
     assert!(recipes.len() >= least, "{recipes:#?}");
     // Job control, as in a shell that somebody types into; whatever is left of it ends with the script.
     let script = format!(
@@ -55,13 +56,14 @@ fn pasted(document: &str, least: usize) -> String {
 }
 
 #[test]
-fn the_job_of_the_readme_succeeds() {
-    let told = pasted("README.md", 3);
-    assert!(told.is_empty() || told.contains("succeeded"), "{told}");
+fn the_job_of_the_readme_and_the_calibration_that_follows_it_succeed() {
+    let told = pasted(&["README.md", "docs/calibration.md"], 8);
+    assert!(told.is_empty() || told.contains("succeeded") && told.contains("ready"), "{told}");
+    assert!(told.is_empty() || told.contains("\"grade\": \"good\""), "{told}");
 }
 
 #[test]
 fn the_recipes_of_operations_work_in_their_order() {
-    let told = pasted("docs/operations.md", 7);
+    let told = pasted(&["docs/operations.md"], 7);
     assert!(told.is_empty() || told.contains("succeeded"), "{told}");
 }
