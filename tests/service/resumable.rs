@@ -242,6 +242,32 @@ async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
     assert!(std::fs::read(blob).unwrap() == bytes, "the bytes are those that were sent");
 }
 
+#[tokio::test]
+async fn the_python_of_the_documentation_uploads_a_file() {
+    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
+        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
+        return;
+    };
+    let app = TestApp::start().await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("masks.npy");
+    std::fs::write(&file, b"0123456789").unwrap();
+    let document = std::fs::read_to_string("docs/uploads.md").unwrap();
+    let (_, after) = document.split_once("```python\n").unwrap();
+    let (recipe, _) = after.split_once("```").unwrap();
+    let call = "import sys\nprint(upload(*sys.argv[1:]))";
+    let mut command = tokio::process::Command::new(&python);
+    command.arg("-c").arg(format!("{recipe}\n{call}"));
+    command.arg(format!("http://{}", app.address())).arg(&file).arg(&token);
+    let output = command.output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let hash = String::from_utf8(output.stdout).unwrap();
+    let stored = app.get(&format!("/v1/blobs/{}", hash.trim())).await.expect(200);
+    assert_eq!(stored.json()["size"], 10);
+}
+
 /// Sends `body` of a piece of `announced` bytes over a connection of its own; gives the offset that is
 /// acknowledged, if one is. A body that is shorter is cut.
 async fn raw_piece(
