@@ -46,8 +46,8 @@ export class Service {
   }
 
   /** Makes a token of this role; gives it. */
-  token(role) {
-    const made = execFileSync(this.program, ["token", "--data", this.folder, "create", "--lab", "optics", "--role", role], { encoding: "utf8" });
+  token(role, ...more) {
+    const made = execFileSync(this.program, ["token", "--data", this.folder, "create", "--role", role, ...(more.length ? more : ["--lab", "optics"])], { encoding: "utf8" });
     return /sci_[\x21-\x7e]*[\w]/.exec(made)[0];
   }
 

@@ -93,6 +93,24 @@ export async function access(browser, checks, program, services) {
   await page.fill("#token", admin);
   await page.click("text=Sign in >> nth=1");
   await page.waitForSelector("#nav >> text=System >> visible=true");
+  // Who may see all labs looks after another one as if it were his own.
+  await page.click("#who");
+  await page.waitForSelector("h1:has-text('Lab optics')");
+  checks.that((await page.locator("[aria-label='All labs']").count()) === 0, "a lab's admin sees no other labs");
+  await page.click("#sign-out");
+  await page.fill("#token", service.token("admin", "--lab", "guests", "--all-labs"));
+  await page.keyboard.press("Enter");
+  await page.waitForSelector("#who:has-text('guests · admin')");
+  await page.click("#who");
+  await page.waitForSelector("[aria-label='All labs'] table");
+  await checks.look(page, "all-labs");
+  await page.click("[aria-label='Look after optics']");
+  await page.waitForSelector("#who:has-text('looking after optics · admin')");
+  await page.reload();
+  await page.waitForSelector("#who:has-text('looking after optics · admin')");
+  await page.click("#who");
+  await page.click("text=Back to your own lab");
+  await page.waitForSelector("#who:text-is('guests · admin')");
   await page.context().close();
 }
 

@@ -1,6 +1,7 @@
 // The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
 
 import { place } from "./dom.js";
+import { lookAfter } from "./keeping.js";
 
 // A session is a cookie that no script can read. What changes something by it shows this header, which no
 // page of another site can send.
@@ -38,6 +39,7 @@ export async function signOut() {
 
 function renew() {
   session += 1;
+  lookAfter(null);
   known.clear();
 }
 

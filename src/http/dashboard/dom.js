@@ -1,10 +1,19 @@
 // Elements from values. Text stays text: nothing here, or anywhere, reads markup from a string.
 
+import { lookedAfter } from "./keeping.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 
-/** An address of the service from where this page is, which may be below a path of a proxy. */
+/**
+ * An address of the service from where this page is, which may be below a path of a proxy; of the lab that is
+ * looked after, where that is another than one's own.
+ */
 export function place(path) {
-  return path.startsWith("/") ? `.${path}` : path;
+  if (!path.startsWith("/")) return path;
+  const lab = lookedAfter();
+  if (!lab || !path.startsWith("/v1/")) return `.${path}`;
+  const [, address, fragment] = /^([^#]*)(.*)$/.exec(path);
+  return `.${address}${address.includes("?") ? "&" : "?"}lab=${lab}${fragment}`;
 }
 
 /** An HTML element with properties and children; null, undefined and false children are left out. */

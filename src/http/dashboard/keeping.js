@@ -18,6 +18,24 @@ export function remember(name, value) {
   }
 }
 
+/** The lab whose data are shown in this tab, if it is not one's own. */
+export function lookedAfter() {
+  try {
+    return sessionStorage.getItem("sci-recon lab");
+  } catch {
+    return null;
+  }
+}
+
+export function lookAfter(lab) {
+  try {
+    if (lab) sessionStorage.setItem("sci-recon lab", lab);
+    else sessionStorage.removeItem("sci-recon lab");
+  } catch {
+    // As above.
+  }
+}
+
 const HELD = 200;
 
 /** The true frames of a job: `{sha256, name, snapshot}`, or null. */

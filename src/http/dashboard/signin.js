@@ -2,7 +2,8 @@
 
 import { announce, facts, h, put, say } from "./dom.js";
 import { bytes } from "./format.js";
-import { get, unanswered, signIn as beginSession, signOut as endSession } from "./api.js";
+import { lookAfter, lookedAfter } from "./keeping.js";
+import { get, known, unanswered, signIn as beginSession, signOut as endSession } from "./api.js";
 
 export const WHAT = "sci-recon turns the coded pictures of a snapshot compressive camera back into video.";
 
@@ -59,6 +60,7 @@ const ROLES = {
 export async function account(root, _, signal) {
   const me = await get("/v1/me", signal);
   const { limits, use } = me;
+  const labs = me.all_labs ? await get("/v1/labs", signal) : null;
   const quota = limits.token_bytes === null ? null : h("meter", { min: 0, max: limits.token_bytes, value: use.token_bytes, high: 0.9 * limits.token_bytes, "aria-label": "Quota used" });
   root.append(h("div", { class: "row head" }, h("h1", null, `Lab ${me.lab}`), h("span", { class: "badge" }, me.role), h("span", { class: "grow" }), me.token && signOut()),
     h("p", null, me.token ? ROLES[me.role] : "This service asks nobody to sign in: no token was made for it."),
@@ -73,7 +75,27 @@ export async function account(root, _, signal) {
         ["Results", bytes(use.result_bytes)],
         ["Jobs that wait or run", h("a", { href: "#/jobs?state=queued,running" }, String(use.jobs))],
         me.token && ["Token", h("code", null, me.token)],
-      ]))));
+      ]))),
+    labs && allLabs(labs.items, me.lab));
+}
+
+/** The labs, for those who look after all of them: one of them is looked at as if it were one's own. */
+function allLabs(labs, here) {
+  const look = (lab) => h("button", { type: "button", class: "small", "aria-label": `Look after ${lab}`, onclick: () => change(lab) }, "Look after");
+  const row = ({ lab, share, use }) => h("tr", null, h("th", { scope: "row" }, lab), h("td", null, share), h("td", null, use.jobs), h("td", null, bytes(use.bytes)),
+    h("td", null, lab === here ? "now" : look(lab)));
+  return h("section", { class: "card", "aria-label": "All labs" }, h("h2", null, "All labs"),
+    h("p", { class: "muted" }, "You may look after every lab: jobs, files and calibrations of the one that you choose are shown in this tab as if it were yours."),
+    lookedAfter() && h("div", { class: "row" }, h("button", { type: "button", onclick: () => change(null) }, "Back to your own lab")),
+    h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Labs" }, h("table", null, h("thead", null, h("tr", null, ["Lab", "Share", "Jobs that wait or run", "Kept here", "Shown"].map((text) => h("th", { scope: "col" }, text)))), h("tbody", null, labs.map(row)))));
+}
+
+function change(lab) {
+  lookAfter(lab);
+  known.clear();
+  announce(lab ? `The lab ${lab} is shown` : "Your own lab is shown");
+  nameplate(document.getElementById("who"));
+  location.hash = "#/jobs";
 }
 
 function signOut() {
@@ -93,7 +115,7 @@ function signOut() {
 export async function nameplate(element) {
   try {
     const me = await get("/v1/me");
-    say(element, me.token ? `${me.lab} · ${me.role}` : me.lab);
+    say(element, me.token ? `${lookedAfter() ? "looking after " : ""}${me.lab} · ${me.role}` : me.lab);
     document.body.dataset.role = me.role;
     element.hidden = false;
   } catch {
