@@ -76,7 +76,7 @@ export async function account(root, _, signal) {
         ["Jobs that wait or run", h("a", { href: "#/jobs?state=queued,running" }, String(use.jobs))],
         me.token && ["Token", h("code", null, me.token)],
       ]))),
-    labs && allLabs(labs.items, me.lab));
+    labs && h("div", { class: "cards" }, allLabs(labs.items, me.lab)));
 }
 
 /** The labs, for those who look after all of them: one of them is looked at as if it were one's own. */
