@@ -32,7 +32,7 @@ TV, FFDNET, WHITE, LOOP, INT8, TWICE, DEFAULT, FIXED = ALGORITHMS = (
 
 
 TURNS = (TV,), (DEFAULT, FIXED), (WHITE, LOOP), (INT8,), (TWICE,), (FFDNET,)   # the order of the work: what tells most comes first
-NETWORKS = TV, FFDNET, WHITE, LOOP, INT8, TWICE     # on the settings of the networks
+NETWORKS = TV, FFDNET, WHITE, LOOP, INT8, TWICE, DEFAULT   # on the settings of the networks
 PLANS = TV, FIXED, DEFAULT                          # on the cases of the schedules
 LOST = 0.1          # dB; a case that loses more counts as lost
 
@@ -402,8 +402,7 @@ def main():
     settings = all_settings({name: len(frames) for name, frames in footage.items()}) if a.full else DEFAULT_SETTINGS
     with tempfile.TemporaryDirectory() as folder:
         known = ways(program, a, footage['city'], folder)
-        names = (*NETWORKS, DEFAULT) if a.full else NETWORKS
-        tasks = [(s, name, known[name]) for s in settings for name in names if name != TWICE or s.twice]
+        tasks = [(s, name, known[name]) for s in settings for name in NETWORKS if name != TWICE or s.twice]
         tasks += [(s, name, known[name]) for s in cases() for name in PLANS]
         report = lambda row: print(json.dumps(row), file=sys.stdout if a.json else sys.stderr, flush=True)
         rows = Rows(program, a, footage).all(tasks, report)
