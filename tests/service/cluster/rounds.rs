@@ -27,7 +27,8 @@ const MEMORY: u64 = 1 << 30;
 struct Plan {
     scene: Scene,
     tile: u32,
-    iterations: u32,
+    /// Of gap-tv; none for the default algorithm with its own schedule.
+    iterations: Option<u32>,
     /// Seconds of silence after which another worker gets a tile.
     ack_wait: u64,
     /// How long a worker is suspended or cut off, the quorum is lost, and the stream's leader is down.
@@ -44,7 +45,7 @@ impl Plan {
     const LONG: Self = Self {
         scene: Scene { frames: 8, height: 1280, width: 1280, snapshots: 1 },
         tile: 288,
-        iterations: 60,
+        iterations: Some(60),
         ack_wait: 5,
         silence: Duration::from_secs(9),
         no_quorum: Duration::from_secs(12),
@@ -55,7 +56,7 @@ impl Plan {
     const SHORT: Self = Self {
         scene: Scene { frames: 8, height: 320, width: 320, snapshots: 1 },
         tile: 96,
-        iterations: 100,
+        iterations: Some(100),
         ack_wait: 2,
         silence: Duration::from_secs(4),
         no_quorum: Duration::from_secs(7),
@@ -64,15 +65,27 @@ impl Plan {
         limit: Duration::from_secs(300),
     };
 
+    /// The default algorithm.
+    const DEEP: Self = Self {
+        scene: Scene { frames: 8, height: 512, width: 512, snapshots: 1 },
+        tile: 144,
+        iterations: None,
+        ..Self::LONG
+    };
+
     fn job(&self, measurement: &str) -> Value {
-        json!({
+        let mut job = json!({
             "measurement": measurement,
-            "algorithm": "gap-tv",
+            "algorithm": "pnp-tv-fastdvdnet",
             "tile": {"size": self.tile, "overlap": 16},
-            "schedule": {"stages": [
-                {"prior": "tv", "iterations": self.iterations, "tv_weight": 0.05, "tv_updates": 40},
-            ]},
-        })
+        });
+        if let Some(iterations) = self.iterations {
+            job["algorithm"] = json!("gap-tv");
+            job["schedule"] = json!({"stages": [
+                {"prior": "tv", "iterations": iterations, "tv_weight": 0.05, "tv_updates": 40},
+            ]});
+        }
+        job
     }
 }
 
@@ -307,9 +320,19 @@ async fn not_once(data: &Path, job: &str) -> i64 {
 }
 
 async fn rounds_of(name: &str, nodes: usize, delay: Duration, count: u32, faults: &[Fault]) {
+    let plan = if rounds().is_some() { Plan::LONG } else { Plan::SHORT };
+    rounds_by(plan, name, (nodes, delay), count, faults).await;
+}
+
+async fn rounds_by(
+    plan: Plan,
+    name: &str,
+    (nodes, delay): (usize, Duration),
+    count: u32,
+    faults: &[Fault],
+) {
     let seed: u64 = rand::random();
     eprintln!("{name}: seed {seed}");
-    let plan = if rounds().is_some() { Plan::LONG } else { Plan::SHORT };
     let Some(mut ground) = Ground::start(plan, nodes, delay, seed).await else { return };
     let expected = local(&plan).await;
     let (_, measurement) = ground.app.scene(&plan.scene).await;
@@ -337,6 +360,17 @@ async fn rounds_of(name: &str, nodes: usize, delay: Duration, count: u32, faults
 #[tokio::test]
 async fn faults_of_all_kinds_change_nothing_with_three_nodes() {
     rounds_of("cluster", 3, Duration::ZERO, rounds().unwrap_or(1), &Fault::ALL).await;
+}
+
+#[tokio::test]
+#[ignore = "part of `make cluster`"]
+async fn faults_of_all_kinds_change_nothing_in_the_default_schedule() {
+    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
+    if !Path::new(&library).exists() {
+        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+        return;
+    }
+    rounds_by(Plan::DEEP, "cluster_deep", (3, Duration::ZERO), 1, &Fault::ALL).await;
 }
 
 #[tokio::test]
