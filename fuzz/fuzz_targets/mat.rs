@@ -2,12 +2,18 @@
 
 mod file;
 
-use sci_recon_core::formats::mat::{SceneArray, open_array};
+use sci_recon_core::formats::mat::SceneArray;
+use sci_recon_core::formats::{Axes, Expected, Wanted, open_array};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     file::with_file(bytes, |path| {
-        for array in [SceneArray::Masks, SceneArray::Measurements] {
-            if let Ok(mut reader) = open_array(path, array, &file::LIMITS) {
+        for (array, axes) in [
+            (SceneArray::Masks, Axes::RowColumnFrame),
+            (SceneArray::Measurements, Axes::FrameRowColumn),
+        ] {
+            let expected = Expected { axes: Some(axes), ..Expected::default() };
+            let wanted = Wanted { expected, ..array.into() };
+            if let Ok(mut reader) = open_array(path, wanted, &file::LIMITS) {
                 file::drain(&mut *reader);
             }
         }

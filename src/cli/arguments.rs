@@ -9,6 +9,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
 use crate::cli::error::Result;
+use crate::formats::Axes;
 use crate::job::{Algorithm, InvalidField, Sequence};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
@@ -142,6 +143,11 @@ pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
 /// Kinds of sequences.
 pub(super) fn sequence() -> impl TypedValueParser<Value = Sequence> {
     PossibleValuesParser::new(Sequence::VARIANTS).try_map(|name: String| name.parse::<Sequence>())
+}
+
+/// Orders of axes.
+pub(super) fn axes() -> impl TypedValueParser<Value = Axes> {
+    PossibleValuesParser::new(Axes::VARIANTS).try_map(|name: String| name.parse::<Axes>())
 }
 
 /// Names of all algorithms.

@@ -11,10 +11,11 @@ use ndarray::{Array2, Array3};
 use serde::Serialize;
 
 use super::CliError;
-use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, sequence};
+use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, axes, sequence};
 use super::model::{Model, cut};
 use super::progress::SnapshotBar;
 use crate::cli::error::Result;
+use crate::formats::Axes;
 use crate::formats::mat::SceneArray;
 use crate::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
 use crate::job::{Algorithm, SceneShape, Schedule, Sequence, Sha256};
@@ -64,6 +65,15 @@ pub struct Arguments {
     /// Value in the truth's file that means 1 [default: as for the measurement].
     #[arg(long, value_name = "VALUE")]
     truth_full_scale: Option<f32>,
+    /// The order of the axes in the masks' file [default: the only one that fits].
+    #[arg(long, value_name = "ORDER", value_parser = axes())]
+    masks_axes: Option<Axes>,
+    /// The same of the measurement.
+    #[arg(long, value_name = "ORDER", value_parser = axes())]
+    measurement_axes: Option<Axes>,
+    /// The same of the truth.
+    #[arg(long, value_name = "ORDER", value_parser = axes())]
+    truth_axes: Option<Axes>,
     #[command(flatten)]
     schedule: ScheduleArguments,
     /// The network of --algorithm learned: an ONNX file with inputs `measurement [1,1,H,W]` and
@@ -214,14 +224,18 @@ impl<'a> Sources<'a> {
                 named(&arguments.masks).ok_or_else(missing)?,
                 SceneArray::Masks,
                 arguments.masks_full_scale,
-            ),
+            )
+            .arranged(arguments.masks_axes, None),
             measurement: Source::file(
                 named(&arguments.measurement).ok_or_else(missing)?,
                 SceneArray::Measurements,
                 arguments.measurement_full_scale,
-            ),
-            truth: named(&arguments.truth)
-                .map(|path| Source::file(path, SceneArray::Truth, arguments.truth_full_scale)),
+            )
+            .arranged(arguments.measurement_axes, None),
+            truth: named(&arguments.truth).map(|path| {
+                Source::file(path, SceneArray::Truth, arguments.truth_full_scale)
+                    .arranged(arguments.truth_axes, None)
+            }),
         })
     }
 }
@@ -243,11 +257,15 @@ struct Input<'a> {
 
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
-        let sources = Sources::new(arguments)?;
+        let mut sources = Sources::new(arguments)?;
         let masks = read_masks(&sources.masks)?;
+        let (frames, height, width) = masks.array.dim();
+        sources.measurement.size = Some((height, width));
+        if let Some(truth) = &mut sources.truth {
+            truth.size = Some((height, width));
+        }
         let Snapshots { first, last } = arguments.snapshots;
         let (measurement, snapshots) = read_snapshots(&sources.measurement, (first, last))?;
-        let (frames, height, width) = masks.array.dim();
         let (count, rows, columns) = measurement.array.dim();
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
@@ -287,7 +305,9 @@ impl<'a> Input<'a> {
             shape: SceneShape { frames, height, width, snapshots: self.snapshots().len() as u32 },
             inputs: Inputs {
                 masks_sha256: sha256(self.sources.masks.path)?,
+                masks_axes: self.masks.axes.map(|axes| axes.to_string()),
                 measurement_sha256: sha256(self.sources.measurement.path)?,
+                measurement_axes: self.measurement.axes.map(|axes| axes.to_string()),
             },
             models,
             scale: ScaleRecord {

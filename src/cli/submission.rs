@@ -6,8 +6,9 @@ use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::CliError;
-use super::arguments::{Snapshots, named_all, sequence};
+use super::arguments::{Snapshots, axes, named_all, sequence};
 use super::client::{Client, Result};
+use crate::formats::Axes;
 use crate::job::{Algorithm, CalibrationId, Sequence, Sha256};
 
 /// How jobs are made of measurements.
@@ -25,6 +26,12 @@ pub(super) struct SubmissionArguments {
     /// What the snapshots are called in a .mat or HDF5 file [default: meas].
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
+    /// The order of the axes of the masks [default: the only one that fits].
+    #[arg(long, value_name = "ORDER", requires = "masks", value_parser = axes())]
+    masks_axes: Option<Axes>,
+    /// The order of the axes of the snapshots [default: the only one that fits].
+    #[arg(long, value_name = "ORDER", value_parser = axes())]
+    axes: Option<Axes>,
     /// The number in the masks that means 1 [default: that of their type].
     #[arg(long, value_name = "NUMBER", requires = "masks")]
     masks_full_scale: Option<f64>,
@@ -84,6 +91,7 @@ impl SubmissionArguments {
         };
         let mut measurement = Map::from_iter([("calibration".to_owned(), json!(calibration))]);
         add(&mut measurement, "array", json!(self.array));
+        add(&mut measurement, "axes", json!(self.axes));
         add(&mut measurement, "full_scale", json!(self.full_scale));
         add(&mut measurement, "camera_fps", json!(self.camera_fps));
         add(&mut measurement, "exposure_s", json!(self.exposure_s));
@@ -109,6 +117,7 @@ impl SubmissionArguments {
         let sha256 = client.sent(masks).await?;
         let mut body = Map::from_iter([("masks".to_owned(), json!(sha256))]);
         add(&mut body, "array", json!(self.masks_array));
+        add(&mut body, "axes", json!(self.masks_axes));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         let body = Value::Object(body);
         // The same masks are the same calibration, whoever asks.

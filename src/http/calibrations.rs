@@ -10,8 +10,9 @@ use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
-use super::intake::{self, Prepared};
+use super::intake::{self, Prepared, Upload};
 use super::page::{Limit, PageBody, Renaming};
+use crate::formats::Axes;
 use crate::formats::validate::MaskStatistics;
 use crate::intake::plan;
 use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
@@ -29,13 +30,16 @@ pub(super) struct CalibrationRequest {
     /// What the masks are called in a file of several arrays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     array: Option<Label>,
+    /// The order of the array's axes; none for the only one that fits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    axes: Option<Axes>,
     full_scale: Option<f32>,
     captures: Option<Captures>,
 }
 
 impl CalibrationRequest {
     pub(super) fn of_masks(name: Option<Label>, masks: Sha256) -> Self {
-        Self { name, masks: Some(masks), array: None, full_scale: None, captures: None }
+        Self { name, masks: Some(masks), array: None, axes: None, full_scale: None, captures: None }
     }
 }
 
@@ -72,6 +76,7 @@ pub(super) struct CalibrationBody {
     masks: Option<Sha256>,
     format: Option<String>,
     sample: Option<String>,
+    axes: Option<String>,
     frames: usize,
     height: Option<usize>,
     width: Option<usize>,
@@ -94,6 +99,7 @@ impl From<Calibration> for CalibrationBody {
             masks: Some(facts.masks),
             format: Some(facts.format),
             sample: Some(facts.sample),
+            axes: facts.axes,
             frames: facts.frames,
             height: Some(facts.height),
             width: Some(facts.width),
@@ -119,6 +125,7 @@ impl From<Unready> for CalibrationBody {
             masks: None,
             format: None,
             sample: None,
+            axes: None,
             frames,
             height: None,
             width: None,
@@ -162,11 +169,17 @@ async fn insert(
     request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
-    let CalibrationRequest { name, masks, array, full_scale, captures } = request;
+    let CalibrationRequest { name, masks, array, axes, full_scale, captures } = request;
     match (masks, captures) {
-        (Some(masks), None) => of_masks(app, access, (name, masks, array, full_scale), key).await,
+        (Some(masks), None) => {
+            let of = Upload { array, axes, full_scale };
+            of_masks(app, access, (name, masks, of), key).await
+        }
         (None, Some(_)) if array.is_some() => {
             Err(ApiError::field("/array", "captures are pictures, not named arrays"))
+        }
+        (None, Some(_)) if axes.is_some() => {
+            Err(ApiError::field("/axes", "captures are [frame, row, column]: leave axes out"))
         }
         (None, Some(captures)) if full_scale.is_none() => {
             of_captures(app, access, (name, captures), key).await
@@ -182,16 +195,13 @@ async fn insert(
 async fn of_masks(
     app: &App,
     access: &Access,
-    (name, masks, array, full_scale): (Option<Label>, Sha256, Option<Label>, Option<f32>),
+    (name, masks, of): (Option<Label>, Sha256, Upload),
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
     let (lab, token) = (&access.lab, access.token);
     app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
     let file = intake::upload(app, masks).await.map_err(|error| error.at("/masks"))?;
-    let prepared = intake::run(app, access, move |desk| {
-        intake::masks(desk, &file, (array.as_ref(), full_scale))
-    });
-    let prepared = prepared.await?;
+    let prepared = intake::run(app, access, move |desk| intake::masks(desk, &file, of)).await?;
     let facts = facts(name, masks, &prepared);
     let made = app.store.add_calibration((lab, token), facts, prepared.file, key).await?;
     drop(prepared.room);
@@ -247,6 +257,7 @@ fn facts(
         masks,
         format: info.format.to_string(),
         sample: info.sample.to_string(),
+        axes: info.axes.map(|axes| axes.to_string()),
         frames: info.frames,
         height: info.height,
         width: info.width,

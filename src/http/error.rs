@@ -263,6 +263,7 @@ impl From<FormatError> for ApiError {
         let refused = Self { reason: Some(error.code()), ..refused };
         match error {
             FormatError::FullScale(_) => refused.at("/full_scale"),
+            FormatError::AxesAmbiguous { .. } | FormatError::NoAxes(_) => refused.at("/axes"),
             FormatError::NoNames | FormatError::MissingArray { .. } => refused.at("/array"),
             _ => refused,
         }

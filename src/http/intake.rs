@@ -14,7 +14,7 @@ use super::app::App;
 use super::error::{ApiError, Code, Result, too_slow};
 use crate::formats::mat::SceneArray;
 use crate::formats::validate::MaskStatistics;
-use crate::formats::{FormatError, Limits, StackInfo, StackWriter, planar};
+use crate::formats::{Axes, FormatError, Limits, StackInfo, StackWriter, planar};
 use crate::intake::{self, Exposure, Source};
 use crate::job::{Finding, Label, Sha256};
 use crate::store::{BlobWriter, Calibration, StagedBlob, Store, StoreError};
@@ -27,6 +27,14 @@ pub(super) struct Prepared<T> {
     pub(super) file: StagedBlob,
     /// Room on the disk, held until the file is on record.
     pub(super) room: Reservation,
+}
+
+/// What is said of an upload.
+pub(super) struct Upload {
+    /// What the array is called in a file of several.
+    pub(super) array: Option<Label>,
+    pub(super) axes: Option<Axes>,
+    pub(super) full_scale: Option<f32>,
 }
 
 /// For whom a check is made, where it may block.
@@ -98,13 +106,10 @@ pub(super) async fn upload(app: &App, sha256: Sha256) -> Result<PathBuf> {
 }
 
 /// Checks masks and writes them on [0, 1].
-pub(super) fn masks(
-    desk: &Desk,
-    upload: &Path,
-    (array, full_scale): (Option<&Label>, Option<f32>),
-) -> Result<Prepared<MaskStatistics>> {
-    let source = Source::upload(upload, SceneArray::Masks, full_scale, *desk.limits());
-    let opened = source.named(array.map(Label::to_string)).open()?;
+pub(super) fn masks(desk: &Desk, file: &Path, of: Upload) -> Result<Prepared<MaskStatistics>> {
+    let source = Source::upload(file, SceneArray::Masks, of.full_scale, *desk.limits());
+    let source = source.named(of.array.map(|name| name.to_string())).arranged(of.axes, None);
+    let opened = source.open()?;
     let (info, full_scale) = (opened.info, opened.full_scale.value());
     let (mut writer, room) = desk.writer(&info)?;
     let found = intake::masks(opened, |mask| {
@@ -118,15 +123,16 @@ pub(super) fn masks(
 /// against the masks of its calibration.
 pub(super) fn measurement(
     desk: &Desk,
-    upload: &Path,
-    (array, full_scale): (Option<&Label>, Option<f32>),
+    file: &Path,
+    of: Upload,
     exposure: &Exposure,
     calibration: &Calibration,
 ) -> Result<Prepared<Vec<Finding>>> {
-    let source = Source::upload(upload, SceneArray::Measurements, full_scale, *desk.limits());
-    let opened = source.named(array.map(Label::to_string)).open()?;
-    let (info, full_scale) = (opened.info, opened.full_scale.value());
     let masks = &calibration.facts;
+    let source = Source::upload(file, SceneArray::Measurements, of.full_scale, *desk.limits());
+    let source = source.named(of.array.map(|name| name.to_string()));
+    let opened = source.arranged(of.axes, Some((masks.height, masks.width))).open()?;
+    let (info, full_scale) = (opened.info, opened.full_scale.value());
     if (info.height, info.width) != (masks.height, masks.width) {
         let detail = format!(
             "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}",

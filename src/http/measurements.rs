@@ -9,9 +9,9 @@ use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
-use super::intake::{self, Prepared};
+use super::intake::{self, Prepared, Upload};
 use super::page::{ListQuery, PageBody, Renaming};
-use crate::formats::StackInfo;
+use crate::formats::{Axes, StackInfo};
 use crate::intake::Exposure;
 use crate::job::{CalibrationId, Finding, InvalidField, Label, MeasurementId, Sequence, Sha256};
 use crate::store::{Inserted, Made, Measurement, NewMeasurement, RequestKey};
@@ -25,6 +25,9 @@ pub(super) struct MeasurementRequest {
     /// What the snapshots are called in a file of several arrays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     array: Option<Label>,
+    /// The order of the array's axes; none for the only one that fits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    axes: Option<Axes>,
     /// Captures of the dark, the LCoS all black, at the measurement's exposure: their average is
     /// subtracted.
     #[serde(default)]
@@ -48,6 +51,7 @@ impl MeasurementRequest {
             calibration,
             data,
             array: None,
+            axes: None,
             dark: Vec::new(),
             saturation: None,
             full_scale: None,
@@ -90,7 +94,7 @@ async fn insert(
 ) -> Result<Inserted<MeasurementId>> {
     check_times(&request)?;
     let lab = &access.lab;
-    let (data, full_scale) = (request.data, request.full_scale);
+    let data = request.data;
     let calibration = app.store.calibration(lab, request.calibration).await;
     let calibration = calibration.map_err(|error| ApiError::reference("/calibration", error))?;
     app.store.upload(lab, data).await.map_err(|error| ApiError::reference("/data", error))?;
@@ -104,9 +108,10 @@ async fn insert(
     }
     let frames = calibration.facts.frames;
     let exposure = Exposure { dark, saturation: request.saturation };
-    let array = request.array.clone();
+    let MeasurementRequest { axes, full_scale, .. } = request;
+    let of = Upload { array: request.array.clone(), axes, full_scale };
     let prepared = intake::run(app, access, move |desk| {
-        intake::measurement(desk, &file, (array.as_ref(), full_scale), &exposure, &calibration)
+        intake::measurement(desk, &file, of, &exposure, &calibration)
     });
     let Prepared { info, full_scale, found, file, room } = prepared.await?;
     let facts = facts(request, &info, full_scale, frames, found);
@@ -147,6 +152,7 @@ fn facts(
         data: request.data,
         format: info.format.to_string(),
         sample: info.sample.to_string(),
+        axes: info.axes.map(|axes| axes.to_string()),
         // The limits on uploads keep the count far below this.
         snapshots: u32::try_from(info.frames).unwrap_or(u32::MAX),
         height: info.height,

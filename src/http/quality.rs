@@ -14,7 +14,7 @@ use super::intake;
 use super::jobs::with_snapshot;
 use super::results::result_file;
 use crate::formats::mat::SceneArray;
-use crate::formats::{FormatError, Limits, npy};
+use crate::formats::{Axes, FormatError, Limits, npy};
 use crate::intake::{Opened, Source};
 use crate::job::{JobId, SceneShape, Sha256};
 use crate::pipeline::quality::{FrameQuality, Quality};
@@ -24,6 +24,7 @@ use crate::pipeline::quality::{FrameQuality, Quality};
 pub(super) struct QualityQuery {
     truth: Sha256,
     full_scale: Option<f32>,
+    axes: Option<Axes>,
 }
 
 #[derive(Debug, Serialize)]
@@ -47,6 +48,7 @@ pub(super) async fn show(
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
     let frames = intake::run(&app, &access, move |desk| {
         let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *desk.limits());
+        let truth = truth.arranged(query.axes, Some((shape.height, shape.width)));
         compare(&path, truth.open()?, snapshot as usize, shape)
     });
     conditional::json(&QualityBody { truth, quality: frames.await?.into() }, &headers)

@@ -295,7 +295,12 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
         schedule: full_schedule(&spec.schedule, pilot.as_ref()),
         pilot,
         shape: spec.shape,
-        inputs: Inputs { masks_sha256: calibration.masks, measurement_sha256: measurement.data },
+        inputs: Inputs {
+            masks_sha256: calibration.masks,
+            masks_axes: calibration.axes.clone(),
+            measurement_sha256: measurement.data,
+            measurement_axes: measurement.axes.clone(),
+        },
         models: ModelRecord::of_job(spec),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,

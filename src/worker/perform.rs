@@ -123,6 +123,7 @@ fn facts(name: Option<Label>, made: &Calibrated, masks: Sha256) -> NewCalibratio
         masks,
         format: "captures".into(),
         sample: made.sample.to_string(),
+        axes: None,
         frames: report.frames,
         height: report.height,
         width: report.width,

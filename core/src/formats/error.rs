@@ -45,6 +45,15 @@ pub enum FormatError {
     /// An array was named, in a file that holds one without a name.
     #[error("the file holds one array without a name: leave array out")]
     NoNames,
+    /// An array whose frames may lie along several of its axes.
+    #[error(
+        "{format} file: the array [{}, {}, {}] may be {fits}: state axes, the one that is right{}",
+        shape[0], shape[1], shape[2], turning(*format)
+    )]
+    AxesAmbiguous { format: Format, shape: [u64; 3], fits: String },
+    /// The axes of pictures were stated as something else than they are.
+    #[error("{0} has pictures of rows and columns, one for each frame: leave axes out")]
+    NoAxes(Format),
     /// Integers of a type that has no scale of its own, and none was stated.
     #[error(
         "the samples are {0}, which has no full scale of its own: state full_scale, the stored number that means 1"
@@ -93,6 +102,8 @@ impl FormatError {
             Self::Malformed { .. } => "malformed",
             Self::OverLimit { .. } => "over_limit",
             Self::MissingArray { .. } | Self::NoNames => "missing_array",
+            Self::AxesAmbiguous { .. } => "axes_ambiguous",
+            Self::NoAxes(_) => "no_axes",
             Self::FullScale(_) | Self::FullScaleNeeded(_) => "invalid_full_scale",
             Self::NotFinite { .. } => "not_finite",
             Self::AboveFullScale { .. } => "above_full_scale",
@@ -120,5 +131,16 @@ impl FormatError {
     /// For `map_err` on I/O: `.map_err(FormatError::io("read the frame"))`.
     pub fn io(action: &'static str) -> impl FnOnce(io::Error) -> Self {
         move |source| Self::Io { action, source }
+    }
+}
+
+/// How an array is saved in another order.
+fn turning(format: Format) -> &'static str {
+    match format {
+        Format::Npy => {
+            ", or save [row, column, frame] as [frame, row, column]: python -c \"import numpy; \
+             numpy.save('out.npy', numpy.moveaxis(numpy.load('in.npy'), -1, 0))\""
+        }
+        _ => "",
     }
 }

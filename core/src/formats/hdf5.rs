@@ -1,7 +1,7 @@
 //! HDF5: MATLAB's level 7.3, h5py and others. One array of a file, frame by frame.
 //!
-//! What is no MATLAB file has the axes (frame, row, column) or (row, column). MATLAB writes its axes (row, column, frame)
-//! in reverse, so there a frame comes as (column, row).
+//! What is no MATLAB file usually has the axes (frame, row, column) or (row, column). MATLAB writes its axes, usually
+//! (row, column, frame), in reverse, so there a frame comes as (column, row).
 //!
 //! `hdf5-reader` is pure Rust and reads this file alone: a binding to libhdf5 would follow references to external
 //! files, so that an upload could read the server's. Ranges are read, not mapped: a file that is cut while it is
@@ -16,108 +16,103 @@ use hdf5_reader::{
     ByteOrder as StoredOrder, Dataset, Datatype, H5Type, Hdf5File, OpenOptions, SliceInfo,
     SliceInfoElem,
 };
-use ndarray::Array2;
 
+use super::array::{self, ArrayReader, Samples};
+use super::axes::{Expected, Writer};
 use super::samples::{self, ByteOrder};
 use super::scene::{SceneArray, list};
-use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use super::{Format, FormatError, FrameReader, Limits, SampleType};
 use crate::formats::error::Result;
 
 /// Chunks that a frame touches are decoded once for all frames they hold, and kept so long. A file whose frames need
 /// more would be decoded again for each frame.
 const CHUNK_CACHE_BYTES: usize = 128 << 20;
 
-/// One array of an HDF5 file.
-pub(super) struct Hdf5Reader {
+/// The numbers of one array of an HDF5 file.
+struct Hdf5Samples {
     dataset: Dataset,
-    info: StackInfo,
-    /// Rows and columns are exchanged, as MATLAB writes them.
-    by_columns: bool,
-    next: usize,
+    /// Numbers of one entry of the first axis; of all of them in an array of two dimensions.
+    entry: usize,
+    /// The next entry.
+    next: u64,
+    truth: bool,
 }
 
-impl Hdf5Reader {
-    /// Opens the array of `file` with this name, which is what `array` says. Errors: no HDF5; no such array; too
-    /// large; another type.
-    pub(super) fn open(
-        file: File,
-        (array, name): (SceneArray, &str),
-        limits: &Limits,
-    ) -> Result<Self> {
-        let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
-        let options = OpenOptions {
-            chunk_cache_bytes: CHUNK_CACHE_BYTES,
-            max_chunk_bytes: CHUNK_CACHE_BYTES,
-            ..OpenOptions::default()
-        };
-        let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
-        let (_, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
-        let dataset = match file.dataset(name) {
-            Ok(dataset) => dataset,
-            Err(Error::Io(source)) => return Err(error(Error::Io(source))),
-            // In a group that is not there, or a group itself.
-            Err(other) if names.iter().any(|there| there == name) => return Err(error(other)),
-            Err(_) => {
-                let (format, name) = (Format::Hdf5, name.to_owned());
-                return Err(FormatError::MissingArray { format, name, present: list(&names) });
-            }
-        };
-        let class = dataset.attribute("MATLAB_class").ok();
-        let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
-        let sample = match (stored(dataset.dtype()), class.as_deref()) {
-            (Some((SampleType::U8, _)), Some("logical")) => SampleType::Bool,
-            (Some(_), Some("char")) => return Err(unsupported("text".to_owned())),
-            (Some((sample, _)), _) => sample,
-            (None, _) => return Err(unsupported(describe(dataset.dtype()))),
-        };
-        let by_columns = class.is_some();
-        let (frames, height, width) = match (dataset.shape(), by_columns) {
-            (&[height, width], false) | (&[width, height], true) => (1, height, width),
-            (&[frames, height, width], false) | (&[frames, width, height], true) => {
-                (frames, height, width)
-            }
-            (shape, _) => {
-                return Err(unsupported(format!("an array of {} dimensions", shape.len())));
-            }
-        };
-        limits.check_shape(Format::Hdf5, frames, height, width)?;
-        check_chunks(&dataset, sample)?;
-        let [frames, height, width] =
-            [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
-        let mut info = StackInfo::new(Format::Hdf5, sample, frames, height, width);
-        if by_columns {
-            info.default_full_scale = Some(array.default_full_scale());
+/// Opens the array of `file` with this name, which is what `array` says. Errors: no HDF5; no such array; too large;
+/// another type; [`FormatError::AxesAmbiguous`].
+pub(super) fn open(
+    file: File,
+    (array, name, expected): (SceneArray, &str, &Expected),
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
+    let options = OpenOptions {
+        chunk_cache_bytes: CHUNK_CACHE_BYTES,
+        max_chunk_bytes: CHUNK_CACHE_BYTES,
+        ..OpenOptions::default()
+    };
+    let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
+    let (_, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
+    let dataset = match file.dataset(name) {
+        Ok(dataset) => dataset,
+        Err(Error::Io(source)) => return Err(error(Error::Io(source))),
+        // In a group that is not there, or a group itself.
+        Err(other) if names.iter().any(|there| there == name) => return Err(error(other)),
+        Err(_) => {
+            let (format, name) = (Format::Hdf5, name.to_owned());
+            return Err(FormatError::MissingArray { format, name, present: list(&names) });
         }
-        Ok(Self { dataset, info, by_columns, next: 0 })
+    };
+    let class = dataset.attribute("MATLAB_class").ok();
+    let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
+    let sample = match (stored(dataset.dtype()), class.as_deref()) {
+        (Some((SampleType::U8, _)), Some("logical")) => SampleType::Bool,
+        (Some(_), Some("char")) => return Err(unsupported("text".to_owned())),
+        (Some((sample, _)), _) => sample,
+        (None, _) => return Err(unsupported(describe(dataset.dtype()))),
+    };
+    let mut shape = dataset.shape().to_vec();
+    let writer = if class.is_some() { Writer::Matlab } else { Writer::Rows };
+    if writer == Writer::Matlab {
+        shape.reverse();
     }
+    let arranged = expected.arrange((Format::Hdf5, writer), &shape)?;
+    let arranged =
+        arranged.ok_or_else(|| unsupported(format!("an array of {} dimensions", shape.len())))?;
+    let mut info = array::info(Format::Hdf5, sample, &arranged, limits)?;
+    check_chunks(&dataset, sample)?;
+    if writer == Writer::Matlab {
+        info.default_full_scale = Some(array.default_full_scale());
+    }
+    let entries = match *dataset.shape() {
+        [first, _, _] => usize::try_from(first).unwrap_or(usize::MAX),
+        _ => 1,
+    };
+    let entry = info.frames * info.height * info.width / entries;
+    let samples = Hdf5Samples { dataset, entry, next: 0, truth: sample == SampleType::Bool };
+    Ok(Box::new(ArrayReader::new(samples, info, arranged.layout)))
 }
 
-impl FrameReader for Hdf5Reader {
-    fn info(&self) -> &StackInfo {
-        &self.info
+impl Samples for Hdf5Samples {
+    fn rewind(&mut self) -> Result<()> {
+        self.next = 0;
+        Ok(())
     }
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        if self.next == self.info.frames {
-            return Ok(None);
-        }
+    fn read(&mut self, count: usize) -> Result<Vec<f32>> {
         let all = SliceInfoElem::Slice { start: 0, end: u64::MAX, step: 1 };
         let mut selections = vec![all; self.dataset.ndim()];
-        if let [frame, _, _] = &mut *selections {
-            *frame = SliceInfoElem::Index(self.next as u64);
+        if let [first, _, _] = &mut *selections {
+            let (start, end) = (self.next, self.next + (count / self.entry) as u64);
+            *first = SliceInfoElem::Slice { start, end, step: 1 };
+            self.next = end;
         }
         let values = self.dataset.read_slice::<Value>(&SliceInfo { selections }).map_err(error)?;
-        self.next += 1;
         let mut values: Vec<f32> = values.into_iter().map(|Value(value)| value).collect();
-        if self.info.sample == SampleType::Bool {
+        if self.truth {
             values.iter_mut().for_each(|value| *value = f32::from(u8::from(*value != 0.0)));
         }
-        let (height, width) = (self.info.height, self.info.width);
-        if self.by_columns {
-            let columns = samples::frame(width, height, values)?;
-            return Ok(Some(columns.t().as_standard_layout().into_owned()));
-        }
-        samples::frame(height, width, values).map(Some)
+        Ok(values)
     }
 }
 
@@ -205,7 +200,7 @@ fn describe(dtype: &Datatype) -> String {
     name.to_owned()
 }
 
-/// Refuses chunks of which those that one frame touches don't fit into the cache.
+/// Refuses chunks of which those that one entry of the first axis touches don't fit into the cache.
 fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     let Some(chunk) = dataset.chunks() else { return Ok(()) };
     let ([.., height, width], Some(depth)) = (dataset.shape(), chunk.first()) else {
@@ -223,8 +218,8 @@ fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     }
     Err(FormatError::OverLimit {
         format: Format::Hdf5,
-        what: "the size of the chunks that hold one frame (save with chunks of one frame each, in h5py \
-               chunks=(1, height, width))",
+        what: "the size of the chunks that hold one entry of the first axis (save with chunks of one each, in \
+               h5py chunks=(1, height, width))",
         value: bytes,
         limit: CHUNK_CACHE_BYTES as u64,
     })

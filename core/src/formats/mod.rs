@@ -9,6 +9,8 @@
 
 #![warn(missing_docs)]
 
+mod array;
+mod axes;
 mod error;
 mod format;
 mod hdf5;
@@ -30,10 +32,11 @@ mod test_support;
 mod tiff;
 pub mod validate;
 
+pub use axes::{Axes, Expected};
 pub use error::FormatError;
 pub use format::Format;
 pub use limits::Limits;
-pub use open::{collect, open_stack, read_stack};
+pub use open::{Wanted, collect, open_array, open_stack, read_stack};
 pub use samples::StackWriter;
 pub use stack::{FrameReader, FullScale, SampleType, StackInfo};
 pub use window::WindowReader;

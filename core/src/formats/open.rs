@@ -7,10 +7,30 @@ use std::path::Path;
 use ndarray::Array3;
 
 use super::format::describe;
-use super::{Format, FormatError, FrameReader, Limits, StackInfo, npy, png, tiff};
+use super::mat::{self, SceneArray};
+use super::{
+    Axes, Expected, Format, FormatError, FrameReader, Limits, StackInfo, hdf5, npy, png, tiff,
+};
 use crate::formats::error::Result;
 
 const ACCEPTED: &str = "npy, TIFF, PNG (1, 8 or 16 bit grey), .mat and HDF5";
+
+/// Which array of a file is meant if it has several, and what is known of it.
+#[derive(Debug, Clone, Copy)]
+pub struct Wanted<'a> {
+    /// What the array is.
+    pub array: SceneArray,
+    /// What it is called there; none for [`SceneArray::name`].
+    pub name: Option<&'a str>,
+    /// What is known of it.
+    pub expected: Expected,
+}
+
+impl From<SceneArray> for Wanted<'_> {
+    fn from(array: SceneArray) -> Self {
+        Self { array, name: None, expected: Expected::default() }
+    }
+}
 
 /// Opens a stack of frames. The format is told by the file's first bytes, never by its name.
 ///
@@ -18,21 +38,61 @@ const ACCEPTED: &str = "npy, TIFF, PNG (1, 8 or 16 bit grey), .mat and HDF5";
 /// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 1, 8
 /// or 16 bit. Errors say what is wrong with the file; see [`FormatError`].
 pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
+    open_any(path, None, limits)
+}
+
+/// The same, or one array of a file of several: .mat, HDF5. [`StackInfo::default_full_scale`] of MATLAB's files is
+/// [`SceneArray::default_full_scale`]. Errors: also [`FormatError::MissingArray`], [`FormatError::NoNames`],
+/// [`FormatError::AxesAmbiguous`] and [`FormatError::NoAxes`].
+pub fn open_array<'a>(
+    path: &Path,
+    wanted: impl Into<Wanted<'a>>,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    open_any(path, Some(wanted.into()), limits)
+}
+
+fn open_any(
+    path: &Path,
+    wanted: Option<Wanted<'_>>,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
-    match format {
-        Format::Npy => Ok(Box::new(npy::NpyReader::open(file, length, limits)?)),
-        Format::Tiff => Ok(Box::new(tiff::TiffReader::open(file, length, limits)?)),
-        Format::Png => Ok(Box::new(png::PngReader::open(file, length, limits)?)),
-        Format::Mat | Format::Hdf5 => Err(FormatError::Unsupported {
-            format,
-            found: "a scene of several arrays".to_owned(),
-            accepted: "one stack a file here; name the file as a scene",
-        }),
-        Format::Exr | Format::Planar => Err(FormatError::UnknownFormat {
-            found: format!("it is a {format} file"),
-            accepted: ACCEPTED,
-        }),
+    let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
+    if let (Format::Mat | Format::Hdf5, Some(Wanted { array, name, .. })) = (format, wanted) {
+        let wanted = (array, name.unwrap_or(array.name()), &expected);
+        return match format {
+            Format::Mat => mat::open(file, length, wanted, limits),
+            _ => hdf5::open(file, wanted, limits),
+        };
+    }
+    if wanted.is_some_and(|wanted| wanted.name.is_some()) {
+        return Err(FormatError::NoNames);
+    }
+    if format == Format::Npy {
+        return Ok(Box::new(npy::open(file, length, (format, &expected), limits)?));
+    }
+    let reader: Box<dyn FrameReader + Send> = match format {
+        Format::Tiff => Box::new(tiff::TiffReader::open(file, length, limits)?),
+        Format::Png => Box::new(png::PngReader::open(file, length, limits)?),
+        Format::Mat | Format::Hdf5 => {
+            return Err(FormatError::Unsupported {
+                format,
+                found: "a scene of several arrays".to_owned(),
+                accepted: "one stack a file here; name the file as a scene",
+            });
+        }
+        Format::Npy | Format::Exr | Format::Planar => {
+            return Err(FormatError::UnknownFormat {
+                found: format!("it is a {format} file"),
+                accepted: ACCEPTED,
+            });
+        }
+    };
+    match expected.axes {
+        None | Some(Axes::FrameRowColumn) => Ok(reader),
+        Some(_) => Err(FormatError::NoAxes(format)),
     }
 }
 

@@ -1,11 +1,11 @@
 //! Samples as bytes: from any accepted type to f32, and from f32 to little-endian bytes.
 
-use std::io::{self, Write};
+use std::io::{self, ErrorKind, Write};
 
 use half::f16;
 use ndarray::{Array2, ArrayView2};
 
-use super::{FormatError, SampleType};
+use super::{Format, FormatError, SampleType};
 use crate::formats::error::Result;
 
 /// The order of the bytes of a sample.
@@ -55,6 +55,22 @@ pub(super) fn frame(height: usize, width: usize, samples: Vec<f32>) -> Result<Ar
     Array2::from_shape_vec((height, width), samples).map_err(|_| {
         FormatError::Internal(format!("{count} samples for a frame of {height}x{width}"))
     })
+}
+
+/// Why bytes could not be read. Decompressors report bad data as I/O errors too: only the system's own carry a
+/// number.
+pub(super) fn read_error(format: Format, source: io::Error) -> FormatError {
+    if source.raw_os_error().is_some() {
+        return FormatError::Io { action: "read the file", source };
+    }
+    match source.kind() {
+        ErrorKind::UnexpectedEof => FormatError::Truncated {
+            format,
+            promised: "more numbers".to_owned(),
+            present: "no more bytes".to_owned(),
+        },
+        _ => FormatError::malformed(format, format!("compressed data: {source}")),
+    }
 }
 
 /// Writes the f32 frames of a stack one after another as little-endian rows, behind a header that

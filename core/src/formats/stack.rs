@@ -2,7 +2,7 @@
 
 use ndarray::Array2;
 
-use super::{Format, FormatError};
+use super::{Axes, Format, FormatError};
 use crate::formats::error::Result;
 use strum::Display;
 
@@ -110,6 +110,8 @@ pub struct StackInfo {
     pub sample: SampleType,
     /// The file's format.
     pub format: Format,
+    /// The order of the array's axes; none for pictures and arrays of two dimensions, where there is no question.
+    pub axes: Option<Axes>,
     /// What means 1.0 unless stated: [`SampleType::default_full_scale`], but 255 for the meas and
     /// orig arrays of a .mat scene, whatever their type.
     pub default_full_scale: Option<FullScale>,
@@ -130,6 +132,7 @@ impl StackInfo {
             width,
             sample,
             format,
+            axes: None,
             default_full_scale: sample.default_full_scale(),
         }
     }

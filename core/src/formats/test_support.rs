@@ -3,10 +3,14 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array3, Axis};
+use ndarray::{Array3, ArrayView3, Axis};
 use tempfile::NamedTempFile;
 
-use super::{FormatError, FrameReader, Limits, StackInfo, open_stack, read_stack};
+use super::mat::SceneArray;
+use super::{
+    Axes, Expected, FormatError, FrameReader, Limits, StackInfo, Wanted, collect, open_array,
+    open_stack, read_stack,
+};
 
 /// A file that another program has written; `make.py` beside it says how.
 pub(super) fn sample(name: &str) -> PathBuf {
@@ -60,4 +64,21 @@ pub(super) fn survive(bytes: &[u8]) {
 /// Bits of all values, so that NaN compares equal to itself.
 pub(super) fn bits(stack: &Array3<f32>) -> Vec<Vec<u32>> {
     stack.axis_iter(Axis(0)).map(|f| f.iter().map(|v| v.to_bits()).collect()).collect()
+}
+
+/// A stack (frame, row, column) as arrays of every order of axes.
+pub(super) fn every_order(stack: &Array3<f32>) -> [(Axes, ArrayView3<'_, f32>); 3] {
+    [
+        (Axes::FrameRowColumn, stack.view()),
+        (Axes::RowColumnFrame, stack.view().permuted_axes([1, 2, 0])),
+        (Axes::ColumnRowFrame, stack.view().permuted_axes([2, 1, 0])),
+    ]
+}
+
+/// The array `mask` of a file, or its only one, whose axes are stated, and how it was read.
+pub(super) fn read_as(path: &Path, axes: Axes) -> Result<(Option<Axes>, Array3<f32>), FormatError> {
+    let expected = Expected { axes: Some(axes), ..Expected::default() };
+    let wanted = Wanted { expected, ..SceneArray::Masks.into() };
+    let (info, stack) = collect(&mut *open_array(path, wanted, &Limits::default())?)?;
+    Ok((info.axes, stack))
 }

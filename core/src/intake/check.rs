@@ -38,29 +38,22 @@ pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
 ) -> Result<MaskStatistics> {
-    check_axes(&opened)?;
+    check_count(&opened)?;
     check_masks(&mut *opened.reader, opened.full_scale, sink)
         .map_err(IntakeError::format(opened.name))
 }
 
-/// Refuses what has more frames than one exposure can tell apart, and what looks like masks whose last axis
-/// is the frame.
-fn check_axes(opened: &Opened) -> Result<()> {
-    let StackInfo { frames, height, width, .. } = opened.info;
-    if frames <= MOST_MASKS && (width >= frames || height < 4 * width) {
+/// Refuses what has more frames than one exposure can tell apart.
+fn check_count(opened: &Opened) -> Result<()> {
+    let StackInfo { frames, height, width, axes, .. } = opened.info;
+    if frames <= MOST_MASKS {
         return Ok(());
     }
-    let mut detail = format!("{frames} masks of {height}x{width} (rows x columns)");
-    if frames > MOST_MASKS {
-        detail += &format!("; a calibration has at most {MOST_MASKS}");
-    }
-    if width <= MOST_MASKS {
-        detail += &format!(
-            "; it looks like {width} masks of {frames}x{height}, saved as [row, column, frame]. \
-             [frame, row, column] is needed: python -c \"import numpy as n; n.save('masks.npy', \
-             n.moveaxis(n.load('FILE.npy'), -1, 0))\""
-        );
-    }
+    let read = axes.map(|axes| format!(", read as {axes}")).unwrap_or_default();
+    let detail = format!(
+        "{frames} masks of {height}x{width} (rows x columns{read}); a calibration has at most {MOST_MASKS}: \
+         send one mask for each frame of an exposure, or state axes"
+    );
     Err(IntakeError::Size { place: opened.name.clone(), detail })
 }
 

@@ -5,9 +5,12 @@ use std::path::Path;
 use ndarray::Array2;
 
 use super::IntakeError;
-use crate::formats::mat::{self, SceneArray};
-use crate::formats::{self, FormatError, FrameReader, FullScale, Limits, StackInfo};
+use crate::formats::mat::SceneArray;
+use crate::formats::{
+    self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, StackInfo, Wanted,
+};
 use crate::intake::error::Result;
+use crate::job::MOST_MASKS;
 
 /// A file, and which array of it is meant if it has several.
 #[derive(Debug, Clone)]
@@ -16,6 +19,10 @@ pub struct Source<'a> {
     pub array: SceneArray,
     /// What that array is called there; none for the field's own name.
     pub named: Option<String>,
+    /// The order of its axes; none for the one that fits.
+    pub axes: Option<Axes>,
+    /// Rows and columns of a frame, where they are known.
+    pub size: Option<(usize, usize)>,
     /// The stored number that means 1; none for the file's own.
     pub full_scale: Option<f32>,
     pub limits: Limits,
@@ -50,7 +57,8 @@ impl<'a> Source<'a> {
         full_scale: Option<f32>,
         limits: Limits,
     ) -> Self {
-        Self { path, array, named: None, full_scale, limits, name: String::new() }
+        let (named, axes, size, name) = (None, None, None, String::new());
+        Self { path, array, named, axes, size, full_scale, limits, name }
     }
 
     /// The same file, of which the array with this name is meant.
@@ -58,20 +66,19 @@ impl<'a> Source<'a> {
         Self { named, ..self }
     }
 
+    /// The same file, whose axes are stated, or whose frames have these rows and columns.
+    pub fn arranged(self, axes: Option<Axes>, size: Option<(usize, usize)>) -> Self {
+        Self { axes, size, ..self }
+    }
+
     /// Opens it.
-    /// Errors: no file, or none of a format that is read; larger than the limits; no such array; no
-    /// full scale.
+    /// Errors: no file, or none of a format that is read; larger than the limits; no such array; axes in
+    /// several orders that fit; no full scale.
     pub fn open(&self) -> Result<Opened> {
-        let named = self.named.as_deref();
-        let opened = match mat::is_scene(self.path) {
-            Ok(true) => {
-                let name = named.unwrap_or(self.array.name());
-                mat::open_named(self.path, (self.array, name), &self.limits)
-            }
-            Ok(false) if named.is_some() => Err(FormatError::NoNames),
-            Ok(false) => formats::open_stack(self.path, &self.limits),
-            Err(error) => Err(error),
-        };
+        let most_frames = (self.array == SceneArray::Masks).then_some(MOST_MASKS);
+        let expected = Expected { axes: self.axes, most_frames, size: self.size };
+        let wanted = Wanted { array: self.array, name: self.named.as_deref(), expected };
+        let opened = formats::open_array(self.path, wanted, &self.limits);
         let reader = opened.map_err(IntakeError::format(&self.name))?;
         let info = *reader.info();
         let full_scale = match (self.full_scale, info.default_full_scale) {

@@ -14,7 +14,7 @@ use super::IntakeError;
 use super::check::{Exposure, masks, measurement};
 use super::open::Source;
 use crate::formats::mat::SceneArray;
-use crate::formats::{FormatError, Limits};
+use crate::formats::{Axes, FormatError, Limits};
 use crate::intake::error::Result;
 
 /// An array on its own scale, and the full scale that brought it there.
@@ -22,15 +22,17 @@ use crate::intake::error::Result;
 pub struct Scaled<T> {
     pub array: T,
     pub full_scale: f32,
+    /// How the axes of the file were read; none for pictures.
+    pub axes: Option<Axes>,
 }
 
 /// Masks \[B,H,W\] on \[0,1\], checked.
 pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     let opened = source.open()?;
-    let full_scale = opened.full_scale.value();
+    let (full_scale, axes) = (opened.full_scale.value(), opened.info.axes);
     let mut stack = Stack::default();
     masks(opened, |mask| stack.push(mask))?;
-    Ok(Scaled { array: stack.into_array()?, full_scale })
+    Ok(Scaled { array: stack.into_array()?, full_scale, axes })
 }
 
 /// Snapshots \[S,H,W\] of a measurement, checked, and how many there are in all. They are given by the
@@ -40,7 +42,8 @@ pub fn read_snapshots(
     (first, last): (usize, Option<usize>),
 ) -> Result<(Scaled<Array3<f32>>, usize)> {
     let opened = source.open()?;
-    let (full_scale, snapshots) = (opened.full_scale.value(), opened.info.frames);
+    let (full_scale, axes) = (opened.full_scale.value(), opened.info.axes);
+    let snapshots = opened.info.frames;
     let last = last.unwrap_or(snapshots.saturating_sub(1));
     if last >= snapshots || last < first {
         let asked = if first == last { first.to_string() } else { format!("{first} to {last}") };
@@ -58,7 +61,7 @@ pub fn read_snapshots(
         next += 1;
         Ok(())
     })?;
-    Ok((Scaled { array: found.into_array()?, full_scale }, snapshots))
+    Ok((Scaled { array: found.into_array()?, full_scale, axes }, snapshots))
 }
 
 /// The true frames \[S B,H,W\] of some snapshots of a measurement, of a file that has those of these

@@ -168,7 +168,10 @@ pub struct Content {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Inputs {
     pub masks_sha256: Sha256,
+    /// How the axes of the array were read; none for pictures.
+    pub masks_axes: Option<String>,
     pub measurement_sha256: Sha256,
+    pub measurement_axes: Option<String>,
 }
 
 /// Every factor between the stored numbers and the solver's \[0,1\]. All are undone in the
@@ -301,7 +304,12 @@ pub(super) fn sample(frames: usize) -> Manifest {
         schedule: Schedule::gap_tv(),
         pilot: None,
         shape: SceneShape { frames, height: 20, width: 24, snapshots: 2 },
-        inputs: Inputs { masks_sha256: hash, measurement_sha256: hash },
+        inputs: Inputs {
+            masks_sha256: hash,
+            masks_axes: None,
+            measurement_sha256: hash,
+            measurement_axes: Some("frame-row-column".to_owned()),
+        },
         models: ModelRecord::of(&Algorithm::PnpTvFastdvdnet.default_schedule()),
         scale: ScaleRecord { masks_full_scale: 1.0, measurement_full_scale: 255.0, white: 0.9 },
         tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),

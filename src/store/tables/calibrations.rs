@@ -24,6 +24,8 @@ pub struct NewCalibration {
     pub masks: Sha256,
     pub format: String,
     pub sample: String,
+    /// How the axes of the array were read; none for pictures.
+    pub axes: Option<String>,
     #[sqlx(try_from = "i64")]
     pub frames: usize,
     #[sqlx(try_from = "i64")]
@@ -297,9 +299,9 @@ pub async fn insert(
 ) -> Result<()> {
     let facts = &calibration.facts;
     sql!(
-        "INSERT INTO calibrations (lab, token, id, name, masks, prepared, format, sample, frames, height,
+        "INSERT INTO calibrations (lab, token, id, name, masks, prepared, format, sample, axes, frames, height,
              width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -309,6 +311,7 @@ pub async fn insert(
             calibration.prepared,
             &facts.format,
             &facts.sample,
+            &facts.axes,
             integer(facts.frames),
             integer(facts.height),
             integer(facts.width),

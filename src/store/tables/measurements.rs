@@ -20,6 +20,8 @@ pub struct NewMeasurement {
     pub data: Sha256,
     pub format: String,
     pub sample: String,
+    /// How the axes of the array were read; none for pictures.
+    pub axes: Option<String>,
     pub snapshots: u32,
     pub height: usize,
     pub width: usize,
@@ -133,10 +135,10 @@ pub async fn insert(
 ) -> Result<()> {
     let facts = &measurement.facts;
     sql!(
-        "INSERT INTO measurements (lab, token, id, name, calibration, data, prepared, format, sample,
+        "INSERT INTO measurements (lab, token, id, name, calibration, data, prepared, format, sample, axes,
              snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings,
              created_at, sequence)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -147,6 +149,7 @@ pub async fn insert(
             measurement.prepared,
             &facts.format,
             &facts.sample,
+            &facts.axes,
             facts.snapshots,
             integer(facts.height),
             integer(facts.width),
@@ -175,6 +178,7 @@ fn measurement(row: &SqliteRow) -> Result<Measurement> {
             data: row.try_get("data")?,
             format: row.try_get("format")?,
             sample: row.try_get("sample")?,
+            axes: row.try_get("axes")?,
             snapshots: row.try_get("snapshots")?,
             height: number(row, "height")?,
             width: number(row, "width")?,

@@ -62,6 +62,7 @@ impl Lab {
             masks: masks.sha256(),
             format: "captures".into(),
             sample: "uint16".into(),
+            axes: None,
             frames: 2,
             height: 64,
             width: 96,

@@ -52,6 +52,13 @@ def main():
     with h5py.File(HERE / "names.h5", "w") as file:
         file["calibrated/masks"] = masks.astype("u1")
         file["shots"] = snapshots.astype("<u2")
+    with h5py.File(HERE / "axes.h5", "w") as file:
+        for axes, order in [("frame-row-column", (0, 1, 2)), ("row-column-frame", (1, 2, 0)), ("column-row-frame", (2, 1, 0))]:
+            values = snapshots.transpose(order).astype("<u2")
+            file[axes] = values
+            file.create_dataset(f"packed/{axes}", data=values, chunks=(2, 2, 2), compression="gzip")
+            file[f"matlab/{axes}"] = np.ascontiguousarray(values.T)
+            file[f"matlab/{axes}"].attrs["MATLAB_class"] = np.bytes_("uint16")
     scipy.io.savemat(HERE / "names.mat", {"shots": np.moveaxis(snapshots, 0, -1).astype("<u2")})
 
 

@@ -72,22 +72,39 @@ class Client:
         *,
         masks_full_scale: float | None = None,
         full_scale: float | None = None,
+        masks_axes: str | None = None,
+        axes: str | None = None,
         folder: str | os.PathLike[str] | None = None,
         **job: Any,
     ) -> Result:
         """Uploads, submits, waits and downloads.
 
         `masks` are [B, H, W], `measurement` is [H, W] or [S, H, W]; arrays or file names. Their full scale, the stored
-        number that means 1, is by default the maximum of an integer type, and 1 for floats. `job` goes on to `submit`.
+        number that means 1, is by default the maximum of an integer type, and 1 for floats. Axes in another order are
+        stated where several fit: "row-column-frame" or "column-row-frame". `job` goes on to `submit`.
         The frames come into `folder`, by default one that goes away with the result.
         """
-        calibration = masks if isinstance(masks, Calibration) else self.calibrate(masks, full_scale=masks_full_scale)
-        taken = self.measure(calibration, measurement, full_scale=full_scale)
+        calibration = (
+            masks
+            if isinstance(masks, Calibration)
+            else self.calibrate(masks, full_scale=masks_full_scale, axes=masks_axes)
+        )
+        taken = self.measure(calibration, measurement, full_scale=full_scale, axes=axes)
         return self.submit(taken, algorithm, **job).wait().result(folder)
 
-    def calibrate(self, masks: Source, *, full_scale: float | None = None, name: str | None = None) -> Calibration:
-        """Makes a calibration of masks [B, H, W]."""
-        record = self._create("calibrations", masks=self.upload(masks), full_scale=full_scale, name=name)
+    def calibrate(
+        self,
+        masks: Source,
+        *,
+        full_scale: float | None = None,
+        array: str | None = None,
+        axes: str | None = None,
+        name: str | None = None,
+    ) -> Calibration:
+        """Makes a calibration of masks [B, H, W]. `array` is their name in a file of several arrays."""
+        record = self._create(
+            "calibrations", masks=self.upload(masks), full_scale=full_scale, array=array, axes=axes, name=name
+        )
         return Calibration(self, record).ready()
 
     def calibrate_captures(
@@ -123,6 +140,8 @@ class Client:
         *,
         dark: Source | Sequence[Source] = (),
         full_scale: float | None = None,
+        array: str | None = None,
+        axes: str | None = None,
         saturation: int | None = None,
         camera_fps: float | None = None,
         exposure_s: float | None = None,
@@ -135,6 +154,8 @@ class Client:
             data=self.upload(data),
             dark=self._uploads(dark),
             full_scale=full_scale,
+            array=array,
+            axes=axes,
             saturation=saturation,
             camera_fps=camera_fps,
             exposure_s=exposure_s,

@@ -1,10 +1,11 @@
 use ndarray::Array3;
 use proptest::prelude::{any, prop, proptest};
 
-use crate::formats::mat::{SceneArray, open_array, open_named};
+use crate::formats::mat::SceneArray;
 use crate::formats::test_support::{assert_names, file, sample};
 use crate::formats::{
-    Format, FormatError, FullScale, Limits, SampleType, StackInfo, collect, read_stack,
+    Axes, Expected, Format, FormatError, FullScale, Limits, SampleType, StackInfo, Wanted, collect,
+    open_array, read_stack,
 };
 
 fn read(name: &str, array: SceneArray) -> Result<(StackInfo, Array3<f32>), FormatError> {
@@ -38,8 +39,8 @@ fn arrays_of_h5py_are_read() {
 #[test]
 fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
     let open = |file: &str, name: &str| {
-        let array = (SceneArray::Measurements, name);
-        collect(&mut *open_named(&sample(file), array, &Limits::default())?)
+        let wanted = Wanted { name: Some(name), ..SceneArray::Measurements.into() };
+        collect(&mut *open_array(&sample(file), wanted, &Limits::default())?)
     };
     for file in ["names.h5", "names.mat"] {
         assert_eq!(open(file, "shots").unwrap().1, snapshots(), "{file}");
@@ -52,6 +53,21 @@ fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
     assert_eq!(open("names.h5", "calibrated/masks").unwrap().1, masks());
     let group = open("names.h5", "calibrated").unwrap_err();
     assert!(group.is_callers_fault(), "{group:?}");
+}
+
+#[test]
+fn axes_in_every_order_are_read() {
+    for axes in [Axes::FrameRowColumn, Axes::RowColumnFrame, Axes::ColumnRowFrame] {
+        for place in ["", "packed/", "matlab/"] {
+            let name = format!("{place}{axes}");
+            let expected = Expected { axes: Some(axes), ..Expected::default() };
+            let array = SceneArray::Measurements;
+            let wanted = Wanted { array, name: Some(&name), expected };
+            let reader = open_array(&sample("axes.h5"), wanted, &Limits::default());
+            let (info, values) = collect(&mut *reader.unwrap()).unwrap();
+            assert_eq!((info.axes, values), (Some(axes), snapshots()), "{name}");
+        }
+    }
 }
 
 #[test]

@@ -1,12 +1,12 @@
 //! The outer structure of a level 5 file: a header, then elements, plain or compressed.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Take};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Take};
 
 use flate2::bufread::ZlibDecoder;
 
 use crate::formats::error::Result;
-use crate::formats::samples::ByteOrder;
+use crate::formats::samples::{self, ByteOrder};
 use crate::formats::{Format, FormatError};
 
 const FILE_HEADER_BYTES: u64 = 128;
@@ -78,16 +78,19 @@ impl Elements {
         Ok(None)
     }
 
+    /// The order of the bytes in a number.
+    pub(super) fn order(&self) -> ByteOrder {
+        self.order
+    }
+
     /// The content of an element, for a look at its header.
     pub(super) fn look_into(&mut self, element: Element) -> Result<Content<&mut BufReader<File>>> {
-        self.file.seek(SeekFrom::Start(element.start)).map_err(read_error)?;
-        Content::new(&mut self.file, element, self.order)
+        Content::open(&mut self.file, element, self.order)
     }
 
     /// The content of an element, to keep.
-    pub(super) fn into_content(mut self, element: Element) -> Result<Content<BufReader<File>>> {
-        self.file.seek(SeekFrom::Start(element.start)).map_err(read_error)?;
-        Content::new(self.file, element, self.order)
+    pub(super) fn into_content(self, element: Element) -> Result<Content<BufReader<File>>> {
+        Content::open(self.file, element, self.order)
     }
 }
 
@@ -106,8 +109,10 @@ enum Source<R> {
     Zlib(ZlibDecoder<Take<R>>),
 }
 
-impl<R: BufRead> Content<R> {
-    fn new(file: R, element: Element, order: ByteOrder) -> Result<Self> {
+impl<R: BufRead + Seek> Content<R> {
+    /// The content of an element of this file, wherever that stands.
+    pub(super) fn open(mut file: R, element: Element, order: ByteOrder) -> Result<Self> {
+        file.seek(SeekFrom::Start(element.start)).map_err(read_error)?;
         let stored = element.bytes;
         let bytes = file.take(stored);
         if !element.compressed {
@@ -122,7 +127,9 @@ impl<R: BufRead> Content<R> {
         content.left = bytes.into();
         Ok(content)
     }
+}
 
+impl<R: BufRead> Content<R> {
     /// The order of the bytes in a number.
     pub(super) fn order(&self) -> ByteOrder {
         self.order
@@ -201,16 +208,5 @@ pub(super) fn malformed(problem: impl Into<String>) -> FormatError {
 }
 
 fn read_error(source: std::io::Error) -> FormatError {
-    // The decompressor reports bad data as I/O errors too: only the system's own carry a number.
-    if source.raw_os_error().is_some() {
-        return FormatError::Io { action: "read the .mat file", source };
-    }
-    match source.kind() {
-        ErrorKind::UnexpectedEof => FormatError::Truncated {
-            format: Format::Mat,
-            promised: "more numbers".to_owned(),
-            present: "no more bytes".to_owned(),
-        },
-        _ => malformed(format!("compressed data: {source}")),
-    }
+    samples::read_error(Format::Mat, source)
 }

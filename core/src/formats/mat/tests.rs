@@ -6,9 +6,9 @@ use flate2::write::ZlibEncoder;
 use ndarray::Array3;
 use proptest::prelude::{any, proptest};
 
-use super::{SceneArray, is_scene, open_array, read_scene_mat};
-use crate::formats::test_support::{assert_names, file, ramp, refusal};
-use crate::formats::{FormatError, Limits, SampleType, collect};
+use super::SceneArray;
+use crate::formats::test_support::{assert_names, every_order, file, ramp, read_as, refusal};
+use crate::formats::{Axes, FormatError, Limits, SampleType, collect, open_array};
 
 /// The level 5 class and storage type of an array, and its numbers as bytes.
 struct Numbers {
@@ -98,12 +98,9 @@ fn plain_and_compressed_scenes_are_read_as_another_library_reads_them() {
     let packed: Vec<_> = plain.iter().map(|e| compressed(e)).collect();
     for elements in [&plain[..], &packed] {
         let bytes = mat(elements, false);
-        let path = file(&bytes);
-        assert!(is_scene(path.path()).unwrap());
-        let scene = read_scene_mat(path.path(), &Limits::default()).unwrap();
-        assert_eq!(scene.masks, masks);
-        assert_eq!(scene.measurements, measurements);
-        assert_eq!(scene.truth.as_ref(), Some(&truth));
+        assert_eq!(read(&bytes, SceneArray::Masks).unwrap(), masks);
+        assert_eq!(read(&bytes, SceneArray::Measurements).unwrap(), measurements);
+        assert_eq!(read(&bytes, SceneArray::Truth).unwrap(), truth);
         let theirs = matfile::MatFile::parse(Cursor::new(&bytes)).unwrap();
         let array = theirs.find_by_name("orig").unwrap();
         assert_eq!(array.size(), &[4, 5, 6]);
@@ -111,8 +108,8 @@ fn plain_and_compressed_scenes_are_read_as_another_library_reads_them() {
         let ours: Vec<f64> = matlab_order(&truth).iter().map(|&v| v.into()).collect();
         assert_eq!(real, &ours);
     }
-    let without = read_scene_mat(file(&mat(&plain[..2], false)).path(), &Limits::default());
-    assert_eq!(without.unwrap().truth, None);
+    let without = read(&mat(&plain[..2], false), SceneArray::Truth).unwrap_err();
+    assert!(matches!(without, FormatError::MissingArray { .. }), "{without}");
 }
 
 #[test]
@@ -165,10 +162,29 @@ fn wrong_arrays_are_refused_by_name() {
     let four = matrix("mask", &[1, 2, 2, 1], &numbers(6, 9), false);
     assert_names(&refused(&mat(&[four], false)), &["4 dimensions", "(row, column, frame)"]);
     assert_names(&refusal(&mat(&others, false)), &["scene of several arrays"]);
-    let npy = file(b"\x93NUMPY\x01\x00");
-    assert!(!is_scene(npy.path()).unwrap());
-    let error = open_array(npy.path(), SceneArray::Masks, &Limits::default()).err().unwrap();
-    assert_names(&error.to_string(), &["npy", ".mat or HDF5"]);
+}
+
+#[test]
+fn axes_in_every_order_are_read() {
+    // More frames than are kept of one pass, more pixels than are read at a time.
+    for shape in [(2, 3, 4), (40, 2, 3), (3, 11, 7)] {
+        let stack = ramp(shape, 200);
+        for (axes, permuted) in every_order(&stack) {
+            let dimensions: Vec<i32> = permuted.shape().iter().map(|&axis| axis as i32).collect();
+            let bytes = permuted.t().iter().map(|&value| value as u8).collect();
+            let numbers = Numbers { class: 9, storage: 2, bytes };
+            let plain = matrix("mask", &dimensions, &numbers, false);
+            for element in [compressed(&plain), plain] {
+                let path = file(&mat(&[element], false));
+                let found = read_as(path.path(), axes).unwrap();
+                assert_eq!(found, (Some(axes), stack.clone()), "{axes}");
+            }
+        }
+    }
+    let flat = Numbers { class: 9, storage: 2, bytes: (0..12).collect() };
+    let path = file(&mat(&[matrix("mask", &[4, 3], &flat, false)], false));
+    let turned = read_as(path.path(), Axes::ColumnRowFrame).unwrap().1;
+    assert_eq!(turned, ramp((1, 3, 4), 12));
 }
 
 #[test]
@@ -251,16 +267,18 @@ fn shared(name: &str) -> Option<PathBuf> {
 #[test]
 fn the_benchmark_scene_fits_its_own_model() {
     let Some(path) = shared("scenes/traffic48_cacti.mat") else { return };
-    let scene = read_scene_mat(&path, &Limits::default()).unwrap();
-    let truth = scene.truth.unwrap();
-    assert_eq!(scene.masks.dim(), (8, 256, 256));
-    assert_eq!(scene.measurements.dim(), (6, 256, 256));
+    let read =
+        |array| collect(&mut *open_array(&path, array, &Limits::default()).unwrap()).unwrap().1;
+    let (masks, measurements) = (read(SceneArray::Masks), read(SceneArray::Measurements));
+    let truth = read(SceneArray::Truth);
+    assert_eq!(masks.dim(), (8, 256, 256));
+    assert_eq!(measurements.dim(), (6, 256, 256));
     assert_eq!(truth.dim(), (48, 256, 256));
     // The file's own measurement is the sum over the masked frames: rows, columns and frames are
     // where they belong.
-    for (snapshot, measured) in scene.measurements.outer_iter().enumerate() {
+    for (snapshot, measured) in measurements.outer_iter().enumerate() {
         let frames = truth.slice(ndarray::s![8 * snapshot..8 * snapshot + 8, .., ..]);
-        let sum = (&frames * &scene.masks).sum_axis(ndarray::Axis(0));
+        let sum = (&frames * &masks).sum_axis(ndarray::Axis(0));
         let worst = (&sum - &measured).iter().fold(0f32, |m, d| m.max(d.abs()));
         assert!(worst < 0.01, "snapshot {snapshot}: {worst}");
     }

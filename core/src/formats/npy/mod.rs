@@ -4,7 +4,7 @@ mod header;
 mod read;
 mod write;
 
-pub(super) use read::NpyReader;
+pub(super) use read::open;
 pub use read::open_windows;
 pub use write::{stack_header, write_f32, write_image_f32, write_u16, writer};
 

@@ -4,9 +4,9 @@ use proptest::prelude::{any, prop, proptest};
 use super::header::Header;
 use super::write_f32;
 use crate::formats::test_support::{
-    assert_names, file, open, ramp, read, refusal, sample, survive,
+    assert_names, every_order, file, open, ramp, read, read_as, refusal, sample, survive,
 };
-use crate::formats::{FormatError, Limits, SampleType, open_stack, read_stack};
+use crate::formats::{Axes, FormatError, Limits, SampleType, open_stack, read_stack};
 
 /// An npy file of version 1.0 with this dictionary.
 fn npy(dictionary: &str, data: &[u8]) -> Vec<u8> {
@@ -93,16 +93,30 @@ fn fortran_order_is_read() {
     let of_numpy = read_stack(&sample("snapshots-fortran.npy"), &Limits::default()).unwrap().1;
     let expected = Array3::from_shape_fn((2, 4, 5), |(k, i, j)| (100 * k + 10 * i + j) as f32);
     assert_eq!(of_numpy, expected);
-    // More frames than are kept of one reading, more pixels than are read at a time.
-    for shape in [(7, 3, 5), (40, 2, 3), (3, 11, 7)] {
+}
+
+#[test]
+fn axes_in_every_order_are_read() {
+    // More frames than are kept of one pass, more pixels than are read at a time, more passes than are made.
+    for shape in [(2, 3, 4), (7, 3, 5), (40, 2, 3), (3, 11, 7), (50, 10, 9)] {
         let stack = ramp(shape, 60_000);
-        let bytes: Vec<u8> =
-            stack.t().iter().flat_map(|value| (*value as u16).to_le_bytes()).collect();
-        let (frames, height, width) = shape;
-        let file = array_file("'<u2'", "True", &format!("({frames}, {height}, {width})"), &bytes);
-        assert_eq!(read(&file).unwrap().1, stack);
-        assert_names(&refusal(&file[..file.len() - 1]), &["cut short"]);
+        for (axes, array) in every_order(&stack) {
+            for fortran in ["False", "True"] {
+                let stored = if fortran == "True" { array.t() } else { array.view() };
+                let bytes: Vec<u8> =
+                    stored.iter().flat_map(|value| (*value as u16).to_le_bytes()).collect();
+                let (a, b, c) = array.dim();
+                let bytes = array_file("'<u2'", fortran, &format!("({a}, {b}, {c})"), &bytes);
+                let found = read_as(file(&bytes).path(), axes).unwrap();
+                assert_eq!(found, (Some(axes), stack.clone()), "{axes} {fortran}");
+                let cut = read_as(file(&bytes[..bytes.len() - 1]).path(), axes).unwrap_err();
+                assert_names(&cut.to_string(), &["cut short"]);
+            }
+        }
     }
+    let flat = array_file("'|u1'", "False", "(2, 3)", &[1, 2, 3, 4, 5, 6]);
+    let turned = read_as(file(&flat).path(), Axes::ColumnRowFrame).unwrap().1;
+    assert_eq!(turned, array![[[1.0, 4.0], [2.0, 5.0], [3.0, 6.0]]]);
 }
 
 #[test]
