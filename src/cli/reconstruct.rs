@@ -44,7 +44,7 @@ pub struct Arguments {
     /// True frames, to be compared with: those of what is reconstructed, or of all snapshots.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// A scene, .mat or HDF5, with `mask`, `meas` and perhaps `orig`, instead of the three files.
+    /// A scene, npz, .mat or HDF5, with `mask`, `meas` and perhaps `orig`, instead of the three files.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["masks", "measurement", "truth"])]
     scene: Option<PathBuf>,
     /// The snapshots, counted from 0: one, a range with both ends in, or all.

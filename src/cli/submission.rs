@@ -20,10 +20,10 @@ pub(super) struct SubmissionArguments {
     /// Masks [frame, row, column] instead of a calibration; the same file makes one calibration only.
     #[arg(long, value_name = "FILE")]
     masks: Option<PathBuf>,
-    /// What the masks are called in a .mat or HDF5 file [default: mask].
+    /// What the masks are called in an npz, .mat or HDF5 file [default: mask].
     #[arg(long, value_name = "NAME", requires = "masks")]
     masks_array: Option<String>,
-    /// What the snapshots are called in a .mat or HDF5 file [default: meas].
+    /// What the snapshots are called in an npz, .mat or HDF5 file [default: meas].
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
     /// The order of the axes of the masks [default: the only one that fits].

@@ -1,51 +1,175 @@
-//! What is refused, and the lines of the documentation that convert it.
+//! The tables of `docs/formats.md`, row by row, with files of the writers that labs use.
 
-use crate::app::TestApp;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 
-/// The commands of the table in `docs/formats.md`.
-fn lines() -> Vec<String> {
+use ndarray::Array3;
+use sci_recon::formats::mat::SceneArray;
+use sci_recon::formats::{Limits, read_stack};
+use sci_recon::intake::Source;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use crate::app::{Answer, TestApp, id};
+
+/// A row of a table: its first cell, and the command in it, if there is one.
+type Row = (String, Option<String>);
+
+/// The rows of the first table below this heading.
+fn rows(heading: &str) -> Vec<Row> {
     let text = std::fs::read_to_string("docs/formats.md").unwrap();
-    let (_, table) = text.split_once("## What is refused").unwrap();
-    let (table, _) = table.split_once("\n## ").unwrap();
-    let commands =
-        table.lines().filter_map(|row| row.split('`').find(|part| part.starts_with("python -c")));
-    commands.map(str::to_owned).collect()
+    let (_, below) = text.split_once(heading).unwrap();
+    let lines = below.lines().skip_while(|line| !line.starts_with("| ---")).skip(1);
+    let row = |line: &str| {
+        let first = line.trim_start_matches("| ").split(" | ").next().unwrap().to_owned();
+        let command = line.split('`').find(|part| part.starts_with("python -c"));
+        (first, command.map(str::to_owned))
+    };
+    lines.take_while(|line| line.starts_with('|')).map(row).collect()
+}
+
+/// What `tests/judges/written_files.py` says of a file.
+#[derive(Deserialize)]
+struct Written {
+    row: String,
+    file: PathBuf,
+    axes: Option<String>,
+    /// How the axes are read if they are not stated; none for pictures.
+    told: Option<String>,
+    name: Option<String>,
+    full_scale: Option<f32>,
+    #[serde(default)]
+    measurement: bool,
+    /// Of one frame instead of all.
+    frames: Option<usize>,
+    /// Why it is refused.
+    reason: Option<String>,
+    /// What a request that is accepted says besides.
+    again: Option<Value>,
+}
+
+struct Judge {
+    python: String,
+    folder: tempfile::TempDir,
+    app: TestApp,
+    calibration: String,
+}
+
+impl Judge {
+    /// Has all files written; none without Python.
+    async fn new() -> Option<(Self, Vec<Written>)> {
+        let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
+            eprintln!(
+                "SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt"
+            );
+            return None;
+        };
+        let folder = tempfile::tempdir().unwrap();
+        run(Command::new(&python).arg("tests/judges/written_files.py").arg(folder.path()));
+        let index = std::fs::read(folder.path().join("index.json")).unwrap();
+        let app = TestApp::start().await;
+        let masks = std::fs::read(folder.path().join("masks.npy")).unwrap();
+        let calibration = id(&app.calibrate(masks).await.expect(201));
+        let judge = Self { python, folder, app, calibration };
+        Some((judge, serde_json::from_slice(&index).unwrap()))
+    }
+
+    /// Sends a file with what is asked of it.
+    async fn send(&self, written: &Written, file: &Path, asked: &Value) -> Answer {
+        let sha256 = self.app.upload(std::fs::read(file).unwrap()).await;
+        let mut body = match written.measurement {
+            true => json!({ "calibration": self.calibration, "data": sha256 }),
+            false => json!({ "masks": sha256 }),
+        };
+        body.as_object_mut().unwrap().extend(asked.as_object().unwrap().clone());
+        let what = if written.measurement { "measurements" } else { "calibrations" };
+        self.app.post(&format!("/v1/{what}"), &body).await
+    }
+
+    /// Sends a file, which must be accepted, and holds its values against those that were written.
+    async fn accept(&self, written: &Written, file: &Path, asked: &Value) {
+        let made = self.send(written, file, asked).await.expect(201).json();
+        let name = if written.measurement { "snapshots.npy" } else { "masks.npy" };
+        let expected = read_stack(&self.folder.path().join(name), &Limits::default()).unwrap().1;
+        let frames = written.frames.unwrap_or(expected.dim().0);
+        let count = if written.measurement { "snapshots" } else { "frames" };
+        let shape = (&made[count], &made["height"], &made["width"]);
+        assert_eq!(json!(shape), json!([frames, 48, 64]), "{} {made}", written.row);
+        if file.ends_with(&written.file) {
+            let told = written.axes.as_ref().or(written.told.as_ref());
+            assert_eq!(made["axes"], json!(told), "{} {made}", written.row);
+        }
+        let array = if written.measurement { SceneArray::Measurements } else { SceneArray::Masks };
+        let said = |key: &str| asked[key].as_str().map(str::to_owned);
+        let axes = said("axes").map(|axes| axes.parse().unwrap());
+        let scale = asked["full_scale"].as_f64().map(|scale| scale as f32);
+        let source = Source::upload(file, array, scale, Limits::default())
+            .named(said("array"))
+            .arranged(axes, written.measurement.then_some((48, 64)));
+        let mut opened = source.open().unwrap();
+        let mut found = Vec::new();
+        while let Some(frame) = opened.next_frame().unwrap() {
+            found.extend(frame);
+        }
+        let found = Array3::from_shape_vec((frames, 48, 64), found).unwrap();
+        let expected = expected.slice_move(ndarray::s![..frames, .., ..]);
+        let worst = (&found - &expected).iter().fold(0f32, |worst, value| worst.max(value.abs()));
+        assert!(worst < 1e-6, "{} {}: {worst}", written.row, written.file.display());
+    }
+}
+
+impl Written {
+    fn asked(&self) -> Value {
+        let mut asked = json!({});
+        let given = [("axes", json!(self.axes)), ("array", json!(self.name))];
+        for (key, value) in given.into_iter().chain([("full_scale", json!(self.full_scale))]) {
+            if !value.is_null() {
+                asked[key] = value;
+            }
+        }
+        asked
+    }
+}
+
+fn run(command: &mut Command) {
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
 #[tokio::test]
-async fn every_line_that_converts_does_so() {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return;
-    };
-    let app = TestApp::start().await;
-    let folder = tempfile::tempdir().unwrap();
-    let run = |command: &mut std::process::Command| {
-        let output = command.output().unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    };
-    run(std::process::Command::new(&python)
-        .arg("tests/judges/refused_files.py")
-        .arg(folder.path()));
-    let lines = lines();
-    assert!(lines.len() >= 4, "{lines:?}");
-    for line in lines {
-        let code = line.strip_prefix("python -c \"").unwrap().strip_suffix('"').unwrap();
-        let name = |mark: &str| {
-            let (_, rest) = code.split_once(&format!("'{mark}.")).unwrap();
-            format!("{mark}.{}", rest.split('\'').next().unwrap())
-        };
-        let read = |name: String| std::fs::read(folder.path().join(name)).unwrap();
-        // Masks with their axes in another order look like others; all else is refused, with its line.
-        if name("in") != "in.npy" {
-            let refused = app.calibrate(read(name("in"))).await.problem(422, "invalid_content");
-            assert!(refused.contains(&line), "no {line} in {refused}");
+async fn every_row_of_the_tables_holds() {
+    let Some((judge, files)) = Judge::new().await else { return };
+    let (accepted, refused) = (rows("## In: masks"), rows("## What is refused"));
+    let told: BTreeSet<&str> = accepted.iter().chain(&refused).map(|(row, _)| &**row).collect();
+    let written: BTreeSet<&str> = files.iter().map(|file| &*file.row).collect();
+    assert_eq!(told, written, "the rows of docs/formats.md, and of tests/judges/written_files.py");
+    for file in &files {
+        let (path, asked) = (judge.folder.path().join(&file.file), file.asked());
+        if accepted.iter().any(|(row, _)| *row == file.row) {
+            judge.accept(file, &path, &asked).await;
+            continue;
         }
-        run(std::process::Command::new(&python).args(["-c", code]).current_dir(folder.path()));
-        let made = app.calibrate(read(name("out"))).await.expect(201).json();
-        let frames = if name("out").ends_with("npy") { 4 } else { 1 };
-        let shape = (&made["frames"], &made["height"], &made["width"]);
-        assert_eq!(serde_json::json!(shape), serde_json::json!([frames, 48, 64]), "{line}");
-        std::fs::remove_file(folder.path().join(name("out"))).unwrap();
+        let answer = judge.send(file, &path, &asked).await;
+        let detail = answer.problem(422, "invalid_content");
+        if let Some(reason) = &file.reason {
+            assert_eq!(answer.json()["reason"], **reason, "{detail}");
+        }
+        if let Some(again) = &file.again {
+            let mut asked = asked.clone();
+            let again = again.as_object().unwrap().clone();
+            let name = |(key, value)| (if key == "name" { "array".to_owned() } else { key }, value);
+            asked.as_object_mut().unwrap().extend(again.into_iter().map(name));
+            judge.accept(file, &path, &asked).await;
+        }
+        let (_, command) = refused.iter().find(|(row, _)| *row == file.row).unwrap();
+        let Some(command) = command else { continue };
+        assert!(detail.contains(command), "{}: no {command} in {detail}", file.row);
+        let code = command.strip_prefix("python -c \"").unwrap().strip_suffix('"').unwrap();
+        let folder = path.parent().unwrap();
+        run(Command::new(&judge.python).args(["-c", code]).current_dir(folder));
+        let mut made = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+        let out = made.find(|path| path.file_stem().is_some_and(|stem| stem == "out"));
+        judge.accept(file, &out.unwrap(), &asked).await;
     }
 }

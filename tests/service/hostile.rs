@@ -54,7 +54,7 @@ async fn bad_masks_are_refused_with_what_is_wrong() {
         ("one byte", b"x".to_vec(), "unknown_format", &[]),
         ("a colour PNG", colour_png(), "unsupported_content", &["PNG"]),
         ("half a PNG", colour_png()[..40].to_vec(), "", &[]),
-        ("a zip", b"PK\x03\x04 and so on".to_vec(), "unknown_format", &["npz"]),
+        ("a zip", b"PK\x03\x04 and so on".to_vec(), "malformed", &["ZIP", "directory"]),
     ];
     for (name, file, reason, words) in cases {
         let answer = app.calibrate(file).await;

@@ -34,6 +34,7 @@ async fn the_manifest_tells_all_and_the_command_line_makes_the_same_frames() {
     let manifest = app.get(&format!("{snapshot}/manifest.json")).await.expect(200).json();
     let content = &manifest["content"];
     assert_eq!(content["inputs"]["measurement_sha256"], data);
+    assert_eq!(content["inputs"]["measurement_axes"], "frame-row-column");
     assert_eq!(content["models"], json!([]), "total variation has no network");
     assert_eq!(content["summary"]["tv_iterations"], 60);
     assert_eq!(content["schedule"]["stages"][0]["tv_updates"], 4, "defaults are filled in");

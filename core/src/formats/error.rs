@@ -42,6 +42,9 @@ pub enum FormatError {
     /// A file of several arrays without the one that was asked for.
     #[error("{format} file has no array named '{name}'; it holds {present}")]
     MissingArray { format: Format, name: String, present: String },
+    /// A picture of an archive that is no frame.
+    #[error("{name}: {source}")]
+    Member { name: String, source: Box<FormatError> },
     /// An array was named, in a file that holds one without a name.
     #[error("the file holds one array without a name: leave array out")]
     NoNames,
@@ -102,6 +105,7 @@ impl FormatError {
             Self::Malformed { .. } => "malformed",
             Self::OverLimit { .. } => "over_limit",
             Self::MissingArray { .. } | Self::NoNames => "missing_array",
+            Self::Member { source, .. } => source.code(),
             Self::AxesAmbiguous { .. } => "axes_ambiguous",
             Self::NoAxes(_) => "no_axes",
             Self::FullScale(_) | Self::FullScaleNeeded(_) => "invalid_full_scale",

@@ -9,6 +9,11 @@ const HDF5_MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 /// The first bytes of our own prepared arrays.
 pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 
+/// As many first bytes tell all formats.
+pub(super) const HEAD_BYTES: u64 = 512;
+/// Where the signature of a tar archive stands, and what it begins with.
+const TAR_MAGIC: (usize, &[u8]) = (257, b"ustar");
+
 /// A file format that is read or written here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
 pub enum Format {
@@ -27,6 +32,15 @@ pub enum Format {
     /// HDF5, and MATLAB's level 7.3 array file, which is HDF5.
     #[strum(serialize = "HDF5")]
     Hdf5,
+    /// A ZIP archive: of numbered pictures, or [`Format::Npz`].
+    #[strum(serialize = "ZIP")]
+    Zip,
+    /// A ZIP archive of npy files.
+    #[strum(serialize = "npz")]
+    Npz,
+    /// A tar archive of numbered pictures.
+    #[strum(serialize = "tar")]
+    Tar,
     /// OpenEXR.
     #[strum(serialize = "EXR")]
     Exr,
@@ -36,7 +50,7 @@ pub enum Format {
 }
 
 impl Format {
-    /// The format whose signature these first bytes (128 suffice) carry.
+    /// The format whose signature these first bytes ([`HEAD_BYTES`] suffice) carry. An npz is a ZIP here.
     pub(super) fn sniff(head: &[u8]) -> Option<Self> {
         const BIG_ENDIAN_MAT: &[u8] = &[1, 0, b'M', b'I'];
         const LITTLE_ENDIAN_MAT: &[u8] = &[0, 1, b'I', b'M'];
@@ -49,6 +63,10 @@ impl Format {
             Some(Self::Png)
         } else if head.starts_with(HDF5_MAGIC) || head.starts_with(b"MATLAB 7.3") {
             Some(Self::Hdf5)
+        } else if head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06") {
+            Some(Self::Zip)
+        } else if head.get(TAR_MAGIC.0..).is_some_and(|head| head.starts_with(TAR_MAGIC.1)) {
+            Some(Self::Tar)
         } else if head.starts_with(&[0x76, 0x2f, 0x31, 0x01]) {
             Some(Self::Exr)
         } else if head.starts_with(PLANAR_MAGIC) {
@@ -66,9 +84,15 @@ impl Format {
 
 /// What a file of an unknown format begins with.
 pub(super) fn describe(head: &[u8]) -> String {
-    if head.starts_with(b"PK\x03\x04") {
-        return "it is a zip archive, perhaps .npz (python -c \"import numpy; numpy.save('out.npy', \
-                numpy.load('in.npz')['NAME'])\" saves one array)"
+    if head.starts_with(b"\x1f\x8b") {
+        return "it is packed by gzip (python -c \"import gzip, shutil; \
+                shutil.copyfileobj(gzip.open('in.gz'), open('out', 'wb'))\" unpacks it)"
+            .to_owned();
+    }
+    if head.starts_with(b"GIF8") || head.starts_with(b"BM") {
+        return "it is a GIF or BMP (python -c \"import numpy; from PIL import Image, ImageSequence; \
+                numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
+                ImageSequence.Iterator(Image.open('in.gif'))])\" saves its grey values)"
             .to_owned();
     }
     if head.starts_with(b"\xff\xd8\xff") {

@@ -192,7 +192,10 @@ fn stored(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
 fn describe(dtype: &Datatype) -> String {
     let name = match dtype {
         Datatype::String { .. } | Datatype::VarLen { .. } => "text",
-        Datatype::Compound { .. } => "records, perhaps complex numbers",
+        Datatype::Compound { .. } => {
+            "records, perhaps complex numbers (absolute values: python -c \"import h5py, numpy; \
+             numpy.save('out.npy', numpy.abs(h5py.File('in.h5')['mask'][()]))\")"
+        }
         Datatype::Reference { .. } => "references, perhaps a cell array",
         Datatype::Enum { .. } => "an enumeration",
         _ => "numbers of an unknown type",
@@ -241,7 +244,13 @@ fn error(error: Error) -> FormatError {
             promised: format!("{needed} bytes at {offset}"),
             present: format!("{available} bytes"),
         },
-        other => FormatError::malformed(Format::Hdf5, other.to_string()),
+        other => FormatError::malformed(
+            Format::Hdf5,
+            format!(
+                "{other} (if h5py reads it: python -c \"import h5py, numpy; numpy.save('out.npy', \
+                 h5py.File('in.h5')['mask'][()])\")"
+            ),
+        ),
     }
 }
 

@@ -15,11 +15,16 @@ mod error;
 mod format;
 mod hdf5;
 mod limits;
+mod member;
+mod npz;
 mod open;
+mod pictures;
 mod samples;
 mod scene;
 mod stack;
+mod tar;
 mod window;
+mod zip;
 
 pub mod bigtiff;
 pub mod exr;

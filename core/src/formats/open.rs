@@ -3,17 +3,21 @@
 use std::fs::File;
 use std::io::{Read, Seek};
 use std::path::Path;
+use std::sync::Arc;
 
 use ndarray::Array3;
 
-use super::format::describe;
+use super::format::{HEAD_BYTES, describe};
 use super::mat::{self, SceneArray};
+use super::pictures::Pictures;
 use super::{
-    Axes, Expected, Format, FormatError, FrameReader, Limits, StackInfo, hdf5, npy, png, tiff,
+    Axes, Expected, Format, FormatError, FrameReader, Limits, StackInfo, hdf5, npy, npz, png, tar,
+    tiff, zip,
 };
 use crate::formats::error::Result;
 
-const ACCEPTED: &str = "npy, TIFF, PNG (1, 8 or 16 bit grey), .mat and HDF5";
+const ACCEPTED: &str =
+    "npy, npz, TIFF, PNG (1, 8 or 16 bit grey), .mat, HDF5, and a ZIP or tar of numbered pictures";
 
 /// Which array of a file is meant if it has several, and what is known of it.
 #[derive(Debug, Clone, Copy)]
@@ -36,12 +40,12 @@ impl From<SceneArray> for Wanted<'_> {
 ///
 /// npy: (frame, row, column) or (row, column) of integers, floats or bool. TIFF and
 /// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 1, 8
-/// or 16 bit. Errors say what is wrong with the file; see [`FormatError`].
+/// or 16 bit. ZIP and tar: numbered pictures. Errors say what is wrong with the file; see [`FormatError`].
 pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
     open_any(path, None, limits)
 }
 
-/// The same, or one array of a file of several: .mat, HDF5. [`StackInfo::default_full_scale`] of MATLAB's files is
+/// The same, or one array of a file of several: .mat, HDF5, npz. [`StackInfo::default_full_scale`] of MATLAB's files is
 /// [`SceneArray::default_full_scale`]. Errors: also [`FormatError::MissingArray`], [`FormatError::NoNames`],
 /// [`FormatError::AxesAmbiguous`] and [`FormatError::NoAxes`].
 pub fn open_array<'a>(
@@ -59,6 +63,9 @@ fn open_any(
 ) -> Result<Box<dyn FrameReader + Send>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
+    if format == Format::Zip {
+        return open_zip(file, length, wanted, limits);
+    }
     let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
     if let (Format::Mat | Format::Hdf5, Some(Wanted { array, name, .. })) = (format, wanted) {
         let wanted = (array, name.unwrap_or(array.name()), &expected);
@@ -74,25 +81,66 @@ fn open_any(
         return Ok(Box::new(npy::open(file, length, (format, &expected), limits)?));
     }
     let reader: Box<dyn FrameReader + Send> = match format {
-        Format::Tiff => Box::new(tiff::TiffReader::open(file, length, limits)?),
+        Format::Tiff => tiff::open(file, length, limits)?,
         Format::Png => Box::new(png::PngReader::open(file, length, limits)?),
-        Format::Mat | Format::Hdf5 => {
-            return Err(FormatError::Unsupported {
-                format,
-                found: "a scene of several arrays".to_owned(),
-                accepted: "one stack a file here; name the file as a scene",
-            });
+        Format::Tar => {
+            let members = (format, tar::members(&file, length)?);
+            Box::new(Pictures::open(Arc::new(file), members, limits)?)
         }
-        Format::Npy | Format::Exr | Format::Planar => {
+        Format::Mat | Format::Hdf5 => return Err(several(format)),
+        Format::Npy | Format::Zip | Format::Npz | Format::Exr | Format::Planar => {
             return Err(FormatError::UnknownFormat {
                 found: format!("it is a {format} file"),
                 accepted: ACCEPTED,
             });
         }
     };
+    of_pictures(reader, &expected)
+}
+
+/// A ZIP of arrays, or of pictures.
+fn open_zip(
+    file: File,
+    length: u64,
+    wanted: Option<Wanted<'_>>,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let members = zip::members(&file, length)?;
+    let arrays = members.iter().filter(|member| member.name.ends_with(npz::EXTENSION)).count();
+    match wanted {
+        Some(Wanted { array, name, expected }) if arrays > 0 => {
+            npz::open(Arc::new(file), members, (array, name, &expected), limits)
+        }
+        None if arrays == 1 => {
+            let only = (SceneArray::Truth, None, &Expected::default());
+            npz::open(Arc::new(file), members, only, limits)
+        }
+        None if arrays > 1 => Err(several(Format::Npz)),
+        Some(Wanted { name: Some(_), .. }) => Err(FormatError::NoNames),
+        _ => {
+            let pictures = Pictures::open(Arc::new(file), (Format::Zip, members), limits)?;
+            let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
+            of_pictures(Box::new(pictures), &expected)
+        }
+    }
+}
+
+/// A stack of pictures, whose axes are known. Errors: [`FormatError::NoAxes`].
+fn of_pictures(
+    reader: Box<dyn FrameReader + Send>,
+    expected: &Expected,
+) -> Result<Box<dyn FrameReader + Send>> {
     match expected.axes {
         None | Some(Axes::FrameRowColumn) => Ok(reader),
-        Some(_) => Err(FormatError::NoAxes(format)),
+        Some(_) => Err(FormatError::NoAxes(reader.info().format)),
+    }
+}
+
+fn several(format: Format) -> FormatError {
+    FormatError::Unsupported {
+        format,
+        found: "a scene of several arrays".to_owned(),
+        accepted: "one stack a file here; name the file as a scene",
     }
 }
 
@@ -129,8 +177,11 @@ pub(super) fn open(path: &Path) -> Result<(File, u64, Format)> {
     if metadata.len() == 0 {
         return Err(unknown("it is empty".to_owned()));
     }
-    let mut head = Vec::with_capacity(128);
-    (&mut file).take(128).read_to_end(&mut head).map_err(FormatError::io("read the file"))?;
+    let mut head = Vec::new();
+    (&mut file)
+        .take(HEAD_BYTES)
+        .read_to_end(&mut head)
+        .map_err(FormatError::io("read the file"))?;
     file.rewind().map_err(FormatError::io("read the file"))?;
     let format = Format::sniff(&head).ok_or_else(|| unknown(describe(&head)))?;
     Ok((file, metadata.len(), format))

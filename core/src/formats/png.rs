@@ -1,7 +1,7 @@
 //! PNG: one grey frame in, 16-bit frames out.
 
 use std::fs::File;
-use std::io::{BufReader, BufWriter, ErrorKind, Write};
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, Write};
 use std::path::Path;
 
 use ::png::{
@@ -21,15 +21,15 @@ const MAX_EXPANSION: u64 = 1032;
 const DECODER_BYTES: usize = 16 << 20;
 
 /// A grey PNG, a stack of one frame.
-pub(super) struct PngReader {
-    decoder: Option<::png::Reader<BufReader<File>>>,
+pub(super) struct PngReader<R: Read + Seek> {
+    decoder: Option<::png::Reader<BufReader<R>>>,
     info: StackInfo,
 }
 
-impl PngReader {
+impl<R: Read + Seek> PngReader<R> {
     /// Reads the header of `file` (`length` bytes long) and checks it against the limits and the
     /// length. Gamma and colour profiles are not applied: the stored numbers count.
-    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self> {
+    pub(super) fn open(file: R, length: u64, limits: &Limits) -> Result<Self> {
         let decoder_limits = DecoderLimits { bytes: DECODER_BYTES };
         let mut decoder = Decoder::new_with_limits(BufReader::new(file), decoder_limits);
         decoder.set_transformations(Transformations::IDENTITY);
@@ -55,13 +55,19 @@ impl PngReader {
         }
         let reader = decoder.read_info().map_err(decoding_error)?;
         if reader.info().animation_control.is_some() {
-            return Err(unsupported("an animation".to_owned()));
+            return Err(FormatError::Unsupported {
+                format: Format::Png,
+                found: "an animation".to_owned(),
+                accepted: "one image (all of them as one array: python -c \"import numpy; from PIL import Image, \
+                           ImageSequence; numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
+                           ImageSequence.Iterator(Image.open('in.png'))])\")",
+            });
         }
         Ok(Self { decoder: Some(reader), info })
     }
 }
 
-impl FrameReader for PngReader {
+impl<R: Read + Seek> FrameReader for PngReader<R> {
     fn info(&self) -> &StackInfo {
         &self.info
     }

@@ -1,4 +1,4 @@
-//! The arrays of a scene, in files that hold several: .mat and HDF5.
+//! The arrays of a scene, in files that hold several: .mat, HDF5 and npz.
 
 use super::FullScale;
 
@@ -20,6 +20,15 @@ impl SceneArray {
             Self::Masks => "mask",
             Self::Measurements => "meas",
             Self::Truth => "orig",
+        }
+    }
+
+    /// The names that are looked for in an archive of NumPy's, where `orig` is called `frames`, too.
+    pub(super) fn names(self) -> &'static [&'static str] {
+        match self {
+            Self::Masks => &["mask"],
+            Self::Measurements => &["meas"],
+            Self::Truth => &["orig", "frames"],
         }
     }
 

@@ -2,23 +2,30 @@
 
 mod directory;
 
-use std::fs::File;
-use std::io::{BufReader, ErrorKind};
+use std::io::{self, BufReader, ErrorKind, Read, Seek, SeekFrom};
 
-use ::tiff::decoder::{Decoder, DecodingResult, Limits as DecoderLimits};
+use ::tiff::decoder::{ChunkType, Decoder, DecodingResult, Limits as DecoderLimits};
 use ::tiff::tags::{PhotometricInterpretation, Tag};
 use ::tiff::{ColorType, TiffError};
 use ndarray::Array2;
 
+use super::array::{ArrayReader, RawSamples, Restart};
+use super::axes::Layout;
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
 use crate::formats::error::Result;
-use directory::malformed;
+use directory::{Pages, malformed};
 
-const ACCEPTED_SAMPLES: &str =
-    "one grey sample a pixel (BlackIsZero): unsigned 1, 8 or 16 bit, or 32- or 64-bit float";
+const ACCEPTED_SAMPLES: &str = "one grey sample a pixel (BlackIsZero): unsigned 1, 8 or 16 bit, or 32- or 64-bit float (other numbers: \
+     python -c \"import numpy, tifffile; numpy.save('out.npy', tifffile.imread('in.tif'))\")";
 const ACCEPTED_COLOUR: &str = "grey, BlackIsZero (grey of colours: python -c \"import numpy, tifffile; a = tifffile.imread('in.tif'); \
-     tifffile.imwrite('out.tif', (a[..., :3] @ numpy.array([.299, .587, .114])).astype(a.dtype))\")";
-const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits";
+     tifffile.imwrite('out.tif', (a[..., :3] @ numpy.array([.299, .587, .114])).round().astype(a.dtype))\")";
+const ACCEPTED_WHITE: &str = "BlackIsZero (of whole numbers: python -c \"import tifffile; \
+     tifffile.imwrite('out.tif', ~tifffile.imread('in.tif'), photometric='minisblack')\")";
+const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits (python -c \"import numpy; from PIL import Image, \
+     ImageSequence; numpy.save('out.npy', [numpy.array(page) for page in \
+     ImageSequence.Iterator(Image.open('in.tif'))])\")";
+const ACCEPTED_BEHIND: &str = "images of 8, 16 or 32 bits that are not compressed, one behind the other, or one \
+     page a frame";
 
 /// TIFF's numbers for the lossless compressions that are read.
 const UNCOMPRESSED: u16 = 1;
@@ -27,18 +34,89 @@ const LOSSLESS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, 32773];
 /// No compression of TIFF expands more: LZW reaches 2560 bytes a byte at the very most.
 const MAX_EXPANSION: u64 = 4096;
 
+/// Opens a TIFF file of `length` bytes, whose pages are frames of one size and type, or whose frames stand behind one
+/// page header, as ImageJ writes them above 4 GB. Checks all headers against the limits, the length and each
+/// other; pixels are not read.
+pub(super) fn open<R: Read + Seek + Send + 'static>(
+    mut file: R,
+    length: u64,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let pages = directory::count_pages(&mut file, length, limits)?;
+    file.rewind().map_err(FormatError::io("read the TIFF"))?;
+    match pages.behind {
+        Some(frames) => Ok(Box::new(behind(file, (frames, pages), length, limits)?)),
+        None => Ok(Box::new(TiffReader::open(file, pages.count, length, limits)?)),
+    }
+}
+
+/// A file that a decoder has looked at, from its first byte.
+struct Whole<R: Read + Seek>(Decoder<BufReader<R>>);
+
+impl<R: Read + Seek> Read for Whole<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        self.0.inner().read(buffer)
+    }
+}
+
+impl<R: Read + Seek + Send> Restart for Whole<R> {
+    fn restart(&mut self) -> io::Result<()> {
+        self.0.inner().rewind()
+    }
+}
+
+/// ImageJ's stacks of more than 4 GB: the pixels of the first frame stand where its page says, those of the others
+/// behind them.
+fn behind<R: Read + Seek + Send>(
+    file: R,
+    (frames, pages): (u64, Pages),
+    length: u64,
+    limits: &Limits,
+) -> Result<ArrayReader<RawSamples<Whole<R>>>> {
+    let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
+    let first = read_page(&mut decoder, 0, length, limits)?;
+    limits.check_shape(Format::Tiff, frames, first.height as u64, first.width as u64)?;
+    let info = StackInfo { frames: frames as usize, ..first };
+    let compression: Option<u16> =
+        decoder.find_tag_unsigned(Tag::Compression).map_err(|e| in_page(0, e))?;
+    let ranges = chunk_ranges(&mut decoder, 0)?;
+    let together = ranges.windows(2).all(|pair| pair[0].0 + pair[0].1 == pair[1].0);
+    let plain = compression.unwrap_or(UNCOMPRESSED) == UNCOMPRESSED
+        && decoder.get_chunk_type() == ChunkType::Strip
+        && first.sample != SampleType::Bool;
+    let (true, true, Some((start, _))) = (plain, together, ranges.first()) else {
+        return Err(FormatError::Unsupported {
+            format: Format::Tiff,
+            found: format!("an ImageJ stack of {frames} images behind one page header, packed"),
+            accepted: ACCEPTED_BEHIND,
+        });
+    };
+    let bytes = info.voxels() * info.sample.bytes() as u64;
+    if start.saturating_add(bytes) > length {
+        return Err(FormatError::Truncated {
+            format: Format::Tiff,
+            promised: format!(
+                "{frames} images of {}x{} {} from byte {start} on ({bytes} bytes)",
+                info.height, info.width, info.sample
+            ),
+            present: format!("{length} bytes in all"),
+        });
+    }
+    let place = decoder.inner().seek(SeekFrom::Start(*start));
+    place.map_err(FormatError::io("read the TIFF"))?;
+    let samples = RawSamples::new(Whole(decoder), *start, (info.sample, pages.order), Format::Tiff);
+    Ok(ArrayReader::new(samples, info, Layout { interleaved: false, by_columns: false }))
+}
+
 /// A TIFF file whose pages are frames of one size and type.
-pub(super) struct TiffReader {
-    decoder: Decoder<BufReader<File>>,
+struct TiffReader<R: Read + Seek> {
+    decoder: Decoder<BufReader<R>>,
     info: StackInfo,
     next: usize,
 }
 
-impl TiffReader {
-    /// Checks all page headers of `file` (`length` bytes long) against the limits, the length and
-    /// each other. Pixels are not read.
-    pub(super) fn open(file: File, length: u64, limits: &Limits) -> Result<Self> {
-        let frames = directory::count_pages(&file, length, limits)?;
+impl<R: Read + Seek> TiffReader<R> {
+    fn open(file: R, frames: usize, length: u64, limits: &Limits) -> Result<Self> {
         let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
         let first = read_page(&mut decoder, 0, length, limits)?;
         for number in 1..frames {
@@ -63,7 +141,7 @@ impl TiffReader {
     }
 }
 
-impl FrameReader for TiffReader {
+impl<R: Read + Seek> FrameReader for TiffReader<R> {
     fn info(&self) -> &StackInfo {
         &self.info
     }
@@ -97,8 +175,8 @@ fn bits(bytes: &[u8], width: usize) -> Vec<f32> {
 }
 
 /// Checks the header of the page that the decoder stands on; the result has one frame.
-fn read_page(
-    decoder: &mut Decoder<BufReader<File>>,
+fn read_page<R: Read + Seek>(
+    decoder: &mut Decoder<BufReader<R>>,
     page: usize,
     length: u64,
     limits: &Limits,
@@ -111,7 +189,10 @@ fn read_page(
     Ok(info)
 }
 
-fn sample_type(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<SampleType> {
+fn sample_type<R: Read + Seek>(
+    decoder: &mut Decoder<BufReader<R>>,
+    page: usize,
+) -> Result<SampleType> {
     let tag = |decoder: &mut Decoder<_>, tag, default: u16| {
         decoder.find_tag_unsigned(tag).map(|v| v.unwrap_or(default)).map_err(|e| in_page(page, e))
     };
@@ -124,6 +205,9 @@ fn sample_type(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<Sa
     let black_is_zero = PhotometricInterpretation::BlackIsZero.to_u16();
     let photometric = tag(decoder, Tag::PhotometricInterpretation, black_is_zero)?;
     if photometric != black_is_zero {
+        if photometric == PhotometricInterpretation::WhiteIsZero.to_u16() {
+            return Err(refused("WhiteIsZero".to_owned(), ACCEPTED_WHITE));
+        }
         let found = match PhotometricInterpretation::from_u16(photometric) {
             Some(name) => format!("{name:?} colours"),
             None => format!("photometric interpretation {photometric}"),
@@ -152,8 +236,8 @@ fn sample_type(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<Sa
 }
 
 /// Checks that the strips or tiles of a page lie in the file and can hold the page.
-fn check_chunks(
-    decoder: &mut Decoder<BufReader<File>>,
+fn check_chunks<R: Read + Seek>(
+    decoder: &mut Decoder<BufReader<R>>,
     page: usize,
     info: &StackInfo,
     length: u64,
@@ -208,7 +292,10 @@ fn check_chunks(
 }
 
 /// Offset and length of each strip or tile.
-fn chunk_ranges(decoder: &mut Decoder<BufReader<File>>, page: usize) -> Result<Vec<(u64, u64)>> {
+fn chunk_ranges<R: Read + Seek>(
+    decoder: &mut Decoder<BufReader<R>>,
+    page: usize,
+) -> Result<Vec<(u64, u64)>> {
     let mut find = |tag| decoder.find_tag_unsigned_vec::<u64>(tag).map_err(|e| in_page(page, e));
     let (offsets, counts) = match find(Tag::StripOffsets)? {
         Some(offsets) => (Some(offsets), find(Tag::StripByteCounts)?),

@@ -1,20 +1,16 @@
 //! Whole arrays in memory, for commands: a snapshot with its masks, and clips.
 
-use std::fmt::Display;
-use std::fs::{self, File};
-use std::io::{Read, Write};
+use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array3, ArrayView2, s};
-use tempfile::NamedTempFile;
-use zip::ZipArchive;
 
 use super::IntakeError;
 use super::check::{Exposure, masks, measurement};
 use super::open::Source;
 use crate::formats::mat::SceneArray;
-use crate::formats::{Axes, FormatError, Limits};
+use crate::formats::{Axes, FormatError};
 use crate::intake::error::Result;
 
 /// An array on its own scale, and the full scale that brought it there.
@@ -99,14 +95,10 @@ pub fn read_truth(
     Ok(Some(truth.slice(s![first..first + wanted, .., ..]).to_owned()))
 }
 
-/// Frames \[T,H,W\] of a file, of an npz archive, or of a folder of pictures in the order of their
-/// names, divided by the full scale; all finite.
+/// Frames \[T,H,W\] of a file, or of a folder of pictures in the order of their names, divided by the full scale; all finite.
 /// Errors: files that can't be read; pictures of different sizes.
 pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
     let source = |path| Source::file(path, SceneArray::Truth, full_scale);
-    if path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("npz")) {
-        return read_frames(&source(extract(path)?.path()));
-    }
     if !path.is_dir() {
         return read_frames(&source(path));
     }
@@ -157,32 +149,6 @@ fn read_frames(source: &Source<'_>) -> Result<Array3<f32>> {
     stack.into_array()
 }
 
-/// The only array of an npz archive, or the one called `frames`, as an npy file of its own.
-fn extract(path: &Path) -> Result<NamedTempFile> {
-    let refused =
-        |problem: &dyn Display| IntakeError::content(format!("frames {}", path.display()), problem);
-    let file = File::open(path).map_err(|error| refused(&error))?;
-    let mut archive = ZipArchive::new(file).map_err(|error| refused(&error))?;
-    let names = archive.file_names().map(|name| name.map(std::borrow::Cow::into_owned));
-    let names = names.collect::<Result<Vec<String>, _>>().map_err(|error| refused(&error))?;
-    let name = match names.as_slice() {
-        [only] => only.clone(),
-        several => several.iter().find(|name| *name == "frames.npy").cloned().ok_or_else(|| {
-            refused(&format!("arrays {several:?}; it must hold one, or one called frames"))
-        })?,
-    };
-    let limit = Limits::default().max_file_bytes;
-    let array = archive.by_name(&name).map_err(|error| refused(&error))?;
-    let mut copy = NamedTempFile::new().map_err(|error| refused(&error))?;
-    // A header may promise less than there is: what is read is bounded, too.
-    let read = std::io::copy(&mut array.take(limit + 1), &mut copy);
-    if read.map_err(|error| refused(&error))? > limit {
-        return Err(refused(&format!("array {name} has more than {limit} bytes")));
-    }
-    copy.flush().map_err(|error| refused(&error))?;
-    Ok(copy)
-}
-
 /// Frames of one size as they arrive.
 #[derive(Default)]
 struct Stack {
@@ -203,39 +169,5 @@ impl Stack {
         let shape = (self.frames, self.size.0, self.size.1);
         Array3::from_shape_vec(shape, self.values)
             .map_err(|error| FormatError::Internal(error.to_string()).into())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::io::Write;
-
-    use zip::ZipWriter;
-    use zip::write::SimpleFileOptions;
-
-    use super::extract;
-
-    #[test]
-    fn the_only_array_or_the_frames_are_taken() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("clip.npz");
-        let write = |arrays: &[(&str, &[u8])]| {
-            let mut archive = ZipWriter::new(std::fs::File::create(&path).unwrap());
-            for (name, bytes) in arrays {
-                archive.start_file(*name, SimpleFileOptions::default()).unwrap();
-                archive.write_all(bytes).unwrap();
-            }
-            archive.finish().unwrap();
-        };
-        let content = || extract(&path).map(|file| std::fs::read(file.path()).unwrap());
-        write(&[("arr_0.npy", b"one")]);
-        assert_eq!(content().unwrap(), b"one");
-        write(&[("masks.npy", b"one"), ("frames.npy", b"two")]);
-        assert_eq!(content().unwrap(), b"two");
-        write(&[("a.npy", b"one"), ("b.npy", b"two")]);
-        let error = content().unwrap_err().to_string();
-        assert!(error.contains("a.npy") && error.contains("clip.npz"), "{error}");
-        std::fs::write(&path, "no archive").unwrap();
-        assert!(content().is_err());
     }
 }

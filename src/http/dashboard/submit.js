@@ -9,7 +9,7 @@ import { gaveUp, get, send } from "./api.js";
 import { given, numberField, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
-const HINT = "npy, TIFF, PNG, .mat or HDF5";
+const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP of pictures";
 
 export async function submit(root, [query], signal) {
   const form = { calibration: null, measurement: null };

@@ -58,7 +58,15 @@ impl ArrayHeader {
     /// How the array's numbers are meant. Errors: a class that is not accepted.
     pub(super) fn sample_type(&self) -> Result<SampleType> {
         let refused = match self.class {
-            _ if self.flags & COMPLEX != 0 => "complex numbers",
+            // A sparse matrix may be complex, too: its line comes first.
+            5 => {
+                "a sparse matrix (python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                 scipy.io.loadmat('in.mat')['mask'].toarray())\")"
+            }
+            _ if self.flags & COMPLEX != 0 => {
+                "complex numbers (absolute values: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                 numpy.moveaxis(abs(scipy.io.loadmat('in.mat')['mask']), -1, 0))\")"
+            }
             6 => return Ok(SampleType::F64),
             7 => return Ok(SampleType::F32),
             9 if self.flags & LOGICAL != 0 => return Ok(SampleType::Bool),
@@ -74,7 +82,6 @@ impl ArrayHeader {
             2 => "a struct",
             3 => "an object",
             4 => "text",
-            5 => "a sparse matrix",
             _ => "an array of an unknown class",
         };
         Err(FormatError::Unsupported {

@@ -169,9 +169,14 @@ impl<'a> Cursor<'a> {
 /// What people call the dtypes that are refused.
 fn dtype_name(code: &[u8], descr: &[u8]) -> String {
     let name = match code {
-        b"O" => "object (a pickle)",
-        b"c8" => "complex64",
-        b"c16" => "complex128",
+        b"O" => {
+            "object (a pickle) (arrays of one size: python -c \"import numpy; numpy.save('out.npy', \
+             numpy.stack(numpy.load('in.npy', allow_pickle=True)))\")"
+        }
+        b"c8" | b"c16" => {
+            "complex64 or complex128 (python -c \"import numpy; numpy.save('out.npy', \
+             numpy.abs(numpy.load('in.npy')))\" saves absolute values)"
+        }
         b"f16" => "float128",
         _ => {
             let shown: String = String::from_utf8_lossy(descr).chars().take(24).collect();

@@ -44,8 +44,13 @@ pub(in crate::formats) fn open<R: Restart>(
     let (Header { sample, order, fortran_order, shape }, start) = read_header(&mut file, length)?;
     let writer = if fortran_order { Writer::Fortran } else { Writer::Rows };
     let arranged = expected.arrange((format, writer), &shape)?;
-    let arranged =
-        arranged.ok_or_else(|| unsupported(format!("an array of {} dimensions", shape.len())))?;
+    let arranged = arranged.ok_or_else(|| {
+        unsupported(format!(
+            "an array of {} dimensions (without those of length 1: python -c \"import numpy; \
+             numpy.save('out.npy', numpy.squeeze(numpy.load('in.npy')))\")",
+            shape.len()
+        ))
+    })?;
     let info = array::info(format, sample, &arranged, limits)?;
     check_length(&info, length.saturating_sub(start))?;
     let samples = RawSamples::new(file, start, (sample, order), format);

@@ -4,8 +4,7 @@
 //! as large as a frame. Here each claim is held against the file's length first.
 
 use std::collections::HashSet;
-use std::fs::File;
-use std::os::unix::fs::FileExt;
+use std::io::{Read, Seek, SeekFrom};
 
 use crate::formats::error::Result;
 use crate::formats::samples::ByteOrder;
@@ -23,8 +22,8 @@ const MAX_ENTRIES: u64 = 1000;
 const DESCRIPTION_BYTES: u64 = 1024;
 
 /// Where the numbers of a page header stand.
-struct Layout<'a> {
-    file: &'a File,
+struct Layout<'a, R> {
+    file: &'a mut R,
     length: u64,
     order: ByteOrder,
     big: bool,
@@ -38,13 +37,25 @@ struct Entry {
     offset: u64,
 }
 
-/// Walks over all page headers and tells how many there are.
+/// What the page headers say.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pages {
+    pub(super) count: usize,
+    /// Images that ImageJ has put behind the only page header, as it does above 4 GB: to read one frame of many
+    /// would be a silent loss.
+    pub(super) behind: Option<u64>,
+    pub(super) order: ByteOrder,
+}
+
+/// Walks over all page headers.
 ///
-/// Errors: values that lie outside the file, pages in a circle, more pages than the limits allow,
-/// and ImageJ's stacks above 4 GB, which have one page header for all frames: to read one frame of
-/// many would be a silent loss.
-pub(super) fn count_pages(file: &File, length: u64, limits: &Limits) -> Result<usize> {
-    let (layout, mut next) = Layout::open(file, length)?;
+/// Errors: values that lie outside the file, pages in a circle, more pages than the limits allow.
+pub(super) fn count_pages<R: Read + Seek>(
+    file: &mut R,
+    length: u64,
+    limits: &Limits,
+) -> Result<Pages> {
+    let (mut layout, mut next) = Layout::open(file, length)?;
     let mut seen = HashSet::new();
     let mut description = None;
     while next != 0 {
@@ -59,15 +70,16 @@ pub(super) fn count_pages(file: &File, length: u64, limits: &Limits) -> Result<u
         }
         next = following;
     }
-    if let (Some(entry), 1) = (description, seen.len()) {
-        layout.check_imagej(&entry)?;
-    }
-    Ok(seen.len())
+    let behind = match (description, seen.len()) {
+        (Some(entry), 1) => layout.imagej_images(&entry)?,
+        _ => None,
+    };
+    Ok(Pages { count: seen.len(), behind, order: layout.order })
 }
 
-impl<'a> Layout<'a> {
+impl<'a, R: Read + Seek> Layout<'a, R> {
     /// Reads the file's header; the second value is the place of the first page header.
-    fn open(file: &'a File, length: u64) -> Result<(Self, u64)> {
+    fn open(file: &'a mut R, length: u64) -> Result<(Self, u64)> {
         let mut layout = Self { file, length, order: ByteOrder::Little, big: false };
         let head = layout.read(0, 8)?;
         if head.starts_with(b"MM") {
@@ -80,10 +92,11 @@ impl<'a> Layout<'a> {
     }
 
     /// The entries of the page header at `at`, and the place of the next one.
-    fn page(&self, page: usize, at: u64) -> Result<(Vec<Entry>, u64)> {
+    fn page(&mut self, page: usize, at: u64) -> Result<(Vec<Entry>, u64)> {
         let (count_bytes, entry_bytes, pointer_bytes) =
             if self.big { (8, 20, 8) } else { (2, 12, 4) };
-        let count = self.number(&self.read(at, count_bytes)?);
+        let count = self.read(at, count_bytes)?;
+        let count = self.number(&count);
         if count > MAX_ENTRIES {
             return Err(malformed(format!(
                 "page {page} claims {count} entries, at most {MAX_ENTRIES} are read"
@@ -136,26 +149,19 @@ impl<'a> Layout<'a> {
         Ok(entry)
     }
 
-    fn check_imagej(&self, description: &Entry) -> Result<()> {
+    /// The images that ImageJ tells of, if they are several.
+    fn imagej_images(&mut self, description: &Entry) -> Result<Option<u64>> {
         if description.bytes <= 8 {
-            return Ok(());
+            return Ok(None);
         }
         let text = self.read(description.offset, description.bytes.min(DESCRIPTION_BYTES))?;
         let text = String::from_utf8_lossy(&text);
         let images = text.lines().find_map(|line| line.strip_prefix("images="));
-        match images.and_then(|count| count.trim().parse::<u64>().ok()) {
-            Some(count) if count > 1 && text.starts_with("ImageJ=") => {
-                Err(FormatError::Unsupported {
-                    format: Format::Tiff,
-                    found: format!("an ImageJ stack of {count} images behind one page header"),
-                    accepted: "one page a frame (BigTIFF for more than 4 GB), or npy",
-                })
-            }
-            _ => Ok(()),
-        }
+        let images = images.and_then(|count| count.trim().parse::<u64>().ok());
+        Ok(images.filter(|count| *count > 1 && text.starts_with("ImageJ=")))
     }
 
-    fn read(&self, at: u64, count: u64) -> Result<Vec<u8>> {
+    fn read(&mut self, at: u64, count: u64) -> Result<Vec<u8>> {
         if at.saturating_add(count) > self.length {
             return Err(FormatError::Truncated {
                 format: Format::Tiff,
@@ -164,8 +170,9 @@ impl<'a> Layout<'a> {
             });
         }
         let mut bytes = vec![0; count as usize];
-        self.file
-            .read_exact_at(&mut bytes, at)
+        let place = self.file.seek(SeekFrom::Start(at));
+        place
+            .and_then(|_| self.file.read_exact(&mut bytes))
             .map_err(FormatError::io("read the TIFF page header"))?;
         Ok(bytes)
     }

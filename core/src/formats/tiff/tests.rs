@@ -210,17 +210,64 @@ fn too_many_pages_and_endless_pages_are_refused() {
     assert!(open(&cycle).err().unwrap().is_callers_fault());
 }
 
-#[test]
-fn an_imagej_stack_behind_one_header_is_refused() {
-    let text = b"ImageJ=1.53\nimages=30\n\0";
+/// ImageJ's layout above 4 GB: one page of 2x3 pixels, big-endian, whose pixels begin at `start`, and an image count.
+fn imagej(images: &str, bits: u16, start: u32) -> Vec<u8> {
+    let text = format!("ImageJ=1.53\nimages={images}\nslices={images}\n\0");
     let mut data = vec![0; 4];
-    data.extend(text);
-    let mut bytes = page(false, &with(grey(2, 2, 8, 4), 270, Value::Long(12)), &data);
+    data.extend(text.as_bytes());
+    let tags = grey(3, 2, bits, 6 * u32::from(bits) / 8);
+    let tags = with(with(tags, 270, Value::Long(12)), 273, Value::Long(start));
+    let tags = if bits == 32 { with(tags, 339, Value::Short(3)) } else { tags };
+    let mut bytes = page(true, &tags, &data);
     // The description: type ASCII, its length, its place.
     let entry = 8 + data.len() + 2 + 5 * 12;
-    bytes[entry + 2] = 2;
-    bytes[entry + 4..entry + 8].copy_from_slice(&(text.len() as u32).to_le_bytes());
-    assert_names(&refusal(&bytes), &["ImageJ stack of 30 images", "BigTIFF"]);
+    bytes[entry + 3] = 2;
+    bytes[entry + 4..entry + 8].copy_from_slice(&(text.len() as u32).to_be_bytes());
+    bytes
+}
+
+#[test]
+fn images_of_imagej_behind_one_header_are_read() {
+    let stack = ramp((30, 2, 3), 200);
+    let whole = |bits: u16, pixels: &dyn Fn(f32) -> Vec<u8>| {
+        let mut bytes = imagej("30", bits, 400);
+        bytes.resize(400, 0);
+        bytes.extend(stack.iter().flat_map(|value| pixels(*value)));
+        bytes
+    };
+    let eight = whole(8, &|value| vec![value as u8]);
+    let float = whole(32, &|value| value.to_be_bytes().into());
+    let sixteen = whole(16, &|value| (value as u16).to_be_bytes().into());
+    for bytes in [&eight, &float, &sixteen] {
+        assert_eq!(read(bytes).unwrap().1, stack);
+        assert_names(&refusal(&bytes[..bytes.len() - 1]), &["30 images of 2x3", "cut short"]);
+    }
+    for (images, words) in [
+        ("9999999999999", ["number of frames", "limit"]),
+        ("4096", ["4096 images of 2x3 uint16", "cut short"]),
+    ] {
+        let mut bytes = imagej(images, 16, 400);
+        bytes.resize(800, 0);
+        assert_names(&refusal(&bytes), &words);
+    }
+    let mut packed = eight.clone();
+    let entry = packed.windows(2).position(|tag| tag == [1, 3]).unwrap();
+    packed[entry + 8..entry + 10].copy_from_slice(&8u16.to_be_bytes());
+    assert_names(&refusal(&packed), &["ImageJ stack of 30 images", "not compressed"]);
+}
+
+#[test]
+fn images_of_imagej_beyond_4_gb_are_read() {
+    use std::io::{Seek, SeekFrom, Write};
+    let stack = ramp((30, 2, 3), 200);
+    let start = u32::MAX - 50;
+    let mut path = file(&imagej("30", 16, start));
+    path.seek(SeekFrom::Start(start.into())).unwrap();
+    let pixels: Vec<u8> = stack.iter().flat_map(|value| (*value as u16).to_be_bytes()).collect();
+    path.write_all(&pixels).unwrap();
+    let (info, found) = read_stack(path.path(), &Limits::default()).unwrap();
+    assert_eq!((info.frames, found), (30, stack));
+    assert!(path.as_file().metadata().unwrap().len() > 1 << 32);
 }
 
 #[test]
