@@ -142,7 +142,7 @@ pub(super) fn measurement(
     }
     let (mut writer, room) = desk.writer(&info)?;
     let limits = desk.limits();
-    let saturated = intake::measurement(opened, exposure, limits, |y| {
+    let passed = intake::measurement(opened, exposure, limits, |y| {
         desk.go_on()?;
         writer.write_frame(y)
     })?;
@@ -150,6 +150,7 @@ pub(super) fn measurement(
     let masks = desk.app.store.dir().blob(&calibration.prepared);
     let darkened = !exposure.dark.is_empty();
     let both = (masks.as_path(), file.path());
-    let found = intake::judge(both, saturated.as_deref(), darkened, limits)?;
+    let mut found = passed.findings;
+    found.extend(intake::judge(both, passed.saturated.as_deref(), darkened, limits)?);
     Ok(Prepared { info, full_scale, found, file, room })
 }

@@ -152,3 +152,24 @@ async fn jobs_are_warned_of_a_bad_calibration_and_masks_of_their_bits() {
     let late = app.submit(&body).await;
     assert_eq!(warned(&app.ended(&late).await), 1);
 }
+
+#[tokio::test]
+async fn twelve_bits_in_sixteen_are_named() {
+    let app = TestApp::start().await;
+    let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
+    for (shift, code, full_scale) in [(4, "left_aligned", 65_520), (0, "right_aligned", 4095)] {
+        let values = (0..48 * 64u16).map(|k| (k.wrapping_mul(37) % 4096) << shift);
+        let mut file = npy_header("<u2", &[48, 64]);
+        file.extend(values.flat_map(u16::to_le_bytes));
+        let sha256 = app.upload(file).await;
+        let mut body = json!({ "calibration": calibration, "data": sha256 });
+        let codes = async |body: &Value| {
+            let made = app.post("/v1/measurements", body).await.expect(201).json();
+            found(&made["warnings"]).into_iter().map(|(code, _)| code).collect::<Vec<_>>()
+        };
+        assert!(codes(&body).await.contains(&code.to_owned()), "{code}");
+        body["full_scale"] = json!(full_scale);
+        body["saturation"] = json!(full_scale);
+        assert!(!codes(&body).await.contains(&code.to_owned()), "{code}");
+    }
+}

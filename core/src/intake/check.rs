@@ -10,10 +10,10 @@ use super::captures::{average, full_number};
 use super::open::Opened;
 use crate::formats::planar::Reader;
 use crate::formats::validate::{MaskStatistics, check_masks, check_snapshots};
-use crate::formats::{self, FormatError, FrameReader, Limits, StackInfo};
+use crate::formats::{self, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::intake::error::Result;
 use crate::job::{Finding, MOST_MASKS};
-use crate::optics::{MeasurementStudy, REACH, judge_measurement};
+use crate::optics::{Digits, MeasurementStudy, REACH, judge_measurement};
 
 /// Side of a window that is looked at, without its margin.
 const WINDOW: usize = 64;
@@ -29,6 +29,14 @@ pub struct Exposure {
     pub dark: Vec<PathBuf>,
     /// The stored number from which on a pixel is full; none for the largest of its type.
     pub saturation: Option<u32>,
+}
+
+/// What was seen of a measurement as it passed.
+#[derive(Debug)]
+pub struct Passed {
+    /// The share of full pixels of each snapshot; none if nobody knows when they are.
+    pub saturated: Option<Vec<f64>>,
+    pub findings: Vec<Finding>,
 }
 
 /// Hands each mask on \[0,1\] to `sink`.
@@ -57,8 +65,7 @@ fn check_count(opened: &Opened) -> Result<()> {
     Err(IntakeError::Size { place: opened.name.clone(), detail })
 }
 
-/// Hands each snapshot, less its dark and divided by the full scale, to `sink`. Tells the share of full
-/// pixels of each; none if nobody knows when they are.
+/// Hands each snapshot, less its dark and divided by the full scale, to `sink`, and tells what was seen.
 /// Errors: whatever is wrong with the file; a dark of another size; snapshots that are 0
 /// everywhere; those of `sink`. What it received must be thrown away then.
 pub fn measurement(
@@ -66,13 +73,16 @@ pub fn measurement(
     exposure: &Exposure,
     limits: &Limits,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
-) -> Result<Option<Vec<f64>>> {
+) -> Result<Passed> {
     let Opened { info, full_scale, reader, name } = opened;
     let dark = average_dark(&exposure.dark, (info.height, info.width), limits)?;
     let saturation = full_number(info.sample, exposure.saturation);
-    let mut exposed = Exposed { reader, dark, saturation, full: Vec::new() };
+    let digits = (info.sample == SampleType::U16).then(Digits::default);
+    let mut exposed = Exposed { reader, dark, saturation, full: Vec::new(), digits };
     check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
-    Ok(saturation.map(|_| exposed.full))
+    let judge = |digits: Digits| digits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
+    let findings = exposed.digits.and_then(judge).map(Finding::from).into_iter().collect();
+    Ok(Passed { saturated: saturation.map(|_| exposed.full), findings })
 }
 
 /// The average \[H,W\] of dark captures, as stored.
@@ -106,6 +116,8 @@ struct Exposed {
     saturation: Option<f32>,
     /// Share of full pixels of each snapshot so far.
     full: Vec<f64>,
+    /// Of 16-bit numbers.
+    digits: Option<Digits>,
 }
 
 impl FrameReader for Exposed {
@@ -115,6 +127,9 @@ impl FrameReader for Exposed {
 
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
         let Some(mut frame) = self.reader.next_frame()? else { return Ok(None) };
+        if let Some(digits) = &mut self.digits {
+            digits.add(&frame);
+        }
         if let Some(saturation) = self.saturation {
             let full = frame.iter().filter(|value| **value >= saturation).count();
             self.full.push(full as f64 / frame.len().max(1) as f64);

@@ -12,7 +12,7 @@ mod report_page;
 mod sample;
 
 pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
-pub use check::{Exposure, judge, masks, measurement};
+pub use check::{Exposure, Passed, judge, masks, measurement};
 pub use error::IntakeError;
 pub use open::{Opened, Source};
 pub use read::{Scaled, read_clip, read_masks, read_snapshots, read_truth};

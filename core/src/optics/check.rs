@@ -245,6 +245,48 @@ fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
     Some(right)
 }
 
+/// Which binary digits the 16-bit numbers of a camera have.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Digits {
+    /// Those that are 1 in any value.
+    used: u16,
+}
+
+impl Digits {
+    /// Takes values as stored.
+    pub fn add<'a>(&mut self, values: impl IntoIterator<Item = &'a f32>) {
+        self.used = values.into_iter().fold(self.used, |used, value| used | *value as u16);
+    }
+
+    /// Numbers of 12 bits in 16, where the full scale and the number from which on a pixel is full are not theirs.
+    pub fn judge(self, full_scale: f32, saturation: f32) -> Option<Finding> {
+        const LEFT: f32 = 65_520.0;
+        const RIGHT: f32 = 4095.0;
+        if self.used.trailing_zeros() == 4 && saturation > LEFT {
+            return Some(Finding::new(
+                "left_aligned",
+                Severity::Warning,
+                "all values are multiples of 16: numbers of 12 bits, left-aligned in 16; a full pixel is 65520 \
+                 and does not count as one"
+                    .to_owned(),
+                "state full_scale and saturation as 65520",
+            ));
+        }
+        if (1..=RIGHT as u16).contains(&self.used) && full_scale > RIGHT {
+            return Some(Finding::new(
+                "right_aligned",
+                Severity::Warning,
+                format!(
+                    "no value is above 4095, and {full_scale} means 1: these may be numbers of 12 bits, \
+                     right-aligned in 16"
+                ),
+                "state full_scale and saturation as 4095, if the camera has 12 bits",
+            ));
+        }
+        None
+    }
+}
+
 /// What is wrong with a measurement; `saturated` is the share of its pixels that were full, if it is
 /// known when they are, and `darkened` says whether a dark was subtracted.
 pub fn judge_measurement(
@@ -448,6 +490,24 @@ mod tests {
         assert_eq!(codes(&masks, &lifted), ["wrong_dark"]);
         assert_eq!(codes(&masks, &(&y - 0.07 * mean)), ["wrong_dark"]);
         assert_eq!(undarkened(&masks, &(&y - 0.07 * mean)), ["negative_offset"]);
+    }
+
+    #[test]
+    fn twelve_bits_in_sixteen_are_named() {
+        let judge = |values: &[f32], full_scale, saturation| {
+            let mut digits = super::Digits::default();
+            digits.add(values);
+            digits.judge(full_scale, saturation).map(|finding| finding.code)
+        };
+        let left = [16.0, 4096.0, 65_520.0, 0.0];
+        assert_eq!(judge(&left, 65_535.0, 65_535.0), Some("left_aligned"));
+        assert_eq!(judge(&left, 65_520.0, 65_520.0), None);
+        let right = [0.0, 3.0, 4095.0];
+        assert_eq!(judge(&right, 65_535.0, 65_535.0), Some("right_aligned"));
+        assert_eq!(judge(&right, 4095.0, 4095.0), None);
+        for values in [&[0.0, 0.0][..], &[17.0, 4096.0], &[0.0, 32_768.0]] {
+            assert_eq!(judge(values, 65_535.0, 65_535.0), None, "{values:?}");
+        }
     }
 
     #[test]

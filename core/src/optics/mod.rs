@@ -23,7 +23,7 @@ mod study;
 
 pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
 pub use camera::{Camera, illumination};
-pub use check::{MeasurementFigures, MeasurementStudy, REACH, judge_measurement};
+pub use check::{Digits, MeasurementFigures, MeasurementStudy, REACH, judge_measurement};
 pub use findings::{
     CaptureFigures, Finding, PatternFigures, Severity, judge_captures, judge_masks,
 };
