@@ -1,0 +1,20 @@
+#![no_main]
+
+mod file;
+
+use sci_recon_core::formats::mat::SceneArray;
+use sci_recon_core::formats::{Axes, Expected, Wanted, open_array, open_stack};
+
+// Both kinds of archives, with arrays and with pictures: the corpus has one of each.
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    file::with_file(bytes, |path| {
+        if let Ok(mut reader) = open_stack(path, &file::LIMITS) {
+            file::drain(&mut *reader);
+        }
+        let expected = Expected { axes: Some(Axes::ColumnRowFrame), ..Expected::default() };
+        let wanted = Wanted { expected, ..SceneArray::Masks.into() };
+        if let Ok(mut reader) = open_array(path, wanted, &file::LIMITS) {
+            file::drain(&mut *reader);
+        }
+    });
+});
