@@ -13,6 +13,7 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %     'algorithm'   'pnp-tv-fastdvdnet' (default), 'gap-tv', 'gap-tv3d', ...
 %     'full_scale'  the number in MEASUREMENT that means 1 (default 1; never guessed)
 %     'masks_full_scale'  the same of MASKS
+%     'mosaic'      'rggb', 'bggr', 'grbg' or 'gbrg' for a colour sensor: FRAMES are [H,W,3,B], or [H,W,3,B,S], then
 %     'camera_fps', 'exposure_s', 'label'   kept with the measurement and the job
 %     'schedule'    a struct, instead of the algorithm's own schedule
 %     'quiet'       true: no lines of progress
@@ -35,7 +36,8 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
   end
 
   calibration = request(o, 'POST', '/v1/calibrations', ...
-                        given(struct('masks', upload(o, masks), 'full_scale', o.masks_full_scale)));
+                        given(struct('masks', upload(o, masks), 'full_scale', o.masks_full_scale, ...
+                                     'mosaic', o.mosaic)));
   calibration = ready(o, '/v1/calibrations/', calibration);
   taken = request(o, 'POST', '/v1/measurements', ...
                   given(struct('calibration', calibration.id, 'data', upload(o, measurement), ...
@@ -66,14 +68,15 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 
   frames = [];
   for s = job.snapshots.first + (0:job.snapshots.count - 1)
-    frames = cat(4, frames, download(o, sprintf('/v1/jobs/%s/snapshots/%d', job.id, s)));
+    % Frames of colours have an axis more.
+    frames = cat(4 + ~isempty(o.mosaic), frames, download(o, sprintf('/v1/jobs/%s/snapshots/%d', job.id, s)));
   end
 end
 
 function o = options(flags)
   o = struct('url', getenv('SCI_RECON_URL'), 'token', getenv('SCI_RECON_TOKEN'), ...
              'algorithm', 'pnp-tv-fastdvdnet', 'full_scale', 1, 'masks_full_scale', 1, 'camera_fps', [], ...
-             'exposure_s', [], 'label', [], 'schedule', [], 'quiet', false);
+             'exposure_s', [], 'mosaic', [], 'label', [], 'schedule', [], 'quiet', false);
   for k = 1:2:numel(flags)
     if k == numel(flags) || ~ischar(flags{k}) || ~isfield(o, flags{k})
       error('sci_recon:option', 'options are pairs of a name and a value; the names are %s', ...
@@ -221,7 +224,7 @@ function status = append(o, file, offset, piece, location, answer)
 end
 
 function frames = download(o, path)
-  % The frames of a snapshot, [H,W,B]; the download goes on where it was after a cut.
+  % The frames of a snapshot, [H,W,B] or [H,W,3,B]; the download goes on where it was after a cut.
   file = tempname();
   clean = onCleanup(@() remove({file}));
   for attempt = 1:12
@@ -292,7 +295,7 @@ function write_npy(file, values)
 end
 
 function values = read_npy(file)
-  % float32 [B,H,W] in C order, as the service writes it.
+  % float32 [B,H,W], or [B,H,W,3] of colours, in C order, as the service writes it.
   id = fopen(file, 'r', 'ieee-le');
   start = fread(id, 8, '*uint8');
   if numel(start) < 8 || start(1) ~= 147
@@ -302,7 +305,12 @@ function values = read_npy(file)
   text = fread(id, fread(id, 1, 'uint16'), '*char')';
   sides = regexp(text, '\(([^)]*)\)', 'tokens', 'once');
   shape = str2double(regexp(sides{1}, '\d+', 'match'));
-  values = permute(reshape(fread(id, prod(shape), '*single'), shape(3), shape(2), shape(1)), [2 1 3]);
+  values = reshape(fread(id, prod(shape), '*single'), fliplr(shape));
+  if numel(shape) == 4
+    values = permute(values, [3 2 1 4]);
+  else
+    values = permute(values, [2 1 3]);
+  end
   fclose(id);
 end
 

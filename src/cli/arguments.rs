@@ -10,7 +10,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use super::CliError;
 use crate::cli::error::Result;
 use crate::formats::Axes;
-use crate::job::{Algorithm, InvalidField, Sequence};
+use crate::job::{Algorithm, InvalidField, Mosaic, Sequence};
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::recon::schedule::Schedule;
@@ -138,6 +138,11 @@ impl NetworkArguments {
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
     let own = &Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1];
     named(own)
+}
+
+/// Colours of a sensor's pixels.
+pub(super) fn mosaic() -> impl TypedValueParser<Value = Mosaic> {
+    PossibleValuesParser::new(Mosaic::VARIANTS).try_map(|name: String| name.parse::<Mosaic>())
 }
 
 /// Kinds of sequences.

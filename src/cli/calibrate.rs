@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use super::{CliError, progress};
 use crate::cli::error::Result;
-use crate::formats::{FormatError, Limits, StackInfo, npy};
+use crate::formats::{Channels, FormatError, Limits, StackInfo, npy};
 use crate::intake::{CaptureFiles, Report, calibrate, report_page};
 
 /// Make masks and a report from raw captures, without a server.
@@ -55,7 +55,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let masks = |info: &StackInfo| {
         let file = File::create(out.join("masks.npy"));
         let file = file.map_err(FormatError::io("write masks.npy"))?;
-        npy::writer(BufWriter::new(file), info.frames, info.height, info.width)
+        npy::writer(BufWriter::new(file), (info.frames, info.height, info.width), Channels::Grey)
     };
     let made = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share);
     let (made, _) = made.map_err(|error| match error.is_retryable() {

@@ -11,14 +11,14 @@ use ndarray::{Array2, Array3};
 use serde::Serialize;
 
 use super::CliError;
-use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, axes, sequence};
+use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, axes, mosaic, sequence};
 use super::model::{Model, cut};
 use super::progress::SnapshotBar;
 use crate::cli::error::Result;
-use crate::formats::Axes;
 use crate::formats::mat::SceneArray;
+use crate::formats::{Axes, Channels};
 use crate::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
-use crate::job::{Algorithm, SceneShape, Schedule, Sequence, Sha256};
+use crate::job::{Algorithm, Mosaic, SceneShape, Schedule, Sequence, Sha256};
 use crate::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use crate::pipeline::networks::NetworkSource;
 use crate::pipeline::pilot::full_schedule;
@@ -65,6 +65,10 @@ pub struct Arguments {
     /// Value in the truth's file that means 1 [default: as for the measurement].
     #[arg(long, value_name = "VALUE")]
     truth_full_scale: Option<f32>,
+    /// The colours of the sensor's pixels, row by row of a cell of 2x2: the frames get their colours, and the truth
+    /// may have them ([frame, row, column, 3]) or be a mosaic, too [default: a grey sensor].
+    #[arg(long, value_name = "NAME", value_parser = mosaic())]
+    mosaic: Option<Mosaic>,
     /// The order of the axes in the masks' file [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     masks_axes: Option<Axes>,
@@ -91,7 +95,7 @@ pub struct Arguments {
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels [default: 320, 384 for those of TV alone, 240 where that makes
+    /// Largest side of a tile, in pixels (with --mosaic those of a sub-image) [default: 320, 384 for those of TV alone, 240 where that makes
     /// room for longer runs of snapshots; for learned 256, or the whole picture for a network that takes
     /// no other].
     #[arg(long, value_name = "PIXELS")]
@@ -100,7 +104,7 @@ pub struct Arguments {
     /// for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
-    /// Folder for frames/, png/, stack.exr, frames.npy and manifest.json; of several snapshots each has its
+    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json; of several snapshots each has its
     /// own folder there, snapshot_0000 and so on.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
@@ -128,8 +132,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
     let algorithm = arguments.schedule.algorithm;
     let model = model(arguments, &network)?;
-    let dim = input.masks.array.dim();
     let snapshots = input.snapshots();
+    let shape = input.shape();
+    let (height, width) = shape.solved();
+    let dim = (shape.frames, height, width);
     let cut = cut(
         (algorithm, &schedule),
         (arguments.tile, arguments.overlap),
@@ -137,7 +143,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         (arguments.sequence, snapshots.len() as u32),
         dim,
     )?;
-    let (plan, runs) = (cut.tiles(dim.1, dim.2)?, cut.run.plan(snapshots)?);
+    let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots)?);
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let threads = arguments.threads.map_or(cores, usize::from);
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
@@ -156,6 +162,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         solver,
         plan: &setup.plan,
         runs: &setup.runs,
+        mosaic: arguments.mosaic,
     };
     let bar = SnapshotBar::new(setup.plan.len() * setup.runs.runs().len());
     let tell = |tile, share| bar.update(tile, share);
@@ -174,9 +181,15 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let run = RunRecord::ended(None, cost, Some(seconds));
     let frames = sequence.masks.dim().0;
-    let frame = |index| solved.frame(&sequence, input.first + index / frames, index % frames);
-    let truth = input.truth.as_ref();
-    let quality = truth.map(|truth| Quality::of_frames(frame, truth.view())).transpose()?;
+    let seen = |index| solved.frame(&sequence, input.first + index / frames, index % frames);
+    let compare = |(truth, channels): &(Array3<f32>, Channels)| {
+        let frame = |index| match (arguments.mosaic, channels) {
+            (Some(mosaic), Channels::Rgb) => mosaic.colours(seen(index).view(), (0, 0)),
+            _ => seen(index),
+        };
+        Quality::of_frames(frame, truth.view(), *channels)
+    };
+    let quality = input.truth.as_ref().map(compare).transpose()?;
     let recipe = input.recipe(&setup, white, &solved)?;
     let report = Report::new(&recipe, &sequence, &solved, &run, quality);
     for (snapshot, folder) in folders {
@@ -252,7 +265,8 @@ struct Input<'a> {
     measurement: Scaled<Array3<f32>>,
     /// The index of the first of them in the file.
     first: usize,
-    truth: Option<Array3<f32>>,
+    truth: Option<(Array3<f32>, Channels)>,
+    mosaic: Option<Mosaic>,
 }
 
 impl<'a> Input<'a> {
@@ -275,11 +289,27 @@ impl<'a> Input<'a> {
                 sources.masks.path.display(),
             )));
         }
+        let mosaic = arguments.mosaic;
+        if mosaic.is_some() && !(height.is_multiple_of(2) && width.is_multiple_of(2)) {
+            return Err(CliError::Input(format!(
+                "--mosaic: the pictures are {height}x{width} (rows x columns); a mosaic has an even number of \
+                 both: crop them so that they begin with the first pixel of a cell"
+            )));
+        }
+        let dim = masks.array.dim();
         let truth = match &sources.truth {
-            Some(source) => read_truth(source, masks.array.dim(), first..first + count, snapshots)?,
+            Some(source) => {
+                read_truth(source, dim, mosaic.is_some(), first..first + count, snapshots)?
+            }
             None => None,
         };
-        Ok(Self { sources, masks, measurement, first, truth })
+        Ok(Self { sources, masks, measurement, first, truth, mosaic })
+    }
+
+    fn shape(&self) -> SceneShape {
+        let (frames, height, width) = self.masks.array.dim();
+        let snapshots = self.measurement.array.dim().0 as u32;
+        SceneShape { frames, height, width, snapshots, mosaic: self.mosaic }
     }
 
     /// The snapshots, by their indices in the file.
@@ -293,7 +323,6 @@ impl<'a> Input<'a> {
     }
 
     fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
-        let (frames, height, width) = self.masks.array.dim();
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule)?;
         models.extend(setup.model.as_ref().map(Model::record));
@@ -302,7 +331,7 @@ impl<'a> Input<'a> {
             algorithm: setup.algorithm,
             schedule: full_schedule(&setup.schedule, pilot.as_ref()),
             pilot,
-            shape: SceneShape { frames, height, width, snapshots: self.snapshots().len() as u32 },
+            shape: self.shape(),
             inputs: Inputs {
                 masks_sha256: sha256(self.sources.masks.path)?,
                 masks_axes: self.masks.axes.map(|axes| axes.to_string()),

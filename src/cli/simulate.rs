@@ -10,12 +10,13 @@ use ndarray::{Array2, Array3, ArrayView3, s};
 use serde::Serialize;
 
 use super::CliError;
+use super::arguments::mosaic;
 use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
 use crate::cli::error::Result;
-use crate::formats::npy;
-use crate::intake::read_clip;
-use crate::optics::{OpticsError, illumination, measure, noisy};
+use crate::formats::{Channels, npy};
+use crate::intake::{read_clip, read_colours};
+use crate::optics::{Mosaic, OpticsError, illumination, measure, noisy};
 
 /// Simulate a snapshot: make masks and measure known frames through them.
 #[derive(Debug, Args)]
@@ -23,6 +24,10 @@ pub struct Arguments {
     /// The scene: npy, npz, multi-page TIFF, a .mat scene's `orig`, or a folder of PNGs.
     #[arg(long, value_name = "FILE")]
     frames: PathBuf,
+    /// A sensor with these colours of its pixels, row by row of a cell of 2x2: the scene has colours then, as
+    /// npy [frame, row, column, 3] or a folder of colour PNGs [default: a grey sensor].
+    #[arg(long, value_name = "NAME", value_parser = mosaic())]
+    mosaic: Option<Mosaic>,
     /// Value in the frames' file that means 1 [default: 255 for uint8 and .mat scenes, 65535 for
     /// uint16, 1 for floats].
     #[arg(long, value_name = "VALUE")]
@@ -58,6 +63,8 @@ struct Record {
     program_version: &'static str,
     pattern: &'static str,
     seed: u64,
+    /// None for a grey sensor.
+    mosaic: Option<Mosaic>,
     compression_ratio: usize,
     snapshots: usize,
     height: usize,
@@ -78,11 +85,24 @@ struct Record {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let frames = read_clip(&arguments.frames, arguments.full_scale)?;
-    check_range(&arguments.frames, &frames)?;
+    let frames = match arguments.mosaic {
+        None => read_clip(&arguments.frames, arguments.full_scale)?,
+        Some(_) => read_colours(&arguments.frames, arguments.full_scale)?,
+    };
+    let channels = if arguments.mosaic.is_some() { Channels::Rgb } else { Channels::Grey };
+    check_range(&arguments.frames, &frames, channels)?;
     let ratio = usize::from(arguments.compression_ratio);
     let used = ratio * usize::from(arguments.snapshots);
-    let (count, height, width) = frames.dim();
+    let (count, height, samples) = frames.dim();
+    let width = samples / channels.count();
+    if let Some(mosaic) = arguments.mosaic
+        && !(height.is_multiple_of(2) && width.is_multiple_of(2))
+    {
+        return Err(CliError::Input(format!(
+            "{} has frames of {height}x{width} (rows x columns); the mosaic {mosaic} needs an even number of both",
+            arguments.frames.display()
+        )));
+    }
     if count < used {
         return Err(CliError::Input(format!(
             "{} holds {count} frames, but {} snapshots of {ratio} frames need {used}",
@@ -93,15 +113,30 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let optics = arguments.masks.optics()?;
     let light = illumination((height, width), optics.vignetting())?;
     // The illumination stays part of the scene: this is what can be seen of it.
-    let truth = &frames.slice(s![..used, .., ..]) * &light;
+    let mut truth = frames.slice(s![..used, .., ..]).to_owned();
+    for channel in 0..channels.count() {
+        let mut of = truth.slice_mut(s![.., .., channel..;channels.count().cast_signed()]);
+        of *= &light;
+    }
     let made = arguments.masks.make(&optics, (ratio, height, width), arguments.seed)?;
     let SimulatedMasks { masks, throughput, scale, apertures } = made;
-    let truth = truth.view();
-    let snapshots = measure_all(&masks, truth, arguments.noise_sigma / 255.0, arguments.seed)?;
+    let seen = match arguments.mosaic {
+        None => truth.clone(),
+        Some(mosaic) => {
+            let mut seen = Array3::zeros((used, height, width));
+            for (mut seen, truth) in seen.outer_iter_mut().zip(truth.outer_iter()) {
+                seen.assign(&mosaic.seen(truth, (0, 0)));
+            }
+            seen
+        }
+    };
+    let seen = seen.view();
+    let snapshots = measure_all(&masks, seen, arguments.noise_sigma / 255.0, arguments.seed)?;
     let mut record = Record {
         program_version: env!("CARGO_PKG_VERSION"),
         pattern: arguments.masks.pattern(),
         seed: arguments.seed,
+        mosaic: arguments.mosaic,
         compression_ratio: ratio,
         snapshots: snapshots.len(),
         height,
@@ -126,10 +161,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             repeats: repeats.into(),
             seed: arguments.seed,
         };
-        let full_scale = lab.write(&arguments.out.join("captures"), snapshots.len(), truth)?;
+        let full_scale = lab.write(&arguments.out.join("captures"), snapshots.len(), seen)?;
         record.capture_full_scale = Some(full_scale);
     }
-    write(&arguments.out, &masks, &snapshots, truth, &record)
+    write(&arguments.out, &masks, &snapshots, (truth.view(), channels), &record)
 }
 
 /// One measurement for each `B` frames of the truth.
@@ -153,12 +188,15 @@ fn write(
     out: &Path,
     masks: &Array3<f32>,
     snapshots: &[Array2<f32>],
-    truth: ArrayView3<'_, f32>,
+    (truth, channels): (ArrayView3<'_, f32>, Channels),
     record: &Record,
 ) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     npy::write_f32(&out.join("masks.npy"), masks.view())?;
-    npy::write_f32(&out.join("truth.npy"), truth)?;
+    match channels {
+        Channels::Grey => npy::write_f32(&out.join("truth.npy"), truth)?,
+        Channels::Rgb => npy::write_colours(&out.join("truth.npy"), truth)?,
+    }
     let measurement = out.join("measurement.npy");
     match snapshots {
         [only] => npy::write_image_f32(&measurement, only.view())?,
@@ -175,11 +213,12 @@ fn write(
 }
 
 /// A scene that is not on \[0,1\] has a full scale that somebody must state.
-fn check_range(path: &Path, frames: &Array3<f32>) -> Result<()> {
+fn check_range(path: &Path, frames: &Array3<f32>, channels: Channels) -> Result<()> {
     let outside = |value: f32| !(-1e-6..=1.0 + 1e-6).contains(&value);
     let Some(((k, i, j), value)) = frames.indexed_iter().find(|(_, v)| outside(**v)) else {
         return Ok(());
     };
+    let j = j / channels.count();
     Err(CliError::Input(format!(
         "frames {}: {value} times the full scale at frame {k}, row {i}, column {j} (counted from \
          0); a scene must lie between 0 and its full scale: state --full-scale",

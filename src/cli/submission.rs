@@ -6,10 +6,10 @@ use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::CliError;
-use super::arguments::{Snapshots, axes, named_all, sequence};
+use super::arguments::{Snapshots, axes, mosaic, named_all, sequence};
 use super::client::{Client, Result};
 use crate::formats::Axes;
-use crate::job::{Algorithm, CalibrationId, Sequence, Sha256};
+use crate::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
 
 /// How jobs are made of measurements.
 #[derive(Debug, Args)]
@@ -35,6 +35,9 @@ pub(super) struct SubmissionArguments {
     /// The number in the masks that means 1 [default: that of their type].
     #[arg(long, value_name = "NUMBER", requires = "masks")]
     masks_full_scale: Option<f64>,
+    /// The colours of the sensor's pixels, row by row of a cell of 2x2 [default: a grey sensor].
+    #[arg(long, value_name = "NAME", requires = "masks", value_parser = mosaic())]
+    mosaic: Option<Mosaic>,
     /// The number in the snapshots that means 1 [default: that of their type].
     #[arg(long, value_name = "NUMBER")]
     full_scale: Option<f64>,
@@ -119,6 +122,7 @@ impl SubmissionArguments {
         add(&mut body, "array", json!(self.masks_array));
         add(&mut body, "axes", json!(self.masks_axes));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
+        add(&mut body, "mosaic", json!(self.mosaic));
         let body = Value::Object(body);
         // The same masks are the same calibration, whoever asks.
         let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));

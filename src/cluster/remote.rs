@@ -657,7 +657,7 @@ impl Transport for Remote {
             return Err(PipelineError::Record { what: "tile's message", problem });
         }
         let pieces = task.pieces.clone();
-        Ok(TileInput { masks, y, plane: task.plane, white: task.white, pieces })
+        Ok(TileInput { masks, y, white: task.white, pieces })
     }
 
     fn model(&self, sha256: Sha256) -> ModelFile {

@@ -15,7 +15,7 @@ use super::page::{Limit, PageBody, Renaming};
 use crate::formats::Axes;
 use crate::formats::validate::MaskStatistics;
 use crate::intake::plan;
-use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, Timestamp};
+use crate::job::{CalibrationId, Captures, Lab, Label, Mosaic, Sha256, Timestamp};
 use crate::store::{
     Calibration, Filter, Inserted, Made, NewCalibration, NewCaptures, Page, RequestKey, Span,
     Unready,
@@ -35,11 +35,22 @@ pub(super) struct CalibrationRequest {
     axes: Option<Axes>,
     full_scale: Option<f32>,
     captures: Option<Captures>,
+    /// The colours of the sensor's pixels; a grey sensor has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    mosaic: Option<Mosaic>,
 }
 
 impl CalibrationRequest {
     pub(super) fn of_masks(name: Option<Label>, masks: Sha256) -> Self {
-        Self { name, masks: Some(masks), array: None, axes: None, full_scale: None, captures: None }
+        Self {
+            name,
+            masks: Some(masks),
+            array: None,
+            axes: None,
+            full_scale: None,
+            captures: None,
+            mosaic: None,
+        }
     }
 }
 
@@ -84,6 +95,7 @@ pub(super) struct CalibrationBody {
     mask_mean: Option<f64>,
     dead_pixels: Option<u64>,
     clipped_negatives: Option<u64>,
+    mosaic: Option<Mosaic>,
 }
 
 impl From<Calibration> for CalibrationBody {
@@ -107,13 +119,14 @@ impl From<Calibration> for CalibrationBody {
             mask_mean: Some(facts.mask_mean),
             dead_pixels: Some(facts.dead_pixels),
             clipped_negatives: Some(facts.clipped_negatives),
+            mosaic: facts.mosaic,
         }
     }
 }
 
 impl From<Unready> for CalibrationBody {
     fn from(unready: Unready) -> Self {
-        let Unready { id, name, frames, fraction, error, created_at } = unready;
+        let Unready { id, name, frames, fraction, mosaic, error, created_at } = unready;
         let failed = error.is_some();
         Self {
             id,
@@ -133,6 +146,7 @@ impl From<Unready> for CalibrationBody {
             mask_mean: None,
             dead_pixels: None,
             clipped_negatives: None,
+            mosaic,
         }
     }
 }
@@ -169,11 +183,12 @@ async fn insert(
     request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
-    let CalibrationRequest { name, masks, array, axes, full_scale, captures } = request;
+    let CalibrationRequest { name, masks, array, axes, full_scale, captures, mosaic } = request;
+    let told = (name, mosaic);
     match (masks, captures) {
         (Some(masks), None) => {
             let of = Upload { array, axes, full_scale };
-            of_masks(app, access, (name, masks, of), key).await
+            of_masks(app, access, (told, masks, of), key).await
         }
         (None, Some(_)) if array.is_some() => {
             Err(ApiError::field("/array", "captures are pictures, not named arrays"))
@@ -182,7 +197,7 @@ async fn insert(
             Err(ApiError::field("/axes", "captures are [frame, row, column]: leave axes out"))
         }
         (None, Some(captures)) if full_scale.is_none() => {
-            of_captures(app, access, (name, captures), key).await
+            of_captures(app, access, (told, captures), key).await
         }
         (None, Some(_)) => {
             let detail = "captures have no full scale: white and black give their masks' scale";
@@ -192,17 +207,33 @@ async fn insert(
     }
 }
 
+/// What a request says of a calibration, however its masks come.
+type Told = (Option<Label>, Option<Mosaic>);
+
+/// Refuses the mosaic of a sensor that can't have one.
+fn check_mosaic(mosaic: Option<Mosaic>, (height, width): (usize, usize)) -> Result<()> {
+    if mosaic.is_none() || (height.is_multiple_of(2) && width.is_multiple_of(2)) {
+        return Ok(());
+    }
+    let detail = format!(
+        "the pictures are {height}x{width} (rows x columns); a mosaic has an even number of both: crop them so \
+         that they begin with the first pixel of a cell"
+    );
+    Err(ApiError::field("/mosaic", &detail))
+}
+
 async fn of_masks(
     app: &App,
     access: &Access,
-    (name, masks, of): (Option<Label>, Sha256, Upload),
+    (told, masks, of): (Told, Sha256, Upload),
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
     let (lab, token) = (&access.lab, access.token);
     app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
     let file = intake::upload(app, masks).await.map_err(|error| error.at("/masks"))?;
     let prepared = intake::run(app, access, move |desk| intake::masks(desk, &file, of)).await?;
-    let facts = facts(name, masks, &prepared);
+    check_mosaic(told.1, (prepared.info.height, prepared.info.width))?;
+    let facts = facts(told, masks, &prepared);
     let made = app.store.add_calibration((lab, token), facts, prepared.file, key).await?;
     drop(prepared.room);
     Ok(made)
@@ -212,7 +243,7 @@ async fn of_masks(
 async fn of_captures(
     app: &App,
     access: &Access,
-    (name, captures): (Option<Label>, Captures),
+    ((name, mosaic), captures): (Told, Captures),
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
     let (lab, token) = (&access.lab, access.token);
@@ -228,11 +259,13 @@ async fn of_captures(
         Ok((captures, plan))
     })
     .await?;
+    check_mosaic(mosaic, plan.size)?;
     let asked = NewCaptures {
         name: name.as_ref(),
         captures: &captures,
         bytes: plan.bytes,
         cost: plan.seconds,
+        mosaic,
     };
     let add = app.store.add_captures((lab, token), asked, key);
     // Twice: as they are measured, and on their scale.
@@ -247,7 +280,7 @@ async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody
 }
 
 fn facts(
-    name: Option<Label>,
+    (name, mosaic): Told,
     masks: Sha256,
     prepared: &Prepared<MaskStatistics>,
 ) -> NewCalibration {
@@ -265,6 +298,7 @@ fn facts(
         mask_mean: found.mean,
         dead_pixels: found.dead_pixels,
         clipped_negatives: found.clipped_negative,
+        mosaic,
     }
 }
 

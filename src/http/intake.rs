@@ -150,7 +150,8 @@ pub(super) fn measurement(
     let masks = desk.app.store.dir().blob(&calibration.prepared);
     let darkened = !exposure.dark.is_empty();
     let both = (masks.as_path(), file.path());
+    let mosaic = calibration.facts.mosaic;
     let mut found = passed.findings;
-    found.extend(intake::judge(both, passed.saturated.as_deref(), darkened, limits)?);
+    found.extend(intake::judge(both, mosaic, passed.saturated.as_deref(), darkened, limits)?);
     Ok(Prepared { info, full_scale, found, file, room })
 }

@@ -234,6 +234,7 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
         height: measurement.height,
         width: measurement.width,
         snapshots: measurement.snapshots,
+        mosaic: calibration.facts.mosaic,
     };
     let model = match request.model {
         None => None,

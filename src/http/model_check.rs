@@ -43,8 +43,10 @@ impl Checker {
     fn command(&self, file: &Path, masks: &NewCalibration) -> Option<Command> {
         let mut command = Command::new(self.program.as_ref()?);
         command.arg("check-model").arg(file);
-        for (name, value) in
-            [("--frames", masks.frames), ("--height", masks.height), ("--width", masks.width)]
+        // Of a mosaic each of the four sub-images goes through the network.
+        let step = if masks.mosaic.is_some() { 2 } else { 1 };
+        let (height, width) = (masks.height / step, masks.width / step);
+        for (name, value) in [("--frames", masks.frames), ("--height", height), ("--width", width)]
         {
             command.arg(name).arg(value.to_string());
         }

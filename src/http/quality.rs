@@ -14,7 +14,7 @@ use super::intake;
 use super::jobs::with_snapshot;
 use super::results::result_file;
 use crate::formats::mat::SceneArray;
-use crate::formats::{Axes, FormatError, Limits, npy};
+use crate::formats::{Axes, Channels, FormatError, Limits, npy};
 use crate::intake::{Opened, Source};
 use crate::job::{JobId, SceneShape, Sha256};
 use crate::pipeline::quality::{FrameQuality, Quality};
@@ -48,8 +48,13 @@ pub(super) async fn show(
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
     let frames = intake::run(&app, &access, move |desk| {
         let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *desk.limits());
+        // Behind a mosaic true frames may have colours, or be as the sensor sees them.
+        let colours = if shape.mosaic.is_some() { truth.open_colours()? } else { None };
+        if let Some(colours) = colours {
+            return compare((&path, Channels::Rgb), colours, snapshot as usize, shape);
+        }
         let truth = truth.arranged(query.axes, Some((shape.height, shape.width)));
-        compare(&path, truth.open()?, snapshot as usize, shape)
+        compare((&path, Channels::Grey), truth.open()?, snapshot as usize, shape)
     });
     conditional::json(&QualityBody { truth, quality: frames.await?.into() }, &headers)
 }
@@ -57,19 +62,21 @@ pub(super) async fn show(
 /// Compares the frames of a snapshot with those of a truth that has the frames of this snapshot, or
 /// of all snapshots of the measurement. Memory holds a frame of each.
 fn compare(
-    path: &Path,
+    (path, channels): (&Path, Channels),
     mut truth: Opened,
     snapshot: usize,
     shape: SceneShape,
 ) -> Result<Vec<FrameQuality>> {
-    let SceneShape { frames, height, width, snapshots } = shape;
+    let SceneShape { frames, height, snapshots, mosaic, .. } = shape;
+    let width = shape.width * channels.count();
     let found = truth.info;
     let all = frames * snapshots as usize;
     if (found.height, found.width) != (height, width) || ![frames, all].contains(&found.frames) {
+        let (rows, columns) = (found.height, found.width / channels.count());
         let detail = format!(
-            "the truth has {} frames of {}x{}; it should have {frames} of {height}x{width} for this \
+            "the truth has {} frames of {rows}x{columns}; it should have {frames} of {height}x{} for this \
              snapshot, or {all} for all",
-            found.frames, found.height, found.width
+            found.frames, shape.width
         );
         return Err(ApiError::new(Code::SizeMismatch, detail));
     }
@@ -80,8 +87,12 @@ fn compare(
     let result = npy::open_windows(path, &Limits::default())?;
     let figures = |k: usize| -> Result<FrameQuality> {
         let truth = next(&mut truth)?;
-        let frame = result.read_window(k..k + 1, 0..height, 0..width)?;
-        let quality = FrameQuality::of(k, frame.index_axis(Axis(0), 0), truth.view());
+        let frame = result.read_window(k..k + 1, 0..height, 0..result.info().width)?;
+        let mut frame = frame.index_axis_move(Axis(0), 0);
+        if let (Channels::Grey, Some(mosaic)) = (channels, mosaic) {
+            frame = mosaic.seen(frame.view(), (0, 0));
+        }
+        let quality = FrameQuality::of(k, frame.view(), truth.view(), channels);
         quality.map_err(|error| ApiError::internal(&error))
     };
     (0..frames).map(figures).collect()

@@ -45,7 +45,7 @@ pub(super) async fn snapshot(
 /// The address of a result file: the inverse of [`frame_file`] and of the routes.
 fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
     let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
-    if let "stack.exr" | "frames.npy" | "manifest.json" = name {
+    if let "stack.exr" | "frames.npy" | "mosaic.npy" | "manifest.json" = name {
         return Some(format!("{base}/{name}"));
     }
     let (stem, kind) = name.rsplit_once('/')?.1.rsplit_once('.')?;
@@ -63,8 +63,8 @@ pub(super) async fn job_manifest(
     send(&app, &job, None, "manifest.json", (&method, &headers)).await
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr` or
-/// `frames.npy`, as the routes have them.
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr`,
+/// `frames.npy` or `mosaic.npy`, as the routes have them.
 pub(super) async fn file(
     Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
@@ -74,6 +74,10 @@ pub(super) async fn file(
 ) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
     let name = uri.path().rsplit('/').next().unwrap_or_default();
+    if name == "mosaic.npy" && job.spec.shape.mosaic.is_none() {
+        let detail = "the sensor of this job is grey: frames.npy has its frames";
+        return Err(ApiError::new(Code::NotFound, detail));
+    }
     send(&app, &job, Some(snapshot), name, (&method, &headers)).await
 }
 

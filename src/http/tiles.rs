@@ -19,10 +19,13 @@ struct TilesBody {
 
 #[derive(Debug, Serialize)]
 struct TileBody {
+    /// The place in the picture that it has a part in.
     row: usize,
     column: usize,
     height: usize,
     width: usize,
+    /// Which sub-image of a mosaic it belongs to.
+    plane: Option<usize>,
     /// The run of snapshots that it belongs to.
     snapshots: SnapshotRange,
     #[serde(flatten)]
@@ -39,9 +42,9 @@ pub(super) async fn list(
     let states = app.store.tile_states(id, snapshot).await?;
     let show = |state: TileState| {
         let tile = plan.tile(state.tile as usize)?;
-        let (row, column, height, width) = (tile.row, tile.column, tile.height, tile.width);
+        let ([row, column, height, width], plane) = (tile.place(), tile.plane());
         let snapshots = SnapshotRange { first: state.run, count: state.snapshots };
-        Some(TileBody { row, column, height, width, snapshots, state })
+        Some(TileBody { row, column, height, width, plane, snapshots, state })
     };
     let body = TilesBody { snapshot, items: states.into_iter().filter_map(show).collect() };
     conditional::json(&body, &headers)

@@ -13,8 +13,8 @@ use super::tables::keys::{self, Inserted, Made, RequestKey};
 use super::tables::measurements::{self, Measurement, NewMeasurement};
 use super::tables::{jobs, quota};
 use crate::job::{
-    CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Sha256, Timestamp, TokenId,
-    planned_seconds,
+    CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Mosaic, Sha256, Timestamp,
+    TokenId, planned_seconds,
 };
 
 #[derive(Debug, Clone)]
@@ -38,6 +38,8 @@ pub struct NewCaptures<'a> {
     pub bytes: u64,
     /// Planned processor seconds.
     pub cost: f64,
+    /// The colours of the sensor's pixels.
+    pub mosaic: Option<Mosaic>,
 }
 
 impl Store {
@@ -101,7 +103,8 @@ impl Store {
         quota::check(&mut transaction, lab, token, prepared.size()).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         calibrations::insert(&mut transaction, (lab, token), &calibration).await?;
-        let asked = Asked { id, token, name: facts.name.as_ref(), captures: None, bytes: 0 };
+        let name = facts.name.as_ref();
+        let asked = Asked { id, token, name, captures: None, bytes: 0, mosaic: facts.mosaic };
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
         let cost = planned_seconds(0, facts.frames, facts.height * facts.width);
         graph::insert_calibration(&mut transaction, lab, id, cost).await?;
@@ -115,7 +118,7 @@ impl Store {
     pub async fn add_captures(
         &self,
         (lab, token): (&Lab, Option<TokenId>),
-        NewCaptures { name, captures, bytes, cost }: NewCaptures<'_>,
+        NewCaptures { name, captures, bytes, cost, mosaic }: NewCaptures<'_>,
         key: Option<&RequestKey>,
     ) -> Result<Inserted<CalibrationId>> {
         let id = CalibrationId::new();
@@ -124,7 +127,7 @@ impl Store {
             return Ok(Inserted::Before(before));
         }
         quota::check(&mut transaction, lab, token, bytes).await?;
-        let asked = Asked { id, token, name, captures: Some(captures), bytes };
+        let asked = Asked { id, token, name, captures: Some(captures), bytes, mosaic };
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
         graph::insert_calibration(&mut transaction, lab, id, cost).await?;
         keys::insert(&mut transaction, lab, Made::Calibration, key, id).await?;

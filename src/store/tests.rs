@@ -73,6 +73,7 @@ impl Lab {
             mask_mean: 0.5,
             dead_pixels: 0,
             clipped_negatives: 0,
+            mosaic: None,
         };
         let masks = upload(b"prepared masks");
         let whose = (&local, None);
@@ -146,7 +147,8 @@ impl Lab {
             .await
             .unwrap()
             .facts;
-        let shape = crate::job::SceneShape { frames: 8, height: 64, width: 96, snapshots: 2 };
+        let (height, width) = (64, 96);
+        let shape = crate::job::SceneShape { frames: 8, height, width, snapshots: 2, mosaic: None };
         let job = JobRequest {
             measurement: self.measurement,
             calibration: None,

@@ -82,6 +82,7 @@ impl Local {
                 white: white(task)?,
                 schedule: spec.schedule.clone(),
                 runs: spec.sequence_plan().map_err(PipelineError::from)?,
+                mosaic: spec.shape.mosaic,
             },
             TaskKind::Tile { snapshot, tile, .. } => {
                 TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
@@ -219,9 +220,8 @@ impl Transport for Local {
 
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError> {
         let arrays = self.arrays(task.masks, task.measurement);
-        let place = (task.tile.rows(), task.tile.columns());
-        let input = arrays.window(task.snapshots.clone(), place, task.white)?;
-        Ok(TileInput { plane: task.plane, pieces: task.pieces.clone(), ..input })
+        let input = arrays.window(task.snapshots.clone(), &task.tile.window(), task.white)?;
+        Ok(TileInput { pieces: task.pieces.clone(), ..input })
     }
 
     fn model(&self, sha256: Sha256) -> ModelFile {
@@ -277,7 +277,6 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
         measurement: task.measurement.prepared,
         snapshots: first..first + runs.runs()[run].len() as u32,
         pieces: own.map(|piece| piece.start - start..piece.end - start).collect(),
-        plane: 0,
         tile,
         white: white(task)?,
         schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),

@@ -8,7 +8,7 @@ use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, 
 use crate::formats::planar::{self, Reader};
 use crate::formats::{Limits, StackInfo};
 use crate::intake::{self, Calibrated, IntakeError, Report, calibrate};
-use crate::job::{Label, Schedule, Sha256, SnapshotRange, TaskProgress, TaskStage};
+use crate::job::{Label, Sha256, SnapshotRange, TaskProgress, TaskStage};
 use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
 use crate::pipeline::blend::{self, StoredTile};
@@ -23,8 +23,7 @@ use crate::pipeline::tile::{TileInput, reconstruct_tile, run_network};
 use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use crate::pipeline::write::{write_manifest, write_result};
 use crate::pipeline::{preview, scale};
-use crate::recon;
-use crate::recon::sequence::{RunShare, SequencePlan};
+use crate::recon::sequence::RunShare;
 use crate::recon::solver::Outcome;
 use crate::store::{CalibrationDone, NewCalibration, StagedBlob};
 
@@ -47,9 +46,12 @@ pub(super) fn perform(
             monitor.reach(TaskStage::Tv, 1.0);
             (Value::Null, Output::Stack(frames))
         }
-        TaskInput::Pilot { arrays, snapshots, white, schedule, runs } => {
-            let task = (snapshots, &schedule, &runs);
-            let record = run_pilot(&arrays, white, task, networks, monitor)?;
+        TaskInput::Pilot { arrays, snapshots, white, schedule, runs, mosaic } => {
+            let y = arrays.snapshot(snapshots.first).map_err(PipelineError::from)?;
+            let place = pilot::place(y.view(), mosaic);
+            let first = snapshots.first as usize;
+            let task = Pilot { first, place: &place, schedule: &schedule, runs: &runs };
+            let record = run_pilot(&arrays, white, (snapshots, &task), networks, monitor)?;
             let decided = full_schedule(&schedule, record.as_ref());
             let share = decided.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
             monitor.reach(monitor.progress().stage, 1.0);
@@ -131,6 +133,8 @@ fn facts(name: Option<Label>, made: &Calibrated, masks: Sha256) -> NewCalibratio
         mask_mean: report.masks.mean,
         dead_pixels: report.masks.dead_pixels,
         clipped_negatives: made.clipped_negatives,
+        // The request has it.
+        mosaic: None,
     }
 }
 
@@ -142,16 +146,13 @@ fn json(record: &impl Serialize) -> Result<Value, PipelineError> {
 fn run_pilot(
     arrays: &Arrays,
     white: f32,
-    (snapshots, schedule, runs): (SnapshotRange, &Schedule, &SequencePlan),
+    (snapshots, task): (SnapshotRange, &Pilot<'_>),
     networks: &mut WarmNetworks,
     monitor: &Monitor,
 ) -> Result<Option<PilotRecord>, PipelineError> {
     let SnapshotRange { first, count } = snapshots;
-    let place = recon::pilot::piece(arrays.snapshot(first)?.view());
-    let (row, column) = (place.0.start, place.1.start);
-    let input = arrays.window(first..first + count, place, white)?;
-    let task = Pilot { first: first as usize, row, column, schedule, runs };
-    Ok(pilot::decide(input, &task, networks, &mut monitor.observe(schedule.clone()))?)
+    let input = arrays.window(first..first + count, task.place, white)?;
+    Ok(pilot::decide(input, task, networks, &mut monitor.observe(task.schedule.clone()))?)
 }
 
 /// What a snapshot takes from the runs that hold it, with the tiles of each. All tiles must be there.

@@ -13,7 +13,8 @@ use serde_json::Value;
 use crate::formats::FormatError;
 use crate::intake::{CaptureFiles, IntakeError};
 use crate::job::{
-    JobId, JobSpec, Label, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange, TaskProgress,
+    JobId, JobSpec, Label, Mosaic, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange,
+    TaskProgress,
 };
 use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
@@ -121,6 +122,7 @@ pub enum TaskInput {
         white: f32,
         schedule: Schedule,
         runs: SequencePlan,
+        mosaic: Option<Mosaic>,
     },
     Tile(Box<TileTask>),
     /// Blend all tiles of the runs that hold a snapshot, and write its frames to the folder.
@@ -159,8 +161,6 @@ pub struct TileTask {
     pub snapshots: Range<u32>,
     /// Those of them that are solved together, by their place in the run.
     pub pieces: Vec<Range<usize>>,
-    /// The colour plane of the sensor, from 0; one today.
-    pub plane: usize,
     pub tile: Tile,
     pub white: f32,
     /// The schedule, after the pilot; without stages if there is a model.

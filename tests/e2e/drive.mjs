@@ -48,6 +48,38 @@ export async function submit(page, checks, scene, small) {
   return page.url().slice(-36);
 }
 
+/** A sensor with a mosaic, from the form to frames in colour. */
+export async function colour(page, checks, scene) {
+  await page.click("#nav >> text=New job");
+  await page.check("input[value=masks]");
+  await drop(page, "label.drop:has(#masks)", "masks.npy", scene.masks);
+  await page.waitForSelector("text=The calibration is taken.");
+  // What is stated later goes with the same file.
+  await page.selectOption("#mosaic", "rggb");
+  await page.waitForSelector(".step:nth-child(1) .verdict:has-text('in colour, RGGB')");
+  await drop(page, "label.drop:has(#data)", "measurement.npy", scene.measurement);
+  await page.waitForSelector("text=The measurement fits the calibration.");
+  await page.selectOption("#algorithm", "gap-tv");
+  await page.click("button[type=submit]");
+  await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
+  await state(page, "succeeded");
+  await page.waitForSelector(".downloads a >> text=Mosaic (npy)");
+  checks.that((await page.$$(".tile")).length === 4, "each of the four sub-images is a tile");
+  checks.that(/red/.test(await page.textContent(".tile title")), "and tells its colour");
+  await page.waitForTimeout(600);
+  const share = await page.evaluate(() => {
+    const canvas = document.querySelector("[aria-label=Frames] .sight canvas");
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    let red = 0;
+    for (let at = 0; at < data.length; at += 4) {
+      if (data[at] > 1.5 * data[at + 1] && data[at + 1] > data[at + 2]) red += 1;
+    }
+    return red / (data.length / 4);
+  });
+  checks.that(share > 0.01 && share < 0.1, `the square is red, and nothing else: ${share}`);
+  await checks.look(page, "colour");
+}
+
 /** Watches a job until it has succeeded; its tiles must show before that. */
 export async function watch(page, checks) {
   await page.waitForSelector(".tile.done", { timeout: 120_000 });

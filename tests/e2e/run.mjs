@@ -8,7 +8,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, captures, compare, decided, judged, manage, network, sample, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, captures, colour, compare, decided, judged, manage, network, sample, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene } from "./scene.mjs";
@@ -53,6 +53,7 @@ async function everything() {
   await checks.step("decided", () => decided(page, checks, content.pilot.stages[0]));
   await checks.look(page, "job-pilot");
   await checks.step("captures", () => captures(page, checks, small));
+  await checks.step("colour", () => colour(page, checks, scene(FRAMES, 192, 256, 1, true)));
   await checks.step("phone", () => phone(browser, checks, service.url, id));
   await checks.step("loading", () => loading(browser, checks, service.url));
   await service.submit(long(measurement, "long job"));

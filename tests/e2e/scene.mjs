@@ -3,8 +3,13 @@
 
 const [BLACK, LIGHT] = [100, 2000];
 
-/** `frames` frames of `height` x `width` and a snapshot of them; gives the files' bytes. */
-export function scene(frames, height, width, seed = 1) {
+/** The colours of a cell of 2x2 pixels, and what each sees of the square and of the ramp. */
+const CELL = [0, 1, 1, 2];
+const TINTS = [[1, 0.4], [0.35, 0.7], [0.15, 1]];
+
+/** `frames` frames of `height` x `width` and a snapshot of them, by a grey sensor or one with the mosaic rggb; gives the
+ * files' bytes. */
+export function scene(frames, height, width, seed = 1, mosaic = false) {
   const masks = new Float32Array(frames * height * width);
   const truth = new Float32Array(masks.length);
   const measurement = new Float32Array(height * width);
@@ -25,7 +30,8 @@ export function scene(frames, height, width, seed = 1) {
         const at = (frame * height + row) * width + column;
         const inside = row >= top && row < top + side && column >= left && column < left + side;
         const wave = 0.35 + 0.2 * Math.sin(column / 9) * Math.cos(row / 13);
-        truth[at] = inside ? 0.95 : wave;
+        const tint = mosaic ? TINTS[CELL[(row % 2) * 2 + (column % 2)]][inside ? 0 : 1] : 1;
+        truth[at] = tint * (inside ? 0.95 : wave);
         masks[at] = random() < 0.5 ? 0 : 1;
         measurement[row * width + column] += masks[at] * truth[at];
       }

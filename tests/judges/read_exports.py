@@ -32,20 +32,23 @@ def main():
     told = {}
     for place, frames in clips.items():
         with tifffile.TiffFile(io.BytesIO(get(f"{place}/stack.tif"))) as file:
-            assert file.is_bigtiff and file.is_ome and file.is_imagej and file.byteorder == "<"
+            colours = frames.ndim == 4
+            assert file.is_bigtiff and file.is_ome and file.byteorder == "<"
             assert len(file.pages) == len(frames)
             found = file.asarray()
             assert found.dtype == np.float32 and found.shape == frames.shape and (found == frames).all()
-            assert file.series[0].axes == "TYX", file.series[0].axes
-            imagej = file.imagej_metadata
-            assert imagej["frames"] == len(frames) and imagej["unit"] == "pixel", imagej
+            assert file.series[0].axes == ("TYXS" if colours else "TYX"), file.series[0].axes
+            assert file.pages[0].photometric == (2 if colours else 1)
+            # ImageJ has no colours of floating point.
+            imagej = {} if colours else file.imagej_metadata
+            assert colours or imagej["frames"] == len(frames) and imagej["unit"] == "pixel", imagej
             pixels = ElementTree.fromstring(file.ome_metadata).find(".//{*}Pixels")
             assert int(pixels.get("SizeT")) == len(frames)
             interval = pixels.get("TimeIncrement")
             assert interval is None or pixels.get("TimeIncrementUnit") == "s"
             told[place] = [imagej.get("finterval"), interval and float(interval)]
             planes = [float(plane.get("DeltaT")) for plane in pixels.findall("{*}Plane")]
-            assert len(planes) == len(frames) and planes == sorted(planes)
+            assert len(planes) in (0, len(frames)) and planes == sorted(planes)
         array = zarr.open_array(
             f"{base}{place}/frames.zarr", mode="r", storage_options={"client_kwargs": {"headers": headers}}
         )

@@ -2,9 +2,9 @@
 
 usage: read_exr.py FOLDER [--attribute NAME]...
 
-FOLDER holds frames.npy (float32, [frame, row, column]), frames/frame_0001.exr and so on, and
-stack.exr with one part a frame. Every EXR part must have the one channel Y, float32, with the bits
-of its frame. With --attribute every part must carry that string attribute, not empty.
+FOLDER holds frames.npy (float32, [frame, row, column], or of colours [frame, row, column, 3]),
+frames/frame_0001.exr and so on, and stack.exr with one part a frame. Every EXR part must have the one
+channel Y, or R, G and B, float32, with the bits of its frame. With --attribute every part must carry that string attribute, not empty.
 Prints one line; exit status 1 on any difference.
 
 Needs the PyPI packages OpenEXR (3.5) and numpy.
@@ -20,10 +20,12 @@ import OpenEXR
 
 def differences(part, expected, attributes, where):
     """Says what is wrong with one part."""
-    if list(part.channels) != ["Y"]:
-        yield f"{where}: channels {list(part.channels)}, expected ['Y']"
+    names = ["Y"] if expected.ndim == 2 else ["R", "G", "B"]
+    if sorted(part.channels) != sorted(names):
+        yield f"{where}: channels {list(part.channels)}, expected {names}"
         return
-    pixels = part.channels["Y"].pixels
+    channels = [part.channels[name].pixels for name in names]
+    pixels = channels[0] if expected.ndim == 2 else numpy.stack(channels, axis=-1)
     if pixels.dtype != numpy.float32 or pixels.shape != expected.shape:
         yield f"{where}: {pixels.dtype} {pixels.shape}, expected float32 {expected.shape}"
     elif not numpy.array_equal(pixels.view(numpy.uint32), expected.view(numpy.uint32)):
@@ -38,7 +40,7 @@ def differences(part, expected, attributes, where):
 def judge(folder, attributes):
     """All differences between the EXR files of a folder and its frames.npy."""
     frames = numpy.ascontiguousarray(numpy.load(folder / "frames.npy"))
-    if frames.dtype != numpy.float32 or frames.ndim != 3:
+    if frames.dtype != numpy.float32 or frames.ndim not in (3, 4):
         return [f"frames.npy: {frames.dtype} {frames.shape}"], 0
     found = []
     names = [f"frame_{k + 1:04d}" for k in range(len(frames))]

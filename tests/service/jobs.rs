@@ -22,7 +22,8 @@ async fn a_job_is_accepted_with_all_that_was_left_open_filled_in() {
     assert_eq!(created.header("location"), format!("/v1/jobs/{}", job["id"].as_str().unwrap()));
     assert_eq!(job["state"], "queued");
     assert_eq!(job["calibration"], calibration);
-    assert_eq!(job["shape"], json!({"frames": 4, "height": 48, "width": 64, "snapshots": 2}));
+    let shape = json!({"frames": 4, "height": 48, "width": 64, "snapshots": 2, "mosaic": null});
+    assert_eq!(job["shape"], shape);
     assert_eq!(job["snapshots"], json!({"first": 0, "count": 2}));
     assert_eq!(job["progress"]["tiles_total"], 1, "both snapshots are reconstructed together");
     assert_eq!(job["progress"]["stage"], "waiting");

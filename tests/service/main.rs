@@ -12,6 +12,7 @@ mod client_libraries;
 mod clients;
 #[cfg(feature = "nats")]
 mod cluster;
+mod colour;
 mod commands;
 mod conditions;
 mod contract;

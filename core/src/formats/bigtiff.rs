@@ -6,6 +6,8 @@
 
 use std::fmt::Write;
 
+use super::Channels;
+
 /// A clip, as viewers are told of it.
 #[derive(Debug, Clone, Copy)]
 pub struct Clip<'a> {
@@ -13,6 +15,8 @@ pub struct Clip<'a> {
     pub name: &'a str,
     /// Frames, rows, columns.
     pub shape: (usize, usize, usize),
+    /// What a pixel has.
+    pub channels: Channels,
     /// Seconds from the start of a frame to that of the next, if it is the same for all and known.
     pub interval_s: Option<f64>,
     /// Start of each frame in seconds, if known.
@@ -36,12 +40,18 @@ const ALIGNMENT: usize = 64;
 /// The bytes before the first frame.
 pub fn head(clip: &Clip<'_>) -> Vec<u8> {
     let (frames, height, width) = clip.shape;
-    let texts = [ome(clip), imagej(clip)].map(|text| [text.as_bytes(), b"\0"].concat());
+    let channels = clip.channels.count();
+    let mut texts = vec![ome(clip)];
+    // ImageJ has no colours of floating point.
+    texts.extend((clip.channels == Channels::Grey).then(|| imagej(clip)));
+    let texts: Vec<_> = texts.iter().map(|text| [text.as_bytes(), b"\0"].concat()).collect();
     let directory = |entries: usize| 8 + entries * ENTRY + 8;
     let with_texts = directory(ENTRIES + texts.len());
     let behind = HEADER.len() + with_texts + frames.saturating_sub(1) * directory(ENTRIES);
     let length = (behind + texts.iter().map(Vec::len).sum::<usize>()).next_multiple_of(ALIGNMENT);
-    let frame_bytes = height * width * size_of::<f32>();
+    let frame_bytes = height * width * channels * size_of::<f32>();
+    // The same number for each channel, 16 bits each.
+    let each = |number: usize| (0..channels).map(|channel| number << (16 * channel)).sum();
     let mut head = HEADER.to_vec();
     head.reserve_exact(length - head.len());
     for frame in 0..frames {
@@ -49,21 +59,23 @@ pub fn head(clip: &Clip<'_>) -> Vec<u8> {
             (256, LONG, 1, width),
             (257, LONG, 1, height),
             // 32 bits a sample, not compressed, black is 0.
-            (258, SHORT, 1, 32),
+            (258, SHORT, channels, each(32)),
             (259, SHORT, 1, 1),
-            (262, SHORT, 1, 1),
+            // Grey, or red, green and blue.
+            (262, SHORT, 1, if channels == 1 { 1 } else { 2 }),
             (273, LONG8, 1, length + frame * frame_bytes),
-            (277, SHORT, 1, 1),
+            (277, SHORT, 1, channels),
             (278, LONG, 1, height),
             (279, LONG8, 1, frame_bytes),
             // Floating point.
-            (339, SHORT, 1, 3),
+            (339, SHORT, channels, each(3)),
         ];
         if frame == 0 {
-            let [ome, imagej] = &texts;
-            let second = behind + ome.len();
-            entries.insert(5, (DESCRIPTION, ASCII, ome.len(), behind));
-            entries.insert(6, (DESCRIPTION, ASCII, imagej.len(), second));
+            let mut at = behind;
+            for (index, text) in texts.iter().enumerate() {
+                entries.insert(5 + index, (DESCRIPTION, ASCII, text.len(), at));
+                at += text.len();
+            }
         }
         head.extend((entries.len() as u64).to_le_bytes());
         for (tag, kind, count, value) in &entries {
@@ -114,11 +126,14 @@ fn ome(clip: &Clip<'_>) -> String {
          <OME xmlns=\"{schema}\" xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \
          xsi:schemaLocation=\"{schema} {schema}/ome.xsd\">\
          <Image ID=\"Image:0\" Name=\"{name}\">\
-         <Pixels ID=\"Pixels:0\" DimensionOrder=\"XYZCT\" Type=\"float\" BigEndian=\"false\" \
-         SizeX=\"{width}\" SizeY=\"{height}\" SizeZ=\"1\" SizeC=\"1\" SizeT=\"{frames}\"{interval}>\
-         <Channel ID=\"Channel:0:0\" SamplesPerPixel=\"1\"/>\
+         <Pixels ID=\"Pixels:0\" DimensionOrder=\"{order}\" Type=\"float\" BigEndian=\"false\" \
+         SizeX=\"{width}\" SizeY=\"{height}\" SizeZ=\"1\" SizeC=\"{channels}\" SizeT=\"{frames}\"{interval}>\
+         <Channel ID=\"Channel:0:0\" SamplesPerPixel=\"{channels}\"/>\
          <TiffData IFD=\"0\" PlaneCount=\"{frames}\"/>{planes}</Pixels></Image></OME>",
-        name = escaped(clip.name)
+        name = escaped(clip.name),
+        channels = clip.channels.count(),
+        // Of a page the colours come first.
+        order = if clip.channels == Channels::Grey { "XYZCT" } else { "XYCZT" },
     )
 }
 
@@ -149,20 +164,28 @@ mod tests {
     use tiff::decoder::{Decoder, DecodingResult};
     use tiff::tags::Tag;
 
-    use super::{Clip, escaped, head};
+    use super::{Channels, Clip, escaped, head};
 
     #[test]
     fn another_reader_finds_every_frame() {
+        for channels in [Channels::Grey, Channels::Rgb] {
+            read(channels);
+        }
+    }
+
+    fn read(channels: Channels) {
         let (frames, height, width) = (3, 5, 7);
         let times = [0.0, 0.25, 0.5];
         let clip = Clip {
             name: "a & b",
             shape: (frames, height, width),
+            channels,
             interval_s: Some(0.25),
             times_s: Some(&times),
         };
         let mut file = head(&clip);
-        let values: Vec<f32> = (0..frames * height * width).map(|at| at as f32 - 7.5).collect();
+        let count = frames * height * width * channels.count();
+        let values: Vec<f32> = (0..count).map(|at| at as f32 - 7.5).collect();
         file.extend(values.iter().flat_map(|value| value.to_le_bytes()));
         let mut decoder = Decoder::new(Cursor::new(file)).unwrap();
         let mut found = Vec::new();

@@ -5,12 +5,15 @@
 //! a time. [`validate`] brings raw frames onto their scale and refuses what cannot be a mask or a
 //! measurement. Outputs are EXR, npy, PNG, BigTIFF and prepared arrays ([`planar`]).
 //!
-//! Arrays are f32 with axes (frame, row, column).
+//! Arrays are f32 with axes (frame, row, column); see [`Channels`] for those of
+//! colours.
 
 #![warn(missing_docs)]
 
 mod array;
 mod axes;
+mod channels;
+mod colour;
 mod error;
 mod format;
 mod hdf5;
@@ -38,6 +41,8 @@ mod tiff;
 pub mod validate;
 
 pub use axes::{Axes, Expected};
+pub use channels::Channels;
+pub use colour::open_colours;
 pub use error::FormatError;
 pub use format::Format;
 pub use limits::Limits;

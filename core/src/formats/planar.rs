@@ -108,6 +108,16 @@ impl Reader {
     ) -> Result<Array3<f32>> {
         self.windows.read_window(frames, rows, columns)
     }
+
+    /// Reads every `step`th row and column of a window; see [`WindowReader::read_lattice`].
+    pub fn read_lattice(
+        &self,
+        frames: Range<usize>,
+        place: (Range<usize>, Range<usize>),
+        step: usize,
+    ) -> Result<Array3<f32>> {
+        self.windows.read_lattice(frames, place, step)
+    }
 }
 
 /// Opens `path` and reads one window; see [`Reader::read_window`].

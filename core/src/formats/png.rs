@@ -1,4 +1,4 @@
-//! PNG: one grey frame in, 16-bit frames out.
+//! PNG: one frame in, frames of 8 or 16 bits out.
 
 use std::fs::File;
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, Write};
@@ -11,7 +11,7 @@ use ::png::{
 use ndarray::{Array2, ArrayView2};
 
 use super::samples::{self, ByteOrder};
-use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use super::{Channels, Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::formats::error::Result;
 
 /// Deflate expands a byte to at most 1032.
@@ -20,7 +20,7 @@ const MAX_EXPANSION: u64 = 1032;
 /// Room for the decoder's own buffers and for chunks that are not pixels.
 const DECODER_BYTES: usize = 16 << 20;
 
-/// A grey PNG, a stack of one frame.
+/// A PNG, a stack of one frame.
 pub(super) struct PngReader<R: Read + Seek> {
     decoder: Option<::png::Reader<BufReader<R>>>,
     info: StackInfo,
@@ -30,21 +30,40 @@ impl<R: Read + Seek> PngReader<R> {
     /// Reads the header of `file` (`length` bytes long) and checks it against the limits and the
     /// length. Gamma and colour profiles are not applied: the stored numbers count.
     pub(super) fn open(file: R, length: u64, limits: &Limits) -> Result<Self> {
-        let decoder_limits = DecoderLimits { bytes: DECODER_BYTES };
-        let mut decoder = Decoder::new_with_limits(BufReader::new(file), decoder_limits);
-        decoder.set_transformations(Transformations::IDENTITY);
-        decoder.set_ignore_text_chunk(true);
-        decoder.set_ignore_iccp_chunk(true);
+        let mut decoder = decoder(file);
         let header = decoder.read_header_info().map_err(decoding_error)?;
-        let (height, width) = (header.height, header.width);
         let sample = match (header.color_type, header.bit_depth) {
             (ColorType::Grayscale, BitDepth::One) => SampleType::Bool,
             (ColorType::Grayscale, BitDepth::Eight) => SampleType::U8,
             (ColorType::Grayscale, BitDepth::Sixteen) => SampleType::U16,
             (color, depth) => return Err(unsupported(format!("{color:?}, {depth:?} bit"))),
         };
+        Self::new(decoder, (sample, Channels::Grey), length, limits)
+    }
+
+    /// The same of a picture of red, green and blue; none for a grey one.
+    pub(super) fn open_colours(file: R, length: u64, limits: &Limits) -> Result<Option<Self>> {
+        let mut decoder = decoder(file);
+        let header = decoder.read_header_info().map_err(decoding_error)?;
+        let sample = match (header.color_type, header.bit_depth) {
+            (ColorType::Rgb, BitDepth::Eight) => SampleType::U8,
+            (ColorType::Rgb, BitDepth::Sixteen) => SampleType::U16,
+            _ => return Ok(None),
+        };
+        Self::new(decoder, (sample, Channels::Rgb), length, limits).map(Some)
+    }
+
+    fn new(
+        mut decoder: Decoder<BufReader<R>>,
+        (sample, channels): (SampleType, Channels),
+        length: u64,
+        limits: &Limits,
+    ) -> Result<Self> {
+        let header = decoder.read_header_info().map_err(decoding_error)?;
+        let (height, width) = (header.height, header.width);
         limits.check_shape(Format::Png, 1, height.into(), width.into())?;
-        let info = StackInfo::new(Format::Png, sample, 1, height as usize, width as usize);
+        let samples = width as usize * channels.count();
+        let info = StackInfo::new(Format::Png, sample, 1, height as usize, samples);
         let promised = (row_bytes(&info) * info.height) as u64;
         if length.saturating_mul(MAX_EXPANSION) < promised {
             return Err(FormatError::Truncated {
@@ -65,6 +84,16 @@ impl<R: Read + Seek> PngReader<R> {
         }
         Ok(Self { decoder: Some(reader), info })
     }
+}
+
+/// Of stored numbers as they are.
+fn decoder<R: Read + Seek>(file: R) -> Decoder<BufReader<R>> {
+    let limits = DecoderLimits { bytes: DECODER_BYTES };
+    let mut decoder = Decoder::new_with_limits(BufReader::new(file), limits);
+    decoder.set_transformations(Transformations::IDENTITY);
+    decoder.set_ignore_text_chunk(true);
+    decoder.set_ignore_iccp_chunk(true);
+    decoder
 }
 
 impl<R: Read + Seek> FrameReader for PngReader<R> {
@@ -97,52 +126,69 @@ fn row_bytes(info: &StackInfo) -> usize {
     }
 }
 
-/// Writes (or overwrites) `path` with a 16-bit grey PNG for looking at: `black` becomes 0, `white`
-/// 65535, linear between, clipped outside; NaN becomes 0. `frame` has the axes (row, column).
+/// Writes (or overwrites) `path` with a 16-bit PNG for looking at: `black` becomes 0, `white`
+/// 65535, linear between, clipped outside; NaN becomes 0. `frame` has the axes (row, column), and for each pixel
+/// as many values as there are channels.
 ///
 /// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
-pub fn write_u16(path: &Path, frame: ArrayView2<'_, f32>, black: f32, white: f32) -> Result<()> {
+pub fn write_u16(
+    path: &Path,
+    frame: ArrayView2<'_, f32>,
+    channels: Channels,
+    black: f32,
+    white: f32,
+) -> Result<()> {
     let file = File::create(path).map_err(FormatError::io("create the PNG"))?;
-    encode_u16(BufWriter::new(file), frame, black, white)
+    encode_u16(BufWriter::new(file), frame, channels, (black, white))
 }
 
-/// An 8-bit grey PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
-/// outside; NaN becomes 0. `frame` has the axes (row, column).
+/// An 8-bit PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
+/// outside; NaN becomes 0. `frame` has the axes (row, column), and for each pixel as many values as there are
+/// channels.
 /// Errors: [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without
 /// pixels.
-pub fn encode_u8(frame: ArrayView2<'_, f32>, black: f32, white: f32) -> Result<Vec<u8>> {
+pub fn encode_u8(
+    frame: ArrayView2<'_, f32>,
+    channels: Channels,
+    black: f32,
+    white: f32,
+) -> Result<Vec<u8>> {
     let factor = 255.0 / (white - black);
     let bytes: Vec<u8> = frame.iter().map(|v| ((v - black) * factor).round() as u8).collect();
     let mut png = Vec::new();
-    encode(&mut png, frame.dim(), BitDepth::Eight, (black, white), &bytes)?;
+    encode(&mut png, frame.dim(), (channels, BitDepth::Eight), (black, white), &bytes)?;
     Ok(png)
 }
 
 fn encode_u16(
     writer: impl Write,
     frame: ArrayView2<'_, f32>,
-    black: f32,
-    white: f32,
+    channels: Channels,
+    (black, white): (f32, f32),
 ) -> Result<()> {
     let factor = 65535.0 / (white - black);
     let bytes: Vec<u8> =
         frame.iter().flat_map(|v| (((v - black) * factor).round() as u16).to_be_bytes()).collect();
-    encode(writer, frame.dim(), BitDepth::Sixteen, (black, white), &bytes)
+    encode(writer, frame.dim(), (channels, BitDepth::Sixteen), (black, white), &bytes)
 }
 
 fn encode(
     writer: impl Write,
-    (height, width): (usize, usize),
-    depth: BitDepth,
+    (height, samples): (usize, usize),
+    (channels, depth): (Channels, BitDepth),
     (black, white): (f32, f32),
     bytes: &[u8],
 ) -> Result<()> {
     if !(black.is_finite() && white.is_finite() && black < white) {
         return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
     }
+    let width = samples / channels.count();
     let [height, width] = [height, width].map(|n| u32::try_from(n).unwrap_or(0));
     let mut encoder = Encoder::new(writer, width, height);
-    encoder.set_color(ColorType::Grayscale);
+    encoder.set_color(match channels {
+        Channels::Grey => ColorType::Grayscale,
+        Channels::Rgb => ColorType::Rgb,
+    });
     encoder.set_depth(depth);
     // The low bits are noise: more effort buys little.
     encoder.set_compression(Compression::Fast);

@@ -41,6 +41,18 @@ impl WindowReader {
         rows: Range<usize>,
         columns: Range<usize>,
     ) -> Result<Array3<f32>> {
+        self.read_lattice(frames, (rows, columns), 1)
+    }
+
+    /// Reads every `step`th row and column of a window, from its first ones on.
+    ///
+    /// Errors: as [`Self::read_window`].
+    pub fn read_lattice(
+        &self,
+        frames: Range<usize>,
+        (rows, columns): (Range<usize>, Range<usize>),
+        step: usize,
+    ) -> Result<Array3<f32>> {
         let (height, width) = (self.info.height, self.info.width);
         let inside = |range: &Range<usize>, axis| range.start <= range.end && range.end <= axis;
         if !(inside(&frames, self.info.frames) && inside(&rows, height) && inside(&columns, width))
@@ -50,19 +62,21 @@ impl WindowReader {
                 self.info.frames
             )));
         }
-        let shape = (frames.len(), rows.len(), columns.len());
+        let step = step.max(1);
+        let shape = (frames.len(), rows.len().div_ceil(step), columns.len().div_ceil(step));
         // Whole rows lie one after another and are read in one go.
-        let segments = if columns.len() == width { 1 } else { rows.len() };
+        let segments = if columns.len() == width && step == 1 { 1 } else { rows.len() };
         let segment_samples = rows.len() * columns.len() / segments.max(1);
         let mut bytes = vec![0; segment_samples * SAMPLE_BYTES as usize];
         let mut values = Vec::with_capacity(shape.0 * shape.1 * shape.2);
         for frame in frames {
-            for segment in 0..segments {
+            for segment in (0..segments).step_by(step) {
                 let sample = (frame * height + rows.start + segment) * width + columns.start;
                 self.file
                     .read_exact_at(&mut bytes, self.start + sample as u64 * SAMPLE_BYTES)
                     .map_err(FormatError::io("read the window"))?;
-                values.extend(samples::decode(&bytes, SampleType::F32, ByteOrder::Little));
+                let read = samples::decode(&bytes, SampleType::F32, ByteOrder::Little);
+                values.extend(read.into_iter().step_by(step));
             }
         }
         Array3::from_shape_vec(shape, values)

@@ -13,8 +13,8 @@ use ndarray::{Array2, Array3, Axis, s};
 use super::IntakeError;
 use crate::formats::planar::{self, Reader};
 use crate::formats::{
-    self, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo, StackWriter, png,
-    read_stack,
+    self, Channels, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo,
+    StackWriter, png, read_stack,
 };
 use crate::intake::error::Result;
 use crate::job::{CalibrationReport, Captures, Finding, MOST_SECONDS, planned_seconds};
@@ -86,6 +86,8 @@ pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
 /// What a calibration of captures will take.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plan {
+    /// Rows and columns of the captures.
+    pub size: (usize, usize),
     /// Of the masks that are made.
     pub bytes: u64,
     /// Of processor time.
@@ -123,7 +125,7 @@ pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
         );
         return Err(IntakeError::Size { place: "/captures".into(), detail });
     }
-    Ok(Plan { bytes: (masks * pixels * size_of::<f32>()) as u64, seconds })
+    Ok(Plan { size: (height, width), bytes: (masks * pixels * size_of::<f32>()) as u64, seconds })
 }
 
 /// What the captures of masks have told.
@@ -310,7 +312,7 @@ fn picture(map: &Array2<f32>) -> Result<Vec<u8>, FormatError> {
         map.slice(s![rows, columns]).mean().unwrap_or(0.0)
     });
     let largest = small.fold(0.0f32, |largest, &value| largest.max(value));
-    png::encode_u8(small.view(), 0.0, if largest > 0.0 { largest } else { 1.0 })
+    png::encode_u8(small.view(), Channels::Grey, 0.0, if largest > 0.0 { largest } else { 1.0 })
 }
 
 #[cfg(test)]

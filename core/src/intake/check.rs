@@ -1,6 +1,7 @@
 //! Checks of masks and measurements as they pass: brought onto their scale frame by frame, a measurement
 //! less its dark, and samples of it held against the masks of its calibration.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayView2};
@@ -12,7 +13,7 @@ use crate::formats::planar::Reader;
 use crate::formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use crate::formats::{self, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::intake::error::Result;
-use crate::job::{Finding, MOST_MASKS};
+use crate::job::{Finding, MOST_MASKS, Mosaic};
 use crate::optics::{Digits, MeasurementStudy, REACH, judge_measurement};
 
 /// Side of a window that is looked at, without its margin.
@@ -141,10 +142,12 @@ impl FrameReader for Exposed {
     }
 }
 
-/// Holds samples of snapshots \[S,H,W\] against masks \[B,H,W\], both as prepared files. `saturated` is
-/// the share of full pixels of each snapshot, `darkened` whether a dark was subtracted.
+/// Holds samples of snapshots \[S,H,W\] against masks \[B,H,W\], both as prepared files; of a mosaic its first green
+/// sub-image, as colours differ from pixel to pixel. `saturated` is the share of full pixels of each snapshot,
+/// `darkened` whether a dark was subtracted.
 pub fn judge(
     (masks, snapshots): (&Path, &Path),
+    mosaic: Option<Mosaic>,
     saturated: Option<&[f64]>,
     darkened: bool,
     limits: &Limits,
@@ -155,9 +158,12 @@ pub fn judge(
     for sample in 0..count.min(SNAPSHOTS) {
         let snapshot = sample * count / count.min(SNAPSHOTS);
         let share = saturated.and_then(|shares| shares.get(snapshot)).copied();
-        let Some(figures) = study(&masks, &snapshots, snapshot)?.finish() else { continue };
+        let Some(figures) = study(&masks, &snapshots, snapshot, mosaic)?.finish() else { continue };
         let number = u32::try_from(snapshot).ok();
-        let judged = judge_measurement(&figures, share, darkened).into_iter();
+        let mut judged = judge_measurement(&figures, share, darkened);
+        // Told by whoever sent them.
+        judged.retain(|found| mosaic.is_none() || found.code != "mosaic");
+        let judged = judged.into_iter();
         findings.extend(judged.map(|found| Finding { snapshot: number, ..Finding::from(found) }));
     }
     Ok(findings)
@@ -168,13 +174,20 @@ fn study(
     masks: &Reader,
     snapshots: &Reader,
     snapshot: usize,
+    mosaic: Option<Mosaic>,
 ) -> Result<MeasurementStudy, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
+    let ((row, column), step) = mosaic.map_or(((0, 0), 1), |mosaic| (mosaic.green(), 2));
+    // From the first pixel to the one behind the last that is looked at.
+    let place = |window: &Range<usize>, first: usize| {
+        first + window.start * step..first + (window.end * step + 1).saturating_sub(step)
+    };
     let mut study = MeasurementStudy::new(frames);
-    for rows in windows(height) {
-        for columns in windows(width) {
-            let band = masks.read_window(0..frames, rows.clone(), columns.clone())?;
-            let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns)?;
+    for rows in windows(height / step) {
+        for columns in windows(width / step) {
+            let place = (place(&rows, row), place(&columns, column));
+            let band = masks.read_lattice(0..frames, place.clone(), step)?;
+            let y = snapshots.read_lattice(snapshot..snapshot + 1, place, step)?;
             study.add(band.view(), y.index_axis(ndarray::Axis(0), 0));
         }
     }
@@ -182,7 +195,7 @@ fn study(
 }
 
 /// Windows with their margins along a side, from even pixels on: all of it if it is short.
-fn windows(length: usize) -> Vec<std::ops::Range<usize>> {
+fn windows(length: usize) -> Vec<Range<usize>> {
     let side = WINDOW + 2 * REACH;
     let count = (length / side).clamp(1, WINDOWS);
     let side = if count == 1 { length.min(2 * side) } else { side };

@@ -79,7 +79,18 @@ impl<'a> Source<'a> {
         let expected = Expected { axes: self.axes, most_frames, size: self.size };
         let wanted = Wanted { array: self.array, name: self.named.as_deref(), expected };
         let opened = formats::open_array(self.path, wanted, &self.limits);
+        self.opened(opened.map_err(IntakeError::format(&self.name))?)
+    }
+
+    /// The same of a clip of colours: frames \[H,3W\], red, green and blue of each pixel. None if the file is of
+    /// another kind.
+    pub fn open_colours(&self) -> Result<Option<Opened>> {
+        let opened = formats::open_colours(self.path, &self.limits);
         let reader = opened.map_err(IntakeError::format(&self.name))?;
+        reader.map(|reader| self.opened(reader)).transpose()
+    }
+
+    fn opened(&self, reader: Box<dyn FrameReader + Send>) -> Result<Opened> {
         let info = *reader.info();
         let full_scale = match (self.full_scale, info.default_full_scale) {
             (Some(value), _) => FullScale::new(value),

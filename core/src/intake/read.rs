@@ -8,9 +8,9 @@ use ndarray::{Array3, ArrayView2, s};
 
 use super::IntakeError;
 use super::check::{Exposure, masks, measurement};
-use super::open::Source;
+use super::open::{Opened, Source};
 use crate::formats::mat::SceneArray;
-use crate::formats::{Axes, FormatError};
+use crate::formats::{Axes, Channels, FormatError};
 use crate::intake::error::Result;
 
 /// An array on its own scale, and the full scale that brought it there.
@@ -61,20 +61,28 @@ pub fn read_snapshots(
 }
 
 /// The true frames \[S B,H,W\] of some snapshots of a measurement, of a file that has those of these
-/// snapshots or of all. A .mat scene may go without; another file may not.
+/// snapshots or of all. A .mat scene may go without; another file may not. Behind a mosaic they may have colours
+/// \[S B,H,3W\], too, which is told.
 /// Errors: a file that can't be read; other sizes.
 pub fn read_truth(
     source: &Source<'_>,
     (frames, height, width): (usize, usize, usize),
+    mosaic: bool,
     which: Range<usize>,
     snapshots: usize,
-) -> Result<Option<Array3<f32>>> {
-    let truth = match read_frames(source) {
+) -> Result<Option<(Array3<f32>, Channels)>> {
+    let colours = if mosaic { source.open_colours()? } else { None };
+    let channels = if colours.is_some() { Channels::Rgb } else { Channels::Grey };
+    let truth = match colours
+        .map_or_else(|| source.open(), Ok)
+        .and_then(|opened| frames_of(source, opened))
+    {
         Err(IntakeError::Format { source: FormatError::MissingArray { .. }, .. }) => {
             return Ok(None);
         }
         truth => truth?,
     };
+    let width = width * channels.count();
     let (count, rows, columns) = truth.dim();
     let wanted = frames * which.len();
     let first = match count {
@@ -92,12 +100,34 @@ pub fn read_truth(
         );
         return Err(IntakeError::Size { place: String::new(), detail });
     };
-    Ok(Some(truth.slice(s![first..first + wanted, .., ..]).to_owned()))
+    Ok(Some((truth.slice(s![first..first + wanted, .., ..]).to_owned(), channels)))
 }
 
 /// Frames \[T,H,W\] of a file, or of a folder of pictures in the order of their names, divided by the full scale; all finite.
 /// Errors: files that can't be read; pictures of different sizes.
 pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
+    clip(path, full_scale, read_frames)
+}
+
+/// The same of frames of colours \[T,H,3W\].
+/// Errors: as [`read_clip`]; frames without colours.
+pub fn read_colours(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
+    clip(path, full_scale, |source| match source.open_colours()? {
+        Some(opened) => frames_of(source, opened),
+        None => {
+            let problem = "they have no colours; an array [frame, row, column, 3] or pictures of red, green and \
+                           blue are needed (python -c \"import numpy as n; n.save('colours.npy', \
+                           n.repeat(n.load('FILE.npy')[..., None], 3, -1))\" makes grey ones of the form)";
+            Err(IntakeError::content(&source.name, &problem))
+        }
+    })
+}
+
+fn clip(
+    path: &Path,
+    full_scale: Option<f32>,
+    read_frames: impl Fn(&Source<'_>) -> Result<Array3<f32>>,
+) -> Result<Array3<f32>> {
     let source = |path| Source::file(path, SceneArray::Truth, full_scale);
     if !path.is_dir() {
         return read_frames(&source(path));
@@ -133,7 +163,11 @@ pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
 
 /// Frames \[T,H,W\] divided by the full scale, all finite.
 fn read_frames(source: &Source<'_>) -> Result<Array3<f32>> {
-    let mut opened = source.open()?;
+    frames_of(source, source.open()?)
+}
+
+/// All frames of what was opened of a source.
+fn frames_of(source: &Source<'_>, mut opened: Opened) -> Result<Array3<f32>> {
     let mut stack = Stack::default();
     while let Some(frame) = opened.next_frame()? {
         if let Some(((row, column), value)) = frame.indexed_iter().find(|(_, v)| !v.is_finite()) {

@@ -7,8 +7,8 @@ use sqlx::sqlite::{Sqlite, SqliteArgumentsBuffer, SqliteTypeInfo, SqliteValueRef
 use sqlx::{Decode, Encode, Type};
 
 use super::{
-    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sequence,
-    Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
+    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, Mosaic, PartialId, Role,
+    Sequence, Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
 };
 
 /// How a type lies in a column: as another one, and how it becomes that one and is read of it.
@@ -57,7 +57,8 @@ column!(
     JobState,
     TaskState,
     TaskStage,
-    Sequence as String,
+    Sequence,
+    Mosaic as String,
     ToString::to_string,
     |text| Ok(text.parse()?)
 );

@@ -14,6 +14,11 @@ const START_BYTES_PER_VOXEL: u64 = 4;
 /// Pixels that the network takes at once, or one frame of the tile if that is larger.
 const NETWORK_PIXELS: u64 = 1 << 17;
 
+/// Previews of the four sub-images of a mosaic, for each voxel of one.
+const COARSE_BYTES_PER_VOXEL: u64 = 16;
+/// A frame of a mosaic as it is assembled: twice, its three colours, and those of its PNG.
+const COLOUR_BYTES_PER_PIXEL: u64 = 40;
+
 impl JobSpec {
     /// The planned cost of a tile in CPU-nanoseconds per voxel: of the schedule, or of a network as
     /// its trial took it.
@@ -31,14 +36,24 @@ impl JobSpec {
     /// An upper bound of the resident memory, in bytes, of a worker that does any task of this job.
     pub fn worker_bytes(&self) -> u64 {
         // A preview by blocks takes far less than a tile.
-        let voxels = self.shape.height * self.shape.width * self.shape.frames;
+        let (height, width) = self.shape.solved();
+        let voxels = height * width * self.shape.frames;
         let whole = if voxels <= preview::WHOLE { voxels as u64 } else { 0 };
-        self.tile_bytes().max(BASE_BYTES + whole * SOLVER_BYTES_PER_VOXEL)
+        let preview = whole * (SOLVER_BYTES_PER_VOXEL + self.mosaic(COARSE_BYTES_PER_VOXEL));
+        let pixels = (self.shape.height * self.shape.width) as u64;
+        let colours = pixels * self.mosaic(COLOUR_BYTES_PER_PIXEL);
+        self.tile_bytes().max(BASE_BYTES + preview.max(colours))
+    }
+
+    /// What a mosaic alone takes.
+    fn mosaic(&self, bytes: u64) -> u64 {
+        if self.shape.mosaic.is_some() { bytes } else { 0 }
     }
 
     fn tile_bytes(&self) -> u64 {
         let side = |length: usize| length.min(self.tile.size) as u64;
-        let pixels = side(self.shape.height) * side(self.shape.width);
+        let (height, width) = self.shape.solved();
+        let pixels = side(height) * side(width);
         let run = self.run.length.min(self.snapshots.count);
         let voxels = pixels * self.shape.frames as u64 * u64::from(run);
         if let Some(model) = &self.model {
@@ -82,7 +97,7 @@ mod tests {
         JobSpec {
             calibration: CalibrationId::new(),
             measurement: MeasurementId::new(),
-            shape: SceneShape { frames, height: side, width: side, snapshots: 1 },
+            shape: SceneShape { frames, height: side, width: side, snapshots: 1, mosaic: None },
             snapshots: SnapshotRange { first: 0, count: 1 },
             sequence: Sequence::Separate,
             run: RunSpec::ALONE,

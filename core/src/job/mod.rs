@@ -16,6 +16,7 @@ mod state;
 mod task;
 mod text;
 
+pub use crate::optics::{MARGIN, Mosaic};
 pub use crate::recon::schedule::Schedule;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;

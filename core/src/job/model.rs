@@ -78,6 +78,7 @@ impl ModelChoice<'_> {
         calibration: CalibrationId,
         shape: SceneShape,
     ) -> Vec<InvalidField> {
+        let (height, width) = shape.solved();
         let mut errors = Vec::new();
         let mut wrong = |pointer: &str, detail: String| {
             errors.push(InvalidField::new(pointer, detail));
@@ -108,12 +109,12 @@ impl ModelChoice<'_> {
         }
         if let (Some(model), Some(tile)) = (self.model, self.tile)
             && model.fixed_size
-            && tile.size < shape.height.max(shape.width)
+            && tile.size < height.max(width)
         {
             let detail = format!(
-                "the network takes pictures of {}x{} pixels only, so they can't be cut into tiles of \
-                 {}: leave the tiles out",
-                shape.height, shape.width, tile.size
+                "the network takes pictures of {height}x{width} pixels only, so they can't be cut into \
+                 tiles of {}: leave the tiles out",
+                tile.size
             );
             wrong("/tile", detail);
         }
@@ -122,7 +123,8 @@ impl ModelChoice<'_> {
 
     /// The tiles where the request names none: for a network of one size, the whole picture.
     pub(super) fn tile(&self, shape: SceneShape) -> TileSpec {
-        let whole = TileSpec::whole(shape.height, shape.width);
+        let (height, width) = shape.solved();
+        let whole = TileSpec::whole(height, width);
         let fixed = self.model.is_some_and(|model| model.fixed_size);
         self.tile.unwrap_or_else(|| if fixed { whole } else { self.algorithm.default_tile() })
     }

@@ -21,6 +21,8 @@ const TILE_BYTES: u64 = 4;
 /// Bytes of a voxel in the results: EXR frames and stack, NumPy (32 bit each) and PNG (16 bit). EXR
 /// and PNG are compressed, but noise is not.
 const RESULT_BYTES: u64 = 4 + 4 + 4 + 2;
+/// The same of the frames of a mosaic: three colours, and what was seen.
+const COLOUR_BYTES: u64 = 3 * RESULT_BYTES + 4;
 /// Headers, manifests and rows, for each snapshot.
 const SNAPSHOT_BYTES: u64 = 1 << 20;
 
@@ -171,7 +173,8 @@ impl JobRequest {
             errors.extend(faults.into_iter().map(|fault| fault.under("/schedule")));
         }
         let sequence = self.sequence.unwrap_or(sequence);
-        let size = (shape.frames, shape.height, shape.width);
+        let (height, width) = shape.solved();
+        let size = (shape.frames, height, width);
         let tile = (tile, self.tile.is_some());
         let cut = Cut::new((sequence, snapshots.count), &schedule, tile, size);
         let Cut { tile, run } = cut.unwrap_or_else(|error| {
@@ -251,7 +254,7 @@ impl SnapshotSelection {
 impl JobSpec {
     /// The tile plan of every snapshot of the job; an error only if the spec was changed by hand.
     pub fn tile_plan(&self) -> Result<TilePlan, ReconError> {
-        TilePlan::new(self.shape.height, self.shape.width, self.tile.size, self.tile.overlap)
+        self.shape.tile_plan(self.tile)
     }
 
     /// The runs of snapshots that are reconstructed together; an error only if the spec was changed by
@@ -278,7 +281,8 @@ impl JobSpec {
         };
         // A spec is checked before it is stored: its tiles can be planned.
         let tiles = self.tile_plan().map_or(0, area) * frames;
-        let results = voxels * RESULT_BYTES + SNAPSHOT_BYTES;
+        let bytes = if self.shape.mosaic.is_some() { COLOUR_BYTES } else { RESULT_BYTES };
+        let results = voxels * bytes + SNAPSHOT_BYTES;
         u64::from(self.snapshots.count) * results + self.snapshots_computed() * tiles * TILE_BYTES
     }
 }
@@ -289,7 +293,8 @@ mod tests {
     use crate::job::{Algorithm, CalibrationId, MeasurementId};
     use serde_json::{Value, json};
 
-    const SHAPE: SceneShape = SceneShape { frames: 8, height: 256, width: 300, snapshots: 6 };
+    const SHAPE: SceneShape =
+        SceneShape { frames: 8, height: 256, width: 300, snapshots: 6, mosaic: None };
 
     fn request(mut fields: Value) -> Result<JobRequest, serde_json::Error> {
         fields["measurement"] = json!(MeasurementId::new());

@@ -5,6 +5,8 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, VariantNames};
 
+use crate::formats::Channels;
+use crate::optics::Mosaic;
 use crate::recon::ReconError;
 use crate::recon::schedule::Schedule;
 use crate::recon::sequence::SequencePlan;
@@ -30,7 +32,8 @@ impl SnapshotRange {
     }
 }
 
-/// How pictures are cut: side and overlap in pixels (see [`crate::recon::tile::TilePlan::new`]).
+/// How pictures are cut: side and overlap in pixels, which are those of a sub-image where the sensor has a mosaic
+/// (see [`crate::recon::tile::TilePlan::new`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TileSpec {
@@ -172,6 +175,32 @@ pub struct SceneShape {
     pub height: usize,
     pub width: usize,
     pub snapshots: u32,
+    /// The colours of the sensor's pixels; none for a grey one.
+    #[serde(default)]
+    pub mosaic: Option<Mosaic>,
+}
+
+impl SceneShape {
+    /// Rows and columns of what is reconstructed by itself: of the picture, or of each of the four sub-images
+    /// of a mosaic.
+    pub fn solved(self) -> (usize, usize) {
+        match self.mosaic {
+            None => (self.height, self.width),
+            Some(_) => (self.height / 2, self.width / 2),
+        }
+    }
+
+    /// How it is cut.
+    /// Errors: tiles that can't be; a mosaic with an odd side.
+    pub fn tile_plan(self, tile: TileSpec) -> Result<TilePlan, ReconError> {
+        let plan = if self.mosaic.is_some() { TilePlan::of_mosaic } else { TilePlan::new };
+        plan(self.height, self.width, tile.size, tile.overlap)
+    }
+
+    /// What a pixel of its frames has.
+    pub fn channels(self) -> Channels {
+        if self.mosaic.is_some() { Channels::Rgb } else { Channels::Grey }
+    }
 }
 
 #[cfg(test)]

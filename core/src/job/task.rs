@@ -103,7 +103,9 @@ impl JobSpec {
         let frames = self.shape.frames as f64;
         let per_voxel = self.planned_ns_per_voxel() * 1e-9;
         let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
-        let whole = preview::block(self.shape.frames, self.shape.height, self.shape.width) == 1;
+        let (height, width) = self.shape.solved();
+        let whole = preview::block(self.shape.frames, height, width) == 1;
+        let write_s = WRITE_S * self.shape.channels().count() as f64;
         let preview = pixels * frames * if whole { PREVIEW_WHOLE_S } else { PREVIEW_BLOCKS_S };
         let snapshots = self.snapshots.indices();
         tasks.extend(snapshots.map(|snapshot| (TaskKind::Preview { snapshot }, preview)));
@@ -129,7 +131,7 @@ impl JobSpec {
             // What no later run holds is complete.
             let complete = runs.runs().get(index + 1).map_or(run.end, |next| next.start) as u32;
             let snapshots = std::mem::replace(&mut assembled, complete)..complete;
-            let assemble = |snapshot| (TaskKind::Assemble { snapshot }, pixels * frames * WRITE_S);
+            let assemble = |snapshot| (TaskKind::Assemble { snapshot }, pixels * frames * write_s);
             tasks.extend(snapshots.map(assemble));
         }
         tasks.push((TaskKind::Manifest, 0.01));

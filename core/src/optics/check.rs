@@ -361,7 +361,8 @@ pub fn judge_measurement(
                  looks like the raw mosaic of a colour sensor that is taken as grey",
                 figures.mosaic.0 * 100.0
             ),
-            "export one colour, or grey pictures, of captures and measurement alike",
+            "state the sensor's mosaic with the calibration, or export grey pictures of captures and measurement \
+             alike",
         ));
     }
     findings.extend(missing(figures));

@@ -13,6 +13,7 @@ mod findings;
 mod geometry;
 mod iid;
 mod masks;
+mod mosaic;
 mod multiplex;
 mod order;
 mod patterns;
@@ -30,6 +31,7 @@ pub use findings::{
 pub use geometry::Geometry;
 pub use iid::iid_masks;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
+pub use mosaic::{MARGIN, Mosaic};
 pub use multiplex::{Draw, Multiplexing};
 pub use order::{Expected, Reordered, pattern_likeness, reordered};
 pub use patterns::{ApertureGrid, Circle, check_patterns, pattern_rank, single_apertures};

@@ -4,13 +4,14 @@ use std::fs::File;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Axis};
+use ndarray::{Array2, Array3, Axis};
 
 use super::error::{PipelineError, Result};
 use super::tile::TileInput;
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
 use crate::job::Sha256;
+use crate::recon::tile::Window;
 
 /// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], their full scale
 /// divided out.
@@ -47,17 +48,26 @@ impl Arrays {
     pub fn window(
         &self,
         snapshots: Range<u32>,
-        (rows, columns): (Range<usize>, Range<usize>),
+        place: &Window,
         white: f32,
     ) -> Result<TileInput, FormatError> {
         let masks = self.masks()?;
         let which = snapshots.start as usize..snapshots.end as usize;
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
-        let y = snapshots.read_window(which, rows.clone(), columns.clone())?;
-        let masks = masks.read_window(0..masks.info().frames, rows, columns)?;
+        let y = window(&snapshots, which, place)?;
+        let masks = window(&masks, 0..masks.info().frames, place)?;
         let whole = 0..y.dim().0;
-        Ok(TileInput { masks, y, plane: 0, white, pieces: vec![whole] })
+        Ok(TileInput { masks, y, white, pieces: vec![whole] })
     }
+}
+
+/// A window of some frames of a prepared array.
+pub fn window(
+    reader: &Reader,
+    frames: Range<usize>,
+    place: &Window,
+) -> Result<Array3<f32>, FormatError> {
+    reader.read_lattice(frames, (place.rows.clone(), place.columns.clone()), place.step)
 }
 
 /// One frame \[H,W\] of a prepared array.

@@ -12,7 +12,7 @@ use super::networks::ModelRecord;
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
 use crate::formats::exr::Attributes;
 use crate::job::{
-    Algorithm, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, ResultFile,
+    Algorithm, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, Mosaic, ResultFile,
     SceneShape, Schedule, Sha256, TaskKind,
 };
 use crate::recon::sequence::{RunShare, SequencePlan};
@@ -47,14 +47,16 @@ pub struct Recipe {
     pub runs: SequencePlan,
     /// What the check of the measurement against its calibration found.
     pub warnings: Vec<Finding>,
-    #[serde(skip)]
+    /// How the frames got their colours; null for a grey sensor. Also tells their size.
+    #[serde(rename = "colour", serialize_with = "colour")]
     pub shape: SceneShape,
     /// Snapshots a second, and seconds that one is exposed, where the camera told.
     #[serde(skip)]
     pub camera: (Option<f64>, Option<f64>),
 }
 
-/// Size and overlap, and tiles as \[row, column, height, width\] in the plan's order.
+/// Size and overlap, and the places of tiles as \[row, column, height, width\] in the plan's order: of a mosaic
+/// four tiles, one of each sub-image, have a part in a place. The size is that in the sub-image then.
 fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::Error> {
     #[derive(Serialize)]
     struct Record {
@@ -62,8 +64,19 @@ fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::
         overlap: usize,
         tiles: Vec<[usize; 4]>,
     }
-    let tiles = plan.tiles().map(|t| [t.row, t.column, t.height, t.width]).collect();
+    let tiles = plan.tiles().map(|tile| tile.place()).collect();
     Record { size: plan.size(), overlap: plan.overlap(), tiles }.serialize(serializer)
+}
+
+/// The sensor's mosaic, and how the colours between its pixels were found.
+fn colour<S: Serializer>(shape: &SceneShape, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Record {
+        mosaic: Mosaic,
+        demosaicking: &'static str,
+    }
+    let record = |mosaic| Record { mosaic, demosaicking: Mosaic::DEMOSAICKING };
+    shape.mosaic.map(record).serialize(serializer)
 }
 
 /// The first and the last snapshot of each run.
@@ -276,6 +289,10 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
         ("measurementSha256".to_owned(), recipe.inputs.measurement_sha256.to_string()),
         ("whiteLevel".to_owned(), recipe.scale.white.to_string()),
     ];
+    if let Some(mosaic) = recipe.shape.mosaic {
+        shared.push(("mosaic".to_owned(), mosaic.to_string()));
+        shared.push(("demosaicking".to_owned(), Mosaic::DEMOSAICKING.to_owned()));
+    }
     for model in &recipe.models {
         shared.push((format!("model {}", model.name), model.sha256.clone()));
     }
@@ -303,7 +320,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         algorithm: Algorithm::GapTv,
         schedule: Schedule::gap_tv(),
         pilot: None,
-        shape: SceneShape { frames, height: 20, width: 24, snapshots: 2 },
+        shape: SceneShape { frames, height: 20, width: 24, snapshots: 2, mosaic: None },
         inputs: Inputs {
             masks_sha256: hash,
             masks_axes: None,
@@ -323,6 +340,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
 #[cfg(test)]
 mod tests {
     use super::CameraRecord;
+    use crate::formats::{Channels, exr};
 
     #[test]
     fn frames_tell_where_they_come_from() {
@@ -341,7 +359,7 @@ mod tests {
         // They must be names that OpenEXR takes.
         let file = tempfile::NamedTempFile::new().unwrap();
         let frame = ndarray::Array2::zeros((2, 2));
-        crate::formats::exr::write_frame(file.path(), frame.view(), &attributes[2]).unwrap();
+        exr::write_frame(file.path(), frame.view(), Channels::Grey, &attributes[2]).unwrap();
     }
 
     #[test]

@@ -1,10 +1,11 @@
 //! The pilot of a job: which of its planned iterations pay, and which of its snapshots belong together,
 //! decided once for all its tiles.
 
-use ndarray::s;
+use ndarray::{ArrayView2, s};
 
 use super::records::{JointRecord, PilotRecord, StageRecord};
 use super::tile::TileInput;
+use crate::optics::Mosaic;
 use crate::recon::ReconError;
 use crate::recon::joints::{self, JointFinding};
 use crate::recon::pilot::{self, StageFinding};
@@ -12,16 +13,28 @@ use crate::recon::prior::Networks;
 use crate::recon::schedule::{Schedule, Stage};
 use crate::recon::sequence::SequencePlan;
 use crate::recon::solver::Observer;
+use crate::recon::tile::Window;
 
 /// What is to be found out, and on which piece of the snapshots.
 #[derive(Debug, Clone, Copy)]
 pub struct Pilot<'a> {
     /// The index of the first snapshot in the measurement.
     pub first: usize,
-    pub row: usize,
-    pub column: usize,
+    /// The piece's place in the picture.
+    pub place: &'a Window,
     pub schedule: &'a Schedule,
     pub runs: &'a SequencePlan,
+}
+
+/// Where in a snapshot \[H,W\] the pilot is run: in the picture, or in the first green sub-image of a mosaic.
+pub fn place(y: ArrayView2<'_, f32>, mosaic: Option<Mosaic>) -> Window {
+    let Some(mosaic) = mosaic else {
+        let (rows, columns) = pilot::piece(y);
+        return Window { rows, columns, step: 1 };
+    };
+    let first = mosaic.green();
+    let (rows, columns) = pilot::piece(y.slice(s![first.0..;2, first.1..;2]));
+    Window::of_plane(rows, columns, first)
 }
 
 /// Runs the pilot on a piece of all snapshots: how long the stages of an adaptive schedule should be, on the
@@ -33,12 +46,14 @@ pub fn decide(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Option<PilotRecord>, ReconError> {
-    let &Pilot { first, row, column, schedule, runs } = task;
+    let &Pilot { first, place, schedule, runs } = task;
     let candidates = runs.joints();
     if !schedule.adaptive && candidates.is_empty() {
         return Ok(None);
     }
+    let (row, column) = (place.rows.start, place.columns.start);
     let (_, height, width) = input.y.dim();
+    let (height, width) = (height * place.step, width * place.step);
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
     let op = op.with_gamma(schedule.gamma)?;
     let mut record =

@@ -13,11 +13,11 @@ use super::pilot;
 use super::progress::ShareDone;
 use super::records::{PilotRecord, TileRecord};
 use super::tile::{TileInput, reconstruct_tile, run_network};
-use crate::recon;
+use crate::optics::Mosaic;
 use crate::recon::schedule::Schedule;
 use crate::recon::sequence::{Piece, SequencePlan};
 use crate::recon::solver::{Control, Observer, Outcome, Progress};
-use crate::recon::tile::{Tile, TilePlan};
+use crate::recon::tile::{Tile, TilePlan, Window};
 
 #[derive(Debug, Clone, Copy)]
 pub struct SequenceInput<'a> {
@@ -33,6 +33,8 @@ pub struct SequenceInput<'a> {
     pub plan: &'a TilePlan,
     /// The cut in time, of these snapshots.
     pub runs: &'a SequencePlan,
+    /// The sensor's colours; the plan is one of a mosaic then.
+    pub mosaic: Option<Mosaic>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -47,14 +49,15 @@ impl SequenceInput<'_> {
     fn window(
         &self,
         snapshots: Range<usize>,
-        (rows, columns): (Range<usize>, Range<usize>),
+        Window { rows, columns, step }: Window,
         pieces: Vec<Range<usize>>,
     ) -> TileInput {
         let snapshots = snapshots.start - self.first..snapshots.end - self.first;
+        let step = step.cast_signed();
+        let masks = s![.., rows.clone();step, columns.clone();step];
         TileInput {
-            masks: self.masks.slice(s![.., rows.clone(), columns.clone()]).to_owned(),
-            y: self.measurement.slice(s![snapshots, rows, columns]).to_owned(),
-            plane: 0,
+            masks: self.masks.slice(masks).to_owned(),
+            y: self.measurement.slice(s![snapshots, rows;step, columns;step]).to_owned(),
             white: self.white,
             pieces,
         }
@@ -109,11 +112,10 @@ pub fn solve(
 ) -> Result<Solved> {
     let mut pilot = None;
     if let Solver::Schedule(schedule) = input.solver {
-        let place = recon::pilot::piece(input.measurement.index_axis(Axis(0), 0));
-        let (row, column) = (place.0.start, place.1.start);
+        let place = pilot::place(input.measurement.index_axis(Axis(0), 0), input.mosaic);
         let mut networks = WarmNetworks::new(network.clone());
-        let window = input.window(input.snapshots(), place, Vec::new());
-        let task = pilot::Pilot { first: input.first, row, column, schedule, runs: input.runs };
+        let window = input.window(input.snapshots(), place.clone(), Vec::new());
+        let task = pilot::Pilot { first: input.first, place: &place, schedule, runs: input.runs };
         pilot = pilot::decide(window, &task, &mut networks, &mut ())?;
     }
     let decided = match (&pilot, input.solver) {
@@ -157,7 +159,7 @@ fn run_tiles(
             let first = snapshots.start;
             let own =
                 own.map(|Piece { snapshots, .. }| snapshots.start - first..snapshots.end - first);
-            let window = input.window(snapshots, (tile.rows(), tile.columns()), own.collect());
+            let window = input.window(snapshots, tile.window(), own.collect());
             let outcome = match input.solver {
                 Solver::Schedule(schedule) => {
                     let share = ShareDone::new(schedule.clone());
@@ -251,7 +253,7 @@ mod tests {
     ) -> SequenceInput<'a> {
         let (masks, measurement) = (masks.view(), y.view());
         let solver = Solver::Schedule(schedule);
-        SequenceInput { masks, measurement, first: 3, white: 1.0, solver, plan, runs }
+        SequenceInput { masks, measurement, first: 3, white: 1.0, solver, plan, runs, mosaic: None }
     }
 
     fn network() -> NetworkSource {

@@ -18,8 +18,6 @@ pub struct TileInput {
     pub masks: Array3<f32>,
     /// The measurement's window \[S,h,w\] of a run of snapshots.
     pub y: Array3<f32>,
-    /// The colour plane of the sensor that both were cut from; grey pictures have plane 0 alone.
-    pub plane: usize,
     /// White level of the scene, above 0: the same for all tiles of a job, or seams would show.
     pub white: f32,
     /// Which snapshots of the run are solved together, by their place in it. The frames of those that are in
@@ -43,14 +41,11 @@ impl TileInput {
         }
         let snapshots = self.y.dim().0;
         let within = |piece: &Range<usize>| !piece.is_empty() && piece.end <= snapshots;
-        if self.plane != 0 || !self.pieces.iter().all(within) {
+        if !self.pieces.iter().all(within) {
             return Err(ReconError::Shape {
                 what: "a tile",
-                found: format!(
-                    "{snapshots} snapshots of colour plane {}, to be solved as {:?}",
-                    self.plane, self.pieces
-                ),
-                expected: "plane 0, and pieces of these snapshots".into(),
+                found: format!("{snapshots} snapshots, to be solved as {:?}", self.pieces),
+                expected: "pieces of these snapshots".into(),
             });
         }
         let op = match SensingOperator::new(self.masks) {
@@ -153,9 +148,9 @@ mod tests {
     use crate::recon::schedule::Schedule;
     use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate, s};
 
-    /// One snapshot of plane 0.
+    /// One snapshot.
     fn input(masks: Array3<f32>, y: Array2<f32>, white: f32) -> TileInput {
-        TileInput { masks, y: y.insert_axis(Axis(0)), plane: 0, white, pieces: vec![0..1] }
+        TileInput { masks, y: y.insert_axis(Axis(0)), white, pieces: vec![0..1] }
     }
 
     fn scene() -> (Array3<f32>, Array3<f32>) {
@@ -233,7 +228,7 @@ mod tests {
         let y = measure(masks.view(), frames.view()).unwrap().insert_axis(Axis(0));
         let y = concatenate(Axis(0), &[y.view(), (0.5 * &y).view(), (0.8 * &y).view()]).unwrap();
         let solve = |y: Array3<f32>, pieces| {
-            let input = TileInput { masks: masks.clone(), y, plane: 0, white: 0.9, pieces };
+            let input = TileInput { masks: masks.clone(), y, white: 0.9, pieces };
             reconstruct_tile(input, &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().frames
         };
         let part = |snapshots: std::ops::Range<usize>| {
@@ -249,13 +244,13 @@ mod tests {
     }
 
     #[test]
-    fn colours_and_pieces_of_other_snapshots_are_refused() {
+    fn pieces_of_other_snapshots_are_refused() {
         let (masks, _) = scene();
-        for (pieces, plane) in [(vec![0..1], 1), (vec![0..2], 0), (vec![1..1], 0)] {
+        for pieces in [vec![0..2], vec![1..1]] {
             let y = Array3::ones((1, 32, 32));
-            let input = TileInput { masks: masks.clone(), y, plane, white: 1.0, pieces };
+            let input = TileInput { masks: masks.clone(), y, white: 1.0, pieces };
             let error = reconstruct_tile(input, &Schedule::gap_tv(), &mut (), &mut ()).unwrap_err();
-            assert!(error.to_string().contains("plane 0"), "{error}");
+            assert!(error.to_string().contains("pieces of these snapshots"), "{error}");
         }
     }
 }

@@ -11,23 +11,28 @@ use serde_json::Value;
 
 use super::error::{PipelineError, Result};
 use super::manifest::{Manifest, SCHEMA_FAMILY, frame_attributes};
-use crate::formats::{exr, npy, png};
+use crate::formats::{Channels, exr, npy, png};
 use crate::job::{ResultFile, Sha256};
 
 const FRAMES: &str = "frames";
 const PNGS: &str = "png";
 const STACK: &str = "stack.exr";
 const ARRAY: &str = "frames.npy";
+/// The frames as a colour sensor saw them.
+const SEEN: &str = "mosaic.npy";
 const MANIFEST: &str = "manifest.json";
 /// All that a result's folder holds, the manifest last.
-const NAMES: [&str; 5] = [FRAMES, PNGS, STACK, ARRAY, MANIFEST];
+const NAMES: [&str; 6] = [FRAMES, PNGS, STACK, ARRAY, SEEN, MANIFEST];
 
 /// Writes `frames/frame_0001.exr` and so on, `png/frame_0001.png` and so on (white as in the
 /// manifest, black is 0), `stack.exr`, `frames.npy` (float32 \[B,H,W\]), and at last the manifest
 /// with the list of these files. All of them are on the disk (fsync) when this returns, and each
 /// was read once, for its hash.
 ///
-/// `frame(k)` is asked once for each frame, in order; memory holds one.
+/// Frames of a mosaic get their colours: EXR has the channels R, G and B then, PNG has colours,
+/// `frames.npy` is \[B,H,W,3\], and `mosaic.npy` \[B,H,W\] has them as the sensor saw them.
+///
+/// `frame(k)` \[H,W\] is asked once for each frame, in order; memory holds one.
 ///
 /// Returns all files, the manifest last.
 /// Errors: those of `frame`, and those of writing. A folder that was begun stays behind.
@@ -43,18 +48,35 @@ pub fn write_result(
     let (height, width) = (manifest.content.height, manifest.content.width);
     let (count, white) = (manifest.content.frames, manifest.content.recipe.scale.white);
     let array = BufWriter::new(File::create(folder.join(ARRAY)).map_err(failed(ARRAY))?);
-    let mut array = npy::writer(array, count, height, width)?;
+    let shape = manifest.content.recipe.shape;
+    let channels = shape.channels();
+    let mut array = npy::writer(array, (count, height, width), channels)?;
+    let mut seen = match shape.mosaic {
+        None => None,
+        Some(mosaic) => {
+            let file = BufWriter::new(File::create(folder.join(SEEN)).map_err(failed(SEEN))?);
+            Some((mosaic, npy::writer(file, (count, height, width), Channels::Grey)?))
+        }
+    };
     let stack = folder.join(STACK);
-    exr::write_stack(&stack, height, width, &attributes, |k| {
-        let frame = frame(k)?;
-        exr::write_frame(&folder.join(frame_name(k)), frame.view(), &attributes[k])?;
-        png::write_u16(&folder.join(png_name(k)), frame.view(), 0.0, white)?;
+    exr::write_stack(&stack, (height, width), channels, &attributes, |k| {
+        let mut frame = frame(k)?;
+        if let Some((mosaic, seen)) = &mut seen {
+            seen.write_frame(frame.view())?;
+            frame = mosaic.colours(frame.view(), (0, 0));
+        }
+        exr::write_frame(&folder.join(frame_name(k)), frame.view(), channels, &attributes[k])?;
+        png::write_u16(&folder.join(png_name(k)), frame.view(), channels, 0.0, white)?;
         array.write_frame(frame.view())?;
         Ok::<_, PipelineError>(frame)
     })?;
     array.finish()?;
     let names = (0..count).map(frame_name).chain((0..count).map(png_name));
-    let names: Vec<_> = names.chain([STACK.to_owned(), ARRAY.to_owned()]).collect();
+    let mut names: Vec<_> = names.chain([STACK.to_owned(), ARRAY.to_owned()]).collect();
+    if let Some((_, seen)) = seen {
+        seen.finish()?;
+        names.push(SEEN.to_owned());
+    }
     let files = &mut manifest.content.files;
     // Side by side: a disk brings many files to safety in the time of a few.
     *files = names.into_par_iter().map(|name| settle(folder, name)).collect::<Result<_, _>>()?;
@@ -107,7 +129,8 @@ pub fn replace_result(made: &Path, folder: &Path) -> Result<()> {
         };
         removed.map_err(failed(name))?;
     }
-    for name in NAMES {
+    // Not every result has all of them.
+    for name in NAMES.into_iter().filter(|name| made.join(name).exists()) {
         fs::rename(made.join(name), folder.join(name)).map_err(failed(name))?;
     }
     Ok(())
@@ -143,10 +166,10 @@ fn sync_dir(folder: &Path, name: &str) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::{check_output, replace_result, write_result};
-    use crate::formats::{Limits, exr, read_stack};
-    use crate::job::{ResultFile, Sha256};
+    use crate::formats::{Limits, exr, npy, open_colours, read_stack};
+    use crate::job::{Mosaic, ResultFile, Sha256};
     use crate::pipeline::manifest::sample;
-    use ndarray::{Array2, Array3};
+    use ndarray::{Array2, Array3, Axis};
     use std::fs;
     use std::path::Path;
 
@@ -179,6 +202,40 @@ mod tests {
         let text = fs::read(folder.path().join("manifest.json")).unwrap();
         let manifest: serde_json::Value = serde_json::from_slice(&text).unwrap();
         assert_eq!(manifest["content"]["files"], serde_json::to_value(&files[..8]).unwrap());
+    }
+
+    #[test]
+    fn frames_of_a_mosaic_get_their_colours() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut manifest = sample(2);
+        manifest.content.recipe.shape.mosaic = Some(Mosaic::Gbrg);
+        let files = write_result(folder.path(), manifest, |k| Ok(frame(k))).unwrap();
+        assert!(files.iter().any(|file| file.name == "mosaic.npy"));
+        let path = |name: &str| folder.path().join(name);
+        let array = |name: &str| {
+            let windows = npy::open_windows(&path(name), &Limits::default()).unwrap();
+            let info = *windows.info();
+            windows.read_window(0..info.frames, 0..info.height, 0..info.width).unwrap()
+        };
+        let (seen, colours) = (array("mosaic.npy"), array("frames.npy"));
+        assert_eq!((seen.dim(), colours.dim()), ((2, 20, 24), (2, 20, 72)));
+        for k in 0..2 {
+            assert_eq!(seen.index_axis(Axis(0), k), frame(k));
+            let expected = Mosaic::Gbrg.colours(frame(k).view(), (0, 0));
+            assert_eq!(colours.index_axis(Axis(0), k), expected);
+        }
+        assert_eq!(exr::read_stack(&path("stack.exr"), &Limits::default()).unwrap().1, colours);
+        let mut picture = open_colours(&path("png/frame_0001.png"), &Limits::default()).unwrap();
+        assert_eq!(picture.as_mut().unwrap().info().width, 72);
+        let text = fs::read(path("manifest.json")).unwrap();
+        let manifest: serde_json::Value = serde_json::from_slice(&text).unwrap();
+        let colour = serde_json::json!({"mosaic": "gbrg", "demosaicking": Mosaic::DEMOSAICKING});
+        assert_eq!(manifest["content"]["colour"], colour);
+        // Without a mosaic nothing of the earlier colours stays.
+        let grey = tempfile::tempdir_in(folder.path()).unwrap();
+        write(grey.path(), 2);
+        replace_result(grey.path(), folder.path()).unwrap();
+        assert!(!path("mosaic.npy").exists());
     }
 
     #[test]

@@ -7,30 +7,80 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result};
 
-/// One tile: the pixels `row..row+height` x `column..column+width`.
+/// A window of a picture: all pixels of these rows and columns, or every second one, which are those of one
+/// colour of a mosaic.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Window {
+    /// From the first row to the one behind the last.
+    pub rows: Range<usize>,
+    /// From the first column to the one behind the last.
+    pub columns: Range<usize>,
+    /// 1 for all pixels, 2 for every second one of each axis.
+    pub step: usize,
+}
+
+impl Window {
+    /// All pixels of a picture.
+    pub fn whole(height: usize, width: usize) -> Self {
+        Self { rows: 0..height, columns: 0..width, step: 1 }
+    }
+
+    /// The window of a picture that is this window, given in its own pixels, of the sub-image which begins at
+    /// this row and column and has every second pixel.
+    pub fn of_plane(
+        rows: Range<usize>,
+        columns: Range<usize>,
+        (row, column): (usize, usize),
+    ) -> Self {
+        let place = |range: Range<usize>, first: usize| {
+            2 * range.start + first..(2 * range.end + first).saturating_sub(1)
+        };
+        Self { rows: place(rows, row), columns: place(columns, column), step: 2 }
+    }
+
+    /// Its pixels of a frame \[H,W\] of the whole picture.
+    pub fn of<'a, T>(&self, frame: ArrayView2<'a, T>) -> ArrayView2<'a, T> {
+        let step = self.step.cast_signed();
+        frame.slice_move(s![self.rows.clone();step, self.columns.clone();step])
+    }
+}
+
+/// One tile: a window of a picture of a grey sensor, or of one of the four sub-images of a mosaic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Tile {
     /// Position in the plan.
     pub index: usize,
-    /// First row.
+    /// The row of its first pixel in the picture.
     pub row: usize,
-    /// First column.
+    /// The column of its first pixel in the picture.
     pub column: usize,
-    /// Rows.
+    /// Rows that it has.
     pub height: usize,
-    /// Columns.
+    /// Columns that it has.
     pub width: usize,
+    /// 1 for all pixels of its place, 2 for every second one of each axis.
+    pub step: usize,
 }
 
 impl Tile {
-    /// Its rows in the picture.
-    pub fn rows(&self) -> Range<usize> {
-        self.row..self.row + self.height
+    /// Its pixels in the picture.
+    pub fn window(&self) -> Window {
+        let span = |first: usize, count: usize| first..first + (count - 1) * self.step + 1;
+        let (rows, columns) = (span(self.row, self.height), span(self.column, self.width));
+        Window { rows, columns, step: self.step }
     }
 
-    /// Its columns in the picture.
-    pub fn columns(&self) -> Range<usize> {
-        self.column..self.column + self.width
+    /// The place in the picture that it has a part in: row, column, height and width in pixels.
+    pub fn place(&self) -> [usize; 4] {
+        let step = self.step;
+        let cell = |first: usize| first / step * step;
+        [cell(self.row), cell(self.column), self.height * step, self.width * step]
+    }
+
+    /// Which sub-image of a mosaic it belongs to, from 0 to 3 as they stand in a cell of 2x2 pixels, row by
+    /// row; none for the picture of a grey sensor.
+    pub fn plane(&self) -> Option<usize> {
+        (self.step == 2).then_some(self.row % 2 * 2 + self.column % 2)
     }
 }
 
@@ -45,6 +95,8 @@ pub struct TilePlan {
     width: usize,
     size: usize,
     overlap: usize,
+    /// 1, or 2 for the sub-images of a mosaic, which are cut alike.
+    step: usize,
     rows: Vec<Span>,
     columns: Vec<Span>,
 }
@@ -83,7 +135,23 @@ impl TilePlan {
             });
         }
         let (rows, columns) = (spans(height, size, overlap), spans(width, size, overlap));
-        Ok(Self { height, width, size, overlap, rows, columns })
+        Ok(Self { height, width, size, overlap, step: 1, rows, columns })
+    }
+
+    /// Cuts each of the four sub-images of a mosaic of `height` x `width` pixels, as [`Self::new`] cuts a
+    /// picture of their size: `size` and `overlap` are in their pixels. Tiles of the same place follow one
+    /// another.
+    /// Errors: as [`Self::new`]; an odd side.
+    pub fn of_mosaic(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
+        if !height.is_multiple_of(2) || !width.is_multiple_of(2) {
+            return Err(ReconError::Shape {
+                what: "a mosaic",
+                found: format!("{height}x{width}"),
+                expected: "an even number of rows and columns".into(),
+            });
+        }
+        let plane = Self::new(height / 2, width / 2, size, overlap)?;
+        Ok(Self { height, width, step: 2, ..plane })
     }
 
     /// Rows and columns of the whole picture.
@@ -103,7 +171,18 @@ impl TilePlan {
 
     /// Number of tiles.
     pub fn len(&self) -> usize {
-        self.rows.len() * self.columns.len()
+        self.planes() * self.rows.len() * self.columns.len()
+    }
+
+    /// Sub-images that are cut: 1, or 4 of a mosaic.
+    fn planes(&self) -> usize {
+        self.step * self.step
+    }
+
+    /// The indices of the spans of a tile.
+    fn position(&self, index: usize) -> (usize, usize) {
+        let place = index / self.planes();
+        (place / self.columns.len(), place % self.columns.len())
     }
 
     /// A plan has at least one tile.
@@ -118,14 +197,16 @@ impl TilePlan {
 
     /// The tile at `index`, row by row; none past the end.
     pub fn tile(&self, index: usize) -> Option<Tile> {
-        let row = self.rows.get(index / self.columns.len())?;
-        let column = self.columns.get(index % self.columns.len())?;
+        let (row, column) = self.position(index);
+        let (row, column) = (self.rows.get(row)?, self.columns.get(column)?);
+        let (step, plane) = (self.step, index % self.planes());
         Some(Tile {
             index,
-            row: row.start,
-            column: column.start,
+            row: row.start * step + plane / step,
+            column: column.start * step + plane % step,
             height: row.weights.len(),
             width: column.weights.len(),
+            step,
         })
     }
 
@@ -137,15 +218,17 @@ impl TilePlan {
     /// Blending weights \[height,width\] of a tile; over all tiles they add up to 1 at every
     /// pixel. They rise as a squared sine over the shared pixels and are separable.
     pub fn weights(&self, tile: &Tile) -> Array2<f32> {
-        let rows = &self.rows[tile.index / self.columns.len()].weights;
-        let columns = &self.columns[tile.index % self.columns.len()].weights;
+        let (row, column) = self.position(tile.index);
+        let (rows, columns) = (&self.rows[row].weights, &self.columns[column].weights);
         Array2::from_shape_fn((tile.height, tile.width), |(i, j)| rows[i] * columns[j])
     }
 
     /// Adds a frame of a tile, with its weights, to the whole frame \[H,W\] (0 at first).
     pub fn blend(&self, tile: &Tile, part: ArrayView2<'_, f32>, mut whole: ArrayViewMut2<'_, f32>) {
         let weights = self.weights(tile);
-        let mut window = whole.slice_mut(s![tile.rows(), tile.columns()]);
+        let Window { rows, columns, step } = tile.window();
+        let step = step.cast_signed();
+        let mut window = whole.slice_mut(s![rows;step, columns;step]);
         ndarray::azip!((sum in &mut window, &value in &part, &weight in &weights) {
             *sum += weight * value;
         });
@@ -212,7 +295,7 @@ fn tapered(length: usize, before: usize, after: usize) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
-    use super::TilePlan;
+    use super::{TilePlan, Window};
     use ndarray::Array2;
     use proptest::prelude::proptest;
 
@@ -235,6 +318,33 @@ mod tests {
                 assert!((sum - 1.0f32).abs() < 1e-5, "{sum}");
             }
         }
+    }
+
+    #[test]
+    fn the_sub_images_of_a_mosaic_are_cut_alike_and_cover_it() {
+        let plan = TilePlan::of_mosaic(200, 132, 64, 16).unwrap();
+        let plane = TilePlan::new(100, 66, 64, 16).unwrap();
+        assert_eq!((plan.len(), plan.largest()), (4 * plane.len(), plane.largest()));
+        let mut whole = Array2::zeros((200, 132));
+        for tile in plan.tiles() {
+            let first = plane.tile(tile.index / 4).unwrap();
+            assert_eq!(tile.plane(), Some(tile.index % 4));
+            let place = [first.row, first.column, first.height, first.width];
+            assert_eq!(tile.place(), place.map(|length| 2 * length));
+            let rows = first.row..first.row + first.height;
+            let columns = first.column..first.column + first.width;
+            let phase = (tile.index % 4 / 2, tile.index % 2);
+            assert_eq!(tile.window(), Window::of_plane(rows, columns, phase));
+            assert_eq!(tile.window().of(whole.view()).dim(), (tile.height, tile.width));
+            let part = Array2::from_elem((tile.height, tile.width), (tile.index % 4) as f32 + 1.0);
+            plan.blend(&tile, part.view(), whole.view_mut());
+        }
+        for ((i, j), value) in whole.indexed_iter() {
+            let expected = (i % 2 * 2 + j % 2) as f32 + 1.0;
+            assert!((value - expected).abs() < 1e-5, "{i} {j}: {value}");
+        }
+        let error = TilePlan::of_mosaic(201, 132, 64, 16).unwrap_err().to_string();
+        assert!(error.contains("201x132") && error.contains("even"), "{error}");
     }
 
     #[test]

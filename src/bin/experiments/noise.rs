@@ -8,6 +8,7 @@ use clap::Args;
 use maud::{Markup, html};
 use ndarray::{Array3, Axis};
 use sci_recon::cli::{CliError, NetworkArguments, algorithms, cut};
+use sci_recon::formats::Channels;
 use sci_recon::job::{Algorithm, Sequence};
 use sci_recon::optics::{
     ApertureGrid, Draw, HybridAperture, Multiplexing, Normalisation, generator, measure, noisy,
@@ -183,10 +184,11 @@ impl Bench<'_> {
                 solver: Solver::Schedule(&self.schedule),
                 plan: &plan,
                 runs: &SequencePlan::separate(0..1),
+                mosaic: None,
             };
             let solved = solve_on_all_cores(&input, &self.network)?;
             let frame = |k| solved.frame(&input, 0, k);
-            let value = Quality::of_frames(frame, clip.frames.view())?.psnr;
+            let value = Quality::of_frames(frame, clip.frames.view(), Channels::Grey)?.psnr;
             eprintln!("{}, {name}, sigma {sigma}: {value:.2} dB", clip.name);
             by_sigma.push(value);
         }

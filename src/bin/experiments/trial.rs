@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use ndarray::{Array2, Array3, ArrayView, ArrayView2, Axis, Dimension, s};
 use sci_recon::cli::{CliError, MaskArguments, Model, cut};
+use sci_recon::formats::Channels;
 use sci_recon::job::{Algorithm, RunSpec, Sequence};
 use sci_recon::optics::{illumination, measure, noisy};
 use sci_recon::pipeline::networks::{ModelRecord, NetworkSource};
@@ -176,6 +177,7 @@ impl Bench {
             solver,
             plan: &plan,
             runs: &runs,
+            mosaic: None,
         };
         let (started, before) = (Instant::now(), cpu_seconds());
         let solved = solve_on_all_cores(&input, &self.network)?;
@@ -220,7 +222,7 @@ impl Quality {
         let mut by_zone: [Vec<Option<f64>>; ZONES] = Default::default();
         for (k, truth) in truth.outer_iter().enumerate() {
             let frame = frame(k);
-            let quality = FrameQuality::of(k, frame.view(), truth)?;
+            let quality = FrameQuality::of(k, frame.view(), truth, Channels::Grey)?;
             by_frame.push(finite(quality.psnr));
             ssim += quality.ssim.unwrap_or_default();
             for (values, error) in by_zone.iter_mut().zip(errors_by_zone(frame.view(), truth)) {

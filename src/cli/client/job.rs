@@ -41,6 +41,9 @@ pub(in crate::cli) enum Wanted {
     /// The same as a BigTIFF for Fiji and napari.
     #[value(name = "stack.tif")]
     Tiff,
+    /// The frames of a colour sensor as it saw them, float32.
+    #[value(name = "mosaic.npy")]
+    Mosaic,
     /// Each frame as an EXR.
     #[value(name = "frames")]
     Frames,
@@ -74,6 +77,7 @@ impl Wanted {
         match self {
             Self::Array => name == "frames.npy",
             Self::Stack => name == "stack.exr",
+            Self::Mosaic => name == "mosaic.npy",
             Self::Frames => name.starts_with("frames/"),
             Self::Pictures => name.starts_with("png/"),
             Self::Manifest => name == "manifest.json",

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
+use crate::formats::Channels;
 use crate::pipeline::quality::{self, FrameQuality};
 
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -34,7 +35,8 @@ pub(super) fn compare(
     cpu_seconds: f64,
 ) -> Result<Quality> {
     let pairs = frames.outer_iter().zip(truth.outer_iter()).enumerate();
-    let compared = pairs.map(|(k, (frame, truth))| FrameQuality::of(k, frame, truth));
+    let compared =
+        pairs.map(|(k, (frame, truth))| FrameQuality::of(k, frame, truth, Channels::Grey));
     let quality = quality::Quality::from(compared.collect::<Result<Vec<_>, _>>()?);
     let ssim = quality.ssim.unwrap_or_default();
     Ok(Quality { psnr_db: quality.psnr, ssim, cpu_seconds })

@@ -17,6 +17,7 @@ use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
 use crate::job::{Pool, Sha256, TaskKind, without_paths};
 use crate::pipeline::PipelineError;
+use crate::pipeline::arrays::window;
 use crate::store::{Claimant, ClaimedTask, MessagePlace, RemoteTask, StoreError, Work};
 use crate::worker::{TileTask, tile_task};
 
@@ -184,8 +185,7 @@ impl Core {
                 Part::Masks => 0..array.info().frames,
                 Part::Snapshots => task.snapshots.start as usize..task.snapshots.end as usize,
             };
-            let window = array.read_window(frames, task.tile.rows(), task.tile.columns())?;
-            arrays::to_bytes(window.view())
+            arrays::to_bytes(window(&array, frames, &task.tile.window())?.view())
         });
         Ok(cut.await.map_err(|_| PipelineError::Thread)??)
     }

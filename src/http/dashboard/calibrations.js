@@ -106,6 +106,7 @@ function about(item) {
   return h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), facts([
     ["Masks (compression ratio)", item.frames],
     ["Size", `${item.height} × ${item.width} (rows × columns)`],
+    ["Sensor", item.mosaic ? `in colour, ${item.mosaic.toUpperCase()}` : "grey"],
     ["Mean transmission", figure(item.mask_mean)],
     ["Dead pixels", `${item.dead_pixels} (${figure((100 * item.dead_pixels) / pixels, 2)} %)`],
     ["Values below 0, set to 0", item.clipped_negatives],

@@ -57,9 +57,9 @@ export function nameOf(thing) {
 
 /** "8 × 256 × 256" with the number of snapshots where there are several. */
 export function shapeOf(job) {
-  const { frames, height, width } = job.shape;
+  const { frames, height, width, mosaic } = job.shape;
   const count = job.snapshots.count;
-  return `${frames} × ${height} × ${width}${count > 1 ? `, ${count} snapshots` : ""}`;
+  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : ""}${count > 1 ? `, ${count} snapshots` : ""}`;
 }
 
 /** What a job is doing, in words. */

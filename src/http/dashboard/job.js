@@ -115,7 +115,7 @@ function line(now) {
   return now.state === "succeeded" ? text : [h("progress", { max: 100, value: percent, "aria-label": "Progress" }), text];
 }
 
-const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "manifest.json": "Manifest" };
+const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "mosaic.npy": "Mosaic (npy)", "manifest.json": "Manifest" };
 
 const ORDER = Object.keys(NAMES);
 

@@ -49,6 +49,8 @@ function choice(name, label, options, chosen, changed) {
   return h("fieldset", { class: "choice" }, h("legend", null, label), options.map(input));
 }
 
+const SENSORS = [["", "grey"], ...["rggb", "bggr", "grbg", "gbrg"].map((name) => [name, `in colour, ${name.toUpperCase()}`])];
+
 function calibrationStep(form, known, wake, wanted, signal) {
   const verdict = h("div", { class: "verdict", "aria-live": "polite" });
   const use = (calibration) => {
@@ -56,8 +58,10 @@ function calibrationStep(form, known, wake, wanted, signal) {
     wake();
   };
   const name = textField("calibration-name", "Name of the calibration", "bench 3, f/8");
-  const nameRow = h("div", { class: "fields" }, name.element);
-  const parts = { known: old(known, wanted, use, signal), masks: masks(name, use, verdict, signal), captures: captures(name, use, verdict, signal) };
+  const sensor = h("select", { id: "mosaic" }, SENSORS.map(([value, text]) => h("option", { value }, text)));
+  const nameRow = h("div", { class: "fields" }, name.element, h("label", { for: "mosaic" }, "The sensor is", sensor));
+  const told = () => given({ name: name.value(), mosaic: sensor.value || null });
+  const parts = { known: old(known, wanted, use, signal), masks: masks(told, sensor, use, verdict, signal), captures: captures(told, use, verdict, signal) };
   const options = [known.length > 0 && ["known", "A stored calibration"], ["masks", "Ready masks"], ["captures", "Raw captures"]].filter(Boolean);
   const show = (value) => {
     for (const [key, part] of Object.entries(parts)) part.element.hidden = key !== value;
@@ -81,12 +85,15 @@ function old(known, wanted, use, signal) {
   return { element, wake };
 }
 
-function masks(name, use, verdict, signal) {
+function masks(told, sensor, use, verdict, signal) {
+  // The file that was dropped last, and the full scale that was chosen for it.
+  let last = null;
   const make = async (sha256, scale) => {
+    last = [sha256, scale];
     use(null);
     put(verdict);
     try {
-      const made = await send("POST", "/v1/calibrations", { masks: sha256, ...given({ name: name.value(), full_scale: scale }) });
+      const made = await send("POST", "/v1/calibrations", { masks: sha256, ...told(), ...given({ full_scale: scale }) });
       put(verdict, taken(made));
       use(made);
     } catch (error) {
@@ -94,18 +101,20 @@ function masks(name, use, verdict, signal) {
       put(verdict, problem(error), askScale((next) => make(sha256, next).catch((later) => put(verdict, problem(later)))));
     }
   };
+  // What is stated later goes with the same file.
+  sensor.addEventListener("change", () => last && make(...last).catch((error) => put(verdict, problem(error))));
   const drop = dropZone("masks", "Calibration set", `one mask a frame: ${HINT}`, signal, (blob) => make(blob.sha256, null));
   return { element: drop.element };
 }
 
-function captures(name, use, verdict, signal) {
+function captures(told, use, verdict, signal) {
   const button = h("button", { type: "button", class: "primary", disabled: true }, "Make the masks");
   const found = new Captures(signal, () => (button.disabled = found.missing() !== null));
   button.addEventListener("click", async () => {
     button.disabled = true;
     use(null);
     try {
-      let made = await send("POST", "/v1/calibrations", { captures: found.value(), ...given({ name: name.value() }) });
+      let made = await send("POST", "/v1/calibrations", { captures: found.value(), ...told() });
       const words = h("p", { class: "muted" });
       put(verdict, words);
       while (made.state === "preparing" && !signal.aborted) {
@@ -133,6 +142,7 @@ function taken(item) {
     h("p", { class: "good" }, "The calibration is taken."),
     facts([
       ["Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
+      item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): nothing is known there`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],

@@ -5,6 +5,8 @@ import { figure, iterationsOf } from "./format.js";
 import { get } from "./api.js";
 import { h, put, s } from "./dom.js";
 
+const COLOURS = { r: "red", g: "green", b: "blue" };
+
 export class TileMap {
   constructor(job, signal) {
     Object.assign(this, { job, signal, chosen: null, tiles: [] });
@@ -58,21 +60,26 @@ export class TileMap {
   }
 
   draw() {
-    const { height, width } = this.job.shape;
+    const { job } = this;
+    const { height, width } = job.shape;
     const done = this.tiles.filter((tile) => tile.state === "done");
     const worst = Math.max(...done.map((tile) => tile.residual ?? 0));
     const run = this.tiles[0]?.snapshots;
     const together = run?.count > 1 ? ` of snapshots ${run.first} to ${run.first + run.count - 1} together` : "";
     const text = `${done.length} of ${this.tiles.length} tiles${together} are done`;
     const unit = Math.max(width, height) / 100;
+    // Of a mosaic four tiles share a place, each a quarter of it for one pixel of a cell.
+    const parts = job.shape.mosaic ? 2 : 1;
+    const at = (start, length, part) => start + unit / 2 + (part * (length - unit)) / parts;
     const rectangle = (tile) => s("rect", {
-      x: tile.column + unit / 2, y: tile.row + unit / 2, width: tile.width - unit, height: tile.height - unit, rx: unit,
+      x: at(tile.column, tile.width, tile.plane % 2), y: at(tile.row, tile.height, Math.floor(tile.plane / 2)),
+      width: (tile.width - unit) / parts, height: (tile.height - unit) / parts, rx: unit,
       class: `tile ${tile.state}${tile.tile === this.chosen ? " chosen" : ""}`, "stroke-width": unit / 2,
       onclick: () => {
         this.select.value = tile.tile;
         this.choose(tile.tile);
       },
-    }, s("title", null, `tile ${tile.tile + 1}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
+    }, s("title", null, `tile ${tile.tile + 1}${job.shape.mosaic ? ` (${COLOURS[job.shape.mosaic[tile.plane]]})` : ""}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
     put(this.map, s("svg", { viewBox: `0 0 ${width} ${height}`, class: "tiles", role: "img", "aria-label": text }, this.tiles.map(rectangle)));
     const most = iterationsOf(this.job.schedule);
     const runs = this.tiles.filter((tile) => tile.state === "running" && tile.iterations > 0);

@@ -4,7 +4,7 @@
 use axum::body::Bytes;
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, Method};
+use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use serde::Deserialize;
 use serde_json::json;
@@ -16,7 +16,7 @@ use super::super::extract::{Caller, Params};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, result_file};
 use super::composed::{Composed, Part, Piece};
-use crate::formats::{bigtiff, npy};
+use crate::formats::{Channels, bigtiff, npy};
 use crate::job::JobId;
 use crate::pipeline::manifest::CameraRecord;
 use crate::store::Job;
@@ -62,6 +62,7 @@ pub(in crate::http) async fn tiff(
     let head = bigtiff::head(&bigtiff::Clip {
         name: &format!("{}{name}", clip.job.id),
         shape: clip.shape(),
+        channels: clip.channels(),
         interval_s: times.interval_s,
         times_s: times.starts_s.as_deref(),
     });
@@ -74,8 +75,7 @@ pub(in crate::http) async fn array(
     method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
-    let (frames, height, width) = clip.shape();
-    let head = npy::stack_header(frames, height, width);
+    let head = npy::stack_header(clip.shape(), clip.channels());
     clip.behind(head, "application/octet-stream", ARRAY, (&method, &headers)).await
 }
 
@@ -85,19 +85,25 @@ pub(in crate::http) async fn zarr(clip: Clip, headers: HeaderMap) -> Result<Resp
     clip.pieces().await?;
     let (frames, height, width) = clip.shape();
     let times = clip.times().await?;
+    let (mut shape, mut names) = (vec![frames, height, width], vec!["frame", "row", "column"]);
+    if clip.channels() == Channels::Rgb {
+        shape.push(clip.channels().count());
+        names.push("colour");
+    }
+    let chunk: Vec<usize> = [1].into_iter().chain(shape[1..].iter().copied()).collect();
     let array = json!({
         "zarr_format": 3,
         "node_type": "array",
-        "shape": [frames, height, width],
+        "shape": shape,
         "data_type": "float32",
         "chunk_grid": {
             "name": "regular",
-            "configuration": { "chunk_shape": [1, height, width] },
+            "configuration": { "chunk_shape": chunk },
         },
         "chunk_key_encoding": { "name": "default", "configuration": { "separator": "/" } },
         "codecs": [{ "name": "bytes", "configuration": { "endian": "little" } }],
         "fill_value": 0.0,
-        "dimension_names": ["frame", "row", "column"],
+        "dimension_names": names,
         "attributes": {
             "job": clip.job.id,
             "frame_interval_s": times.interval_s,
@@ -112,15 +118,23 @@ pub(in crate::http) struct Chunk {
     frame: usize,
 }
 
-/// `frames.zarr/c/{frame}/0/0`: the samples of a frame, counted from 0.
+/// `frames.zarr/c/{frame}/0/0`, or `frames.zarr/c/{frame}/0/0/0` of colours: the samples of a frame, counted from
+/// 0.
 pub(in crate::http) async fn chunk(
     clip: Clip,
     Params(Chunk { frame }): Params<Chunk>,
+    uri: Uri,
     method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
     let each = clip.job.spec.shape.frames;
     let frames = clip.shape().0;
+    // A chunk has as many numbers as the array has axes.
+    let axes = uri.path().rsplit('/').take_while(|part| *part != "c").count();
+    if axes != if clip.channels() == Channels::Rgb { 4 } else { 3 } {
+        let detail = "the array has other axes: zarr.json says which";
+        return Err(ApiError::new(Code::NotFound, detail));
+    }
     if frame >= frames {
         let detail = format!("the array has {frames} frames, counted from 0");
         return Err(ApiError::new(Code::NotFound, detail));
@@ -158,9 +172,13 @@ impl Clip {
         (self.snapshots().len() * shape.frames, shape.height, shape.width)
     }
 
+    fn channels(&self) -> Channels {
+        self.job.spec.shape.channels()
+    }
+
     fn frame_bytes(&self) -> u64 {
         let shape = self.job.spec.shape;
-        (shape.height * shape.width * size_of::<f32>()) as u64
+        (shape.height * shape.width * self.channels().count() * size_of::<f32>()) as u64
     }
 
     /// The raw frames of a snapshot.

@@ -88,6 +88,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::{BUDGET, Pictures};
+    use crate::formats::Channels;
     use crate::http::pictures::render::Picture;
     use ndarray::Array2;
 
@@ -98,6 +99,7 @@ mod tests {
             width: 1024,
             identity: name.to_string(),
             settled: true,
+            channels: Channels::Grey,
             depth: 1,
             read: Box::new(move |rows, columns| {
                 reads.fetch_add(1, Ordering::Relaxed);

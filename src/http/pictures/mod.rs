@@ -152,13 +152,14 @@ async fn draw(
     if conditional::is_known(headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
     }
+    let channels = picture.channels;
     let values = app.pictures.reduced(Arc::new(picture), region).await?;
     let encode = tokio::task::spawn_blocking(move || {
         let (black, white) = window.unwrap_or_else(|| {
             let found = render::spread(&values);
             (found.low, if found.high > found.low { found.high } else { found.low + 1.0 })
         });
-        png::encode_u8(values.view(), black, white)
+        png::encode_u8(values.view(), channels, black, white)
     });
     let bytes = encode.await.map_err(|error| ApiError::internal(&error))??;
     Ok((tags, [(header::CONTENT_TYPE, "image/png")], bytes).into_response())

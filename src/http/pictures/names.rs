@@ -222,7 +222,7 @@ async fn snapshots_of(app: &App, measurement: &Measurement) -> Result<Stack> {
 
 async fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Result<Stack> {
     let files = Files::Prepared(app.store.intact_blob(sha256).await?);
-    Ok(Stack { shape, identity: sha256.to_string(), files })
+    Ok(Stack { shape, identity: sha256.to_string(), files, mosaic: None })
 }
 
 /// The frames of a snapshot: those of the result, or the tiles that are done, on the preview. The bytes of
@@ -236,6 +236,7 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
                 shape,
                 identity: file.sha256.to_string(),
                 files: Files::Frames(path),
+                mosaic: spec.shape.mosaic,
             });
         }
         Err(StoreError::NotFound { .. }) => {}
@@ -259,15 +260,16 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
         if !record.solved.contains(&place) {
             return None;
         }
-        let (rows, columns) =
-            (tile.row..tile.row + tile.height, tile.column..tile.column + tile.width);
+        let window = tile.window();
+        let (rows, columns, step) = (window.rows, window.columns, window.step);
         let first = place * spec.shape.frames;
-        Some(DoneTile { rows, columns, first, path: app.store.dir().blob(&done.sha256) })
+        Some(DoneTile { rows, columns, step, first, path: app.store.dir().blob(&done.sha256) })
     };
     let tiles = done.into_iter().filter_map(place).collect();
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };
     let identity = Sha256::of(hashes.as_bytes()).to_string();
-    Ok(Stack { shape, identity, files: Files::Tiles(Arc::new(unfinished)) })
+    let files = Files::Tiles(Arc::new(unfinished));
+    Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic })
 }
 
 #[cfg(test)]

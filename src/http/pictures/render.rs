@@ -2,16 +2,16 @@
 
 use std::ops::Range;
 
-use ndarray::Array2;
+use ndarray::{Array2, s};
 
-use crate::formats::FormatError;
+use crate::formats::{Channels, FormatError};
 
 /// Pixels of a tile's side.
 pub(super) const TILE: usize = 256;
 /// Samples that are held at the same time: 16 MiB.
 const BAND: usize = 4 << 20;
 
-/// Reads rows and columns of a picture: f32 \[rows, columns\].
+/// Reads rows and columns of a picture: f32 \[rows, columns\], of colours \[rows, 3 columns\].
 type Read = dyn Fn(Range<usize>, Range<usize>) -> Result<Array2<f32>, FormatError> + Send + Sync;
 
 /// A picture of which windows can be read.
@@ -22,6 +22,7 @@ pub(in crate::http) struct Picture {
     pub(super) identity: String,
     /// False while the content still grows.
     pub(super) settled: bool,
+    pub(super) channels: Channels,
     /// Samples that are read for each pixel.
     pub(super) depth: usize,
     pub(super) read: Box<Read>,
@@ -73,11 +74,13 @@ impl Picture {
         Some(Region { level, rows, columns })
     }
 
-    /// The values of a region \[rows, columns\]: each is the mean of the pixels that it stands for.
+    /// The values of a region \[rows, columns\], of colours \[rows, 3 columns\]: each is the mean of the pixels that
+    /// it stands for.
     /// Reads no more than these, a band of rows at a time.
     pub(super) fn reduce(&self, region: &Region) -> Result<Array2<f32>, FormatError> {
         let step = 1usize << region.level;
-        let mut reduced = Array2::zeros((region.rows.len(), region.columns.len()));
+        let channels = self.channels.count();
+        let mut reduced = Array2::zeros((region.rows.len(), region.columns.len() * channels));
         let columns = region.columns.start * step..(region.columns.end * step).min(self.width);
         let band = (BAND / (step * columns.len() * self.depth).max(1)).max(1);
         for start in region.rows.clone().step_by(band) {
@@ -88,9 +91,14 @@ impl Picture {
                 let lines = offset * step..((offset + 1) * step).min(window.nrows());
                 let mut target = reduced.row_mut(row - region.rows.start);
                 for line in lines.clone() {
-                    let line = window.row(line);
-                    for (sum, part) in target.iter_mut().zip(line.exact_or_rest(step)) {
-                        *sum += part;
+                    for channel in 0..channels {
+                        let of = s![channel..;channels.cast_signed()];
+                        let line = window.row(line);
+                        let parts = line.slice(of);
+                        let mut sums = target.slice_mut(of);
+                        for (sum, part) in sums.iter_mut().zip(parts.exact_or_rest(step)) {
+                            *sum += part;
+                        }
                     }
                 }
                 target /= lines.len() as f32;
@@ -126,12 +134,30 @@ pub(super) fn spread(values: &Array2<f32>) -> Spread {
 
 #[cfg(test)]
 mod tests {
-    use super::{Picture, TILE, spread};
+    use super::{Channels, Picture, TILE, spread};
     use ndarray::{Array2, s};
+
+    #[test]
+    fn each_colour_is_reduced_by_itself() {
+        let colours =
+            Array2::from_shape_fn((5, 21), |(i, at)| (100 * (at % 3) + i + at / 3) as f32);
+        let grey = |c: usize| picture(colours.slice(s![.., c..;3]).to_owned(), 1);
+        let all = colours.clone();
+        let read = move |rows: std::ops::Range<usize>, columns: std::ops::Range<usize>| {
+            Ok(all.slice(s![rows, 3 * columns.start..3 * columns.end]).to_owned())
+        };
+        let whole = Picture { channels: Channels::Rgb, read: Box::new(read), ..grey(0) };
+        let region = whole.whole(1);
+        let found = whole.reduce(&region).unwrap();
+        for c in 0..3 {
+            assert_eq!(found.slice(s![.., c..;3]), grey(c).reduce(&region).unwrap());
+        }
+    }
 
     fn picture(values: Array2<f32>, depth: usize) -> Picture {
         let (height, width) = values.dim();
         Picture {
+            channels: Channels::Grey,
             height,
             width,
             identity: "test".into(),

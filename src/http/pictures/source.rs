@@ -9,8 +9,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use ndarray::{Array2, Array3, Axis, s};
 
 use super::render::Picture;
-use crate::formats::{self, FormatError, Limits, StackInfo, npy, planar};
-use crate::job::Sha256;
+use crate::formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
+use crate::job::{MARGIN, Mosaic, Sha256};
 
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
@@ -18,6 +18,8 @@ pub(super) struct Stack {
     pub(super) shape: (usize, usize, usize),
     pub(super) identity: String,
     pub(super) files: Files,
+    /// Of frames that a colour sensor saw: result files have their colours, tiles have not.
+    pub(super) mosaic: Option<Mosaic>,
 }
 
 #[derive(Debug, Clone)]
@@ -36,12 +38,13 @@ pub(super) struct Unfinished {
     pub(super) tiles: Vec<DoneTile>,
 }
 
-/// A tile that is done, as a prepared array, the window that it covers, and which of its frames is the
-/// snapshot's first.
+/// A tile that is done, as a prepared array, the window that it covers, of which it has every `step`th pixel, and
+/// which of its frames is the snapshot's first.
 #[derive(Debug)]
 pub(super) struct DoneTile {
     pub(super) rows: Range<usize>,
     pub(super) columns: Range<usize>,
+    pub(super) step: usize,
     pub(super) first: usize,
     pub(super) path: PathBuf,
 }
@@ -49,7 +52,52 @@ pub(super) struct DoneTile {
 type Window = Result<Array3<f32>, FormatError>;
 
 impl Stack {
+    /// What is shown: \[frames, rows, columns\], of colours \[frames, rows, 3 columns\].
     fn window(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
+        match (self.mosaic, &self.files) {
+            (None, _) => self.stored(frames, rows, columns),
+            (Some(_), Files::Frames(_)) => {
+                self.stored(frames, rows, 3 * columns.start..3 * columns.end)
+            }
+            (Some(mosaic), _) => {
+                // The colours of a pixel follow from those around it.
+                let wider = |range: &Range<usize>, end: usize| {
+                    range.start.saturating_sub(MARGIN)..(range.end + MARGIN).min(end)
+                };
+                let (down, across) = (wider(&rows, self.shape.1), wider(&columns, self.shape.2));
+                let first = (down.start, across.start);
+                let (top, left) = (rows.start - down.start, 3 * (columns.start - across.start));
+                let inside = s![top..top + rows.len(), left..left + 3 * columns.len()];
+                let seen = self.stored(frames, down, across)?;
+                let mut shown = Array3::zeros((seen.dim().0, rows.len(), 3 * columns.len()));
+                for (seen, mut shown) in seen.outer_iter().zip(shown.outer_iter_mut()) {
+                    shown.assign(&mosaic.colours(seen, first).slice(inside));
+                }
+                Ok(shown)
+            }
+        }
+    }
+
+    /// The frames as the sensor sees them: \[frames, rows, columns\].
+    fn seen(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
+        let (Some(mosaic), Files::Frames(_)) = (self.mosaic, &self.files) else {
+            return self.stored(frames, rows, columns);
+        };
+        let first = (rows.start, columns.start);
+        let colours = self.window(frames, rows.clone(), columns.clone())?;
+        let mut seen = Array3::zeros((colours.dim().0, rows.len(), columns.len()));
+        for (colours, mut seen) in colours.outer_iter().zip(seen.outer_iter_mut()) {
+            seen.assign(&mosaic.seen(colours, first));
+        }
+        Ok(seen)
+    }
+
+    fn channels(&self) -> Channels {
+        if self.mosaic.is_some() { Channels::Rgb } else { Channels::Grey }
+    }
+
+    /// What the files have.
+    fn stored(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
         let limits = Limits::default();
         match &self.files {
             Files::Prepared(path) => {
@@ -60,7 +108,7 @@ impl Stack {
             }
             Files::Tiles(unfinished) => {
                 let mut whole = match &unfinished.preview {
-                    Some(path) => enlarged(path, self.shape, frames.clone(), &rows, &columns)?,
+                    Some(path) => enlarged(path, self, frames.clone(), &rows, &columns)?,
                     None => Array3::from_elem((frames.len(), rows.len(), columns.len()), f32::NAN),
                 };
                 lay(&unfinished.tiles, frames, rows, columns, &mut whole)?;
@@ -87,7 +135,8 @@ impl Stack {
             width,
             identity: format!("{} {name}", self.identity),
             settled: self.settled(),
-            depth,
+            channels: self.channels(),
+            depth: depth * self.channels().count(),
             read: Box::new(move |rows, columns| read(&stack, rows, columns)),
         }
     }
@@ -146,17 +195,18 @@ impl Stack {
         let frames = self.shape.0;
         let name = format!("{} {} {snapshot} residual", masks.identity, measurement.identity);
         let (masks, measurement) = (masks.clone(), measurement.clone());
-        self.picture(&name, 2 * frames, move |stack, rows, columns| {
+        let picture = self.picture(&name, 2 * frames, move |stack, rows, columns| {
             let y = measurement.window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
             let mut rest = first(y);
             let masks = masks.window(0..frames, rows.clone(), columns.clone())?;
-            let x = stack.window(0..frames, rows, columns)?;
+            let x = stack.seen(0..frames, rows, columns)?;
             for (mask, frame) in masks.outer_iter().zip(x.outer_iter()) {
                 ndarray::azip!((rest in &mut rest, &c in &mask, &x in &frame) *rest -= c * x);
             }
             rest.mapv_inplace(f32::abs);
             Ok(rest)
-        })
+        });
+        Picture { channels: Channels::Grey, ..picture }
     }
 }
 
@@ -174,6 +224,7 @@ pub(super) fn sent(
         width: info.width,
         identity: format!("{sha256} sent {frame}"),
         settled: true,
+        channels: Channels::Grey,
         depth: 1,
         read: Box::new(move |rows, columns| {
             let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
@@ -200,20 +251,26 @@ fn first(window: Array3<f32>) -> Array2<f32> {
     window.index_axis_move(Axis(0), 0)
 }
 
-/// A window of a preview as large as the frames: every pixel has the value of its place.
+/// A window of a preview as large as the frames: every pixel has the value of its place, of a mosaic that of its
+/// sub-image.
 fn enlarged(
     path: &Path,
-    (_, height, width): (usize, usize, usize),
+    stack: &Stack,
     frames: Range<usize>,
     rows: &Range<usize>,
     columns: &Range<usize>,
 ) -> Window {
+    let (_, height, width) = stack.shape;
+    let step = if stack.mosaic.is_some() { 2 } else { 1 };
+    let from = |at: usize, length: usize, coarse: usize| {
+        at / step * (coarse / step) / (length / step) * step + at % step
+    };
     let reader = planar::Reader::open(path, &Limits::default())?;
     let (h, w) = (reader.info().height, reader.info().width);
     let size = (frames.len(), rows.len(), columns.len());
     let coarse = reader.read_window(frames, 0..h, 0..w)?;
     Ok(Array3::from_shape_fn(size, |(k, i, j)| {
-        coarse[[k, (rows.start + i) * h / height, (columns.start + j) * w / width]]
+        coarse[[k, from(rows.start + i, height, h), from(columns.start + j, width, w)]]
     }))
 }
 
@@ -226,21 +283,30 @@ fn lay(
     columns: Range<usize>,
     whole: &mut Array3<f32>,
 ) -> Result<(), FormatError> {
-    let common = |a: &Range<usize>, b: &Range<usize>| a.start.max(b.start)..a.end.min(b.end);
-    let within =
-        |part: &Range<usize>, of: &Range<usize>| part.start - of.start..part.end - of.start;
     for tile in tiles {
+        let step = tile.step;
+        // From the first pixel that both have.
+        let common = |shown: &Range<usize>, has: &Range<usize>| {
+            let before = shown.start.saturating_sub(has.start).next_multiple_of(step);
+            has.start + before..shown.end.min(has.end)
+        };
         let (down, across) = (common(&rows, &tile.rows), common(&columns, &tile.columns));
         if down.is_empty() || across.is_empty() {
             continue;
         }
+        let of_tile = |part: &Range<usize>, has: &Range<usize>| {
+            (part.start - has.start) / step..(part.end - has.start).div_ceil(step)
+        };
         let part = planar::Reader::open(&tile.path, &Limits::default())?.read_window(
             tile.first + frames.start..tile.first + frames.end,
-            within(&down, &tile.rows),
-            within(&across, &tile.columns),
+            of_tile(&down, &tile.rows),
+            of_tile(&across, &tile.columns),
         )?;
-        let place = s![.., within(&down, &rows), within(&across, &columns)];
-        whole.slice_mut(place).assign(&part);
+        let shown =
+            |part: &Range<usize>, of: &Range<usize>| part.start - of.start..part.end - of.start;
+        let (down, across, step) =
+            (shown(&down, &rows), shown(&across, &columns), step.cast_signed());
+        whole.slice_mut(s![.., down;step, across;step]).assign(&part);
     }
     Ok(())
 }
@@ -249,8 +315,8 @@ fn lay(
 mod tests {
     use std::sync::Arc;
 
-    use super::{DoneTile, Files, Stack, Unfinished};
-    use crate::formats::planar;
+    use super::{DoneTile, Files, Mosaic, Stack, Unfinished};
+    use crate::formats::{npy, planar};
     use ndarray::{Array3, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
@@ -264,7 +330,7 @@ mod tests {
     }
 
     fn stack(shape: (usize, usize, usize), files: Files) -> Stack {
-        Stack { shape, identity: "x".into(), files }
+        Stack { shape, identity: "x".into(), files, mosaic: None }
     }
 
     #[test]
@@ -294,6 +360,49 @@ mod tests {
     }
 
     #[test]
+    fn an_unfinished_mosaic_is_shown_in_the_colours_of_the_finished_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let mosaic = Mosaic::Grbg;
+        let seen =
+            Array3::from_shape_fn((2, 16, 20), |(k, i, j)| ((k * 320 + i * 20 + j) as f32).sin());
+        let mut colours = Array3::zeros((2, 16, 60));
+        for (seen, mut colours) in seen.outer_iter().zip(colours.outer_iter_mut()) {
+            colours.assign(&mosaic.colours(seen, (0, 0)));
+        }
+        let array = folder.path().join("frames.npy");
+        npy::write_colours(&array, colours.view()).unwrap();
+        // A preview of one pixel for each colour, and all tiles: each a sub-image.
+        let coarse = Array3::from_shape_fn((2, 2, 2), |(k, i, j)| seen[[k, i, j]]);
+        let preview = Some(prepared(folder.path(), "preview", &coarse));
+        let tile = |plane: usize| {
+            let (row, column) = (plane / 2, plane % 2);
+            let part = seen.slice(s![.., row..;2, column..;2]).to_owned();
+            let path = prepared(folder.path(), &format!("tile {plane}"), &part);
+            DoneTile { rows: row..15 + row, columns: column..19 + column, step: 2, first: 0, path }
+        };
+        let unfinished =
+            |tiles| Files::Tiles(Arc::new(Unfinished { preview: preview.clone(), tiles }));
+        let of = |files| Stack { mosaic: Some(mosaic), ..stack((2, 16, 20), files) };
+        let (done, all) = (of(Files::Frames(array)), of(unfinished((0..4).map(tile).collect())));
+        for (rows, columns) in [(0..16, 0..20), (3..9, 5..8), (7..8, 0..20)] {
+            let window = |stack: &Stack| stack.window(0..2, rows.clone(), columns.clone()).unwrap();
+            let place = s![.., rows.clone(), 3 * columns.start..3 * columns.end];
+            assert_eq!(window(&done), colours.slice(place));
+            assert_eq!(window(&all), colours.slice(place));
+            let sensor = |stack: &Stack| stack.seen(0..2, rows.clone(), columns.clone()).unwrap();
+            let place = s![.., rows.clone(), columns.clone()];
+            assert_eq!(
+                (sensor(&done), sensor(&all)),
+                (seen.slice(place).to_owned(), seen.slice(place).to_owned())
+            );
+        }
+        let begun = of(unfinished(Vec::new())).seen(0..1, 0..16, 0..20).unwrap();
+        assert_eq!((begun[[0, 14, 18]], begun[[0, 9, 3]]), (coarse[[0, 0, 0]], coarse[[0, 1, 1]]));
+        let picture = done.frame(1);
+        assert_eq!(picture.reduce(&picture.whole(0)).unwrap(), colours.slice(s![1, .., ..]));
+    }
+
+    #[test]
     fn tiles_that_are_done_stand_in_their_place_on_the_preview() {
         let folder = tempfile::tempdir().unwrap();
         let x = Array3::from_shape_fn((2, 40, 40), |(k, i, j)| (k * 1600 + i * 40 + j) as f32);
@@ -303,8 +412,13 @@ mod tests {
         let coarse_path = prepared(folder.path(), "preview", &coarse);
         for preview in [None, Some(coarse_path)] {
             let below = |i: usize, j: usize| preview.as_ref().map(|_| coarse[[1, i / 8, j / 8]]);
-            let tiles =
-                vec![DoneTile { rows: 16..40, columns: 20..40, first: 0, path: path.clone() }];
+            let tiles = vec![DoneTile {
+                rows: 16..40,
+                columns: 20..40,
+                step: 1,
+                first: 0,
+                path: path.clone(),
+            }];
             let unfinished = Unfinished { preview: preview.clone(), tiles };
             let picture = stack((2, 40, 40), Files::Tiles(Arc::new(unfinished))).frame(1);
             assert!(!picture.settled);

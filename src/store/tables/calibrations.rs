@@ -10,7 +10,9 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::types::Json;
 use sqlx::{FromRow, Row, SqliteConnection};
 
-use crate::job::{CalibrationId, Captures, Lab, Label, Sha256, TaskState, Timestamp, TokenId};
+use crate::job::{
+    CalibrationId, Captures, Lab, Label, Mosaic, Sha256, TaskState, Timestamp, TokenId,
+};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{
@@ -39,6 +41,8 @@ pub struct NewCalibration {
     pub dead_pixels: u64,
     /// Values below 0, set to 0.
     pub clipped_negatives: u64,
+    /// The colours of the sensor's pixels; none for a grey one.
+    pub mosaic: Option<Mosaic>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
@@ -60,6 +64,7 @@ pub struct Unready {
     pub frames: usize,
     /// How much of the work is done, on \[0,1\].
     pub fraction: f64,
+    pub mosaic: Option<Mosaic>,
     /// Why there will be no masks; none while they are made.
     pub error: Option<String>,
     pub created_at: Timestamp,
@@ -124,7 +129,7 @@ impl Store {
         limit: u32,
     ) -> Result<Page<Unready>> {
         let rows = sql!(
-            "SELECT calibration, name, captures, created_at, state, fraction,
+            "SELECT calibration, name, captures, mosaic, created_at, state, fraction,
                  (SELECT reason FROM attempts
                   WHERE task = tasks.id AND attempt = tasks.attempt) AS reason
              FROM calibration_requests JOIN tasks USING (calibration)
@@ -239,11 +244,11 @@ pub async fn insert_made(
     prepared: Sha256,
     facts: NewCalibration,
 ) -> Result<()> {
-    let request =
-        "SELECT lab, token, name, created_at FROM calibration_requests WHERE calibration = ?";
-    let (lab, token, name, created_at) = sql_as!(request, [id]).fetch_one(&mut *connection).await?;
-    // It may have been renamed since the worker began.
-    let facts = NewCalibration { name, ..facts };
+    let request = "SELECT lab, token, name, mosaic, created_at FROM calibration_requests WHERE calibration = ?";
+    let (lab, token, name, mosaic, created_at) =
+        sql_as!(request, [id]).fetch_one(&mut *connection).await?;
+    // It may have been renamed since the worker began, which knows nothing of colours.
+    let facts = NewCalibration { name, mosaic, ..facts };
     insert(connection, (&lab, token), &Calibration { id, prepared, created_at, facts }).await?;
     sql!("DELETE FROM calibration_captures WHERE calibration = ?", [id])
         .execute(connection)
@@ -262,19 +267,20 @@ pub struct Asked<'a> {
     pub captures: Option<&'a Captures>,
     /// Bytes of the masks that are to be made.
     pub bytes: u64,
+    pub mosaic: Option<Mosaic>,
 }
 
 /// Writes down what is asked for.
 pub async fn insert_request(
     connection: &mut SqliteConnection,
     lab: &Lab,
-    &Asked { id, token, name, captures, bytes }: &Asked<'_>,
+    &Asked { id, token, name, captures, bytes, mosaic }: &Asked<'_>,
 ) -> Result<()> {
     sql!(
         "INSERT INTO calibration_requests (calibration, lab, token, name, captures, prepared_bytes,
-             created_at)
-         VALUES (?, ?, ?, ?, ?, ?, ?)",
-        [id, lab, token, name, captures.map(Json), integer(bytes), Timestamp::now()]
+             created_at, mosaic)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        [id, lab, token, name, captures.map(Json), integer(bytes), Timestamp::now(), mosaic]
     )
     .execute(&mut *connection)
     .await?;
@@ -300,8 +306,8 @@ pub async fn insert(
     let facts = &calibration.facts;
     sql!(
         "INSERT INTO calibrations (lab, token, id, name, masks, prepared, format, sample, axes, frames, height,
-             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at, mosaic)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -319,7 +325,8 @@ pub async fn insert(
             facts.mask_mean,
             integer(facts.dead_pixels),
             integer(facts.clipped_negatives),
-            calibration.created_at
+            calibration.created_at,
+            facts.mosaic
         ]
     )
     .execute(connection)
@@ -334,6 +341,7 @@ fn unready(row: &SqliteRow) -> Result<Unready> {
         id: row.try_get("calibration")?,
         name: row.try_get("name")?,
         frames: captures.masks.len(),
+        mosaic: row.try_get("mosaic")?,
         fraction: row.try_get("fraction")?,
         // The reason of the last attempt; one that is tried again is none for a user.
         error: if failed { row.try_get("reason")? } else { None },

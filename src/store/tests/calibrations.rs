@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::{LEASE, Lab};
-use crate::job::{CalibrationId, Captures, TaskKind, TaskProgress, TaskState};
+use crate::job::{CalibrationId, Captures, Mosaic, TaskKind, TaskProgress, TaskState};
 use crate::store::{
     CalibrationDone, ClaimedTask, Completion, Heartbeat, MAX_FAILURES, NewCalibration, NewCaptures,
     Product, StoreError, Unready, Work, WorkerEnd,
@@ -46,7 +46,9 @@ impl Lab {
         };
         let lab = crate::job::Lab::local();
         let name = "optics of May".parse().unwrap();
-        let asked = NewCaptures { name: Some(&name), captures: &captures, bytes: 1, cost: 2.5 };
+        let mosaic = Some(Mosaic::Gbrg);
+        let name = Some(&name);
+        let asked = NewCaptures { name, captures: &captures, bytes: 1, cost: 2.5, mosaic };
         self.store.add_captures((&lab, None), asked, None).await.unwrap().id()
     }
 
@@ -70,6 +72,7 @@ impl Lab {
             mask_mean: 0.5,
             dead_pixels: 0,
             clipped_negatives: 0,
+            mosaic: None,
         };
         let done = CalibrationDone { masks: Some((facts, masks)), ..report() };
         let completion = Completion {
@@ -100,6 +103,7 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     assert_eq!(lab.store.heartbeat(&task.lease, half, None).await.unwrap(), Heartbeat::Continue);
     let shown = lab.unready(first).await.unwrap();
     assert_eq!((shown.frames, shown.fraction, shown.error), (2, 0.5, None));
+    assert_eq!(shown.mosaic, Some(Mosaic::Gbrg));
     let refused = lab.store.calibration(&local, first).await;
     assert!(matches!(refused, Err(StoreError::Unready { error: None, .. })));
     // Jobs are forecast and watched as if there were no calibrations.
@@ -111,6 +115,7 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     assert!(lab.unready(first).await.is_none());
     let made = lab.store.calibration(&local, first).await.unwrap();
     assert_eq!((made.created_at, made.facts.frames), (shown.created_at, 2));
+    assert_eq!(made.facts.mosaic, Some(Mosaic::Gbrg), "as it was asked for");
     assert!(lab.store.report(first).await.unwrap().is_some());
     assert_eq!(lab.store.map(first, "mean").await.unwrap().unwrap(), b"png");
     let done = |kind: &str| kind == "calibration";
@@ -202,7 +207,7 @@ async fn captures_that_are_gone_are_named() {
         saturation: None,
     };
     let whose = (&crate::job::Lab::local(), None);
-    let asked = NewCaptures { name: None, captures: &captures, bytes: 1, cost: 1.0 };
+    let asked = NewCaptures { name: None, captures: &captures, bytes: 1, cost: 1.0, mosaic: None };
     let refused = lab.store.add_captures(whose, asked, None).await;
     assert!(matches!(refused, Err(StoreError::NotFound { what: "blob", id })
         if id == gone.to_string()));

@@ -4,7 +4,7 @@ mod deep;
 mod hostile;
 mod losses;
 mod namespaces;
-mod nodes;
+pub mod nodes;
 mod proxy;
 mod rounds;
 mod scale;

@@ -72,6 +72,7 @@ class Client:
         *,
         masks_full_scale: float | None = None,
         full_scale: float | None = None,
+        mosaic: str | None = None,
         masks_axes: str | None = None,
         axes: str | None = None,
         folder: str | os.PathLike[str] | None = None,
@@ -81,14 +82,14 @@ class Client:
 
         `masks` are [B, H, W], `measurement` is [H, W] or [S, H, W]; arrays or file names. Their full scale, the stored
         number that means 1, is by default the maximum of an integer type, and 1 for floats. Axes in another order are
-        stated where several fit: "row-column-frame" or "column-row-frame". `job` goes on to `submit`.
+        stated where several fit: "row-column-frame" or "column-row-frame". A colour sensor has a `mosaic`: "rggb",
+        "bggr", "grbg" or "gbrg". `job` goes on to `submit`.
         The frames come into `folder`, by default one that goes away with the result.
         """
-        calibration = (
-            masks
-            if isinstance(masks, Calibration)
-            else self.calibrate(masks, full_scale=masks_full_scale, axes=masks_axes)
-        )
+        if isinstance(masks, Calibration):
+            calibration = masks
+        else:
+            calibration = self.calibrate(masks, full_scale=masks_full_scale, axes=masks_axes, mosaic=mosaic)
         taken = self.measure(calibration, measurement, full_scale=full_scale, axes=axes)
         return self.submit(taken, algorithm, **job).wait().result(folder)
 
@@ -99,12 +100,15 @@ class Client:
         full_scale: float | None = None,
         array: str | None = None,
         axes: str | None = None,
+        mosaic: str | None = None,
         name: str | None = None,
     ) -> Calibration:
-        """Makes a calibration of masks [B, H, W]. `array` is their name in a file of several arrays."""
-        record = self._create(
-            "calibrations", masks=self.upload(masks), full_scale=full_scale, array=array, axes=axes, name=name
-        )
+        """Makes a calibration of masks [B, H, W]; of a colour sensor with a `mosaic`.
+
+        `array` is their name in a file of several arrays.
+        """
+        given = {"full_scale": full_scale, "array": array, "axes": axes, "mosaic": mosaic, "name": name}
+        record = self._create("calibrations", masks=self.upload(masks), **given)
         return Calibration(self, record).ready()
 
     def calibrate_captures(
@@ -116,6 +120,7 @@ class Client:
         black_with_mask: Source | Sequence[Source] | None = None,
         patterns: Source | None = None,
         saturation: int | None = None,
+        mosaic: str | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Makes a calibration of raw captures, and waits until its masks are there.
@@ -131,7 +136,7 @@ class Client:
         }
         if black_with_mask is not None:
             captures["black_with_mask"] = self._uploads(black_with_mask)
-        return Calibration(self, self._create("calibrations", captures=captures, name=name)).ready()
+        return Calibration(self, self._create("calibrations", captures=captures, mosaic=mosaic, name=name)).ready()
 
     def measure(
         self,
@@ -363,7 +368,8 @@ class Result:
 
     @cached_property
     def frames(self) -> npt.NDArray[np.float32]:
-        """All frames, those of one snapshot after the other: [B * S, H, W], float32.
+        """All frames, those of one snapshot after the other: [B * S, H, W], of a colour sensor
+        [B * S, H, W, 3], float32.
 
         Of one snapshot it is a memory map of the downloaded file; of several an array in memory.
         """

@@ -12,9 +12,9 @@ use ::exr::meta::attribute::{AttributeValue, SampleType, Text};
 use ::exr::meta::header::Header;
 use ndarray::Array3;
 
-use super::{CHANNEL, FRAME_TIME};
+use super::{FRAME_TIME, names};
 use crate::formats::error::Result;
-use crate::formats::{Format, FormatError, Limits};
+use crate::formats::{Channels, Format, FormatError, Limits};
 
 /// What a part says about its frame.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -29,10 +29,11 @@ pub struct Part {
     pub frames_per_second: Option<(i32, u32)>,
 }
 
-/// Reads all parts; the frames have the axes (frame, row, column).
+/// Reads all parts; the frames have the axes (frame, row, column), and those of colours red, green and blue of each
+/// pixel one after the other.
 ///
 /// Errors: I/O; [`FormatError::Unsupported`] for parts of differing sizes or with other channels
-/// than one float32 `Y`; limits and malformed files.
+/// than one `Y`, or `R`, `G` and `B`, all float32; limits and malformed files.
 pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32>)> {
     let file = File::open(path).map_err(FormatError::io("open the EXR file"))?;
     let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
@@ -40,36 +41,50 @@ pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32
     let strict = true;
     let reader = block::read(BufReader::new(file), strict).map_err(error)?;
     let headers = reader.headers().to_vec();
-    let (height, width) = common_size(&headers)?;
+    let (height, width, channels) = common_form(&headers)?;
     limits.check_shape(Format::Exr, headers.len() as u64, height as u64, width as u64)?;
-    let mut stack = Array3::zeros((headers.len(), height, width));
+    let count = channels.count();
+    let mut stack = Array3::zeros((headers.len(), height, width * count));
     let mut blocks = reader.all_chunks(strict).map_err(error)?.sequential_decompressor(strict);
     while let Some(block) = blocks.decompress_next_block() {
         let block = block.map_err(error)?;
         let (samples, _) = block.data.as_chunks::<4>();
-        let start = block.index.pixel_position.1 * width;
+        let first = block.index.pixel_position.1;
         let mut frame = stack.index_axis_mut(ndarray::Axis(0), block.index.layer);
-        for (pixel, sample) in frame.iter_mut().skip(start).zip(samples) {
-            *pixel = f32::from_ne_bytes(*sample);
+        // Of each row one channel after the other.
+        for (index, line) in samples.chunks(width).enumerate() {
+            let (row, channel) = (first + index / count, names(channels)[index % count].1);
+            let pixels = frame.row_mut(row).into_iter().skip(channel).step_by(count);
+            for (pixel, sample) in pixels.zip(line) {
+                *pixel = f32::from_ne_bytes(*sample);
+            }
         }
     }
     Ok((headers.iter().map(part).collect(), stack))
 }
 
-fn common_size(headers: &[Header]) -> Result<(usize, usize)> {
-    let mut sizes = headers.iter().map(|header| {
-        let channel = header.channels.list.first();
-        let only_y = header.channels.list.len() == 1
-            && channel.is_some_and(|c| c.name.eq(CHANNEL) && c.sample_type == SampleType::F32);
+/// Rows, columns and channels.
+fn common_form(headers: &[Header]) -> Result<(usize, usize, Channels)> {
+    let channels_of = |header: &Header| {
+        let found = &header.channels.list;
+        let fits = |channels: &Channels| {
+            let mut pairs = found.iter().zip(names(*channels));
+            found.len() == channels.count()
+                && pairs.all(|(c, (name, _))| c.name.eq(name) && c.sample_type == SampleType::F32)
+        };
+        [Channels::Grey, Channels::Rgb].into_iter().find(fits)
+    };
+    let mut forms = headers.iter().map(|header| {
         let scan_lines = matches!(header.blocks, ::exr::meta::BlockDescription::ScanLines);
-        (only_y && scan_lines).then_some((header.layer_size.1, header.layer_size.0))
+        let channels = channels_of(header).filter(|_| scan_lines)?;
+        Some((header.layer_size.1, header.layer_size.0, channels))
     });
-    match sizes.next() {
-        Some(Some(first)) if sizes.all(|size| size == Some(first)) => Ok(first),
+    match forms.next() {
+        Some(Some(first)) if forms.all(|form| form == Some(first)) => Ok(first),
         _ => Err(FormatError::Unsupported {
             format: Format::Exr,
             found: "other parts".to_owned(),
-            accepted: "parts of one size with one float32 channel Y in scan lines",
+            accepted: "parts of one size with one float32 channel Y, or R, G and B, in scan lines",
         }),
     }
 }

@@ -2,7 +2,7 @@ use ndarray::{Array2, Array3, Axis, array};
 
 use super::{Attributes, read_stack, write_frame, write_stack};
 use crate::formats::test_support::{assert_names, bits, file, ramp};
-use crate::formats::{FormatError, Limits};
+use crate::formats::{Channels, FormatError, Limits};
 
 fn awkward() -> Array3<f32> {
     let mut stack = ramp((3, 37, 21), 1 << 20).mapv(|v| (v * 0.37).sin() / 3.0);
@@ -30,7 +30,8 @@ fn attributes(k: usize) -> Attributes {
 fn a_frame_survives_bit_for_bit_with_its_attributes() {
     let stack = awkward();
     let path = tempfile::NamedTempFile::new().unwrap();
-    write_frame(path.path(), stack.index_axis(ndarray::Axis(0), 0), &attributes(3)).unwrap();
+    write_frame(path.path(), stack.index_axis(ndarray::Axis(0), 0), Channels::Grey, &attributes(3))
+        .unwrap();
     let (parts, back) = read_stack(path.path(), &Limits::default()).unwrap();
     assert_eq!(bits(&back), bits(&stack)[..1]);
     let [part] = &*parts else { panic!("one part") };
@@ -47,7 +48,7 @@ fn a_stack_survives_bit_for_bit_and_asks_for_its_frames_in_order() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let parts: Vec<_> = (0..3).map(attributes).collect();
     let mut asked = Vec::new();
-    write_stack(path.path(), 37, 21, &parts, |k| {
+    write_stack(path.path(), (37, 21), Channels::Grey, &parts, |k| {
         asked.push(k);
         Ok::<_, FormatError>(stack.index_axis(ndarray::Axis(0), k).to_owned())
     })
@@ -61,10 +62,24 @@ fn a_stack_survives_bit_for_bit_and_asks_for_its_frames_in_order() {
 }
 
 #[test]
+fn colours_survive_bit_for_bit() {
+    let stack = awkward();
+    let path = tempfile::NamedTempFile::new().unwrap();
+    let parts: Vec<_> = (0..3).map(attributes).collect();
+    write_stack(path.path(), (37, 7), Channels::Rgb, &parts, |k| {
+        Ok::<_, FormatError>(stack.index_axis(Axis(0), k).to_owned())
+    })
+    .unwrap();
+    assert_eq!(bits(&read_stack(path.path(), &Limits::default()).unwrap().1), bits(&stack));
+    write_frame(path.path(), stack.index_axis(Axis(0), 2), Channels::Rgb, &parts[2]).unwrap();
+    assert_eq!(bits(&read_stack(path.path(), &Limits::default()).unwrap().1), bits(&stack)[2..]);
+}
+
+#[test]
 fn a_view_is_written_in_its_own_order() {
     let frame = array![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]];
     let path = tempfile::NamedTempFile::new().unwrap();
-    write_frame(path.path(), frame.t(), &Attributes::default()).unwrap();
+    write_frame(path.path(), frame.t(), Channels::Grey, &Attributes::default()).unwrap();
     let (_, back) = read_stack(path.path(), &Limits::default()).unwrap();
     assert_eq!(back.index_axis(ndarray::Axis(0), 0), frame.t());
 }
@@ -73,12 +88,13 @@ fn a_view_is_written_in_its_own_order() {
 fn the_error_of_the_source_comes_through() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let parts = vec![Attributes::default(); 2];
-    let result = write_stack(path.path(), 2, 2, &parts, |k| match k {
+    let result = write_stack(path.path(), (2, 2), Channels::Grey, &parts, |k| match k {
         0 => Ok(Array2::zeros((2, 2))),
         _ => Err(FormatError::AllMasksZero { frames: 77 }),
     });
     assert!(matches!(result, Err(FormatError::AllMasksZero { frames: 77 })));
-    let result = write_stack(path.path(), 2, 2, &parts, |_| Ok(Array2::zeros((2, 3))));
+    let result =
+        write_stack(path.path(), (2, 2), Channels::Grey, &parts, |_| Ok(Array2::zeros((2, 3))));
     assert!(matches!(result, Err(FormatError::Internal(_))), "{result:?}");
 }
 
@@ -91,11 +107,13 @@ fn attributes_that_cannot_be_written_are_refused() {
     {
         let texts = names.iter().map(|n| ((*n).to_owned(), "value".to_owned())).collect();
         let attributes = Attributes { texts, ..Attributes::default() };
-        let result = write_frame(path.path(), frame.view(), &attributes);
+        let result = write_frame(path.path(), frame.view(), Channels::Grey, &attributes);
         assert!(matches!(result, Err(FormatError::Internal(_))), "{names:?}: {result:?}");
     }
     let empty = Array2::zeros((0, 2));
-    assert!(write_frame(path.path(), empty.view(), &Attributes::default()).is_err());
+    assert!(
+        write_frame(path.path(), empty.view(), Channels::Grey, &Attributes::default()).is_err()
+    );
 }
 
 #[test]
@@ -103,7 +121,7 @@ fn cut_files_are_refused() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let stack = awkward();
     let parts = vec![Attributes::default(); 3];
-    write_stack(path.path(), 37, 21, &parts, |k| {
+    write_stack(path.path(), (37, 21), Channels::Grey, &parts, |k| {
         Ok::<_, FormatError>(stack.index_axis(ndarray::Axis(0), k).to_owned())
     })
     .unwrap();
@@ -126,10 +144,11 @@ fn the_same_frames_give_the_same_bytes() {
     let files: Vec<(Vec<u8>, Vec<u8>)> = (0..4)
         .map(|_| {
             let path = folder.path().join("frame.exr");
-            write_frame(&path, frames.index_axis(Axis(0), 0), &attributes[0]).unwrap();
+            write_frame(&path, frames.index_axis(Axis(0), 0), Channels::Grey, &attributes[0])
+                .unwrap();
             let frame = std::fs::read(&path).unwrap();
             let (_, height, width) = frames.dim();
-            write_stack(&path, height, width, &attributes, |k| {
+            write_stack(&path, (height, width), Channels::Grey, &attributes, |k| {
                 Ok::<_, FormatError>(frames.index_axis(Axis(0), k).to_owned())
             })
             .unwrap();

@@ -4,9 +4,9 @@ mod header;
 mod read;
 mod write;
 
-pub(super) use read::open;
 pub use read::open_windows;
-pub use write::{stack_header, write_f32, write_image_f32, write_u16, writer};
+pub(super) use read::{open, open_colours};
+pub use write::{stack_header, write_colours, write_f32, write_image_f32, write_u16, writer};
 
 #[cfg(test)]
 mod tests;

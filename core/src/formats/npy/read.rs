@@ -6,14 +6,15 @@ use std::path::Path;
 
 use super::header::{Header, MAX_HEADER_BYTES, unsupported};
 use crate::formats::array::{self, ArrayReader, RawSamples, Restart};
-use crate::formats::axes::{Expected, Writer};
+use crate::formats::axes::{Expected, Layout, Writer};
 use crate::formats::error::Result;
 use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::{self, ByteOrder};
-use crate::formats::{Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
+use crate::formats::{Channels, Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
-/// Opens an npy stack of shape (frame, row, column), float32, little-endian and in C order, of which
-/// windows are then read: the form in which this program writes frames.
+/// Opens an npy stack of shape (frame, row, column), or (frame, row, column, 3) whose frames are then three times as
+/// wide, float32, little-endian and in C order, of which windows are then read: the form in which this program
+/// writes frames.
 /// Errors: those of reading a header, and [`FormatError::Unsupported`] for another form.
 pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {
     let mut file = File::open(path).map_err(FormatError::io("open the array"))?;
@@ -22,13 +23,15 @@ pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {
     let (header, start) = read_header(&mut file, length)?;
     let plain = (header.sample, header.order, header.fortran_order)
         == (SampleType::F32, ByteOrder::Little, false);
-    let (true, [frames, height, width]) = (plain, &*header.shape) else {
-        return Err(unsupported(format!("{} of {} dimensions", header.sample, header.shape.len())));
+    let (shape, channels) = match *header.shape {
+        [frames, height, width] if plain => ([frames, height, width], Channels::Grey),
+        [frames, height, width, 3] if plain => ([frames, height, width], Channels::Rgb),
+        _ => {
+            let found = format!("{} of {} dimensions", header.sample, header.shape.len());
+            return Err(unsupported(found));
+        }
     };
-    limits.check_shape(Format::Npy, *frames, *height, *width)?;
-    let [frames, height, width] =
-        [frames, height, width].map(|n| usize::try_from(*n).unwrap_or(usize::MAX));
-    let info = StackInfo::new(Format::Npy, SampleType::F32, frames, height, width);
+    let info = checked(shape, channels, SampleType::F32, limits)?;
     check_length(&info, length.saturating_sub(start))?;
     Ok(WindowReader::new(file, info, start))
 }
@@ -55,6 +58,36 @@ pub(in crate::formats) fn open<R: Restart>(
     check_length(&info, length.saturating_sub(start))?;
     let samples = RawSamples::new(file, start, (sample, order), format);
     Ok(ArrayReader::new(samples, info, arranged.layout))
+}
+
+/// The same of an array of shape (frame, row, column, 3) in C order; none for another shape.
+pub(in crate::formats) fn open_colours<R: Restart>(
+    mut file: R,
+    length: u64,
+    limits: &Limits,
+) -> Result<Option<ArrayReader<RawSamples<R>>>> {
+    let (Header { sample, order, fortran_order, shape }, start) = read_header(&mut file, length)?;
+    let [frames, height, width, 3] = *shape else { return Ok(None) };
+    if fortran_order {
+        return Err(unsupported("colours in Fortran order".to_owned()));
+    }
+    let info = checked([frames, height, width], Channels::Rgb, sample, limits)?;
+    check_length(&info, length.saturating_sub(start))?;
+    let samples = RawSamples::new(file, start, (sample, order), Format::Npy);
+    Ok(Some(ArrayReader::new(samples, info, Layout { interleaved: false, by_columns: false })))
+}
+
+/// A shape that is within the limits; the width is that of the rows.
+fn checked(
+    [frames, height, width]: [u64; 3],
+    channels: Channels,
+    sample: SampleType,
+    limits: &Limits,
+) -> Result<StackInfo> {
+    limits.check_shape(Format::Npy, frames, height, width)?;
+    let [frames, height, width] =
+        [frames, height, width].map(|n| usize::try_from(n).unwrap_or(usize::MAX));
+    Ok(StackInfo::new(Format::Npy, sample, frames, height, width * channels.count()))
 }
 
 /// The header and the offset of the first sample.

@@ -6,7 +6,7 @@ use super::write_f32;
 use crate::formats::test_support::{
     assert_names, every_order, file, open, ramp, read, read_as, refusal, sample, survive,
 };
-use crate::formats::{Axes, FormatError, Limits, SampleType, open_stack, read_stack};
+use crate::formats::{Axes, Channels, FormatError, Limits, SampleType, open_stack, read_stack};
 
 /// An npy file of version 1.0 with this dictionary.
 fn npy(dictionary: &str, data: &[u8]) -> Vec<u8> {
@@ -209,11 +209,11 @@ fn what_is_written_is_read_by_another_library() {
 
 #[test]
 fn a_writer_refuses_frames_that_do_not_fit() {
-    let mut writer = super::writer(Vec::new(), 1, 2, 2).unwrap();
+    let mut writer = super::writer(Vec::new(), (1, 2, 2), Channels::Grey).unwrap();
     assert!(writer.write_frame(Array2::zeros((2, 3)).view()).is_err());
     writer.write_frame(Array2::zeros((2, 2)).view()).unwrap();
     assert!(writer.write_frame(Array2::zeros((2, 2)).view()).is_err());
-    let unfinished = super::writer(Vec::new(), 1, 2, 2).unwrap();
+    let unfinished = super::writer(Vec::new(), (1, 2, 2), Channels::Grey).unwrap();
     assert!(matches!(unfinished.finish(), Err(FormatError::Internal(_))));
 }
 

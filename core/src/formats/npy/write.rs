@@ -6,34 +6,52 @@ use std::path::Path;
 
 use ndarray::{Array2, ArrayView2, ArrayView3};
 
-use crate::formats::FormatError;
 use crate::formats::error::Result;
 use crate::formats::format::NPY_MAGIC;
 use crate::formats::samples::StackWriter;
+use crate::formats::{Channels, FormatError};
 
-/// The bytes before the frames of an npy file of shape (frame, row, column), little-endian float32.
-pub fn stack_header(frames: usize, height: usize, width: usize) -> Vec<u8> {
-    header(&format!("({frames}, {height}, {width})"))
+/// The bytes before the frames of an npy file of shape (frame, row, column) or, of colours, (frame, row, column,
+/// 3), little-endian float32.
+pub fn stack_header((frames, height, width): (usize, usize, usize), channels: Channels) -> Vec<u8> {
+    header(&match channels {
+        Channels::Grey => format!("({frames}, {height}, {width})"),
+        Channels::Rgb => format!("({frames}, {height}, {width}, {})", channels.count()),
+    })
 }
 
-/// Writes the header of an npy file of shape (frame, row, column), little-endian float32; the frames
-/// come next. `to` should be buffered.
+/// Writes the header of an npy file of this shape (frame, row, column) and, of colours, a fourth axis, little-endian
+/// float32; the frames come next. `to` should be buffered.
 pub fn writer<W: Write>(
     mut to: W,
-    frames: usize,
-    height: usize,
-    width: usize,
+    (frames, height, width): (usize, usize, usize),
+    channels: Channels,
 ) -> Result<StackWriter<W>> {
-    to.write_all(&stack_header(frames, height, width))
+    to.write_all(&stack_header((frames, height, width), channels))
         .map_err(FormatError::io("write the npy header"))?;
-    Ok(StackWriter::new(to, frames, height, width))
+    Ok(StackWriter::new(to, frames, height, width * channels.count()))
 }
 
 /// Writes (or overwrites) the file `path` with `stack`, axes (frame, row, column).
 pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<()> {
-    let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
+    write_all(path, stack, stack.dim(), Channels::Grey)
+}
+
+/// Writes (or overwrites) the file `path` with frames of colours \[frame, row, 3 column\]: axes (frame, row, column,
+/// 3).
+pub fn write_colours(path: &Path, stack: ArrayView3<'_, f32>) -> Result<()> {
     let (frames, height, width) = stack.dim();
-    let mut writer = writer(BufWriter::new(file), frames, height, width)?;
+    write_all(path, stack, (frames, height, width / Channels::Rgb.count()), Channels::Rgb)
+}
+
+fn write_all(
+    path: &Path,
+    stack: ArrayView3<'_, f32>,
+    shape: (usize, usize, usize),
+    channels: Channels,
+) -> Result<()> {
+    let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
+    let mut writer = writer(BufWriter::new(file), shape, channels)?;
     for frame in stack.outer_iter() {
         writer.write_frame(frame)?;
     }
@@ -96,7 +114,7 @@ fn typed_header(sample: &str, shape: &str) -> Vec<u8> {
     text.push('\n');
     let mut bytes = NPY_MAGIC.to_vec();
     bytes.extend([1, 0]);
-    // Three numbers of at most 20 digits: far below the 65535 bytes of version 1.0.
+    // Four numbers of at most 20 digits: far below the 65535 bytes of version 1.0.
     bytes.extend((text.len() as u16).to_le_bytes());
     bytes.extend(text.as_bytes());
     bytes

@@ -9,7 +9,7 @@ use crate::formats::mat::SceneArray;
 use crate::formats::test_support::{
     assert_names, every_order, file, ramp, read_as, refusal, survive,
 };
-use crate::formats::{Format, FormatError, Limits, Wanted, collect, npy, open_array};
+use crate::formats::{Channels, Format, FormatError, Limits, Wanted, collect, npy, open_array};
 
 /// The options of stored and of deflated members.
 fn options() -> [SimpleFileOptions; 2] {
@@ -31,7 +31,7 @@ pub(in crate::formats) fn archive(
 
 fn array(stack: &Array3<f32>) -> Vec<u8> {
     let (frames, height, width) = stack.dim();
-    let mut writer = npy::writer(Vec::new(), frames, height, width).unwrap();
+    let mut writer = npy::writer(Vec::new(), (frames, height, width), Channels::Grey).unwrap();
     stack.outer_iter().for_each(|frame| writer.write_frame(frame).unwrap());
     writer.finish().unwrap()
 }

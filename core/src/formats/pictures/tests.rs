@@ -7,11 +7,14 @@ use crate::formats::npz::tests::archive;
 use crate::formats::test_support::{
     assert_names, file, ramp, read, read_as, refusal, sample, survive,
 };
-use crate::formats::{Axes, Format, Limits, SampleType, open_stack, png};
+use crate::formats::{Axes, Channels, Format, Limits, SampleType, open_stack, png};
 
 /// The frames as PNG pictures of 8 bits.
 fn pictures(stack: &Array3<f32>) -> Vec<Vec<u8>> {
-    stack.outer_iter().map(|frame| png::encode_u8(frame, 0.0, 255.0).unwrap()).collect()
+    stack
+        .outer_iter()
+        .map(|frame| png::encode_u8(frame, Channels::Grey, 0.0, 255.0).unwrap())
+        .collect()
 }
 
 fn zipped(members: &[(&str, Vec<u8>)]) -> Vec<u8> {

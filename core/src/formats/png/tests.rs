@@ -4,7 +4,7 @@ use proptest::prelude::{any, proptest};
 
 use super::{encode_u16, write_u16};
 use crate::formats::test_support::{assert_names, open, ramp, read, refusal, survive};
-use crate::formats::{FormatError, Limits, SampleType, read_stack};
+use crate::formats::{Channels, FormatError, Limits, SampleType, read_stack};
 
 fn png(color: ColorType, depth: BitDepth, width: u32, height: u32, data: &[u8]) -> Vec<u8> {
     let mut bytes = Vec::new();
@@ -21,7 +21,7 @@ fn png(color: ColorType, depth: BitDepth, width: u32, height: u32, data: &[u8]) 
 fn sixteen(height: usize, width: usize) -> Vec<u8> {
     let frame = ramp((1, height, width), 65536);
     let mut bytes = Vec::new();
-    encode_u16(&mut bytes, frame.slice(s![0, .., ..]), 0.0, 65535.0).unwrap();
+    encode_u16(&mut bytes, frame.slice(s![0, .., ..]), Channels::Grey, (0.0, 65535.0)).unwrap();
     bytes
 }
 
@@ -51,11 +51,11 @@ fn grey_of_eight_and_sixteen_bit_is_read_as_stored() {
 fn levels_are_stretched_and_clipped() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let frame = array![[-1.0, 0.0, 0.25], [0.5, 9.0, f32::NAN]];
-    write_u16(path.path(), frame.view(), 0.0, 0.5).unwrap();
+    write_u16(path.path(), frame.view(), Channels::Grey, 0.0, 0.5).unwrap();
     let (_, stack) = read_stack(path.path(), &Limits::default()).unwrap();
     assert_eq!(stack, array![[[0.0, 0.0, 32768.0], [65535.0, 65535.0, 0.0]]]);
     for (black, white) in [(1.0, 1.0), (2.0, 1.0), (0.0, f32::NAN), (f32::NEG_INFINITY, 0.0)] {
-        let error = write_u16(path.path(), frame.view(), black, white).unwrap_err();
+        let error = write_u16(path.path(), frame.view(), Channels::Grey, black, white).unwrap_err();
         assert!(matches!(error, FormatError::Internal(_)), "{error}");
     }
 }
