@@ -107,7 +107,7 @@ class Client:
 
         `array` is their name in a file of several arrays.
         """
-        given = {"full_scale": full_scale, "array": array, "axes": axes, "mosaic": mosaic, "name": name}
+        given: Record = {"full_scale": full_scale, "array": array, "axes": axes, "mosaic": mosaic, "name": name}
         record = self._create("calibrations", masks=self.upload(masks), **given)
         return Calibration(self, record).ready()
 
