@@ -1,5 +1,7 @@
 // What a person does with the dashboard, step by step.
 
+import { scene as drawn } from "./scene.mjs";
+
 export const HOSTILE = "<img src=x onerror=alert(1)>";
 
 const state = (page, name) => page.waitForSelector(`.head .badge.${name}`, { timeout: 120_000 });
@@ -26,6 +28,9 @@ export async function submit(page, checks, scene, small) {
   await page.click(".askscale >> text=255 means 1");
   await page.waitForSelector("text=The calibration is taken.");
   checks.that((await page.$(".askscale")) === null, "the full scale is asked for, and the file need not come again");
+  await drop(page, masks, "cube.npy", drawn(40, 48, 56).masks);
+  await page.click(".askscale >> text=frame, row, column");
+  await page.waitForSelector(".step:nth-child(1) .verdict:has-text('40 of 48 × 56')");
   await page.fill("#calibration-name", "bench 3");
   await drop(page, masks, "masks.npy", scene.masks);
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('960')");

@@ -81,7 +81,19 @@ export function askScale(again) {
     h("div", { class: "row" }, SCALES.map((scale) => h("button", { type: "button", class: "small", onclick: () => again(scale) }, `${scale} means 1`)), other, use));
 }
 
-/** Whether a refusal is about the full scale. */
-export function scaleInDoubt(error) {
-  return ["above_full_scale", "invalid_full_scale"].includes(error.reason) || (error.errors ?? []).some((item) => item.pointer === "/full_scale");
+/** The orders of an array's axes, in words. */
+const ORDERS = { "frame-row-column": "frame, row, column", "row-column-frame": "row, column, frame", "column-row-frame": "column, row, frame" };
+
+/** Asks for the order of the axes, of those that a refusal says fit. */
+function askAxes(error, again) {
+  const fit = Object.entries(ORDERS).filter(([name]) => error.message.includes(name));
+  return h("div", { class: "askscale", role: "group", "aria-label": "Axes" }, h("p", null, h("b", null, "In which order are the axes of the array?")),
+    h("div", { class: "row" }, fit.map(([name, words]) => h("button", { type: "button", class: "small", onclick: () => again(name) }, words))));
+}
+
+/** Asks for what a refusal leaves in doubt, beside what was stated; null where nothing can be stated. `again` gets all of it. */
+export function askAbout(error, stated, again) {
+  if (error.reason === "axes_ambiguous") return askAxes(error, (axes) => again({ ...stated, axes }));
+  const scale = ["above_full_scale", "invalid_full_scale"].includes(error.reason) || (error.errors ?? []).some((item) => item.pointer === "/full_scale");
+  return scale ? askScale((full_scale) => again({ ...stated, full_scale })) : null;
 }

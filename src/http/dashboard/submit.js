@@ -1,7 +1,7 @@
 // A new job in three steps: masks or captures, the measurement, the reconstruction with what it will take.
 
 import { announce, calmly, facts, h, put, say } from "./dom.js";
-import { askScale, dropZone, problem, scaleInDoubt } from "./drop.js";
+import { askAbout, askScale, dropZone, problem } from "./drop.js";
 import { bytes, duration, figure } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings } from "./report.js";
@@ -86,24 +86,25 @@ function old(known, wanted, use, signal) {
 }
 
 function masks(told, sensor, use, verdict, signal) {
-  // The file that was dropped last, and the full scale that was chosen for it.
+  // The file that was dropped last, and what was stated of it: its full scale, its axes.
   let last = null;
-  const make = async (sha256, scale) => {
-    last = [sha256, scale];
+  const make = async (sha256, stated) => {
+    last = [sha256, stated];
     use(null);
     put(verdict);
     try {
-      const made = await send("POST", "/v1/calibrations", { masks: sha256, ...told(), ...given({ full_scale: scale }) });
+      const made = await send("POST", "/v1/calibrations", { masks: sha256, ...told(), ...stated });
       put(verdict, taken(made));
       use(made);
     } catch (error) {
-      if (!scaleInDoubt(error)) throw error;
-      put(verdict, problem(error), askScale((next) => make(sha256, next).catch((later) => put(verdict, problem(later)))));
+      const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));
+      if (!question) throw error;
+      put(verdict, problem(error), question);
     }
   };
   // What is stated later goes with the same file.
   sensor.addEventListener("change", () => last && make(...last).catch((error) => put(verdict, problem(error))));
-  const drop = dropZone("masks", "Calibration set", `one mask a frame: ${HINT}`, signal, (blob) => make(blob.sha256, null));
+  const drop = dropZone("masks", "Calibration set", `one mask a frame: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
   return { element: drop.element };
 }
 
@@ -166,19 +167,19 @@ function measurementStep(form, changed, signal) {
     darks.splice(0, darks.length, ...next);
     say(darkList, darks.length ? `Subtracted is the average of ${darks.map((dark) => dark.name).join(", ")}.` : "");
     forget.hidden = darks.length === 0;
-    if (last) make(last, scaled).catch((error) => put(verdict, problem(error)));
+    if (last) make(last, known).catch((error) => put(verdict, problem(error)));
   };
-  // The file that was dropped last, the full scale that was chosen for it, and which attempt counts.
-  let [last, scaled, turn] = [null, null, 0];
-  const make = async (sha256, scale = null) => {
+  // The file that was dropped last, what was stated of it (its full scale, its axes), and which attempt counts.
+  let [last, known, turn] = [null, {}, 0];
+  const make = async (sha256, stated = {}) => {
     turn += 1;
     const mine = turn;
     form.measurement = null;
     changed();
     put(verdict);
-    const body = { name: name.value(), full_scale: scale, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
+    const body = { name: name.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
     const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
-    [last, scaled] = [sha256, scale];
+    [last, known] = [sha256, stated];
     try {
       const made = await send("POST", "/v1/measurements", { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) });
       // Something else was chosen meanwhile.
@@ -186,20 +187,21 @@ function measurementStep(form, changed, signal) {
       form.measurement = made;
     } catch (error) {
       if (mine !== turn) return;
-      if (!scaleInDoubt(error)) {
+      const question = askAbout(error, stated, again);
+      if (!question) {
         last = null;
         throw error;
       }
-      put(verdict, problem(error), askScale(again));
+      put(verdict, problem(error), question);
       return;
     }
-    const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale(again);
+    const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale((full_scale) => again({ ...stated, full_scale }));
     put(verdict, fits(form.measurement), doubt);
     changed();
   };
   // What is stated later goes with the same file: it need not be dropped again.
   for (const input of [fps.input, exposure.input, sequence]) {
-    input.addEventListener("change", () => last && make(last, scaled).catch((error) => put(verdict, problem(error))));
+    input.addEventListener("change", () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
   const dark = dropZone("darks", "Dark captures", "Optional: with the LCoS all black, at the same exposure", signal, async (blob, file) => {
