@@ -1,15 +1,16 @@
 #![no_main]
 
-use sci_recon_core::job::{CalibrationId, JobRequest, SceneShape, without_paths};
+use sci_recon_core::job::{CalibrationId, JobRequest, Mosaic, SceneShape, Sequence, without_paths};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     if let Ok(text) = std::str::from_utf8(bytes) {
         let _ = without_paths(text);
     }
     let Ok(request) = serde_json::from_slice::<JobRequest>(bytes) else { return };
-    let shape = SceneShape { frames: 8, height: 512, width: 512, snapshots: 3 };
+    let mosaic = (bytes.len() % 2 == 0).then_some(Mosaic::Rggb);
+    let shape = SceneShape { frames: 8, height: 512, width: 512, snapshots: 3, mosaic };
     // What is accepted can be planned.
-    if let Ok(spec) = request.resolve(CalibrationId::new(), shape, None) {
+    if let Ok(spec) = request.resolve(CalibrationId::new(), shape, Sequence::Contiguous, None) {
         assert!(spec.tile_plan().is_ok());
         assert!(spec.disk_bytes() > 0 && spec.worker_bytes() > 0);
     }
