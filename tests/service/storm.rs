@@ -192,9 +192,10 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
                 // Now and then it is let be, and something else is killed.
                 let pid = if round % 12 == 4 { child.id() } else { target.unwrap_or(app.pid()) };
                 kill_later(pid, pause / 4).await.unwrap();
-                let good = child.wait().unwrap().success();
-                assert_eq!(good, out.exists(), "a copy is there if and only if it is whole");
-                if good {
+                let ended = child.wait().unwrap().success();
+                assert!(out.exists() || !ended, "a copy that was reported is there");
+                // What has its name is whole, also if the program was killed before it could say so.
+                if out.exists() {
                     ledger.copies.push(out);
                 }
             }
