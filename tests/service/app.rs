@@ -256,6 +256,15 @@ impl TestApp {
     }
 }
 
+/// Python with the readers and clients of the tests; none, and a word on it, where there is none.
+pub fn judges() -> Option<String> {
+    let python = std::env::var("SCI_RECON_JUDGES").ok();
+    if python.is_none() {
+        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
+    }
+    python
+}
+
 /// The identifier in an answer.
 pub fn id(answer: &Answer) -> String {
     answer.json()["id"].as_str().unwrap().to_owned()

@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering;
 
 use serde_json::Value;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, judges};
 use crate::resumable::cutting;
 use crate::samples::Scene;
 
@@ -29,10 +29,7 @@ async fn over_cuts(app: &TestApp, mut client: tokio::process::Command) -> Value 
 
 #[tokio::test]
 async fn python_makes_the_round_trip_over_connections_that_are_cut() {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return;
-    };
+    let Some(python) = judges() else { return };
     let app = TestApp::with(&["--workers", "1"]).await;
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene { frames: 8, height: 384, width: 384, snapshots: 2 };

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use serde_json::{Value, json};
 
-use crate::app::{Answer, TestApp, id};
+use crate::app::{Answer, TestApp, id, judges};
 #[cfg(feature = "nats")]
 use crate::cluster::nodes::{Nats, RemoteWorker};
 use crate::faults::results_of;
@@ -114,10 +114,7 @@ fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
 
 /// The officials' reader of EXR on all files of a snapshot.
 fn judge_exr(folder: &Path) {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return;
-    };
+    let Some(python) = judges() else { return };
     let mut judge = Command::new(python);
     judge.arg("tests/judges/read_exr.py").arg(folder).args(["--attribute", "demosaicking"]);
     let output = judge.output().unwrap();

@@ -3,7 +3,7 @@
 use reqwest::Method;
 use serde_json::{Value, json};
 
-use crate::app::{TestApp, id};
+use crate::app::{TestApp, id, judges};
 use crate::samples::Scene;
 
 /// A job of two snapshots that has succeeded: 50 snapshots a second, exposed for 16 ms.
@@ -20,10 +20,7 @@ async fn done(app: &TestApp) -> String {
 
 #[tokio::test]
 async fn other_programs_read_all_exports_bit_for_bit() {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return;
-    };
+    let Some(python) = judges() else { return };
     let app = TestApp::with(&["--workers", "1"]).await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);

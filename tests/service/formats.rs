@@ -11,7 +11,7 @@ use sci_recon::intake::Source;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use crate::app::{Answer, TestApp, id};
+use crate::app::{Answer, TestApp, id, judges};
 
 /// A row of a table: its first cell, and the command in it, if there is one.
 type Row = (String, Option<String>);
@@ -59,12 +59,7 @@ struct Judge {
 impl Judge {
     /// Has all files written; none without Python.
     async fn new() -> Option<(Self, Vec<Written>)> {
-        let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-            eprintln!(
-                "SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt"
-            );
-            return None;
-        };
+        let python = judges()?;
         let folder = tempfile::tempdir().unwrap();
         run(Command::new(&python).arg("tests/judges/written_files.py").arg(folder.path()));
         let index = std::fs::read(folder.path().join("index.json")).unwrap();

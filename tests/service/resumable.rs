@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::app::{Answer, TestApp};
+use crate::app::{Answer, TestApp, judges};
 use crate::faults::{kills, sha256};
 
 const ABC: &str = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
@@ -213,10 +213,7 @@ async fn pump(mut from: impl AsyncRead + Unpin, mut to: impl AsyncWrite + Unpin,
 
 #[tokio::test]
 async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return;
-    };
+    let Some(python) = judges() else { return };
     let app = TestApp::start().await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
@@ -244,10 +241,7 @@ async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
 
 #[tokio::test]
 async fn the_python_of_the_documentation_uploads_a_file() {
-    let Ok(python) = std::env::var("SCI_RECON_JUDGES") else {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
-        return;
-    };
+    let Some(python) = judges() else { return };
     let app = TestApp::start().await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
