@@ -222,8 +222,10 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
         }
         // A process that is dying may still be taken for a living one.
         tokio::time::sleep(Duration::from_millis(20)).await;
-        if !app.lives() {
-            app.restart();
+        while answer(app.request(Method::GET, "/livez")).await.is_none() {
+            if !app.lives() {
+                app.restart();
+            }
         }
     }
 
