@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release install dist demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -38,10 +38,14 @@ serve: runtime ## the service on 127.0.0.1:8080, data in ./data
 # What `sci-recon --version` says: the version, and the commit that it is built from.
 PACKAGE := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 COMMIT := $(shell git describe --always --dirty --exclude '*' 2>/dev/null)
+VERSION := $(PACKAGE)$(if $(COMMIT), ($(COMMIT)))
 PROGRAM := $${CARGO_TARGET_DIR:-target}/release/sci-recon
 PREFIX ?= /usr/local
 release: runtime
-	SCI_RECON_VERSION="$(PACKAGE)$(if $(COMMIT), ($(COMMIT)))" $(CARGO) build --release --locked
+	SCI_RECON_VERSION="$(VERSION)" $(CARGO) build --release --locked
+
+version: ## what `sci-recon --version` will say of a build of this commit
+	@echo "$(VERSION)"
 
 install: release ## program, library, models, unit, completions and man pages below PREFIX=/usr/local (DESTDIR for packages)
 	@scripts/install.sh "$(PROGRAM)" "$(DESTDIR)$(PREFIX)" "$(PREFIX)"
@@ -52,6 +56,9 @@ dist: release ## the same as an archive, dist/sci-recon-VERSION-x86_64-linux.tar
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
 	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
+
+dist-check: dist ## the archive in an empty root with Debian's glibc and libstdc++: first token, health, the default job; needs root
+	@tests/judges/dist.sh dist/$(ARCHIVE).tar.gz
 
 runtime: ## libonnxruntime into ./runtime, from its pinned PyPI wheel
 	@scripts/fetch-onnxruntime.sh

@@ -106,7 +106,11 @@ function record = ready(o, path, record)
     record = request(o, 'GET', [path record.id], []);
   end
   if isfield(record, 'state') && strcmp(record.state, 'failed')
-    error('sci_recon:failed', '%s', char(record.error));
+    code = 'failed';
+    if isfield(record, 'problem') && isstruct(record.problem)
+      code = record.problem.code;
+    end
+    error(['sci_recon:' code], '%s', char(record.error));
   end
 end
 

@@ -6,8 +6,8 @@ use clap::{Args, Subcommand};
 
 use super::CliError;
 use super::wait::wait;
-use crate::cluster::{Authority, Check, ClusterError, Node, configuration};
-use crate::config::NatsArguments;
+use crate::cluster::{Authority, Check, ClusterError, Node, Program, configuration};
+use crate::config::{NatsArguments, VERSION};
 use crate::job::{Pool, Timestamp};
 
 /// Sets up the NATS server for workers on other machines, makes and revokes their credentials, and says
@@ -186,7 +186,7 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
 
 fn examine(check: &CheckArguments) -> Result<(), CliError> {
     let NatsArguments { nats, nats_creds } = &check.nats;
-    let checks = wait(Check::run(nats.as_deref(), nats_creds.as_deref()))?;
+    let checks = wait(Check::run(nats.as_deref(), nats_creds.as_deref(), Program::of(VERSION)))?;
     let bad = checks.iter().filter(|check| !check.good).count();
     for Check { what, good, found } in checks {
         println!("{} {what}: {found}", if good { "ok     " } else { "missing" });

@@ -7,7 +7,7 @@ use std::thread;
 use std::time::Instant;
 
 use clap::Args;
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, ArrayView3};
 use serde::Serialize;
 
 use super::CliError;
@@ -18,7 +18,7 @@ use crate::cli::error::Result;
 use crate::formats::mat::SceneArray;
 use crate::formats::{Axes, Channels};
 use crate::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
-use crate::job::{Algorithm, Mosaic, SceneShape, Schedule, Sequence, Sha256};
+use crate::job::{Algorithm, Assessment, Mosaic, SceneShape, Schedule, Sequence, Sha256};
 use crate::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use crate::pipeline::networks::NetworkSource;
 use crate::pipeline::pilot::full_schedule;
@@ -191,11 +191,21 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
     let recipe = input.recipe(&setup, white, &solved)?;
-    let report = Report::new(&recipe, &sequence, &solved, &run, quality);
+    let expected = |snapshot| {
+        let told = solved.assessments(&sequence, snapshot, &recipe.schedule);
+        recipe.expected(snapshot, &told)
+    };
+    let expected: Vec<_> = input.snapshots().map(expected).collect();
+    let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
+    let all = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
+    report.assessment = Assessment::of_all(all);
     for (snapshot, folder) in folders {
         let tiles = solved.records(&sequence, snapshot);
-        let manifest = recipe.snapshot(snapshot, tiles, run.clone());
-        write(&folder, manifest, |k| solved.frame(&sequence, snapshot, k))?;
+        let expected = expected.get(snapshot - input.first).cloned().flatten();
+        let (assessment, error) = expected.map(|found| (found.assessment, found.error)).unzip();
+        let manifest = recipe.snapshot(snapshot, tiles, assessment, run.clone());
+        let frame = |k| solved.frame(&sequence, snapshot, k);
+        write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
     }
     report.print(arguments)
 }
@@ -352,12 +362,17 @@ impl<'a> Input<'a> {
     }
 }
 
-fn write(out: &Path, manifest: Manifest, frame: impl Fn(usize) -> Array2<f32>) -> Result<()> {
+fn write(
+    out: &Path,
+    manifest: Manifest,
+    error: Option<ArrayView3<'_, f32>>,
+    frame: impl Fn(usize) -> Array2<f32>,
+) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(failed)?;
     // A failure on the way leaves an earlier result as it was.
     let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
-    write_result(made.path(), manifest, |k| Ok(frame(k)))?;
+    write_result(made.path(), manifest, error, |k| Ok(frame(k)))?;
     Ok(replace_result(made.path(), out)?)
 }
 
@@ -371,6 +386,8 @@ struct Report {
     height: usize,
     width: usize,
     psnr_db: Option<f64>,
+    /// How good the frames are, as far as that can be told without a truth: the mean over the snapshots.
+    assessment: Option<Assessment>,
     /// Of each snapshot, where the truth is known.
     psnr_db_by_snapshot: Vec<f64>,
     ssim: Option<f64>,
@@ -411,6 +428,7 @@ impl Report {
             height,
             width,
             psnr_db: quality.as_ref().map(|quality| quality.psnr),
+            assessment: None,
             psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
             ssim: quality.as_ref().and_then(|quality| quality.ssim),
             seconds: run.seconds.unwrap_or_default(),
@@ -445,6 +463,12 @@ impl Report {
             self.denoiser_passes,
             self.stop_reason
         );
+        if let Some(told) = &self.assessment {
+            println!(
+                "expected without a truth: {:.1} dB, four times of five from {:.1} to {:.1} dB",
+                told.psnr_db, told.psnr_low_db, told.psnr_high_db
+            );
+        }
         for stage in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             println!(
                 "{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}{}",

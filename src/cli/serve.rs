@@ -14,9 +14,9 @@ use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 #[cfg(feature = "nats")]
-use crate::cluster::{Access, ClusterError, Credential, Hub, describe_metrics};
+use crate::cluster::{Access, ClusterError, Credential, Hub, Program, describe_metrics};
 #[cfg(feature = "nats")]
-use crate::config::{ClusterArguments, RemoteArguments};
+use crate::config::{ClusterArguments, RemoteArguments, VERSION};
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, listen, router};
 use crate::store::{Purpose, Store, StoreError};
@@ -108,7 +108,9 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. The API.
-    let service = router(App::new(store.clone(), settings, metrics, trouble, closing));
+    let app = App::new(store.clone(), settings, metrics, trouble, closing);
+    app.resume_checks().await?;
+    let service = router(app);
     tokio::select! {
         () = listen(listener, service, stopped(stop.clone())) => {}
         () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
@@ -173,7 +175,8 @@ async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>
     let credential = nats.nats_creds.as_deref().map(Credential::read).transpose()?;
     let access =
         Access::new(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")?;
-    Ok(Some(Hub::start(store.clone(), access, Duration::from_secs(*ack_wait))))
+    let program = Program::of(VERSION);
+    Ok(Some(Hub::start(store.clone(), access, program, Duration::from_secs(*ack_wait))))
 }
 
 /// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.

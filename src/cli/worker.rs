@@ -13,7 +13,9 @@ use super::guard::guard;
 use super::{CliError, logging};
 use crate::cli::error::Result;
 #[cfg(feature = "nats")]
-use crate::cluster::{ClusterError, Remote, RemoteSettings};
+use crate::cluster::{ClusterError, Program, Remote, RemoteSettings};
+#[cfg(feature = "nats")]
+use crate::config::VERSION;
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
 use crate::pipeline::NetworkSource;
@@ -107,6 +109,7 @@ async fn work(
 fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
     let remote = &settings.remote;
     RemoteSettings {
+        program: Program::of(VERSION),
         urls: remote.nats.nats.clone(),
         credential: remote.nats.nats_creds.clone(),
         pool: remote.pool.clone(),

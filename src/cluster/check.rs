@@ -48,13 +48,14 @@ impl Check {
         }
     }
 
-    /// Looks at all that a server needs or, with the credential of a pool, a worker of it.
+    /// Looks at all that a server needs or, with the credential of a pool, a worker of it that is this program.
     ///
     /// # Errors
     /// If no message server can be reached at all.
     pub async fn run(
         urls: Option<&str>,
         credential: Option<&Path>,
+        program: Program,
     ) -> Result<Vec<Self>, ClusterError> {
         let credential = credential.map(Credential::read).transpose()?.unwrap_or_default();
         let connection =
@@ -62,7 +63,7 @@ impl Check {
         let mut checks =
             vec![version(&connection), payload(&connection), round_trip(&connection).await];
         match credential.pool() {
-            Some(pool) => checks.extend(worker(&connection, pool).await),
+            Some(pool) => checks.extend(worker(&connection, pool, program).await),
             None => checks.extend(server(&connection).await),
         }
         Ok(checks)
@@ -188,14 +189,14 @@ async fn clocks(connection: &Connection, subject: &str) -> Check {
 }
 
 /// What a worker of a pool needs.
-async fn worker(connection: &Connection, pool: &Pool) -> Vec<Check> {
+async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<Check> {
     let worker = WorkerId::new();
     let hello = Hello {
         worker,
         host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
         pid: std::process::id(),
         device: "check".into(),
-        program: Program::this(),
+        program,
     };
     let mut checks = vec![welcome(connection, pool, &hello).await];
     let consumer = connection.pool(pool).await;

@@ -169,10 +169,10 @@ pub struct Program {
 }
 
 impl Program {
-    /// This program.
-    pub fn this() -> Self {
+    /// This program, of the version that it says of itself, with its commit.
+    pub fn of(version: &str) -> Self {
         let models = Network::ALL.map(ModelRecord::carried).to_vec();
-        Self { version: env!("CARGO_PKG_VERSION").into(), models }
+        Self { version: version.into(), models }
     }
 
     /// Why a worker with `other` can't work for this one; none if it can.
@@ -205,11 +205,13 @@ mod tests {
 
     #[test]
     fn another_version_or_another_network_is_refused_with_both() {
-        let this = Program::this();
+        let this = Program::of("0.1.0 (c51e2c3)");
         assert_eq!(this.refusal(&this), None);
-        let old = Program { version: "0.0.9".into(), ..this.clone() };
-        let refusal = this.refusal(&old).unwrap();
-        assert!(refusal.contains("0.0.9") && refusal.contains(&this.version), "{refusal}");
+        for version in ["0.0.9", "0.1.0 (e45ec33)", "0.1.0"] {
+            let other = Program { version: version.into(), ..this.clone() };
+            let refusal = this.refusal(&other).unwrap();
+            assert!(refusal.contains(version) && refusal.contains(&this.version), "{refusal}");
+        }
         let mut other = this.clone();
         other.models[0].sha256 = "ab".repeat(32);
         let refusal = this.refusal(&other).unwrap();

@@ -30,4 +30,5 @@ pub use check::Check;
 pub use configuration::Node;
 pub use connection::{Access, ClusterError, Credential};
 pub use hub::{Hub, describe_metrics};
+pub use message::Program;
 pub use remote::{Remote, RemoteSettings};

@@ -51,6 +51,8 @@ const TELL: (Duration, Duration) = (Duration::from_secs(600), Duration::from_sec
 /// What a worker on another machine is told when it starts.
 #[derive(Debug, Clone)]
 pub struct RemoteSettings {
+    /// What this worker is.
+    pub program: Program,
     /// Addresses of the message server, separated by commas; none for those of the credential.
     pub urls: Option<String>,
     /// The file with the credential; none for a server that is open to all.
@@ -164,7 +166,7 @@ impl Remote {
         let told = told.map_err(ClusterError::nats("listen to the server"))?;
         let device = settings.device;
         let hello =
-            Hello { worker, host, pid: std::process::id(), device, program: Program::this() };
+            Hello { worker, host, pid: std::process::id(), device, program: settings.program };
         let (start, mut pause) = (Instant::now(), LOOK);
         let ack_wait = loop {
             if let Some(ack_wait) = introduce(&connection, &pool, &hello).await? {

@@ -12,6 +12,7 @@ use super::events::Events;
 use super::metrics::Metrics;
 use super::model_check::Checker;
 use super::pictures::Pictures;
+use super::running::Checks;
 use super::shares::Turns;
 use crate::config::ServeArguments;
 use crate::formats::Limits;
@@ -37,6 +38,9 @@ pub struct Services {
     pub(super) admission: Admission,
     /// Each check takes a core and a frame of memory; of a lab there is one at a time.
     pub(super) intake: Turns,
+    pub(super) checks: Checks,
+    /// Ends what has no end of its own.
+    pub(super) closing: CancellationToken,
     /// When it was last tried whether files can be written, and what came of it.
     pub(super) disk_tried: Mutex<Option<(Instant, std::result::Result<(), String>)>>,
     pub(super) checker: Checker,
@@ -58,12 +62,14 @@ impl App {
         closing: CancellationToken,
     ) -> Self {
         Self(Arc::new(Services {
-            events: Events::start(store.clone(), closing),
+            events: Events::start(store.clone(), closing.clone()),
             pictures: Pictures::new(),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
             intake: Turns::new(CHECKS_AT_ONCE, CHECKS),
+            checks: Checks::default(),
+            closing,
             disk_tried: Mutex::default(),
             checker: Checker::new(settings),
             metrics,

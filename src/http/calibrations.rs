@@ -1,28 +1,34 @@
 //! `/v1/calibrations`: masks of optical settings.
 
+use std::time::Duration;
+
 use axum::Json;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use tokio_util::sync::CancellationToken;
 
-use super::access::Access;
+use super::access::{Access, Owner};
+use super::admission::Reservation;
 use super::app::App;
+use super::checks::{self, Checked, Stage, patience};
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
-use super::intake::{self, Prepared, Upload};
-use super::page::{Limit, PageBody, Renaming};
+use super::intake::{self, Desk, Prepared, Upload};
+use super::page::{Limit, PageBody, Renaming, ShowQuery};
 use crate::formats::Axes;
 use crate::formats::validate::MaskStatistics;
 use crate::intake::plan;
 use crate::job::{CalibrationId, Captures, Lab, Label, Mosaic, Sha256, Timestamp};
 use crate::store::{
-    Calibration, Filter, Inserted, Made, NewCalibration, NewCaptures, Page, RequestKey, Span,
-    Unready,
+    Calibration, Filter, Inserted, Made, NewCalibration, NewCaptures, NewCheck, Page, RequestKey,
+    Source, Span, StagedBlob, Unready,
 };
 
 /// The body of `POST /v1/calibrations`: masks, or the captures to make them of.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CalibrationRequest {
     name: Option<Label>,
@@ -64,31 +70,23 @@ pub(super) struct ListQuery {
     created_before: Option<Timestamp>,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-enum CalibrationState {
-    /// Masks are made of captures.
-    Preparing,
-    Ready,
-    /// There will be none; `error` says why.
-    Failed,
-}
-
 /// A calibration as it is shown. What is known of masks is null until they are there.
 #[derive(Debug, Serialize)]
 pub(super) struct CalibrationBody {
     id: CalibrationId,
-    state: CalibrationState,
+    state: Stage,
     /// How much of the work is done, in percent.
     percent: f64,
     error: Option<String>,
+    /// The same as the problem with which the request would have been answered.
+    problem: Option<Value>,
     created_at: Timestamp,
     name: Option<Label>,
     masks: Option<Sha256>,
     format: Option<String>,
     sample: Option<String>,
     axes: Option<String>,
-    frames: usize,
+    frames: Option<usize>,
     height: Option<usize>,
     width: Option<usize>,
     full_scale: Option<f32>,
@@ -103,16 +101,17 @@ impl From<Calibration> for CalibrationBody {
         let Calibration { id, created_at, facts, .. } = calibration;
         Self {
             id,
-            state: CalibrationState::Ready,
+            state: Stage::Ready,
             percent: 100.0,
             error: None,
+            problem: None,
             created_at,
             name: facts.name,
             masks: Some(facts.masks),
             format: Some(facts.format),
             sample: Some(facts.sample),
             axes: facts.axes,
-            frames: facts.frames,
+            frames: Some(facts.frames),
             height: Some(facts.height),
             width: Some(facts.width),
             full_scale: Some(facts.full_scale),
@@ -124,15 +123,17 @@ impl From<Calibration> for CalibrationBody {
     }
 }
 
-impl From<Unready> for CalibrationBody {
-    fn from(unready: Unready) -> Self {
-        let Unready { id, name, frames, fraction, mosaic, error, created_at } = unready;
-        let failed = error.is_some();
-        Self {
+impl TryFrom<Unready> for CalibrationBody {
+    type Error = ApiError;
+
+    fn try_from(unready: Unready) -> Result<Self> {
+        let Unready { id, name, frames, fraction, mosaic, error, problem, created_at } = unready;
+        Ok(Self {
             id,
-            state: if failed { CalibrationState::Failed } else { CalibrationState::Preparing },
+            state: Stage::unready(error.as_ref()),
             percent: (fraction * 1000.0).round() / 10.0,
             error,
+            problem: checks::problem(problem)?,
             created_at,
             name,
             masks: None,
@@ -147,7 +148,7 @@ impl From<Unready> for CalibrationBody {
             dead_pixels: None,
             clipped_negatives: None,
             mosaic,
-        }
+        })
     }
 }
 
@@ -157,53 +158,107 @@ pub(super) async fn create(
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
-    let (status, id) = created(make(&app, &access, request, key.as_ref()).await?);
+    let (status, id) =
+        created(make(&app, &access, request, key.as_ref(), patience(&headers)).await?);
     let body = body(&app, &access.lab, id).await?;
-    let made = body.state == CalibrationState::Ready;
+    let made = body.state == Stage::Ready;
     let status = if made { status } else { StatusCode::ACCEPTED };
     let location = [(header::LOCATION, format!("/v1/calibrations/{id}"))];
     Ok((status, location, Json(body)).into_response())
 }
 
-/// Makes one, or finds the one that was made with the same key.
+/// Makes one, or finds the one that was made with the same key. Waits so long for the check of ready masks.
 pub(super) async fn make(
     app: &App,
     access: &Access,
     request: CalibrationRequest,
     key: Option<&RequestKey>,
+    patience: Duration,
 ) -> Result<Inserted<CalibrationId>> {
-    let insert = insert(app, access, request, key);
+    request.is_whole()?;
+    if request.captures.is_none() {
+        return checks::made(app, access, request, key, patience).await;
+    }
+    let insert = of_captures(app, access, request, key);
     once(app, &access.lab, (Made::Calibration, key), insert).await
 }
 
-/// Makes a calibration of masks, or has one made of captures.
-async fn insert(
-    app: &App,
-    access: &Access,
-    request: CalibrationRequest,
-    key: Option<&RequestKey>,
-) -> Result<Inserted<CalibrationId>> {
-    let CalibrationRequest { name, masks, array, axes, full_scale, captures, mosaic } = request;
-    let told = (name, mosaic);
-    match (masks, captures) {
-        (Some(masks), None) => {
-            let of = Upload { array, axes, full_scale };
-            of_masks(app, access, (told, masks, of), key).await
+impl CalibrationRequest {
+    /// Refuses what does not go together.
+    fn is_whole(&self) -> Result<()> {
+        match (&self.masks, &self.captures) {
+            (Some(_), None) => Ok(()),
+            (None, Some(_)) if self.array.is_some() => {
+                Err(ApiError::field("/array", "captures are pictures, not named arrays"))
+            }
+            (None, Some(_)) if self.axes.is_some() => {
+                Err(ApiError::field("/axes", "captures are [frame, row, column]: leave axes out"))
+            }
+            (None, Some(_)) if self.full_scale.is_some() => {
+                let detail = "captures have no full scale: white and black give their masks' scale";
+                Err(ApiError::field("/full_scale", detail))
+            }
+            (None, Some(_)) => Ok(()),
+            _ => Err(ApiError::field("", "name either masks or captures, not both or none")),
         }
-        (None, Some(_)) if array.is_some() => {
-            Err(ApiError::field("/array", "captures are pictures, not named arrays"))
+    }
+
+    /// The uploaded masks.
+    fn masks(&self) -> Result<Sha256> {
+        self.masks.ok_or_else(|| ApiError::field("/masks", "name the masks"))
+    }
+}
+
+impl Checked for CalibrationRequest {
+    const WHAT: Made = Made::Calibration;
+    type Id = CalibrationId;
+    type Passed = (NewCalibration, StagedBlob, Reservation);
+
+    fn new_id() -> CalibrationId {
+        CalibrationId::new()
+    }
+
+    fn draft(&self) -> NewCheck {
+        NewCheck {
+            name: self.name.clone(),
+            calibration: None,
+            request: String::new(),
+            files: self.masks.into_iter().collect(),
         }
-        (None, Some(_)) if axes.is_some() => {
-            Err(ApiError::field("/axes", "captures are [frame, row, column]: leave axes out"))
-        }
-        (None, Some(captures)) if full_scale.is_none() => {
-            of_captures(app, access, (told, captures), key).await
-        }
-        (None, Some(_)) => {
-            let detail = "captures have no full scale: white and black give their masks' scale";
-            Err(ApiError::field("/full_scale", detail))
-        }
-        _ => Err(ApiError::field("", "name either masks or captures, not both or none")),
+    }
+
+    async fn vet(&self, app: &App, owner: &Owner) -> Result<()> {
+        let there = app.store.upload(&owner.lab, self.masks()?).await;
+        there.map_err(|error| ApiError::reference("/masks", error))?;
+        Ok(())
+    }
+
+    async fn check(
+        self,
+        app: &App,
+        owner: &Owner,
+        stop: &CancellationToken,
+    ) -> Result<Self::Passed> {
+        let masks = self.masks()?;
+        let file = intake::upload(app, masks).await.map_err(|error| error.at("/masks"))?;
+        let of = Upload { array: self.array, axes: self.axes, full_scale: self.full_scale };
+        let look = move |desk: &Desk| intake::masks(desk, &file, of);
+        let prepared = intake::run(app, owner, stop, look).await?;
+        check_mosaic(self.mosaic, (prepared.info.height, prepared.info.width))?;
+        let facts = facts((self.name, self.mosaic), masks, &prepared);
+        Ok((facts, prepared.file, prepared.room))
+    }
+
+    async fn keep(
+        app: &App,
+        owner: &Owner,
+        (facts, file, room): Self::Passed,
+        source: Source<'_, CalibrationId>,
+    ) -> Result<Inserted<CalibrationId>> {
+        let made =
+            app.store.add_calibration((&owner.lab, owner.token), facts, file, source).await?;
+        drop(room);
+        Ok(made)
     }
 }
 
@@ -222,30 +277,16 @@ fn check_mosaic(mosaic: Option<Mosaic>, (height, width): (usize, usize)) -> Resu
     Err(ApiError::field("/mosaic", &detail))
 }
 
-async fn of_masks(
-    app: &App,
-    access: &Access,
-    (told, masks, of): (Told, Sha256, Upload),
-    key: Option<&RequestKey>,
-) -> Result<Inserted<CalibrationId>> {
-    let (lab, token) = (&access.lab, access.token);
-    app.store.upload(lab, masks).await.map_err(|error| ApiError::reference("/masks", error))?;
-    let file = intake::upload(app, masks).await.map_err(|error| error.at("/masks"))?;
-    let prepared = intake::run(app, access, move |desk| intake::masks(desk, &file, of)).await?;
-    check_mosaic(told.1, (prepared.info.height, prepared.info.width))?;
-    let facts = facts(told, masks, &prepared);
-    let made = app.store.add_calibration((lab, token), facts, prepared.file, key).await?;
-    drop(prepared.room);
-    Ok(made)
-}
-
 /// Puts captures in the queue, once they look as if they could be calibrated with.
 async fn of_captures(
     app: &App,
     access: &Access,
-    ((name, mosaic), captures): (Told, Captures),
+    request: CalibrationRequest,
     key: Option<&RequestKey>,
 ) -> Result<Inserted<CalibrationId>> {
+    let CalibrationRequest { name, captures: Some(captures), mosaic, .. } = request else {
+        return Err(ApiError::field("/captures", "name the captures"));
+    };
     let (lab, token) = (&access.lab, access.token);
     captures.check().map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     for (place, upload) in captures.uploads() {
@@ -253,7 +294,7 @@ async fn of_captures(
         intake::upload(app, upload).await.map_err(|error| error.at(&place))?;
     }
     let store = app.store.clone();
-    let (captures, plan) = intake::run(app, access, move |desk| {
+    let (captures, plan) = intake::run(app, &access.owner(), &app.closing, move |desk| {
         let files = captures.map(|upload| store.dir().blob(upload));
         let plan = plan(&files, desk.limits())?;
         Ok((captures, plan))
@@ -274,7 +315,7 @@ async fn of_captures(
 
 async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody> {
     match app.store.unready(lab, id).await? {
-        Some(unready) => Ok(unready.into()),
+        Some(unready) => unready.try_into(),
         None => Ok(app.store.calibration(lab, id).await?.into()),
     }
 }
@@ -310,11 +351,15 @@ pub(super) async fn list(
     let limit = query.limit.get();
     let created = Span { from: query.created_after, before: query.created_before };
     let filter = Filter { calibration: None, created, after: query.cursor };
-    let ready = app.store.calibrations(&access.lab, filter, limit).await?;
+    // In this order: what becomes ready between the two looks is named, and once.
     let unready = app.store.all_unready(&access.lab, filter, limit).await?;
+    let ready = app.store.calibrations(&access.lab, filter, limit).await?;
     let mut items: Vec<CalibrationBody> = ready.items.into_iter().map(Into::into).collect();
-    items.extend(unready.items.into_iter().map(CalibrationBody::from));
+    for item in unready.items {
+        items.push(item.try_into()?);
+    }
     items.sort_by_key(|item| std::cmp::Reverse(item.id));
+    items.dedup_by_key(|item| item.id);
     let most = usize::try_from(limit).unwrap_or(usize::MAX);
     let more = ready.more || unready.more || items.len() > most;
     items.truncate(most);
@@ -325,8 +370,12 @@ pub(super) async fn list(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
+    QueryOf(query): QueryOf<ShowQuery>,
     headers: HeaderMap,
 ) -> Result<Response> {
+    if let Some(time) = query.wait(&app) {
+        app.events.calibrated(&app.store, &access.lab, id, time).await?;
+    }
     conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }
 
@@ -344,5 +393,6 @@ pub(super) async fn delete(
     Params(id): Params<CalibrationId>,
 ) -> Result<StatusCode> {
     app.store.delete_calibration(&access.lab, id).await?;
+    app.checks.stop(id);
     Ok(StatusCode::NO_CONTENT)
 }

@@ -7,6 +7,7 @@ use axum::Json;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use serde_json::Value;
 use strum::{EnumString, IntoStaticStr, VariantArray};
 
 use crate::formats::FormatError;
@@ -50,6 +51,7 @@ codes! {
     NotFound: StatusCode::NOT_FOUND, "There is no such thing", false;
     NotReady: StatusCode::NOT_FOUND, "It is not there yet", true;
     CalibrationNotReady: StatusCode::CONFLICT, "The masks are not there", true;
+    MeasurementNotReady: StatusCode::CONFLICT, "The measurement is not checked", true;
     MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Not with this method", false;
     UploadStalled: StatusCode::REQUEST_TIMEOUT, "The upload came to a halt", true;
     OffsetMismatch: StatusCode::CONFLICT, "The piece does not follow", false;
@@ -73,6 +75,7 @@ codes! {
     TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Enough files wait to be checked", true;
     QueueFull: StatusCode::TOO_MANY_REQUESTS, "Enough jobs wait", true;
     Internal: StatusCode::INTERNAL_SERVER_ERROR, "The service has failed", true;
+    MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "The movie can't be made", false;
     FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "The stored file is damaged", false;
     Unavailable: StatusCode::SERVICE_UNAVAILABLE, "The service can't serve this now", true;
     TimedOut: StatusCode::SERVICE_UNAVAILABLE, "The answer took too long", true;
@@ -156,6 +159,29 @@ impl ApiError {
         self
     }
 
+    pub(super) fn code(&self) -> Code {
+        self.code
+    }
+
+    /// The body of the answer.
+    pub(super) fn problem(&self) -> Value {
+        let (status, title, retryable) = self.code.row();
+        let code = self.code.into_str();
+        let problem = Problem {
+            r#type: format!("/problems/{code}"),
+            title,
+            status: status.as_u16(),
+            detail: &self.detail,
+            code,
+            retryable: retryable && self.has_hope,
+            instance: REQUEST_ID.try_with(|id| format!("urn:sci-recon:request:{id}")).ok(),
+            reason: self.reason,
+            pointer: self.errors.first().map(|error| error.pointer.as_str()),
+            errors: &self.errors,
+        };
+        serde_json::json!(problem)
+    }
+
     /// An error of ours: the log gets the cause, the user does not.
     pub fn internal(cause: &(dyn std::error::Error + 'static)) -> Self {
         tracing::error!(error = cause, "a request failed");
@@ -165,22 +191,9 @@ impl ApiError {
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
-        let (status, title, retryable) = self.code.row();
+        let (status, _, retryable) = self.code.row();
         let retryable = retryable && self.has_hope;
-        let code = self.code.into_str();
-        let problem = Problem {
-            r#type: format!("/problems/{code}"),
-            title,
-            status: status.as_u16(),
-            detail: &self.detail,
-            code,
-            retryable,
-            instance: REQUEST_ID.try_with(|id| format!("urn:sci-recon:request:{id}")).ok(),
-            reason: self.reason,
-            pointer: self.errors.first().map(|error| error.pointer.as_str()),
-            errors: &self.errors,
-        };
-        let mut response = (status, Json(problem)).into_response();
+        let mut response = (status, Json(self.problem())).into_response();
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
         if retryable && (status == StatusCode::TOO_MANY_REQUESTS || status.is_server_error()) {
@@ -201,6 +214,7 @@ impl From<StoreError> for ApiError {
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
             StoreError::Unready { .. } => Code::CalibrationNotReady,
+            StoreError::Unchecked { .. } => Code::MeasurementNotReady,
             StoreError::InUse { .. } | StoreError::FileInUse(_) => Code::InUse,
             StoreError::State(_) | StoreError::NotFinal(_) | StoreError::Ended(_) => {
                 Code::IllegalState
@@ -232,8 +246,12 @@ impl From<StoreError> for ApiError {
             | StoreError::Refused { .. }
             | StoreError::Corrupt { .. } => return Self::internal(&error),
         };
-        // A calibration that has failed will never be ready.
-        let has_hope = !matches!(error, StoreError::Unready { error: Some(_), .. });
+        // What has failed will never be ready.
+        let has_hope = !matches!(
+            error,
+            StoreError::Unready { error: Some(_), .. }
+                | StoreError::Unchecked { error: Some(_), .. }
+        );
         Self { has_hope, ..Self::new(code, error.to_string()) }
     }
 }
@@ -251,10 +269,12 @@ impl From<FormatError> for ApiError {
         if error.is_disk_full() {
             return disk_full(&error);
         }
-        if let FormatError::Io { source, .. } = &error
-            && source.kind() == ErrorKind::TimedOut
-        {
-            return too_slow();
+        if let FormatError::Io { source, .. } = &error {
+            match source.kind() {
+                ErrorKind::TimedOut => return too_slow(),
+                ErrorKind::Interrupted => return StoreError::Interrupted.into(),
+                _ => {}
+            }
         }
         if !error.is_callers_fault() {
             return Self::internal(&error);

@@ -1,4 +1,4 @@
-//! `/v1/events`: says which jobs and calibrations have changed, for those who would poll otherwise.
+//! `/v1/events`: says which jobs, calibrations and checks of measurements have changed, for those who would poll otherwise.
 //!
 //! Workers are other processes, so the server looks at the database once a second, as long as
 //! somebody listens, and compares what it sees with what it saw before.
@@ -21,8 +21,8 @@ use tokio_util::sync::CancellationToken;
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use crate::job::{CalibrationId, JobId, Lab};
-use crate::store::{CalibrationMark, JobMark, Store};
+use crate::job::{CalibrationId, JobId, Lab, MeasurementId};
+use crate::store::{CalibrationMark, CheckMark, JobMark, Store, StoreError};
 
 /// The longest time between two looks at all jobs.
 const LOOK: Duration = Duration::from_secs(1);
@@ -33,7 +33,7 @@ const LISTENERS: usize = 128;
 /// The most jobs that an event names; beyond that a list is cheaper to read again.
 const NAMED: usize = 200;
 
-/// Requests of one lab that wait for the end of a job at the same time: each holds a connection.
+/// Requests of one lab that wait for the end of something at the same time: each holds a connection.
 const WAITERS: usize = 64;
 /// What an event says that does not name all jobs.
 const MORE: &str = "\"more\":true";
@@ -55,7 +55,11 @@ type Versions<Id, Mark> = HashMap<(Lab, Id), Mark>;
 struct Told {
     jobs: HashMap<Lab, String>,
     calibrations: HashMap<Lab, String>,
+    measurements: HashMap<Lab, String>,
 }
+
+/// Which of what labs are told.
+type Kind = fn(&Told) -> &HashMap<Lab, String>;
 
 type Changes = Arc<Told>;
 
@@ -80,8 +84,7 @@ impl Events {
 }
 
 impl Events {
-    /// Waits until a job of the lab has ended, at most for `time` and until the service stops. No connection
-    /// to the database is held meanwhile: the looks that listeners need serve all who wait.
+    /// Waits until a job of the lab has ended.
     pub(super) async fn ended(
         &self,
         store: &Store,
@@ -89,16 +92,55 @@ impl Events {
         job: JobId,
         time: Duration,
     ) -> Result<()> {
+        let ended = || async { Ok(store.job_state(lab, job).await?.is_final()) };
+        self.until(lab, time, (|told| &told.jobs, job.to_string()), ended).await
+    }
+
+    /// Waits until the masks of a calibration are there, or there will be none.
+    pub(super) async fn calibrated(
+        &self,
+        store: &Store,
+        lab: &Lab,
+        id: CalibrationId,
+        time: Duration,
+    ) -> Result<()> {
+        let settled =
+            || async { Ok(store.unready(lab, id).await?.is_none_or(|it| it.error.is_some())) };
+        self.until(lab, time, (|told| &told.calibrations, id.to_string()), settled).await
+    }
+
+    /// Waits until a measurement has passed its check, or has not.
+    pub(super) async fn measured(
+        &self,
+        store: &Store,
+        lab: &Lab,
+        id: MeasurementId,
+        time: Duration,
+    ) -> Result<()> {
+        let settled = || async {
+            Ok(store.measurement_check(lab, id).await?.is_none_or(|it| it.problem.is_some()))
+        };
+        self.until(lab, time, (|told| &told.measurements, id.to_string()), settled).await
+    }
+
+    /// Waits until something of this kind and name is `settled`, at most for `time` and until the service stops. No
+    /// connection to the database is held meanwhile: the looks that listeners need serve all who wait.
+    async fn until<F: Future<Output = Result<bool>>>(
+        &self,
+        lab: &Lab,
+        time: Duration,
+        (kind, name): (Kind, String),
+        settled: impl Fn() -> F,
+    ) -> Result<()> {
         let _place = self.waiters.take(lab)?;
-        // Before the first look at the job, so that no change falls between them.
+        // Before the first look at it, so that no change falls between them.
         let mut receiver = self.sender.subscribe();
-        let name = job.to_string();
         let ended = async {
-            while !store.job_state(lab, job).await?.is_final() {
+            while !settled().await? {
                 loop {
                     match receiver.recv().await {
                         Ok(changes) => {
-                            let text = changes.jobs.get(lab);
+                            let text = kind(&changes).get(lab);
                             if text.is_some_and(|text| text.contains(&name) || text.contains(MORE))
                             {
                                 break;
@@ -119,7 +161,7 @@ impl Events {
     }
 }
 
-/// How many requests of each lab wait for the end of a job.
+/// How many requests of each lab wait for the end of something.
 #[derive(Debug, Clone, Default)]
 struct Waiters(Arc<Mutex<HashMap<Lab, usize>>>);
 
@@ -132,7 +174,7 @@ impl Waiters {
         let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let own = waiting.entry(lab.clone()).or_default();
         if *own >= WAITERS {
-            let detail = format!("{WAITERS} requests of this lab wait for jobs; ask without wait");
+            let detail = format!("{WAITERS} requests of this lab wait; ask without wait");
             return Err(ApiError::new(Code::TooManyWaiters, detail));
         }
         *own += 1;
@@ -152,9 +194,24 @@ impl Drop for Waiter {
     }
 }
 
+/// What was last seen.
+struct Marks {
+    jobs: Versions<JobId, JobMark>,
+    calibrations: Versions<CalibrationId, CalibrationMark>,
+    /// Of those that have not passed their check; it does not change what has.
+    measurements: Versions<MeasurementId, CheckMark>,
+}
+
+async fn marks(store: &Store) -> Result<Marks, StoreError> {
+    Ok(Marks {
+        jobs: store.job_marks().await?,
+        calibrations: store.calibration_marks().await?,
+        measurements: store.check_marks().await?,
+    })
+}
+
 async fn look(store: Store, sender: broadcast::Sender<Changes>) {
-    let mut before: Option<(Versions<JobId, JobMark>, Versions<CalibrationId, CalibrationMark>)> =
-        None;
+    let mut before: Option<Marks> = None;
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
@@ -173,21 +230,26 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             continue;
         }
         // A failing database shows in every other answer, too.
-        let Ok(jobs) = store.job_marks().await else { continue };
-        let Ok(calibrations) = store.calibration_marks().await else { continue };
+        let Ok(now) = marks(&store).await else { continue };
         let told = match &before {
             Some(before) => Told {
-                jobs: changes(&before.0, &jobs),
-                calibrations: changes(&before.1, &calibrations),
+                jobs: changes(&before.jobs, &now.jobs),
+                calibrations: changes(&before.calibrations, &now.calibrations),
+                measurements: moved(&before.measurements, &now.measurements),
             },
             // What changed between the greeting and this first look is not known.
-            None => Told { jobs: everything(&jobs), calibrations: everything(&calibrations) },
+            None => Told {
+                jobs: everything(&now.jobs),
+                calibrations: everything(&now.calibrations),
+                // Of every lab that can have any.
+                measurements: everything(&now.calibrations),
+            },
         };
-        if !told.jobs.is_empty() || !told.calibrations.is_empty() {
+        if !told.jobs.is_empty() || !told.calibrations.is_empty() || !told.measurements.is_empty() {
             // Fails only if the last listener has just gone.
             let _ = sender.send(told.into());
         }
-        before = Some((jobs, calibrations));
+        before = Some(now);
         tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;
     }
 }
@@ -205,6 +267,19 @@ fn changes<Id: Copy + Ord + Hash + Serialize, Mark: PartialEq>(
         changes.entry(lab).or_default().deleted.push(*id);
     }
     told(changes.into_iter().map(|(lab, change)| (lab, change.cut())))
+}
+
+/// As [`changes`], of things that leave `now` when they have come to their end: those have changed, too.
+fn moved<Id: Copy + Ord + Hash + Serialize, Mark: PartialEq>(
+    before: &Versions<Id, Mark>,
+    now: &Versions<Id, Mark>,
+) -> HashMap<Lab, String> {
+    let mut moved: HashMap<&Lab, Change<Id>> = HashMap::new();
+    let new = now.iter().filter(|(id, mark)| before.get(id) != Some(mark)).map(|(id, _)| id);
+    for (lab, id) in new.chain(before.keys().filter(|id| !now.contains_key(id))) {
+        moved.entry(lab).or_default().changed.push(*id);
+    }
+    told(moved.into_iter().map(|(lab, change)| (lab, change.cut())))
 }
 
 /// Has every lab that has such things read its list again.
@@ -279,8 +354,12 @@ impl Listener {
             };
             match received {
                 Ok(changes) => {
-                    let both = [("jobs", &changes.jobs), ("calibrations", &changes.calibrations)];
-                    for (name, told) in both {
+                    let kinds = [
+                        ("jobs", &changes.jobs),
+                        ("calibrations", &changes.calibrations),
+                        ("measurements", &changes.measurements),
+                    ];
+                    for (name, told) in kinds {
                         let text = told.get(&self.lab);
                         self.waiting
                             .extend(text.map(|text| Event::default().event(name).data(text)));

@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
 
-use super::access::Access;
+use super::access::Owner;
 use super::admission::Reservation;
 use super::app::App;
 use super::error::{ApiError, Code, Result, too_slow};
@@ -40,23 +41,31 @@ pub(super) struct Upload {
 /// For whom a check is made, where it may block.
 pub(super) struct Desk {
     app: App,
-    access: Access,
+    owner: Owner,
     runtime: Handle,
+    /// When nobody wants the check any more, or the service ends.
+    stop: CancellationToken,
     /// When the check is to give up.
     deadline: Instant,
 }
 
-/// Runs a check where it may block, when it is the lab's turn.
-/// Errors: 503 if it takes too long; it ends with its next frame then, and so does the lab's turn.
-pub(super) async fn run<T, F>(app: &App, access: &Access, check: F) -> Result<T>
+/// Runs a check where it may block, when it is the lab's turn, until `stop`.
+/// Errors: 503 if it takes too long or is stopped; it ends with its next frame then, and so does the lab's turn.
+pub(super) async fn run<T, F>(
+    app: &App,
+    owner: &Owner,
+    stop: &CancellationToken,
+    check: F,
+) -> Result<T>
 where
     T: Send + 'static,
     F: FnOnce(&Desk) -> Result<T> + Send + 'static,
 {
-    let turn = app.intake.take(&access.lab).await?;
+    let turn = stop.run_until_cancelled(app.intake.take(&owner.lab)).await;
+    let turn = turn.unwrap_or_else(|| Err(StoreError::Interrupted.into()))?;
     let (time, runtime) = (app.settings.check_time(), Handle::current());
-    let (app, access, deadline) = (app.clone(), access.clone(), Instant::now() + time);
-    let desk = Desk { app, access, runtime, deadline };
+    let (app, owner, deadline) = (app.clone(), owner.clone(), Instant::now() + time);
+    let desk = Desk { app, owner, runtime, stop: stop.clone(), deadline };
     let checked = tokio::task::spawn_blocking(move || {
         // Held until the check ends, also if the user does not wait for it.
         let _turn = turn;
@@ -77,6 +86,11 @@ impl Desk {
 
     /// Ends a check that has taken too long. Who waited for it has been told.
     fn go_on(&self) -> Result<(), FormatError> {
+        if self.stop.is_cancelled() {
+            return Err(FormatError::io("check the file to its end")(
+                ErrorKind::Interrupted.into(),
+            ));
+        }
         if Instant::now() < self.deadline {
             return Ok(());
         }
@@ -86,7 +100,7 @@ impl Desk {
     /// A prepared array to be written, if the disk has room for it, and the lab and its token may keep it.
     fn writer(&self, info: &StackInfo) -> Result<(StackWriter<BlobWriter>, Reservation)> {
         let bytes = planar::bytes(info);
-        let Access { lab, token, .. } = &self.access;
+        let Owner { lab, token } = &self.owner;
         let room = self.runtime.block_on(async {
             self.app.store.check_quota(lab, *token, bytes).await?;
             self.app.admission.reserve(bytes).await

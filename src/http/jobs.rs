@@ -1,7 +1,6 @@
 //! `/v1/jobs`: asking for a reconstruction and watching it.
 
 use std::str::FromStr;
-use std::time::Duration;
 
 use axum::Json;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
@@ -15,11 +14,11 @@ use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, idempotency_key};
-use super::page::{Limit, PageBody};
+use super::page::{Limit, PageBody, ShowQuery};
 use crate::job::{
-    Algorithm, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec, JobState, Lab,
-    Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule, Sequence, Sha256,
-    SnapshotRange, TileSpec, Timestamp, priority_error,
+    Algorithm, Assessment, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec,
+    JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule, Sequence,
+    Sha256, SnapshotRange, TileSpec, Timestamp, priority_error,
 };
 use crate::store::{
     Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob, Page, Span, StoreError,
@@ -48,6 +47,7 @@ pub(super) struct JobBody {
     created_at: Timestamp,
     started_at: Option<Timestamp>,
     finished_at: Option<Timestamp>,
+    assessment: Option<Assessment>,
     progress: JobProgress,
 }
 
@@ -80,6 +80,7 @@ impl JobBody {
             created_at: job.created_at,
             started_at: job.started_at,
             finished_at: job.finished_at,
+            assessment: job.assessment,
             progress,
         }
     }
@@ -117,35 +118,6 @@ impl FromStr for States {
             })
         };
         text.split(',').map(state).collect::<Result<_, _>>().map(Self)
-    }
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ShowQuery {
-    #[serde(default)]
-    wait: Wait,
-}
-
-/// Seconds to wait for the end of a job, on 0 to 20.
-#[derive(Debug, Clone, Copy, Default, Deserialize)]
-#[serde(try_from = "f64")]
-struct Wait(f64);
-
-impl Wait {
-    fn time(self) -> Duration {
-        Duration::from_secs_f64(self.0)
-    }
-}
-
-impl TryFrom<f64> for Wait {
-    type Error = String;
-
-    fn try_from(seconds: f64) -> Result<Self, String> {
-        if (0.0..=20.0).contains(&seconds) {
-            return Ok(Self(seconds));
-        }
-        Err(format!("wait is {seconds}; it must be from 0 to 20 seconds"))
     }
 }
 
@@ -339,10 +311,8 @@ pub(super) async fn show(
     QueryOf(query): QueryOf<ShowQuery>,
     headers: HeaderMap,
 ) -> Result<Response> {
-    if query.wait.0 > 0.0 {
-        // A proxy, or the limit on the time of answers, must not come first.
-        let longest = app.settings.request_time() / 2;
-        app.events.ended(&app.store, &access.lab, id, query.wait.time().min(longest)).await?;
+    if let Some(time) = query.wait(&app) {
+        app.events.ended(&app.store, &access.lab, id, time).await?;
     }
     conditional::json(&body(&app, &access.lab, id).await?, &headers)
 }

@@ -7,7 +7,7 @@ use super::app::App;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params};
 use crate::job::{InvalidField, Lab};
-use crate::store::{Entitlement, LabRow, LabUse, StoreError, share_error};
+use crate::store::{Entitlement, LabRow, LabUse, share_error};
 
 #[derive(Debug, Serialize)]
 pub(super) struct LabBody {
@@ -65,7 +65,7 @@ pub(super) async fn show(
     Caller(app, _): Caller,
     Params(lab): Params<String>,
 ) -> Result<Json<LabBody>> {
-    let row = find(&app, &lab).await?;
+    let row = app.store.lab(&lab).await?;
     Ok(Json(body(&app, row).await?))
 }
 
@@ -75,7 +75,7 @@ pub(super) async fn change(
     Params(lab): Params<String>,
     Body(changes): Body<Changes>,
 ) -> Result<Json<LabBody>> {
-    let lab = find(&app, &lab).await?.lab;
+    let lab = app.store.lab(&lab).await?.lab;
     let Changes { share, bytes, jobs } = changes;
     let mut errors: Vec<_> =
         share.and_then(share_error).map(|e| InvalidField::new("/share", e)).into_iter().collect();
@@ -88,14 +88,8 @@ pub(super) async fn change(
         return Err(ApiError::fields(Code::InvalidRequest, errors));
     }
     app.store.entitle(&lab, Entitlement { share, max_bytes: bytes, max_jobs: jobs }).await?;
-    let row = find(&app, lab.as_str()).await?;
+    let row = app.store.lab(lab.as_str()).await?;
     Ok(Json(body(&app, row).await?))
-}
-
-async fn find(app: &App, name: &str) -> Result<LabRow> {
-    let mut labs = app.store.labs().await?.into_iter();
-    let found = labs.find(|row| row.lab.as_str() == name);
-    found.ok_or_else(|| StoreError::NotFound { what: "lab", id: name.to_owned() }.into())
 }
 
 async fn body(app: &App, row: LabRow) -> Result<LabBody> {

@@ -1,7 +1,10 @@
-//! Pages of lists.
+//! Pages of lists, and queries that several kinds of things share.
+
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::app::App;
 use crate::job::{CalibrationId, Label, Timestamp};
 use crate::store::{Filter, Page, Span};
 
@@ -54,6 +57,39 @@ impl<Id> ListQuery<Id> {
     pub(super) fn filter(self) -> Filter<Id> {
         let created = Span { from: self.created_after, before: self.created_before };
         Filter { calibration: self.calibration, created, after: self.cursor }
+    }
+}
+
+/// The query of something that comes to an end.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ShowQuery {
+    #[serde(default)]
+    wait: Wait,
+}
+
+impl ShowQuery {
+    /// How long to wait; none for not at all.
+    pub(super) fn wait(&self, app: &App) -> Option<Duration> {
+        // A proxy, or the limit on the time of answers, must not come first.
+        let longest = app.settings.request_time() / 2;
+        (self.wait.0 > 0.0).then(|| Duration::from_secs_f64(self.wait.0).min(longest))
+    }
+}
+
+/// Seconds to wait for the end of what is shown, on 0 to 20.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(try_from = "f64")]
+struct Wait(f64);
+
+impl TryFrom<f64> for Wait {
+    type Error = String;
+
+    fn try_from(seconds: f64) -> Result<Self, String> {
+        if (0.0..=20.0).contains(&seconds) {
+            return Ok(Self(seconds));
+        }
+        Err(format!("wait is {seconds}; it must be from 0 to 20 seconds"))
     }
 }
 

@@ -76,8 +76,12 @@ fn meaning(code: Code) -> &'static str {
             "The job or the calibration has not come that far. Its state says how far it is."
         }
         Code::CalibrationNotReady => {
-            "The masks of the calibration are still being made; wait for the state ready. One that has \
+            "The masks of the calibration are still being made or checked; wait for the state ready. One that has \
              failed will never be ready: its error says why."
+        }
+        Code::MeasurementNotReady => {
+            "The measurement is still being checked; wait for the state ready. One that has failed will never \
+             be ready: its problem says why."
         }
         Code::MethodNotAllowed => "The header Allow names the methods that this address takes.",
         Code::UploadStalled => {
@@ -127,6 +131,9 @@ fn meaning(code: Code) -> &'static str {
         }
         Code::Internal => {
             "The log of the service has the cause, under the identifier of the request."
+        }
+        Code::MovieFailed => {
+            "A worker has tried three times; the detail has its reason. Asked for again, it is tried again."
         }
         Code::FileDamaged => {
             "The disk of the service has lost or changed the file; no byte of it is sent. Retry its job, and it \

@@ -46,7 +46,8 @@ pub(super) async fn show(
     let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
     let (shape, truth) = (job.spec.shape, query.truth);
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
-    let frames = intake::run(&app, &access, move |desk| {
+    let owner = access.owner();
+    let frames = intake::run(&app, &owner, &app.closing, move |desk| {
         let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *desk.limits());
         // Behind a mosaic true frames may have colours, or be as the sensor sees them.
         let colours = if shape.mosaic.is_some() { truth.open_colours()? } else { None };

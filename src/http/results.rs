@@ -12,7 +12,7 @@ use super::download::Download;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
-use crate::job::{JobId, ResultFile};
+use crate::job::{JobId, JobState, ResultFile};
 use crate::store::{Job, StoreError};
 
 #[derive(Debug, Serialize)]
@@ -45,7 +45,7 @@ pub(super) async fn snapshot(
 /// The address of a result file: the inverse of [`frame_file`] and of the routes.
 fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
     let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
-    if let "stack.exr" | "frames.npy" | "mosaic.npy" | "manifest.json" = name {
+    if let "stack.exr" | "frames.npy" | "mosaic.npy" | "error.npy" | "manifest.json" = name {
         return Some(format!("{base}/{name}"));
     }
     let (stem, kind) = name.rsplit_once('/')?.1.rsplit_once('.')?;
@@ -64,7 +64,7 @@ pub(super) async fn job_manifest(
 }
 
 /// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr`,
-/// `frames.npy` or `mosaic.npy`, as the routes have them.
+/// `frames.npy`, `mosaic.npy` or `error.npy`, as the routes have them.
 pub(super) async fn file(
     Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
@@ -130,6 +130,10 @@ async fn send(
     download.send(open, request).await
 }
 
+/// Why there is no `error.npy`.
+const NO_PREDICTION: &str =
+    "no error can be predicted for frames of this algorithm, schedule or sensor";
+
 /// A result file as it is on record, and where it lies.
 /// Errors: 404 if it is not there yet.
 pub(super) async fn result_file(
@@ -139,6 +143,11 @@ pub(super) async fn result_file(
     name: &str,
 ) -> Result<(ResultFile, PathBuf)> {
     match app.store.result_file(job, snapshot, name).await {
+        Err(StoreError::NotFound { .. })
+            if name == "error.npy" && job.state == JobState::Succeeded =>
+        {
+            Err(ApiError::new(Code::NotFound, NO_PREDICTION))
+        }
         Err(StoreError::NotFound { .. }) => {
             let detail = format!("{name} is not there yet; the job's state says how far it is");
             Err(ApiError::new(Code::NotReady, detail))
@@ -147,10 +156,11 @@ pub(super) async fn result_file(
     }
 }
 
-fn media_type(name: &str) -> &'static str {
+pub(super) fn media_type(name: &str) -> &'static str {
     match name.rsplit_once('.').map(|(_, kind)| kind) {
         Some("exr") => "image/x-exr",
         Some("png") => "image/png",
+        Some("mp4") => "video/mp4",
         Some("json") => "application/json",
         _ => "application/octet-stream",
     }
@@ -162,7 +172,7 @@ pub(super) fn attachment(job: JobId, snapshot: Option<u32>, name: &str) -> Strin
 }
 
 /// The name under which a browser saves the file: one that tells jobs and snapshots apart.
-fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String {
+pub(super) fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String {
     let file = name.rsplit('/').next().unwrap_or(name);
     let short: String =
         job.to_string().chars().rev().take(8).collect::<Vec<_>>().into_iter().rev().collect();

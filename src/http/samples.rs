@@ -47,7 +47,8 @@ pub(super) async fn create(
 ) -> Result<Response> {
     // Apart from the keys with which the lab makes such things itself.
     let key = idempotency_key(&headers)?.map(|key| format!("/v1/samples {key}"));
-    let staged = intake::run(&app, &access, |desk| simulate(desk.store())).await?;
+    let staged =
+        intake::run(&app, &access.owner(), &app.closing, |desk| simulate(desk.store())).await?;
     app.admission.check_length(&access, staged.iter().map(StagedBlob::size).sum()).await?;
     let mut files = Vec::new();
     for file in staged {
@@ -55,10 +56,12 @@ pub(super) async fn create(
     }
     let [masks, data, truth] = [files[0], files[1], files[2]];
     let request_key = |file: Sha256| key.clone().map(|key| RequestKey { key, request: file });
+    // The next step needs what this one makes.
+    let time = 2 * app.settings.check_time();
     let named = CalibrationRequest::of_masks(name(), masks);
-    let made = calibrations::make(&app, &access, named, request_key(masks).as_ref()).await?;
+    let made = calibrations::make(&app, &access, named, request_key(masks).as_ref(), time).await?;
     let named = MeasurementRequest::of_data(name(), made.id(), data);
-    let made = measurements::make(&app, &access, named, request_key(data).as_ref()).await?;
+    let made = measurements::make(&app, &access, named, request_key(data).as_ref(), time).await?;
     let job = JobRequest {
         measurement: made.id(),
         calibration: None,

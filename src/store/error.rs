@@ -56,6 +56,12 @@ pub enum StoreError {
         /// Why there will be none; none while they are made.
         error: Option<String>,
     },
+    #[error("{}", unchecked(*.id, .error.as_deref()))]
+    Unchecked {
+        id: crate::job::MeasurementId,
+        /// Why it did not pass; none while the check goes on.
+        error: Option<String>,
+    },
     #[error("the {what} is used by {users} {by}; delete those first")]
     InUse { what: &'static str, by: &'static str, users: u64 },
     #[error("a calibration, a measurement or a model needs the file {0}; delete that first")]
@@ -102,9 +108,18 @@ pub enum StoreError {
 fn unready(id: crate::job::CalibrationId, error: Option<&str>) -> String {
     match error {
         None => {
-            format!("the masks of calibration {id} are still being made; ask again in a moment")
+            format!(
+                "the masks of calibration {id} are still being made or checked; ask again in a moment"
+            )
         }
         Some(error) => format!("calibration {id} has failed: {error}"),
+    }
+}
+
+fn unchecked(id: crate::job::MeasurementId, error: Option<&str>) -> String {
+    match error {
+        None => format!("measurement {id} is still being checked; ask again in a moment"),
+        Some(error) => format!("measurement {id} has not passed its check: {error}"),
     }
 }
 

@@ -53,17 +53,18 @@ pub use integrity::Audit;
 pub use queue::{
     Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Estimate,
     Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
-    MessagePlace, Product, ProgressStage, RemoteBeat, RemoteTask, Work, WorkerEnd,
+    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
+    WorkerEnd,
 };
 pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewCaptures, NewJob};
 pub use tables::{
-    Blob, BlobRow, Calibration, CalibrationMark, Entitlement, FIRST_RESERVE, FoundPartial,
-    Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model,
-    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, RequestKey,
-    TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, Unready,
-    WorkerPlace, WorkerRow, WorkerTask, share_error,
+    Blob, BlobRow, Calibration, CalibrationMark, Check, CheckMark, Entitlement, FIRST_RESERVE,
+    FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made,
+    Measurement, Model, NewCalibration, NewCheck, NewMeasurement, NewModel, NewPartial, Origin,
+    Partial, PartialFile, RequestKey, Source, TaskCounts, TaskRecord, TaskTotals, TileHistory,
+    TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

@@ -65,7 +65,31 @@ macro_rules! sql_scalar {
     ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query_scalar($text)$(.bind($value))* };
 }
 
-pub(super) use {sql, sql_as, sql_scalar};
+/// A page of what belongs to calibrations and labs, newest first, with one more item than the page has, by `sql!`
+/// or `sql_as!`. The table is followed by WHERE and what else must hold.
+macro_rules! listed {
+    ($statement:ident, $place:expr, $lab:expr, $filter:expr, $limit:expr) => {
+        $statement!(
+            sqlx::AssertSqlSafe(format!(
+                "SELECT * FROM {} lab = ?1 AND (?2 IS NULL OR id < ?2)
+                   AND (?3 IS NULL OR calibration = ?3)
+                   AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
+                 ORDER BY id DESC LIMIT ?4",
+                $place
+            )),
+            [
+                $lab,
+                $filter.after,
+                $filter.calibration,
+                i64::from($limit) + 1,
+                $filter.created.from,
+                $filter.created.before
+            ]
+        )
+    };
+}
+
+pub(super) use {listed, sql, sql_as, sql_scalar};
 
 /// The column as a length.
 pub(super) fn number(row: &SqliteRow, column: &'static str) -> Result<usize> {

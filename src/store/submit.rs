@@ -9,6 +9,7 @@ use super::rows::{Reference, require, sql_as};
 use super::staging::StagedBlob;
 use super::tables::blobs::Origin;
 use super::tables::calibrations::{self, Asked, Calibration, NewCalibration};
+use super::tables::checks::Source;
 use super::tables::keys::{self, Inserted, Made, RequestKey};
 use super::tables::measurements::{self, Measurement, NewMeasurement};
 use super::tables::{jobs, quota};
@@ -80,25 +81,29 @@ impl Store {
     }
 
     /// Records a calibration and puts its prepared masks in place. Its report is made by a worker.
-    /// Errors: [`StoreError::KeyReused`].
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::Quota`]; [`StoreError::NotFound`] if the upload, or the
+    /// check that it comes of, is gone.
     pub async fn add_calibration(
         &self,
         (lab, token): (&Lab, Option<TokenId>),
         facts: NewCalibration,
         prepared: StagedBlob,
-        key: Option<&RequestKey>,
+        source: Source<'_, CalibrationId>,
     ) -> Result<Inserted<CalibrationId>> {
-        let calibration = Calibration {
+        let mut calibration = Calibration {
             id: CalibrationId::new(),
             prepared: prepared.sha256(),
             created_at: Timestamp::now(),
             facts,
         };
-        let (id, facts) = (calibration.id, &calibration.facts);
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, Made::Calibration, key).await? {
+        if let Some(before) = source.before(&mut transaction, lab, Made::Calibration).await? {
             return Ok(Inserted::Before(before));
         }
+        if let Some((id, at, name)) = source.promised(&mut transaction, Made::Calibration).await? {
+            (calibration.id, calibration.created_at, calibration.facts.name) = (id, at, name);
+        }
+        let (id, facts) = (calibration.id, &calibration.facts);
         require(&mut transaction, &[Reference::Blob(facts.masks)]).await?;
         quota::check(&mut transaction, lab, token, prepared.size()).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
@@ -108,7 +113,7 @@ impl Store {
         calibrations::insert_request(&mut transaction, lab, &asked).await?;
         let cost = planned_seconds(0, facts.frames, facts.height * facts.width);
         graph::insert_calibration(&mut transaction, lab, id, cost).await?;
-        keys::insert(&mut transaction, lab, Made::Calibration, key, id).await?;
+        source.settle(&mut transaction, lab, (Made::Calibration, id)).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }
@@ -136,31 +141,35 @@ impl Store {
     }
 
     /// Records a measurement and puts its prepared snapshots in place.
-    /// Errors: [`StoreError::KeyReused`].
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::Quota`]; [`StoreError::NotFound`] if the upload, the
+    /// calibration, or the check that it comes of, is gone.
     pub async fn add_measurement(
         &self,
         (lab, token): (&Lab, Option<TokenId>),
         facts: NewMeasurement,
         prepared: StagedBlob,
-        key: Option<&RequestKey>,
+        source: Source<'_, MeasurementId>,
     ) -> Result<Inserted<MeasurementId>> {
-        let measurement = Measurement {
+        let mut measurement = Measurement {
             id: MeasurementId::new(),
             prepared: prepared.sha256(),
             created_at: Timestamp::now(),
             facts,
         };
-        let facts = &measurement.facts;
-        let references = [Reference::Calibration(facts.calibration), Reference::Blob(facts.data)];
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, Made::Measurement, key).await? {
+        if let Some(before) = source.before(&mut transaction, lab, Made::Measurement).await? {
             return Ok(Inserted::Before(before));
         }
+        if let Some((id, at, name)) = source.promised(&mut transaction, Made::Measurement).await? {
+            (measurement.id, measurement.created_at, measurement.facts.name) = (id, at, name);
+        }
+        let facts = &measurement.facts;
+        let references = [Reference::Calibration(facts.calibration), Reference::Blob(facts.data)];
         require(&mut transaction, &references).await?;
         quota::check(&mut transaction, lab, token, prepared.size()).await?;
         self.publish(&mut transaction, prepared, Origin::Prepared).await?;
         measurements::insert(&mut transaction, (lab, token), &measurement).await?;
-        keys::insert(&mut transaction, lab, Made::Measurement, key, measurement.id).await?;
+        source.settle(&mut transaction, lab, (Made::Measurement, measurement.id)).await?;
         transaction.commit().await?;
         Ok(Inserted::New(measurement.id))
     }

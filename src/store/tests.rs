@@ -4,6 +4,7 @@ mod calibrations;
 mod failures;
 mod keeping;
 mod migration;
+mod movies;
 mod remote;
 mod sequences;
 mod turns;
@@ -11,12 +12,12 @@ mod turns;
 use std::io::Write;
 use std::time::Duration;
 
-use serde_json::json;
+use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::{
     ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
-    Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd, WorkerPlace,
+    Product, Purpose, Source, StagedDir, Store, StoreError, Work, WorkerEnd, WorkerPlace,
 };
 use crate::job::{
     Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sequence, Sha256,
@@ -77,7 +78,8 @@ impl Lab {
         };
         let masks = upload(b"prepared masks");
         let whose = (&local, None);
-        let calibration = store.add_calibration(whose, facts, masks, None).await.unwrap().id();
+        let calibration =
+            store.add_calibration(whose, facts, masks, Source::Request(None)).await.unwrap().id();
         let facts = NewMeasurement {
             name: None,
             calibration,
@@ -96,7 +98,8 @@ impl Lab {
             warnings: Vec::new(),
         };
         let data = upload(b"prepared data");
-        let measurement = store.add_measurement(whose, facts, data, None).await.unwrap().id();
+        let measurement =
+            store.add_measurement(whose, facts, data, Source::Request(None)).await.unwrap().id();
         let worker = WorkerId::new();
         store.worker_started(worker, 1, &WorkerPlace::default()).await.unwrap();
         let lab = Self { store, measurement, worker, _folder: folder };
@@ -180,7 +183,7 @@ impl Lab {
     fn blob(&self, content: &str) -> Product {
         let mut writer = self.store.blob_writer().unwrap();
         writer.write_all(content.as_bytes()).unwrap();
-        Product::Tile(writer.finish().unwrap())
+        Product::File(writer.finish().unwrap())
     }
 
     /// Does the task as a worker would and says what the store answered.
@@ -193,9 +196,11 @@ impl Lab {
             TaskKind::Assemble { .. } => {
                 let folder = self.store.staged_dir().unwrap();
                 std::fs::create_dir(folder.path().join("frames")).unwrap();
-                let file = file(&folder, "frames/frame_0001.exr", "pixels");
-                Product::Files(folder, vec![file])
+                let frame = file(&folder, "frames/frame_0001.exr", "pixels");
+                let array = file(&folder, "frames.npy", "pixels");
+                Product::Files(folder, vec![frame, array])
             }
+            TaskKind::Movie { snapshot } => self.blob(&format!("movie {snapshot:?}")),
             TaskKind::Calibration => Product::Calibration(Box::new(calibrations::report())),
             TaskKind::Manifest => {
                 let folder = self.store.staged_dir().unwrap();
@@ -203,7 +208,11 @@ impl Lab {
                 Product::Files(folder, vec![file])
             }
         };
-        let record = json!({"kind": task.kind.into_str()});
+        let record = match task.kind {
+            // Its record is the assessment of the job.
+            TaskKind::Manifest => Value::Null,
+            kind => json!({"kind": kind.into_str()}),
+        };
         let progress = TaskProgress { fraction: 0.5, ..TaskProgress::START };
         self.store.complete(&task.lease, Completion { progress, record, product }).await.unwrap()
     }

@@ -17,14 +17,15 @@ use crate::job::{Sha256, TaskKind, TaskProgress, WorkerId};
 use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
 use crate::pipeline::blend::StoredTile;
-use crate::pipeline::manifest::{Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
+use crate::pipeline::manifest::{CameraRecord, Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
+use crate::pipeline::movie::MovieTask;
 use crate::pipeline::networks::{ModelFile, ModelRecord};
 use crate::pipeline::pilot::full_schedule;
 use crate::pipeline::records::{PilotRecord, PreparedRecord};
 use crate::pipeline::tile::TileInput;
 use crate::store::{
-    Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, Product, StagedBlob, Store,
-    StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
+    Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, MovieWork, Product, StagedBlob,
+    Store, StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
 };
 
 /// The store, and who works for it.
@@ -64,6 +65,10 @@ impl Local {
                     Ok(TaskInput::Report(self.path(masks)))
                 }
             },
+            Work::Movie(work) => {
+                let file = self.store.staged_path().map_err(failed)?;
+                Ok(TaskInput::Movie(Box::new(movie_task(work)?), file))
+            }
         }
     }
 
@@ -73,13 +78,16 @@ impl Local {
         let folder = || self.store.staged_dir().map_err(failed);
         Ok(match kind {
             TaskKind::Prepare => TaskInput::Prepare { arrays, snapshots: spec.snapshots },
-            TaskKind::Preview { snapshot } => {
-                TaskInput::Preview { arrays, shape: spec.shape, snapshot, white: white(task)? }
-            }
+            TaskKind::Preview { snapshot } => TaskInput::Preview {
+                arrays,
+                shape: spec.shape,
+                snapshot,
+                white: white(task.prepared.as_ref())?,
+            },
             TaskKind::Pilot => TaskInput::Pilot {
                 arrays,
                 snapshots: spec.snapshots,
-                white: white(task)?,
+                white: white(task.prepared.as_ref())?,
                 schedule: spec.schedule.clone(),
                 runs: spec.sequence_plan().map_err(PipelineError::from)?,
                 mosaic: spec.shape.mosaic,
@@ -105,7 +113,9 @@ impl Local {
                 tasks: tasks(&task.records, attempt)?,
                 folder: folder()?,
             },
-            TaskKind::Calibration => return Err(not_possible(kind).into()),
+            TaskKind::Calibration | TaskKind::Movie { .. } => {
+                return Err(not_possible(kind).into());
+            }
         })
     }
 
@@ -114,7 +124,8 @@ impl Local {
         Ok(match output {
             Output::Record => Product::Record,
             Output::TileCost(share) => Product::TileCost(share),
-            Output::Stack(frames) => Product::Tile(self.staged(frames.view())?),
+            Output::Stack(frames) => Product::File(self.staged(frames.view())?),
+            Output::File(file) => Product::File(file.finish()?),
             Output::Files(folder, files) => Product::Files(folder, files),
             Output::Calibration(done) => Product::Calibration(done),
         })
@@ -178,6 +189,9 @@ impl Transport for Local {
             }
             Work::Calibration(task) => {
                 tracing::info_span!("task", calibration = %task.calibration, kind = name, task = %id)
+            }
+            Work::Movie(work) => {
+                tracing::info_span!("task", job = %work.job, kind = name, task = %id)
             }
         };
         let here = self.clone();
@@ -243,10 +257,23 @@ fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, 
     T::deserialize(record).map_err(PipelineError::record(what))
 }
 
-/// White level of the scene.
-fn white(task: &JobTask) -> Result<f32, PipelineError> {
-    let prepared = task.prepared.as_ref().unwrap_or(&Value::Null);
-    Ok(parsed::<PreparedRecord>("prepare task", prepared)?.white)
+/// White level of the scene, as the prepare task recorded it.
+fn white(prepared: Option<&Value>) -> Result<f32, PipelineError> {
+    Ok(parsed::<PreparedRecord>("prepare task", prepared.unwrap_or(&Value::Null))?.white)
+}
+
+fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
+    let MovieWork { spec, measurement, prepared, arrays, .. } = work;
+    let facts = &measurement.facts;
+    let frames = spec.shape.frames;
+    let record = CameraRecord::new((facts.camera_fps, facts.exposure_s), 0, frames);
+    let exposure = record.and_then(|record| record.frame_exposure_s(frames));
+    Ok(MovieTask {
+        shape: spec.shape,
+        white: white(prepared.as_ref())?,
+        scene_fps: exposure.map(|seconds| 1.0 / seconds),
+        clips: arrays.clone(),
+    })
 }
 
 /// What the pilot found; none before it, and for a job without one.
@@ -278,7 +305,7 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
         snapshots: first..first + runs.runs()[run].len() as u32,
         pieces: own.map(|piece| piece.start - start..piece.end - start).collect(),
         tile,
-        white: white(task)?,
+        white: white(task.prepared.as_ref())?,
         schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),
         model: task.spec.model.as_ref().map(|model| model.sha256),
     })
@@ -304,7 +331,7 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,
-            white: white(task)?,
+            white: white(task.prepared.as_ref())?,
         },
         tile_plan: spec.tile_plan()?,
         runs: spec.sequence_plan()?,

@@ -8,9 +8,10 @@ use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, 
 use crate::formats::planar::{self, Reader};
 use crate::formats::{Limits, StackInfo};
 use crate::intake::{self, Calibrated, IntakeError, Report, calibrate};
-use crate::job::{Label, Sha256, SnapshotRange, TaskProgress, TaskStage};
+use crate::job::{Assessment, Label, Sha256, SnapshotRange, TaskProgress, TaskStage};
 use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
+use crate::pipeline::assessment::TileAssessment;
 use crate::pipeline::blend::{self, StoredTile};
 use crate::pipeline::manifest::Recipe;
 use crate::pipeline::networks::{ModelFile, WarmNetworks};
@@ -22,7 +23,7 @@ use crate::pipeline::records::{
 use crate::pipeline::tile::{TileInput, reconstruct_tile, run_network};
 use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use crate::pipeline::write::{write_manifest, write_result};
-use crate::pipeline::{preview, scale};
+use crate::pipeline::{movie, preview, scale};
 use crate::recon::sequence::RunShare;
 use crate::recon::solver::Outcome;
 use crate::store::{CalibrationDone, NewCalibration, StagedBlob};
@@ -67,21 +68,35 @@ pub(super) fn perform(
             let cost = CostRecord::sum(tiles.iter().map(|tile| &tile.record.cost));
             let run = RunRecord::ended(Some(job.to_string()), cost, None);
             let records = tiles.iter().map(|tile| tile.record.tile.clone()).collect();
-            let manifest = recipe.snapshot(snapshot as usize, records, run.clone());
+            let told: Vec<_> = shares
+                .iter()
+                .map(|(share, tiles)| {
+                    let told = tiles.iter().map(|tile| tile.record.assessment.clone());
+                    (share.clone(), told.collect())
+                })
+                .collect();
+            let expected = recipe.expected(snapshot as usize, &told);
+            let assessment = expected.as_ref().map(|expected| expected.assessment.clone());
+            let error = expected.as_ref().map(|expected| expected.error.view());
+            let manifest =
+                recipe.snapshot(snapshot as usize, records, assessment.clone(), run.clone());
             let summary = manifest.content.summary.clone();
-            let files = write_result(folder.path(), manifest, |k| {
+            let files = write_result(folder.path(), manifest, error, |k| {
                 monitor.check()?;
                 monitor.reach(TaskStage::Writing, k as f64 / recipe.shape.frames as f64);
                 Ok(blend::stored_frame(&recipe.tile_plan, &shares, k)?)
             })?;
             monitor.reach(TaskStage::Writing, 1.0);
-            let record = SnapshotRecord { summary, run, files: files.clone() };
+            let record = SnapshotRecord { summary, assessment, run, files: files.clone() };
             (json(&record)?, Output::Files(folder, files))
         }
         TaskInput::Manifest { job, spec, recipe, tasks, folder } => {
+            let snapshots = tasks.snapshots.iter();
+            let of_all =
+                Assessment::of_all(snapshots.map(|(_, record)| record.assessment.as_ref()));
             let file = write_manifest(folder.path(), &recipe.job(job, &spec, tasks))?;
             monitor.reach(TaskStage::Writing, 1.0);
-            (Value::Null, Output::Files(folder, vec![file]))
+            (json(&of_all)?, Output::Files(folder, vec![file]))
         }
         TaskInput::Captures { name, files, scratch, masks } => {
             let open =
@@ -93,6 +108,10 @@ pub(super) fn perform(
             let masks = masks.finish().map_err(TransportError::from)?;
             let facts = facts(name, &made, masks.sha256());
             (Value::Null, calibration(Some((facts, masks)), made.report, monitor))
+        }
+        TaskInput::Movie(task, file) => {
+            movie::write(file.path(), &task, monitor)?;
+            (Value::Null, Output::File(file))
         }
         TaskInput::Report(masks) => {
             let masks = Reader::open(&masks, &Limits::default()).map_err(IntakeError::from)?;
@@ -196,7 +215,12 @@ fn tile(
         peak_rss_bytes: peak_rss_bytes(),
     };
     let solved = task.pieces.iter().flat_map(Clone::clone).collect();
-    Ok((TileTaskRecord { tile: TileRecord::from(&outcome), solved, cost }, outcome.frames))
+    let assessment = match task.model {
+        Some(_) => None,
+        None => TileAssessment::of(&outcome, &task.schedule),
+    };
+    let tile = TileRecord::from(&outcome);
+    Ok((TileTaskRecord { tile, solved, assessment, cost }, outcome.frames))
 }
 
 /// One run of an end-to-end network, which can't be stopped on its way.

@@ -20,6 +20,7 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::arrays::Arrays;
 use crate::pipeline::blend::StoredTile;
 use crate::pipeline::manifest::{JobTasks, Recipe};
+use crate::pipeline::movie::MovieTask;
 use crate::pipeline::networks::ModelFile;
 use crate::pipeline::tile::TileInput;
 use crate::recon::sequence::SequencePlan;
@@ -149,6 +150,8 @@ pub enum TaskInput {
     },
     /// Make a report on masks, a prepared array at this place.
     Report(PathBuf),
+    /// Make a movie, which is written to the file.
+    Movie(Box<MovieTask>, StagedPath),
 }
 
 /// A tile to be reconstructed. Arrays and models are named by their hashes, so that this can go to
@@ -184,6 +187,8 @@ pub enum Output {
     TileCost(f64),
     /// The frames \[S B,h,w\] of a tile, or \[B,h,w\] of a preview.
     Stack(Array3<f32>),
+    /// A movie.
+    File(StagedPath),
     /// Files of a result, which are on the disk, and their folder.
     Files(StagedDir, Vec<ResultFile>),
     /// The report on a calibration, and its masks if they were made of captures.

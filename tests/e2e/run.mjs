@@ -8,7 +8,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, captures, colour, compare, decided, judged, manage, network, sample, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, captures, colour, compare, decided, judged, manage, movie, network, sample, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene } from "./scene.mjs";
@@ -41,6 +41,7 @@ async function everything() {
   await service.when(tried, (job) => job.state === "succeeded", 300);
   await checks.step("judged", () => judged(page, checks, service.url, tried));
   await page.goto(`${service.url}/#/jobs/${id}`);
+  await checks.step("movie", () => movie(page, checks, [FRAMES, 720, 960]));
   await checks.step("view", () => view(page, checks, FRAMES));
   const { measurement } = await service.call("GET", `/v1/jobs/${id}`);
   const other = await service.submit({ measurement, algorithm: "gap-tv", label: "ten iterations", schedule: { stages: [{ prior: "tv", iterations: 10, tv_weight: 0.05 }] } });
@@ -54,6 +55,7 @@ async function everything() {
   await checks.look(page, "job-pilot");
   await checks.step("captures", () => captures(page, checks, small));
   await checks.step("colour", () => colour(page, checks, scene(FRAMES, 192, 256, 1, true)));
+  await checks.step("movie in colour", () => movie(page, checks, [FRAMES, 192, 256]));
   await checks.step("phone", () => phone(browser, checks, service.url, id));
   await checks.step("loading", () => loading(browser, checks, service.url));
   await service.submit(long(measurement, "long job"));

@@ -26,6 +26,8 @@ def main():
             assert difference < 0.05, f"snapshot {snapshot} does not fit its measurement: {difference}"
         stack = result.download("stack.exr", snapshot=1)
         assert stack.read_bytes()[:4] == bytes([0x76, 0x2F, 0x31, 0x01])
+        for movie in (result.movie(), result.movie(snapshot=1)):
+            assert movie.read_bytes()[4:8] == b"ftyp" and movie.parent.parent == folder / "result"
         assert not list(stack.parent.glob("*.part"))
         assert result.manifest["content"]["schedule"]
         # What the service refuses is told in its words, and not tried again.

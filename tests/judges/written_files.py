@@ -4,6 +4,7 @@
 [4, 48, 64] of 0 and 1, or snapshots [2, 48, 64] from 0 to 250.
 """
 
+import contextlib
 import gzip
 import io
 import json
@@ -15,6 +16,7 @@ import zipfile
 import h5py
 import imageio.v3 as imageio
 import numpy as np
+import OpenEXR
 import scipy.io
 import scipy.sparse
 import tifffile
@@ -40,11 +42,18 @@ def path(row, file, **asked):
 
 
 def matlab73(place, **arrays):
-    """MATLAB's layout: a block of 512 bytes before the file, axes in reverse, the class as an attribute."""
-    with h5py.File(place, "w", userblock_size=512) as file:
+    """MATLAB's layout: axes in reverse, the class as an attribute."""
+    with level73(place) as file:
         for name, (values, matlab) in arrays.items():
             dataset = file.create_dataset(name, data=np.ascontiguousarray(values.T), chunks=values.T.shape, compression="gzip")
             dataset.attrs["MATLAB_class"] = np.bytes_(matlab)
+
+
+@contextlib.contextmanager
+def level73(place):
+    """An HDF5 file behind MATLAB's block of 512 bytes."""
+    with h5py.File(place, "w", userblock_size=512) as file:
+        yield file
     with place.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64 HDF5 schema 1.00 .".ljust(116) + b"\0" * 8 + b"\0\x02IM")
 
@@ -132,6 +141,11 @@ def accepted():
         file.create_dataset("mask", data=MASKS.astype(">f4"), chunks=(1, 48, 64), compression="gzip", shuffle=True)
     with h5py.File(path(row, "a.h5", name="run/masks", axes="row-column-frame"), "w") as file:
         file.create_dataset("run/masks", data=mask.astype("<i4"), chunks=(16, 16, 2), fletcher32=True)
+    # MATLAB's h5write of [row, column, frame]: the sizes in reverse, and no class.
+    with h5py.File(path(row, "a.h5", axes="frame-column-row"), "w") as file:
+        file["mask"] = mask.astype("f8").T
+    with h5py.File(path(row, "a.h5", told="frame-column-row", measurement=True, full_scale=250), "w") as file:
+        file["meas"] = meas.astype("<u2").T
     with h5py.File(path(row, "a.h5", told="row-column-frame", measurement=True, full_scale=250), "w") as file:
         file.create_dataset("meas", data=meas.astype("<u2"), chunks=(8, 64, 1), compression="gzip")
 
@@ -166,6 +180,14 @@ def refused():
     tifffile.imwrite(path(row, "in.tif"), 255 - EIGHT, photometric="miniswhite")
     row = "a TIFF packed in another way"
     pages[0].save(path(row, "in.tif"), save_all=True, append_images=pages[1:], compression="zstd")
+    row = "TIFF pages of several sizes"
+    with tifffile.TiffWriter(path(row, "in.tif")) as file:
+        for frame in MASKS.astype("f4"):
+            file.write(frame, photometric="minisblack", contiguous=False)
+        file.write(MASKS[0, ::2, ::2].astype("f4"), photometric="minisblack")
+    row = "EXR"
+    parts = [OpenEXR.Part({}, {"Y": frame.astype("f4")}, str(k)) for k, frame in enumerate(MASKS)]
+    OpenEXR.File(parts).write(str(path(row, "in.exr")))
     row = "a GIF or BMP"
     pages[0].save(path(row, "in.gif"), save_all=True, append_images=pages[1:])
     Image.fromarray(EIGHT[0]).save(path(row, "in.gif", frames=1), "bmp")
@@ -194,6 +216,31 @@ def refused():
     scipy.io.savemat(path(row, "in.mat", frames=1), {"mask": scipy.sparse.csc_matrix(MASKS[0].astype("f8"))})
     row = "complex numbers in a `.mat`"
     scipy.io.savemat(path(row, "in.mat"), {"mask": mask.astype("c16")})
+    row = "a cell array in a `.mat`"
+    cells = np.empty((1, 4), object)
+    cells[0] = [frame.astype("f8") for frame in MASKS]
+    scipy.io.savemat(path(row, "in.mat"), {"mask": cells})
+    row = "a struct in a `.mat`"
+    scipy.io.savemat(path(row, "in.mat"), {"mask": {"data": mask, "date": "today"}})
+    row = "more than three axes in a `.mat`"
+    scipy.io.savemat(path(row, "in.mat"), {"mask": mask.reshape(48, 64, 2, 2, order="F")})
+    scipy.io.savemat(path(row, "in.mat"), {"mask": mask[:, :, None]})
+    row = "a cell array in a `.mat` of level 7.3"
+    with level73(path(row, "in.mat")) as file:
+        cells = [file.create_dataset(f"#refs#/{k}", data=frame.astype("f8").T).ref for k, frame in enumerate(MASKS)]
+        dataset = file.create_dataset("mask", data=np.array(cells, h5py.ref_dtype).reshape(4, 1))
+        dataset.attrs["MATLAB_class"] = np.bytes_("cell")
+    row = "a struct in a `.mat` of level 7.3"
+    with level73(path(row, "in.mat")) as file:
+        file.create_dataset("mask/data", data=mask.T).attrs["MATLAB_class"] = np.bytes_("double")
+        file["mask"].attrs["MATLAB_class"] = np.bytes_("struct")
+    row = "more than three axes in a `.mat` of level 7.3"
+    matlab73(path(row, "in.mat"), mask=(mask.reshape(48, 64, 2, 2, order="F"), "double"))
+    row = "more than three axes in HDF5"
+    with h5py.File(path(row, "in.h5"), "w") as file:
+        file["mask"] = MASKS.reshape(2, 2, 48, 64)
+    row = "a MATLAB file of level 4 (`save -v4`)"
+    scipy.io.savemat(path(row, "in.mat", frames=1), {"mask": MASKS[0].astype("f8")}, format="4")
     row = "HDF5 packed by a filter of its own (LZF, szip)"
     with h5py.File(path(row, "in.h5"), "w") as file:
         file.create_dataset("mask", data=MASKS, chunks=(1, 48, 64), compression="lzf")

@@ -52,5 +52,8 @@ async fn run(
     let last = app.get(&format!("/v1/jobs/{job}/snapshots/0/tiles/0/history")).await.expect(200);
     let last = last.json()["points"].as_array().unwrap().last().unwrap()[0].clone();
     assert_eq!(last, decided, "the tiles do as many iterations as the schedule says");
-    (results(app, &job).await, content)
+    let mut files = results(app, &job).await;
+    // A fixed schedule has no pilot, which knows more of the error.
+    files.retain(|name, _| !name.ends_with("error.npy"));
+    (files, content)
 }

@@ -101,6 +101,7 @@ fn a_simulated_snapshot_is_reconstructed() {
             "provider",
             "stop_reason",
             "pilot",
+            "assessment",
         ];
         expected.sort_unstable();
         assert_eq!(fields, expected);
@@ -388,6 +389,13 @@ fn the_demo_shows_what_the_service_is_for() {
     assert!(pnp["ssim"].as_f64() > tv["ssim"].as_f64(), "{report:#}");
     let frames = files.path("demo/frames/pnp-tv-fastdvdnet/snapshot_0000/frames");
     assert_eq!(std::fs::read_dir(frames).unwrap().count(), 8);
+    let page = std::fs::read_to_string(files.path("demo/report.html")).unwrap();
+    let shown: Vec<&str> =
+        page.split("src=\"").skip(1).map(|rest| rest.split('"').next().unwrap()).collect();
+    assert_eq!(shown.iter().filter(|file| file.ends_with(".mp4")).count(), 2, "{shown:?}");
+    for file in &shown {
+        assert!(files.path(&format!("demo/{file}")).is_file(), "{file}");
+    }
 }
 
 #[test]

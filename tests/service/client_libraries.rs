@@ -1,12 +1,16 @@
 //! The clients that labs write programs with, against the real service.
 
-use std::sync::atomic::Ordering;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde_json::Value;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
 
 use crate::app::{TestApp, judges};
 use crate::resumable::cutting;
-use crate::samples::Scene;
+use crate::samples::{Scene, constant};
 
 /// What a client makes of a service that is reached over connections that are cut, and how many were.
 async fn over_cuts(app: &TestApp, mut client: tokio::process::Command) -> Value {
@@ -43,6 +47,29 @@ async fn python_makes_the_round_trip_over_connections_that_are_cut() {
 }
 
 #[tokio::test]
+async fn the_notebook_runs_from_top_to_bottom() {
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let mut notebook = tokio::process::Command::new(python);
+    // A relative path would be the kernel's.
+    let clients = concat!(env!("CARGO_MANIFEST_DIR"), "/clients/python");
+    notebook.env("PYTHONPATH", format!("{clients}/src"));
+    notebook.env("SCI_RECON_URL", format!("http://{}", app.address()));
+    notebook.arg("tests/judges/run_notebook.py");
+    notebook.arg(format!("{clients}/examples/first_reconstruction.ipynb"));
+    let output = notebook.output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let text = told["printed"].as_str().unwrap();
+    let jobs = app.get("/v1/jobs").await.expect(200).json();
+    assert!(text.contains(jobs["items"][0]["id"].as_str().unwrap()), "{told}");
+    let psnr = text.split("PSNR ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
+    assert!(psnr.parse::<f64>().unwrap() > 25.0, "{told}");
+    let shown = told["kinds"].to_string();
+    assert!(shown.contains("image/png") && shown.contains("text/html"), "{told}");
+}
+
+#[tokio::test]
 async fn octave_makes_the_round_trip_over_connections_that_are_cut() {
     let mut client = tokio::process::Command::new("octave-cli");
     client.args(["--quiet", "--no-init-file", "tests/judges/octave_client.m"]);
@@ -51,4 +78,91 @@ async fn octave_makes_the_round_trip_over_connections_that_are_cut() {
         return;
     }
     over_cuts(&TestApp::with(&["--workers", "1"]).await, client).await;
+}
+
+/// Hands connections on to the service, which is asked on the way to answer before files are checked. Says how
+/// often.
+async fn hasty(service: String) -> (SocketAddr, Arc<AtomicU64>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let (address, asked) = (listener.local_addr().unwrap(), Arc::new(AtomicU64::new(0)));
+    let counter = asked.clone();
+    tokio::spawn(async move {
+        loop {
+            let (mut client, _) = listener.accept().await.unwrap();
+            let (service, asked) = (service.clone(), counter.clone());
+            tokio::spawn(async move {
+                let mut server = TcpStream::connect(&service).await.unwrap();
+                let (mut from_client, mut to_client) = client.split();
+                let (mut from_server, mut to_server) = server.split();
+                let requests = async {
+                    let mut buffer = vec![0; 64 << 10];
+                    while let Ok(count @ 1..) = from_client.read(&mut buffer).await {
+                        let head = buffer[..count].to_ascii_lowercase();
+                        let key = b"\r\nidempotency-key:";
+                        let place = head.windows(key.len()).position(|part| part == key);
+                        let (before, after) = buffer[..count].split_at(place.unwrap_or(0));
+                        let hurry: &[u8] =
+                            if place.is_some() { b"\r\nPrefer: respond-async" } else { b"" };
+                        asked.fetch_add(u64::from(place.is_some()), Ordering::Relaxed);
+                        if to_server.write_all(&[before, hurry, after].concat()).await.is_err() {
+                            return;
+                        }
+                    }
+                };
+                tokio::select! {
+                    () = requests => {}
+                    _ = tokio::io::copy(&mut from_server, &mut to_client) => {}
+                }
+            });
+        }
+    });
+    (address, asked)
+}
+
+#[tokio::test]
+async fn clients_wait_for_checks_that_outlast_their_requests() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (proxy, asked) = hasty(app.address()).await;
+    let folder = tempfile::tempdir().unwrap();
+    let scene = Scene { frames: 8, height: 96, width: 96, snapshots: 2 };
+    std::fs::write(folder.path().join("masks.npy"), scene.masks()).unwrap();
+    std::fs::write(folder.path().join("measurement.npy"), scene.snapshots()).unwrap();
+    let bright = constant(&[8, 96, 96], 3.0);
+    std::fs::write(folder.path().join("bright.npy"), bright).unwrap();
+    let url = format!("http://{proxy}");
+    let submit = async |masks: &str| {
+        let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        command.args(["submit", "measurement.npy", "--algorithm", "gap-tv", "--masks", masks]);
+        command.current_dir(folder.path()).env("SCI_RECON_URL", &url).output().await.unwrap()
+    };
+    let output = submit("masks.npy").await;
+    let (told, errors) = (output.stdout, String::from_utf8_lossy(&output.stderr).into_owned());
+    assert!(output.status.success(), "{errors}");
+    let job = String::from_utf8(told).unwrap().trim().to_owned();
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert!(asked.load(Ordering::Relaxed) >= 3, "calibration, measurement and job");
+    let output = submit("bright.npy").await;
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    assert!(
+        errors.contains("invalid_content") && errors.contains("above the full scale 1"),
+        "{errors}"
+    );
+    // The one in Python looks at all jobs there are.
+    app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
+    if let Some(python) = judges() {
+        let mut client = tokio::process::Command::new(python);
+        client.env("PYTHONPATH", "clients/python/src").env("SCI_RECON_URL", &url);
+        client.arg("tests/judges/python_client.py").arg(folder.path());
+        let output = client.output().await.unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    let mut client = tokio::process::Command::new("octave-cli");
+    client.args(["--quiet", "--no-init-file", "tests/judges/octave_client.m"]);
+    match client.env("SCI_RECON_URL", &url).output().await {
+        Ok(output) => {
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        }
+        Err(_) => eprintln!("SKIPPED: there is no octave-cli"),
+    }
 }

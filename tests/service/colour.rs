@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use crate::app::{Answer, TestApp, id, judges};
 #[cfg(feature = "nats")]
 use crate::cluster::nodes::{Nats, RemoteWorker};
+use crate::exports::judge_movies;
 use crate::faults::results_of;
 use crate::pipeline::values;
 use crate::samples::npy;
@@ -198,6 +199,7 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
     app.get(&format!("{base}/frames.zarr/c/0/0/0")).await.problem(404, "not_found");
     let chunk = app.get(&format!("{base}/frames.zarr/c/3/0/0/0")).await.expect(200).bytes;
     assert_eq!(chunk.len(), SIDE * SIDE * 3 * 4);
+    judge_movies(&app, (&job, SNAPSHOTS), &token).await;
     if let Ok(python) = std::env::var("SCI_RECON_JUDGES") {
         let mut judge = tokio::process::Command::new(python);
         judge.arg("tests/judges/read_exports.py").arg(format!("http://{}", app.address()));

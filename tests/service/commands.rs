@@ -77,16 +77,27 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     assert_eq!(calibrations["items"].as_array().unwrap().len(), 1);
 
     assert_eq!(lab.text(&["watch", &job]).await, format!("{job} succeeded"));
-    let everything = ["frames.npy,stack.exr,stack.tif,frames,png,manifest.json", "sequence.npy"];
+    let everything = [
+        "frames.npy,stack.exr,stack.tif,movie.mp4,frames,png,manifest.json",
+        "sequence.npy,sequence.mp4",
+    ];
     let line =
         ["fetch", &job, "--out", "out", "--json", "--file", everything[0], "--file", everything[1]];
     let fetched = lab.json(&line).await;
-    // The array, the stacks, the manifest, EXR and PNG of each frame of each snapshot; the manifest and the array of all.
-    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (4 + 2 * 8) + 2, "{fetched:#}");
-    for file in ["snapshot_0001/frames.npy", "snapshot_0000/png/frame_0003.png", "sequence.npy"] {
+    // The array, the stacks, the movie, the manifest, EXR and PNG of each frame of each snapshot; the manifest, the array and
+    // the movie of all.
+    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (5 + 2 * 8) + 3, "{fetched:#}");
+    for file in [
+        "snapshot_0001/frames.npy",
+        "snapshot_0000/png/frame_0003.png",
+        "snapshot_0001/movie.mp4",
+        "sequence.npy",
+        "sequence.mp4",
+    ] {
         let (place, name) = file.split_once('/').unwrap_or(("", file));
-        let path = match place {
-            "" => "sequence/frames.npy".to_owned(),
+        let path = match (place, name) {
+            ("", "sequence.npy") => "sequence/frames.npy".to_owned(),
+            ("", _) => "sequence/movie.mp4".to_owned(),
             _ => {
                 format!("snapshots/{}/{}", &place[12..], name.replace("png/frame_0003", "frames/3"))
             }

@@ -125,6 +125,17 @@ async fn a_damaged_result_is_not_served_and_is_made_again() {
     assert_eq!(results(&app, &job).await, before);
     let (good, found) = verify(app.data());
     assert!(good, "{found}");
+    // What the lab is charged with is what is there, though it was made several times.
+    let mut database = app.database().await;
+    let mut sums = async || -> (i64, i64) {
+        let sums = "SELECT (SELECT coalesce(sum(result_bytes), 0) FROM jobs),
+                           (SELECT coalesce(sum(size), 0) FROM result_files)";
+        sqlx::query_as(sums).fetch_one(&mut database).await.unwrap()
+    };
+    let (charged, there) = sums().await;
+    assert!(charged == there && there > 0, "{charged} {there}");
+    app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
+    assert_eq!(sums().await, (0, 0));
 }
 
 #[tokio::test]

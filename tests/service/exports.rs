@@ -1,9 +1,13 @@
 //! Results in the forms of other programs.
 
+use std::path::PathBuf;
+use std::time::Duration;
+
 use reqwest::Method;
 use serde_json::{Value, json};
 
-use crate::app::{TestApp, id, judges};
+use crate::app::{Answer, TestApp, id, judges};
+use crate::limits::entitle;
 use crate::samples::Scene;
 
 /// A job of two snapshots that has succeeded: 50 snapshots a second, exposed for 16 ms.
@@ -34,7 +38,7 @@ async fn other_programs_read_all_exports_bit_for_bit() {
     assert_eq!(told["intervals"]["/snapshots/1"], json!([0.004, 0.004]));
     // Between the snapshots the camera pauses.
     assert_eq!(told["intervals"]["/sequence"], json!([null, null]));
-    assert_eq!(told["members"], 2 * 11 + 1);
+    assert_eq!(told["members"], 2 * 12 + 1);
 }
 
 #[tokio::test]
@@ -95,4 +99,150 @@ async fn exports_are_there_with_the_results_and_are_cached_and_cut_like_files() 
     let cut =
         app.request(Method::GET, &format!("/v1/jobs/{job}/results.zip")).send().await.unwrap();
     assert!(cut.bytes().await.is_err(), "the archive breaks off before the damaged file");
+}
+
+/// What the movie's judge says of all movies of a job.
+pub async fn judge_movies(
+    app: &TestApp,
+    (job, snapshots): (&str, usize),
+    token: &str,
+) -> Option<Value> {
+    let mut judge = tokio::process::Command::new(judges()?);
+    judge.arg("tests/judges/read_movies.py").arg(format!("http://{}", app.address()));
+    judge.args([job, &snapshots.to_string()]).env("SCI_RECON_TOKEN", token);
+    let output = judge.output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    eprintln!("movies: {told}");
+    Some(told)
+}
+
+#[tokio::test]
+async fn another_decoder_sees_the_frames_in_their_movies() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let job = done(&app).await;
+    let Some(told) = judge_movies(&app, (&job, 2), &token).await else { return };
+    // 16 ms for four frames.
+    assert_eq!(told["title"], "250 frames/s, played at 10");
+}
+
+impl TestApp {
+    /// The first answer about a movie that is not that it is being made.
+    async fn movie(&self, path: &str) -> Answer {
+        loop {
+            let answer = self.get(path).await;
+            if answer.status != 202 {
+                return answer;
+            }
+            assert_eq!(
+                (answer.header("retry-after"), answer.header("cache-control")),
+                ("1", "no-store")
+            );
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    }
+
+    /// Bytes of the lab's results.
+    async fn kept(&self) -> u64 {
+        self.get("/v1/me").await.expect(200).json()["use"]["result_bytes"].as_u64().unwrap()
+    }
+
+    /// Where a movie lies.
+    fn movie_file(&self, movie: &Answer) -> PathBuf {
+        let etag = movie.header("etag").trim_matches('"');
+        self.data().join("blobs").join(&etag[..2]).join(&etag[2..])
+    }
+}
+
+#[tokio::test]
+async fn a_movie_is_made_when_it_is_asked_for_and_is_a_result_like_others() {
+    let mut app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let stuck = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
+        {"prior": "tv", "iterations": 10_000, "tv_weight": 0.05, "tv_updates": 40}]}});
+    let stuck = app.submit(&stuck).await;
+    for path in ["snapshots/0", "sequence"] {
+        app.get(&format!("/v1/jobs/{stuck}/{path}/movie.mp4")).await.problem(404, "not_ready");
+    }
+    app.post(&format!("/v1/jobs/{stuck}/cancel"), &json!({})).await.expect(202);
+    let job = done(&app).await;
+    let path = format!("/v1/jobs/{job}/snapshots/1/movie.mp4");
+    let sequence = format!("/v1/jobs/{job}/sequence/movie.mp4");
+
+    // Nobody makes it before somebody asks for it, and nobody can while there is no worker.
+    let before = app.kept().await;
+    app.restart_with(&["--workers", "0"]);
+    let first = app.get(&path).await.expect(202);
+    assert_eq!(first.json(), json!({"state": "waiting", "percent": 0.0}));
+    assert_eq!(app.get(&format!("/v1/jobs/{job}")).await.json()["state"], "succeeded");
+    app.restart_with(&["--workers", "1"]);
+
+    let movie = app.movie(&path).await.expect(200);
+    let (size, etag) = (movie.bytes.len(), movie.header("etag").to_owned());
+    assert_eq!(movie.header("content-type"), "video/mp4");
+    assert!(movie.header("content-disposition").ends_with("_0001_movie.mp4\""), "{movie:?}");
+    assert_eq!(&movie.bytes[4..8], b"ftyp");
+    assert_eq!(app.kept().await, before + size as u64);
+    let head = app.send(app.request(Method::HEAD, &path)).await.expect(200);
+    assert_eq!(head.header("content-length"), size.to_string());
+    app.send(app.request(Method::GET, &path).header("if-none-match", &etag)).await.expect(304);
+    let rest =
+        app.request(Method::GET, &path).header("range", "bytes=100-").header("if-range", &etag);
+    assert_eq!(app.send(rest).await.expect(206).bytes, movie.bytes[100..]);
+    // The archive has what no other file can be made of.
+    let listed = app.get(&format!("/v1/jobs/{job}/snapshots/1")).await.expect(200).json();
+    assert!(!listed.to_string().contains("movie"), "{listed}");
+
+    // A damaged one is made again, with the same bytes.
+    let file = app.movie_file(&movie);
+    let mut bytes = movie.bytes.clone();
+    bytes[size / 2] ^= 1;
+    std::fs::write(&file, bytes).unwrap();
+    app.get(&path).await.expect(202);
+    assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
+
+    // Of damaged frames there is none: it says so, and is there again after the job's retry.
+    let array = app.data().join("results").join(&job).join("snapshot_0000/frames.npy");
+    let whole = std::fs::read(&array).unwrap();
+    std::fs::write(&array, &whole[..whole.len() - 1]).unwrap();
+    let detail = app.movie(&sequence).await.problem(500, "movie_failed");
+    assert!(detail.contains("frames.npy is damaged: retry the job"), "{detail}");
+    app.get(&sequence).await.expect(202);
+    app.movie(&sequence).await.problem(500, "movie_failed");
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/frames.npy")).await.problem(500, "file_damaged");
+    app.post(&format!("/v1/jobs/{job}/retry"), &json!({})).await.expect(202);
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert!(!file.exists(), "movies of results that may be others go");
+    let both = app.movie(&sequence).await.expect(200);
+    assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
+
+    // They go with their job.
+    app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
+    assert!(!app.movie_file(&movie).exists() && !app.movie_file(&both).exists());
+    app.get(&path).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn of_the_smallest_frames_there_is_no_movie() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) =
+        app.scene(&Scene { frames: 2, height: 48, width: 12, snapshots: 1 }).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let path = format!("/v1/jobs/{job}/sequence/movie.mp4");
+    let detail = app.get(&path).await.problem(404, "not_found");
+    assert!(detail.contains("48x12") && detail.contains("below 16"), "{detail}");
+}
+
+#[tokio::test]
+async fn a_lab_without_room_gets_no_movie() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let token = app.token(&["create", "--lab", "a"]);
+    app.sign_in(&token);
+    let job = done(&app).await;
+    entitle(&app, &["a", "--bytes", "1"]);
+    let path = format!("/v1/jobs/{job}/sequence/movie.mp4");
+    app.get(&path).await.problem(507, "quota_exceeded");
 }

@@ -80,7 +80,7 @@ async fn kills_at_random_moments_change_nothing_in_any_result() {
     let undisturbed = app.submit(&job(&measurement)).await;
     assert_eq!(app.ended(&undisturbed).await["state"], "succeeded");
     let expected = results(&app, &undisturbed).await;
-    assert_eq!(expected.len(), 2 * (4 + 4 + 2));
+    assert_eq!(expected.len(), 2 * (4 + 4 + 3));
 
     let seed: u64 = rand::random();
     eprintln!("seed of the kills: {seed}");

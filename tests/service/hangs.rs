@@ -94,3 +94,74 @@ async fn a_worker_that_hangs_as_a_whole_is_replaced() {
     let job = app.submit(&body).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 }
+
+/// A control group of the kernel for memory, below that of the tests.
+struct Group(PathBuf);
+
+impl Group {
+    /// A group with so much memory; none, and a word on it, where none can be made.
+    fn new(bytes: u64) -> Option<Self> {
+        let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+        let found = groups.lines().find_map(|line| {
+            let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
+            let (root, limit) = match controllers {
+                "memory" => ("/sys/fs/cgroup/memory", "memory.limit_in_bytes"),
+                "" => ("/sys/fs/cgroup", "memory.max"),
+                _ => return None,
+            };
+            let name = format!("{root}{path}/sci-recon-{}", std::process::id());
+            std::fs::create_dir(&name).ok()?;
+            // From here on it is removed, whatever comes.
+            let group = Self(name.into());
+            std::fs::write(group.0.join(limit), bytes.to_string()).ok()?;
+            Some(group)
+        });
+        if found.is_none() {
+            eprintln!("SKIPPED: no control group for memory can be made here");
+        }
+        found
+    }
+
+    fn take_in(&self, process: u32) {
+        std::fs::write(self.0.join("cgroup.procs"), process.to_string()).unwrap();
+    }
+}
+
+impl Drop for Group {
+    fn drop(&mut self) {
+        // Its last process is gone a moment before the kernel lets go of the group.
+        for _ in 0..100 {
+            if std::fs::remove_dir(&self.0).is_ok() {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        eprintln!("{} is left", self.0.display());
+    }
+}
+
+#[tokio::test]
+async fn a_task_whose_workers_the_kernel_kills_for_their_memory_is_given_up_with_the_reason() {
+    let Some(group) = Group::new(300 << 20) else { return };
+    let greedy = "for (;;) { char *p = malloc(1 << 20); if (!p) abort();
+        for (int i = 0; i < 1 << 20; i += 4096) p[i] = 1; usleep(2000); }";
+    let (_folder, app) = with_library(greedy).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // Its workers are born where it is; that which it has already is elsewhere.
+    group.take_in(app.pid());
+    app.kill_worker(0);
+    let job = app.submit(&deep(&measurement)).await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "failed", "{done:#}");
+    let error = done["error"].as_str().unwrap();
+    assert!(error.contains("no memory left") && error.contains("(5 attempts)"), "{error}");
+    let peak = error.split("seen at ").nth(1).and_then(|text| text.split(' ').next());
+    let peak: u64 = peak.and_then(|peak| peak.parse().ok()).unwrap_or_default();
+    assert!((1..=300).contains(&peak), "{error}");
+    // The service itself was spared, and goes on.
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
+    let figures = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
+    assert!(figures.contains("sci_recon_worker_exits_total{reason=\"starved\"} 5"), "{figures}");
+    drop(app);
+}

@@ -24,7 +24,7 @@ fn as_lab(app: &TestApp, token: &str, method: Method, path: &str) -> RequestBuil
     app.request(method, path).bearer_auth(token)
 }
 
-fn entitle(app: &TestApp, arguments: &[&str]) {
+pub fn entitle(app: &TestApp, arguments: &[&str]) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     let output = command.args(["lab", "--data"]).arg(app.data()).arg("set").args(arguments);
     let output = output.output().unwrap();

@@ -8,7 +8,7 @@ use crate::pipeline::values;
 use crate::samples::Scene;
 
 /// Rows, columns and values of an 8-bit grey PNG.
-fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
+pub fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
     assert_eq!(answer.header("content-type"), "image/png");
     let mut reader = png::Decoder::new(std::io::Cursor::new(&answer.bytes)).read_info().unwrap();
     let mut values = vec![0; reader.output_buffer_size().unwrap()];

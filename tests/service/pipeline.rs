@@ -78,7 +78,7 @@ async fn a_job_gives_frames_that_look_like_the_scene() {
         assert_eq!(listed["ready"], true);
         let files = listed["files"].as_array().unwrap();
         // EXR and PNG of each frame, the stack, the array, the manifest.
-        assert_eq!(files.len(), 4 + 4 + 3);
+        assert_eq!(files.len(), 4 + 4 + 4);
         for file in files {
             let answer = app.get(file["href"].as_str().unwrap()).await.expect(200);
             assert_eq!(answer.bytes.len() as u64, file["size"].as_u64().unwrap());

@@ -55,6 +55,11 @@ async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
         manifest["content"]["schedule"].clone()
     };
     assert_eq!(schedule(FINISHED).await, schedule(WAITING).await);
+    // What is there is charged, also what was made before that was counted.
+    let sums = "SELECT (SELECT sum(result_bytes) FROM jobs), (SELECT sum(size) FROM result_files)";
+    let mut database = app.database().await;
+    let (charged, there): (i64, i64) = sqlx::query_as(sums).fetch_one(&mut database).await.unwrap();
+    assert!(charged == there && there > 0, "{charged} {there}");
     // Calibrations keep their report, and the one that waited is made.
     app.get(&format!("/v1/calibrations/{CALIBRATION}/report.json")).await.expect(200);
     let made = async || app.get(&format!("/v1/calibrations/{CAPTURES}")).await.expect(200).json();
@@ -64,4 +69,55 @@ async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
         tokio::time::sleep(std::time::Duration::from_millis(100)).await;
     }
     assert_eq!(made().await["state"], "ready");
+}
+
+/// What a command says of a folder, and whether it ended well.
+fn said(arguments: &[&str], data: &Path) -> (bool, String) {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let output = command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
+    let output = output.output().unwrap();
+    (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+#[tokio::test]
+async fn a_copy_is_restored_by_a_newer_version_and_refused_by_an_older_one() {
+    let serve = ["serve", "--listen", "127.0.0.1:0", "--workers", "0", "--min-free-bytes", "0"];
+    // A copy by the version before is a folder like this one.
+    let folder = tempfile::tempdir().unwrap();
+    let old = folder.path().join("old");
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/version-0.1"), &old);
+    let before = std::fs::read(old.join("sci-recon.db")).unwrap();
+    for arguments in [&["verify"][..], &["token", "list"]] {
+        let (good, text) = said(arguments, &old);
+        assert!(!good && text.contains("older version of this program"), "{arguments:?}: {text}");
+    }
+    assert_eq!(std::fs::read(old.join("sci-recon.db")).unwrap(), before, "nothing was changed");
+    let restored = TestApp::on(folder, "old", &["--workers", "1"]).await;
+    assert_eq!(restored.ended(WAITING).await["state"], "succeeded");
+    assert!(said(&["verify"], restored.data()).0);
+
+    // A copy of that, as a later version would have made it.
+    let folder = tempfile::tempdir().unwrap();
+    let new = folder.path().join("new");
+    let out = new.display().to_string();
+    assert!(said(&["backup", "--out", &out], restored.data()).0);
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(new.join("sci-recon.db"));
+    let mut database = sqlx::ConnectOptions::connect(&options).await.unwrap();
+    let later =
+        "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+                 VALUES (9999, 'later', 1, x'00', 0)";
+    sqlx::query(later).execute(&mut database).await.unwrap();
+    sqlx::Connection::close(database).await.unwrap();
+    let marker = new.join("sci-recon.json");
+    let mut mark: Value = serde_json::from_slice(&std::fs::read(&marker).unwrap()).unwrap();
+    (mark["schema"], mark["version"]) = (9999.into(), "9.9.9".into());
+    std::fs::write(&marker, mark.to_string()).unwrap();
+    let before = std::fs::read(new.join("sci-recon.db")).unwrap();
+    let again = folder.path().join("again").display().to_string();
+    for arguments in [&serve[..], &["verify"], &["backup", "--out", &again], &["token", "list"]] {
+        let (good, text) = said(arguments, &new);
+        assert!(!good && text.contains("by version 9.9.9 (schema 9999)"), "{arguments:?}: {text}");
+        assert!(text.contains("Nothing was changed"), "{arguments:?}: {text}");
+    }
+    assert_eq!(std::fs::read(new.join("sci-recon.db")).unwrap(), before);
 }

@@ -7,7 +7,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
-use crate::samples::{Scene, npy};
+use crate::samples::{Scene, constant, npy};
 
 /// The value of a figure with these labels.
 fn figure(text: &str, name: &str) -> f64 {
@@ -68,6 +68,16 @@ async fn listeners_hear_of_calibrations() {
     app.send(rename).await.expect(200);
     let told = heard("event: calibrations\ndata: ").await;
     assert_eq!(told["changed"], json!([calibration]));
+    // Of measurements they hear what goes on after the answer.
+    let data = app.upload(constant(&[16, 16], 1.0)).await;
+    let body = json!({"calibration": calibration, "data": data});
+    let ask = app.request(Method::POST, "/v1/measurements").json(&body);
+    let measurement = id(&app.send(ask.header("Prefer", "respond-async")).await.expect(202));
+    let told = heard("event: measurements\ndata: ").await;
+    assert_eq!(told, json!({"changed": [measurement], "deleted": [], "more": false}));
+    app.delete(&format!("/v1/measurements/{measurement}")).await.expect(204);
+    let told = heard("event: measurements\ndata: ").await;
+    assert_eq!(told["changed"], json!([measurement]));
     app.delete(&place).await.expect(204);
     let told = heard("event: calibrations\ndata: ").await;
     assert_eq!(told["deleted"], json!([calibration]));

@@ -20,6 +20,8 @@ pub enum Axes {
     RowColumnFrame,
     /// \[column, row, frame\].
     ColumnRowFrame,
+    /// \[frame, column, row\]: what MATLAB's `h5write` makes of \[row, column, frame\].
+    FrameColumnRow,
 }
 
 /// No camera has fewer rows or columns.
@@ -76,12 +78,14 @@ impl Axes {
             Self::FrameRowColumn => (first, second, third),
             Self::RowColumnFrame => (third, first, second),
             Self::ColumnRowFrame => (third, second, first),
+            Self::FrameColumnRow => (first, third, second),
         }
     }
 }
 
 impl Writer {
     /// The orders that people use, the usual one first. In MATLAB a matrix is \[row, column\].
+    /// [`Axes::FrameColumnRow`] is not among them: turned pictures of a size that nobody knows are no worse than others.
     fn orders(self) -> &'static [Axes] {
         use Axes::{ColumnRowFrame, FrameRowColumn, RowColumnFrame};
         match self {
@@ -93,9 +97,9 @@ impl Writer {
     fn layout(self, axes: Axes) -> Layout {
         let (interleaved, by_columns) = match (axes, self == Self::Rows) {
             (Axes::FrameRowColumn, true) | (Axes::ColumnRowFrame, false) => (false, false),
-            (Axes::RowColumnFrame, true) => (true, false),
+            (Axes::RowColumnFrame, true) | (Axes::FrameColumnRow, false) => (true, false),
             (Axes::ColumnRowFrame, true) | (Axes::FrameRowColumn, false) => (true, true),
-            (Axes::RowColumnFrame, false) => (false, true),
+            (Axes::RowColumnFrame, false) | (Axes::FrameColumnRow, true) => (false, true),
         };
         Layout { interleaved, by_columns }
     }
@@ -111,7 +115,7 @@ impl Expected {
     ) -> Result<Option<Arranged>> {
         match *shape {
             [first, second] => {
-                let turned = self.axes == Some(Axes::ColumnRowFrame);
+                let turned = matches!(self.axes, Some(Axes::ColumnRowFrame | Axes::FrameColumnRow));
                 let (height, width) = if turned { (second, first) } else { (first, second) };
                 let by_columns = turned == (writer == Writer::Rows);
                 let layout = Layout { interleaved: false, by_columns };
@@ -128,8 +132,8 @@ impl Expected {
         }
     }
 
-    /// The order that was stated; else the one that fits what is known; if none does, the usual one, whose sizes
-    /// are refused elsewhere.
+    /// The order that was stated; else the one that fits what is known; if none does, that of turned pictures of
+    /// the right size, or the usual one, whose sizes are refused elsewhere.
     fn order(&self, format: Format, writer: Writer, shape: [u64; 3]) -> Result<Axes> {
         let usual = writer.orders()[0];
         let fits: Vec<Axes> =
@@ -144,6 +148,9 @@ impl Expected {
                 };
                 let fits: Vec<String> = fits.iter().map(told).collect();
                 Err(FormatError::AxesAmbiguous { format, shape, fits: fits.join(", ") })
+            }
+            (None, []) if self.size.is_some() && self.fits(Axes::FrameColumnRow.sizes(shape)) => {
+                Ok(Axes::FrameColumnRow)
             }
             (None, _) => Ok(usual),
         }
@@ -181,7 +188,7 @@ mod tests {
 
     #[test]
     fn one_order_that_fits_is_taken() {
-        use Axes::{ColumnRowFrame, FrameRowColumn, RowColumnFrame};
+        use Axes::{ColumnRowFrame, FrameColumnRow, FrameRowColumn, RowColumnFrame};
         assert_eq!(of(MASKS, Writer::Rows, [8, 256, 256]), Ok(FrameRowColumn));
         assert_eq!(of(MASKS, Writer::Rows, [8, 48, 64]), Ok(FrameRowColumn));
         assert_eq!(of(MASKS, Writer::Matlab, [256, 256, 8]), Ok(RowColumnFrame));
@@ -191,6 +198,7 @@ mod tests {
             ([5, 480, 640], FrameRowColumn),
             ([480, 640, 5], RowColumnFrame),
             ([640, 480, 5], ColumnRowFrame),
+            ([5, 640, 480], FrameColumnRow),
             // More than a sensor's worth of snapshots, which are few enough for the limits.
             ([480, 640, 640], RowColumnFrame),
         ] {

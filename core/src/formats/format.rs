@@ -98,6 +98,36 @@ pub(super) fn describe(head: &[u8]) -> String {
     if head.starts_with(b"\xff\xd8\xff") {
         return "it is a JPEG, which changes the values it stores".to_owned();
     }
+    if is_level_4(head) {
+        return "it is a MATLAB file of level 4 (python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                scipy.io.loadmat('in.mat')['mask'])\")"
+            .to_owned();
+    }
     let start: Vec<String> = head.iter().take(8).map(|b| format!("{b:02x}")).collect();
     format!("it begins with the bytes {}", start.join(" "))
+}
+
+/// Whether a file begins as MATLAB's level 4 does, which has no signature: with the kind of numbers, rows, columns,
+/// whether there are imaginary parts, and the length of a name, which follows.
+fn is_level_4(head: &[u8]) -> bool {
+    let Some((header, rest)) = head.split_first_chunk::<20>() else { return false };
+    let (words, _) = header.as_chunks::<4>();
+    // The thousands of the kind tell the order of bytes: 0 for little-endian, 1 for big-endian.
+    [(u32::from_le_bytes as fn([u8; 4]) -> u32, 0), (u32::from_be_bytes, 1000)].iter().any(
+        |(number, kinds)| {
+            let [kind, rows, columns, imaginary, length] =
+                [0, 1, 2, 3, 4].map(|i| number(words[i]));
+            let name = (length as usize)
+                .checked_sub(1)
+                .and_then(|end| Some((rest.get(..end)?, rest.get(end)?)));
+            (*kinds..=kinds + 52).contains(&kind)
+                && rows > 0
+                && columns > 0
+                && imaginary <= 1
+                && name.is_some_and(|(name, end)| {
+                    let word = |byte: &u8| byte.is_ascii_alphanumeric() || *byte == b'_';
+                    !name.is_empty() && name.iter().all(word) && *end == 0
+                })
+        },
+    )
 }

@@ -52,12 +52,16 @@ pub(super) fn open(
         ..OpenOptions::default()
     };
     let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
-    let (_, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
+    let (groups, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
     let dataset = match file.dataset(name) {
         Ok(dataset) => dataset,
         Err(Error::Io(source)) => return Err(error(Error::Io(source))),
-        // In a group that is not there, or a group itself.
-        Err(other) if names.iter().any(|there| there == name) => return Err(error(other)),
+        Err(other) if names.iter().any(|there| there == name) => {
+            return Err(error(other));
+        }
+        Err(_) if groups.iter().any(|there| there == name) => {
+            return Err(unsupported(GROUP.to_owned()));
+        }
         Err(_) => {
             let (format, name) = (Format::Hdf5, name.to_owned());
             return Err(FormatError::MissingArray { format, name, present: list(&names) });
@@ -77,8 +81,7 @@ pub(super) fn open(
         shape.reverse();
     }
     let arranged = expected.arrange((Format::Hdf5, writer), &shape)?;
-    let arranged =
-        arranged.ok_or_else(|| unsupported(format!("an array of {} dimensions", shape.len())))?;
+    let arranged = arranged.ok_or_else(|| many_axes(shape.len(), writer))?;
     let mut info = array::info(Format::Hdf5, sample, &arranged, limits)?;
     check_chunks(&dataset, sample)?;
     if writer == Writer::Matlab {
@@ -196,7 +199,10 @@ fn describe(dtype: &Datatype) -> String {
             "records, perhaps complex numbers (absolute values: python -c \"import h5py, numpy; \
              numpy.save('out.npy', numpy.abs(h5py.File('in.h5')['mask'][()]))\")"
         }
-        Datatype::Reference { .. } => "references, perhaps a cell array",
+        Datatype::Reference { .. } => {
+            "references, perhaps a cell array (of a frame each: python -c \"import h5py, numpy; f = \
+             h5py.File('in.mat'); numpy.save('out.npy', [f[cell][()].T for cell in f['mask'][()].ravel()])\")"
+        }
         Datatype::Enum { .. } => "an enumeration",
         _ => "numbers of an unknown type",
     };
@@ -226,6 +232,27 @@ fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
         value: bytes,
         limit: CHUNK_CACHE_BYTES as u64,
     })
+}
+
+/// What MATLAB makes of a struct.
+const GROUP: &str = "a group, perhaps a struct (its first field: python -c \"import h5py, numpy; s = \
+     h5py.File('in.mat')['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0][()].T, -1, 0))\")";
+
+/// An array of pictures along several axes.
+fn many_axes(count: usize, writer: Writer) -> FormatError {
+    let line = match writer {
+        Writer::Matlab => {
+            "a = h5py.File('in.mat')['mask'][()]; numpy.save('out.npy', \
+             a.reshape(-1, *a.shape[-2:]).transpose(0, 2, 1))"
+        }
+        Writer::Rows | Writer::Fortran => {
+            "a = h5py.File('in.h5')['mask'][()]; numpy.save('out.npy', a.reshape(-1, *a.shape[-2:]))"
+        }
+    };
+    let line = format!("python -c \"import h5py, numpy; {line}\"");
+    unsupported(format!(
+        "an array of {count} dimensions (all pictures, one after the other: {line})"
+    ))
 }
 
 fn unsupported(found: String) -> FormatError {

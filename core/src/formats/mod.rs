@@ -3,7 +3,7 @@
 //! Inputs ([`open_stack`], [`mat`]) come from strangers: every claim of a header is checked against
 //! the limits and the file's real length before memory is taken, and stacks are read one frame at
 //! a time. [`validate`] brings raw frames onto their scale and refuses what cannot be a mask or a
-//! measurement. Outputs are EXR, npy, PNG, BigTIFF and prepared arrays ([`planar`]).
+//! measurement. Outputs are EXR, npy, PNG, BigTIFF, movies and prepared arrays ([`planar`]).
 //!
 //! Arrays are f32 with axes (frame, row, column); see [`Channels`] for those of
 //! colours.
@@ -32,6 +32,7 @@ mod zip;
 pub mod bigtiff;
 pub mod exr;
 pub mod mat;
+pub mod movie;
 pub mod npy;
 pub mod planar;
 pub mod png;

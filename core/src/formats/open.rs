@@ -88,7 +88,13 @@ fn open_any(
             Box::new(Pictures::open(Arc::new(file), members, limits)?)
         }
         Format::Mat | Format::Hdf5 => return Err(several(format)),
-        Format::Npy | Format::Zip | Format::Npz | Format::Exr | Format::Planar => {
+        Format::Exr => {
+            let found = "it is an EXR file (channel Y of each part: python -c \"import numpy, OpenEXR; f = \
+                         OpenEXR.File('in.exr', separate_channels=True); numpy.save('out.npy', \
+                         [part.channels['Y'].pixels for part in f.parts])\")";
+            return Err(FormatError::UnknownFormat { found: found.to_owned(), accepted: ACCEPTED });
+        }
+        Format::Npy | Format::Zip | Format::Npz | Format::Planar => {
             return Err(FormatError::UnknownFormat {
                 found: format!("it is a {format} file"),
                 accepted: ACCEPTED,

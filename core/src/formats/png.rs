@@ -153,11 +153,16 @@ pub fn encode_u8(
     black: f32,
     white: f32,
 ) -> Result<Vec<u8>> {
-    let factor = 255.0 / (white - black);
-    let bytes: Vec<u8> = frame.iter().map(|v| ((v - black) * factor).round() as u8).collect();
+    let bytes: Vec<u8> = frame.iter().map(level_u8(black, white)).collect();
     let mut png = Vec::new();
     encode(&mut png, frame.dim(), (channels, BitDepth::Eight), (black, white), &bytes)?;
     Ok(png)
+}
+
+/// What a value becomes in pictures of 8 bits for looking at: see [`encode_u8`].
+pub fn level_u8(black: f32, white: f32) -> impl Fn(&f32) -> u8 {
+    let factor = 255.0 / (white - black);
+    move |value| ((value - black) * factor).round() as u8
 }
 
 fn encode_u16(

@@ -67,11 +67,12 @@ pub(super) fn bits(stack: &Array3<f32>) -> Vec<Vec<u32>> {
 }
 
 /// A stack (frame, row, column) as arrays of every order of axes.
-pub(super) fn every_order(stack: &Array3<f32>) -> [(Axes, ArrayView3<'_, f32>); 3] {
+pub(super) fn every_order(stack: &Array3<f32>) -> [(Axes, ArrayView3<'_, f32>); 4] {
     [
         (Axes::FrameRowColumn, stack.view()),
         (Axes::RowColumnFrame, stack.view().permuted_axes([1, 2, 0])),
         (Axes::ColumnRowFrame, stack.view().permuted_axes([2, 1, 0])),
+        (Axes::FrameColumnRow, stack.view().permuted_axes([0, 2, 1])),
     ]
 }
 

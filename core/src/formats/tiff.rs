@@ -125,7 +125,9 @@ impl<R: Read + Seek> TiffReader<R> {
             if page != first {
                 return Err(malformed(format!(
                     "page {number} is {}x{} {}, but page 0 is {}x{} {} (counted from 0); \
-                     all pages must be alike",
+                     all pages must be alike (without those of another size: python -c \"import numpy, tifffile; \
+                     p = tifffile.TiffFile('in.tif').pages; numpy.save('out.npy', [a.asarray() for a in p if \
+                     a.shape == p[0].shape])\")",
                     page.height, page.width, page.sample, first.height, first.width, first.sample
                 )));
             }

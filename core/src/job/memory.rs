@@ -7,7 +7,7 @@ use crate::recon::schedule::Method;
 
 /// The program, its thread stacks and, with the deep denoiser, ONNX Runtime and the network.
 const BASE_BYTES: u64 = 128 << 20;
-/// Arrays of the solver for each voxel of a tile (measured: 16 bytes).
+/// Arrays of the solver for each voxel of a tile (measured: 16 bytes; 4 more hold the frames after its first stage).
 const SOLVER_BYTES_PER_VOXEL: u64 = 24;
 /// The solver's start of a projection, with momentum or ADMM; and ADMM's multiplier.
 const START_BYTES_PER_VOXEL: u64 = 4;
@@ -18,6 +18,10 @@ const NETWORK_PIXELS: u64 = 1 << 17;
 const COARSE_BYTES_PER_VOXEL: u64 = 16;
 /// A frame of a mosaic as it is assembled: twice, its three colours, and those of its PNG.
 const COLOUR_BYTES_PER_PIXEL: u64 = 40;
+/// The encoder of a movie, for each sample of a frame of it, with the frames of a group; and the rows that are
+/// read at a time.
+const MOVIE_BYTES_PER_SAMPLE: u64 = 128;
+const MOVIE_BYTES: u64 = 48 << 20;
 
 impl JobSpec {
     /// The planned cost of a tile in CPU-nanoseconds per voxel: of the schedule, or of a network as
@@ -42,7 +46,8 @@ impl JobSpec {
         let preview = whole * (SOLVER_BYTES_PER_VOXEL + self.mosaic(COARSE_BYTES_PER_VOXEL));
         let pixels = (self.shape.height * self.shape.width) as u64;
         let colours = pixels * self.mosaic(COLOUR_BYTES_PER_PIXEL);
-        self.tile_bytes().max(BASE_BYTES + preview.max(colours))
+        let movie = MOVIE_BYTES + self.movie_samples() * MOVIE_BYTES_PER_SAMPLE;
+        self.tile_bytes().max(BASE_BYTES + preview.max(colours).max(movie))
     }
 
     /// What a mosaic alone takes.

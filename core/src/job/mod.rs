@@ -2,6 +2,7 @@
 
 mod access;
 mod algorithm;
+mod assessment;
 mod captures;
 #[cfg(feature = "sqlite")]
 mod columns;
@@ -20,6 +21,7 @@ pub use crate::optics::{MARGIN, Mosaic};
 pub use crate::recon::schedule::Schedule;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
+pub use assessment::Assessment;
 pub use captures::{Captures, MOST_MASKS, MOST_SECONDS, planned_seconds};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
@@ -32,5 +34,8 @@ pub use report::{
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
 pub use shape::{Cut, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
-pub use task::{ResultFile, TaskKind, TaskProgress, TaskStage, TaskState};
+pub use task::{
+    LEAST_MOVIE_SIDE, MOVIE_SIDE, ResultFile, TaskKind, TaskProgress, TaskStage, TaskState,
+    movie_step,
+};
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
 
 use super::request::JobSpec;
+use super::shape::SceneShape;
 use super::text::Sha256;
 use crate::recon::{ReconError, joints, pilot, preview};
 
@@ -13,6 +14,11 @@ const WRITE_S: f64 = 110e-9;
 /// The same of a preview by blocks, and of one that is done whole (measured).
 const PREVIEW_BLOCKS_S: f64 = 10e-9;
 const PREVIEW_WHOLE_S: f64 = 120e-9;
+/// The same for each sample of a movie (measured; of noise it is twice as much).
+const MOVIE_S: f64 = 700e-9;
+/// No side of a movie is longer, or shorter: AV1's encoder takes no smaller ones.
+pub const MOVIE_SIDE: usize = 1920;
+pub const LEAST_MOVIE_SIDE: usize = 16;
 
 /// What a task does. Snapshots are counted from 0 within the measurement, tiles within the tile plan.
 ///
@@ -46,6 +52,10 @@ pub enum TaskKind {
     Manifest,
     /// Make the masks of a calibration from its captures, and the report on them.
     Calibration,
+    /// Make a movie of the frames of a snapshot, or of all of a job, which somebody has asked for.
+    Movie {
+        snapshot: Option<u32>,
+    },
 }
 
 impl TaskKind {
@@ -55,6 +65,7 @@ impl TaskKind {
             Self::Preview { snapshot }
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
+            Self::Movie { snapshot } => snapshot,
             Self::Prepare | Self::Pilot | Self::Manifest | Self::Calibration => None,
         }
     }
@@ -89,6 +100,7 @@ impl TaskKind {
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),
             ("calibration", None, None) => Some(Self::Calibration),
+            ("movie", snapshot, None) => Some(Self::Movie { snapshot }),
             _ => None,
         }
     }
@@ -137,6 +149,40 @@ impl JobSpec {
         tasks.push((TaskKind::Manifest, 0.01));
         Ok(tasks)
     }
+
+    /// Planned CPU-seconds of the movie of a snapshot or, with none, of all of them.
+    #[allow(clippy::cast_precision_loss)] // counts far below 2^53
+    pub fn movie_cost(&self, snapshot: Option<u32>) -> f64 {
+        let SceneShape { frames, height, width, .. } = self.shape;
+        let snapshots = if snapshot.is_some() { 1 } else { self.snapshots.count as usize };
+        let samples = snapshots * frames * height * width * self.shape.channels().count();
+        samples as f64 * READ_S + self.movie_bytes(snapshot) as f64 * MOVIE_S
+    }
+
+    /// Samples of the movie of a snapshot or, with none, of all of them: more bytes than it takes.
+    pub fn movie_bytes(&self, snapshot: Option<u32>) -> u64 {
+        let snapshots = if snapshot.is_some() { 1 } else { u64::from(self.snapshots.count) };
+        snapshots * self.shape.frames as u64 * self.movie_samples()
+    }
+
+    /// Whether the frames are large enough for a movie.
+    pub fn has_movie(&self) -> bool {
+        let SceneShape { height, width, .. } = self.shape;
+        height.min(width).div_ceil(movie_step(height, width)) >= LEAST_MOVIE_SIDE
+    }
+
+    /// Samples of a frame of a movie.
+    pub(super) fn movie_samples(&self) -> u64 {
+        let step = movie_step(self.shape.height, self.shape.width);
+        let side = |length: usize| length.div_ceil(step) as u64;
+        side(self.shape.height) * side(self.shape.width) * self.shape.channels().count() as u64
+    }
+}
+
+/// Every so many rows and columns of pictures of this size are one of their movie: a power of two.
+pub fn movie_step(height: usize, width: usize) -> usize {
+    let fits = |step: &usize| height.max(width).div_ceil(*step) <= MOVIE_SIDE;
+    (0..usize::BITS).map(|level| 1 << level).find(fits).unwrap_or(1)
 }
 
 /// The place of a tile in the order of work. Multiples of the golden ratio go all over the picture: it

@@ -41,6 +41,9 @@ pub enum PipelineError {
          calibration and the measurement anew"
     )]
     Corrupt { what: &'static str, sha256: Sha256 },
+    /// A result file has other bytes than it was written with.
+    #[error("the stored {0} is damaged: retry the job, and it is made again")]
+    Result(String),
     #[error("snapshot {snapshot}: {source}")]
     Snapshot { snapshot: u32, source: ReconError },
     #[error("the record of the {what} can't be used: {problem}")]
@@ -70,7 +73,10 @@ impl PipelineError {
         match self {
             Self::Recon(error) => matches!(error, ReconError::Runtime(_)),
             Self::Format(error) => !error.is_callers_fault(),
-            Self::Snapshot { .. } | Self::Record { .. } | Self::Corrupt { .. } => false,
+            Self::Snapshot { .. }
+            | Self::Record { .. }
+            | Self::Corrupt { .. }
+            | Self::Result(_) => false,
             _ => true,
         }
     }

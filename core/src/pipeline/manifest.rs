@@ -8,12 +8,13 @@ use std::collections::BTreeMap;
 
 use serde::{Serialize, Serializer};
 
+use super::assessment::{Expected, TileAssessment, expected};
 use super::networks::ModelRecord;
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
 use crate::formats::exr::Attributes;
 use crate::job::{
-    Algorithm, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, Mosaic, ResultFile,
-    SceneShape, Schedule, Sha256, TaskKind,
+    Algorithm, Assessment, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, Mosaic,
+    ResultFile, SceneShape, Schedule, Sha256, TaskKind,
 };
 use crate::recon::sequence::{RunShare, SequencePlan};
 use crate::recon::tile::TilePlan;
@@ -92,12 +93,39 @@ impl Recipe {
         self.runs.shares(snapshot, &cuts, self.shape.frames)
     }
 
-    /// The manifest of a snapshot, by its index in the measurement, but for its files.
-    pub fn snapshot(&self, snapshot: usize, tiles: Vec<TileRecord>, run: RunRecord) -> Manifest {
-        let SceneShape { frames, height, width, .. } = self.shape;
+    /// What the checks found of a snapshot, by its index in the measurement.
+    fn warnings_of(&self, snapshot: usize) -> Vec<Finding> {
         let concerns = |warning: &Finding| warning.snapshot.is_none_or(|s| s as usize == snapshot);
-        let mut recipe = self.clone();
-        recipe.warnings.retain(concerns);
+        self.warnings.iter().filter(|warning| concerns(warning)).cloned().collect()
+    }
+
+    /// What the tiles of a snapshot, by its index in the measurement, let expect of its frames: of each run that
+    /// has a share in it those of its tiles, in the plan's order. None of a mosaic, whose colours no prediction was
+    /// fitted to.
+    pub fn expected(
+        &self,
+        snapshot: usize,
+        shares: &[(RunShare, Vec<Option<TileAssessment>>)],
+    ) -> Option<Expected> {
+        if self.shape.mosaic.is_some() {
+            return None;
+        }
+        let course = self.pilot.as_ref().and_then(PilotRecord::course).unwrap_or_default();
+        let by = (&self.schedule, course);
+        let scale = (self.shape.frames, self.scale.white);
+        expected(&self.tile_plan, shares, by, scale, &self.warnings_of(snapshot))
+    }
+
+    /// The manifest of a snapshot, by its index in the measurement, but for its files.
+    pub fn snapshot(
+        &self,
+        snapshot: usize,
+        tiles: Vec<TileRecord>,
+        assessment: Option<Assessment>,
+        run: RunRecord,
+    ) -> Manifest {
+        let SceneShape { frames, height, width, .. } = self.shape;
+        let recipe = Self { warnings: self.warnings_of(snapshot), ..self.clone() };
         let content = Content {
             camera: CameraRecord::new(self.camera, snapshot, frames),
             recipe,
@@ -106,6 +134,7 @@ impl Recipe {
             width,
             snapshot,
             summary: Summary::of(&tiles),
+            assessment,
             tiles,
             files: Vec::new(),
         };
@@ -122,7 +151,8 @@ impl Recipe {
         }
         let entry = |(snapshot, record): (u32, SnapshotRecord)| {
             let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
-            SnapshotEntry { snapshot, summary: record.summary, files: files.collect() }
+            let SnapshotRecord { summary, assessment, .. } = record;
+            SnapshotEntry { snapshot, summary, assessment, files: files.collect() }
         };
         let snapshots = snapshots.into_iter().map(entry).collect();
         JobManifest {
@@ -172,6 +202,8 @@ pub struct Content {
     /// What came of each tile that has a part in the snapshot: run by run, in the plan's order.
     tiles: Vec<TileRecord>,
     pub summary: Summary,
+    /// How good the frames are, as far as that can be told without a truth; null where it can't.
+    pub assessment: Option<Assessment>,
     camera: Option<CameraRecord>,
     /// The files that came out, without this one.
     pub files: Vec<ResultFile>,
@@ -260,6 +292,7 @@ struct JobContent {
 struct SnapshotEntry {
     snapshot: u32,
     summary: Summary,
+    assessment: Option<Assessment>,
     /// Without the snapshot's own manifest, whose times differ from run to run.
     files: Vec<ResultFile>,
 }
@@ -334,7 +367,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         warnings: Vec::new(),
         camera: (Some(50.0), Some(0.012)),
     };
-    recipe.snapshot(1, Vec::new(), RunRecord::ended(None, CostRecord::default(), None))
+    recipe.snapshot(1, Vec::new(), None, RunRecord::ended(None, CostRecord::default(), None))
 }
 
 #[cfg(test)]

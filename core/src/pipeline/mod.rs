@@ -4,9 +4,11 @@
 //! whichever way it came. They know arrays and files, not the store or the queue.
 
 pub mod arrays;
+pub mod assessment;
 pub mod blend;
 pub mod error;
 pub mod manifest;
+pub mod movie;
 pub mod networks;
 pub mod pilot;
 pub mod preview;

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::job::{ResultFile, Timestamp};
+use super::assessment::{Course, TileAssessment};
+use crate::job::{Assessment, ResultFile, Timestamp};
 use crate::recon::prior::Prior;
 use crate::recon::schedule::Schedule;
 use crate::recon::solver::Outcome;
@@ -36,6 +37,16 @@ impl PilotRecord {
         }
         let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
         schedule.decided(&found.collect::<Vec<_>>())
+    }
+
+    /// What predictions are made of; none if the schedule was fixed.
+    pub fn course(&self) -> Option<Course> {
+        let (first, last) = (self.stages.first()?, self.stages.last()?);
+        Some(Course {
+            before: first.error_after,
+            after: last.error_after,
+            share: last.iterations as f64 / last.planned.max(1) as f64,
+        })
     }
 
     /// The joints that are taken apart, each given by the snapshot before it.
@@ -118,6 +129,9 @@ pub struct TileTaskRecord {
     /// The snapshots that have frames here, by their place in the run; the others are left to another run.
     #[serde(default = "the_only_one")]
     pub solved: Vec<usize>,
+    /// None where nothing can be told, and of before there were any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub assessment: Option<TileAssessment>,
     /// From reading its window to its frames.
     #[serde(flatten)]
     pub cost: CostRecord,
@@ -201,6 +215,8 @@ impl Summary {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SnapshotRecord {
     pub summary: Summary,
+    #[serde(default)]
+    pub assessment: Option<Assessment>,
     pub run: RunRecord,
     /// All files, the manifest last.
     pub files: Vec<ResultFile>,

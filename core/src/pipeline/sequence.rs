@@ -6,6 +6,7 @@ use std::thread;
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 
+use super::assessment::TileAssessment;
 use super::blend;
 use super::error::{PipelineError, Result};
 use super::networks::{ModelFile, NetworkSource, WarmNetworks};
@@ -15,7 +16,7 @@ use super::records::{PilotRecord, TileRecord};
 use super::tile::{TileInput, reconstruct_tile, run_network};
 use crate::optics::Mosaic;
 use crate::recon::schedule::Schedule;
-use crate::recon::sequence::{Piece, SequencePlan};
+use crate::recon::sequence::{Piece, RunShare, SequencePlan};
 use crate::recon::solver::{Control, Observer, Outcome, Progress};
 use crate::recon::tile::{Tile, TilePlan, Window};
 
@@ -89,6 +90,22 @@ impl Solved {
     pub fn records(&self, input: &SequenceInput<'_>, snapshot: usize) -> Vec<TileRecord> {
         let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
         shares.iter().flat_map(|share| &self.runs[share.run]).map(TileRecord::from).collect()
+    }
+
+    /// What the tiles of a snapshot let expect, run by run, in the plan's order.
+    pub fn assessments(
+        &self,
+        input: &SequenceInput<'_>,
+        snapshot: usize,
+        schedule: &Schedule,
+    ) -> Vec<(RunShare, Vec<Option<TileAssessment>>)> {
+        let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
+        let of = |share: RunShare| {
+            let tiles = self.runs[share.run].iter();
+            let found = tiles.map(|tile| TileAssessment::of(tile, schedule)).collect();
+            (share, found)
+        };
+        shares.into_iter().map(of).collect()
     }
 
     fn cuts(&self) -> Vec<usize> {

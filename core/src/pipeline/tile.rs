@@ -2,9 +2,10 @@
 
 use std::ops::Range;
 
-use ndarray::{Array3, ArrayView3, Axis, s};
+use ndarray::{Array3, Array4, ArrayView3, Axis, s};
 
 use crate::recon::ReconError;
+use crate::recon::assessment::Model;
 use crate::recon::learned::SnapshotNetwork;
 use crate::recon::prior::Networks;
 use crate::recon::schedule::Schedule;
@@ -70,6 +71,7 @@ impl TileInput {
             denoiser_passes: 0,
             residual: 0.0,
             stop_reason: StopReason::Converged,
+            features: None,
         };
         let Some((op, y)) = self.on_unit_scale()? else { return Ok(whole) };
         let mut op = op.with_gamma(gamma)?;
@@ -87,6 +89,12 @@ impl TileInput {
             }
             let place = s![piece.start * frames..piece.end * frames, .., ..];
             whole.frames.slice_mut(place).assign(&outcome.frames);
+            if let Some(seen) = outcome.features {
+                let (features, _, rows, columns) = seen.dim();
+                let none = || Array4::zeros((features, whole.frames.dim().0, rows, columns));
+                let place = s![.., piece.start * frames..piece.end * frames, .., ..];
+                whole.features.get_or_insert_with(none).slice_mut(place).assign(&seen);
+            }
             whole.tv_iterations = whole.tv_iterations.max(outcome.tv_iterations);
             whole.denoiser_passes = whole.denoiser_passes.max(outcome.denoiser_passes);
             whole.residual = whole.residual.max(outcome.residual);
@@ -108,9 +116,13 @@ pub fn reconstruct_tile(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome, ReconError> {
+    let solve = match Model::of(schedule) {
+        Some(_) => solver::reconstruct_assessed,
+        None => solver::reconstruct,
+    };
     input.solved(schedule.gamma, |op, y, part| {
         observer.part(part);
-        solver::reconstruct(op, y, schedule, networks, observer)
+        solve(op, y, schedule, networks, observer)
     })
 }
 
@@ -125,6 +137,7 @@ pub fn run_network(
         let rest = &y - &op.forward(frames.view())?;
         let norm = squares(y).max(f64::MIN_POSITIVE);
         Ok(Outcome {
+            features: None,
             frames,
             tv_iterations: 0,
             denoiser_passes: 1,

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter};
 use std::path::Path;
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView3};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::Value;
@@ -20,9 +20,11 @@ const STACK: &str = "stack.exr";
 const ARRAY: &str = "frames.npy";
 /// The frames as a colour sensor saw them.
 const SEEN: &str = "mosaic.npy";
+/// The expected error of blocks of the frames.
+const ERROR: &str = "error.npy";
 const MANIFEST: &str = "manifest.json";
 /// All that a result's folder holds, the manifest last.
-const NAMES: [&str; 6] = [FRAMES, PNGS, STACK, ARRAY, SEEN, MANIFEST];
+const NAMES: [&str; 7] = [FRAMES, PNGS, STACK, ARRAY, SEEN, ERROR, MANIFEST];
 
 /// Writes `frames/frame_0001.exr` and so on, `png/frame_0001.png` and so on (white as in the
 /// manifest, black is 0), `stack.exr`, `frames.npy` (float32 \[B,H,W\]), and at last the manifest
@@ -32,6 +34,8 @@ const NAMES: [&str; 6] = [FRAMES, PNGS, STACK, ARRAY, SEEN, MANIFEST];
 /// Frames of a mosaic get their colours: EXR has the channels R, G and B then, PNG has colours,
 /// `frames.npy` is \[B,H,W,3\], and `mosaic.npy` \[B,H,W\] has them as the sensor saw them.
 ///
+/// `error.npy` has the expected error of the frames \[B, rows, columns of blocks\], if there is one.
+///
 /// `frame(k)` \[H,W\] is asked once for each frame, in order; memory holds one.
 ///
 /// Returns all files, the manifest last.
@@ -39,6 +43,7 @@ const NAMES: [&str; 6] = [FRAMES, PNGS, STACK, ARRAY, SEEN, MANIFEST];
 pub fn write_result(
     folder: &Path,
     mut manifest: Manifest,
+    error: Option<ArrayView3<'_, f32>>,
     mut frame: impl FnMut(usize) -> Result<Array2<f32>>,
 ) -> Result<Vec<ResultFile>> {
     for name in [FRAMES, PNGS] {
@@ -76,6 +81,13 @@ pub fn write_result(
     if let Some((_, seen)) = seen {
         seen.finish()?;
         names.push(SEEN.to_owned());
+    }
+    if let Some(error) = error {
+        let file = BufWriter::new(File::create(folder.join(ERROR)).map_err(failed(ERROR))?);
+        let mut writer = npy::writer(file, error.dim(), Channels::Grey)?;
+        error.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
+        writer.finish()?;
+        names.push(ERROR.to_owned());
     }
     let files = &mut manifest.content.files;
     // Side by side: a disk brings many files to safety in the time of a few.
@@ -178,7 +190,7 @@ mod tests {
     }
 
     fn write(folder: &Path, frames: usize) -> Vec<ResultFile> {
-        write_result(folder, sample(frames), |k| Ok(frame(k))).unwrap()
+        write_result(folder, sample(frames), None, |k| Ok(frame(k))).unwrap()
     }
 
     #[test]
@@ -209,7 +221,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut manifest = sample(2);
         manifest.content.recipe.shape.mosaic = Some(Mosaic::Gbrg);
-        let files = write_result(folder.path(), manifest, |k| Ok(frame(k))).unwrap();
+        let files = write_result(folder.path(), manifest, None, |k| Ok(frame(k))).unwrap();
         assert!(files.iter().any(|file| file.name == "mosaic.npy"));
         let path = |name: &str| folder.path().join(name);
         let array = |name: &str| {

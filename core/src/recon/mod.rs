@@ -8,6 +8,7 @@
 
 #![warn(missing_docs)]
 
+pub mod assessment;
 mod defaults;
 pub mod error;
 pub mod joints;

@@ -1,5 +1,6 @@
 //! The paper's experiments on clips of your own: a program beside the service, on the same library.
 
+mod assess;
 mod clips;
 mod markdown;
 mod noise;
@@ -21,12 +22,14 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Experiment {
+    Assess(Box<assess::Arguments>),
     Noise(noise::Arguments),
     Tables(Box<tables::Arguments>),
 }
 
 fn main() -> ExitCode {
     let outcome = match Arguments::parse().experiment {
+        Experiment::Assess(arguments) => assess::run(&arguments),
         Experiment::Noise(arguments) => noise::run(&arguments),
         Experiment::Tables(arguments) => tables::run(&arguments),
     };

@@ -10,10 +10,12 @@ use sci_recon::job::{Algorithm, RunSpec, Sequence};
 use sci_recon::optics::{illumination, measure, noisy};
 use sci_recon::pipeline::networks::{ModelRecord, NetworkSource};
 use sci_recon::pipeline::quality::FrameQuality;
-use sci_recon::pipeline::records::{Summary, TileRecord};
+use sci_recon::pipeline::records::{PilotRecord, Summary, TileRecord};
 use sci_recon::pipeline::scale::white;
 use sci_recon::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use sci_recon::pipeline::usage::cpu_seconds;
+use sci_recon::recon::sequence::SequencePlan;
+use sci_recon::recon::solver::Outcome;
 use sci_recon::recon::tile::TilePlan;
 use sha2::{Digest, Sha256};
 
@@ -61,6 +63,35 @@ pub struct Measured<'a> {
     /// \[S B,H,W\].
     truth: Array3<f32>,
     sha256: String,
+}
+
+/// A tile and what is known of it.
+pub struct FirstTile {
+    pub outcome: Outcome,
+    pub white: f32,
+    pub pilot: Option<PilotRecord>,
+}
+
+impl<'a> Measured<'a> {
+    /// The true frames \[S B,H,W\] on \[0,1\].
+    pub fn truth(&self) -> &Array3<f32> {
+        &self.truth
+    }
+
+    fn white(&self) -> Result<f32, CliError> {
+        white(self.masks.view(), self.measurement.view())
+            .map_err(|error| CliError::Input(format!("clip {}: {error}", self.clip)))
+    }
+
+    fn input<'b>(
+        &'b self,
+        (plan, runs): (&'b TilePlan, &'b SequencePlan),
+        solver: Solver<'b>,
+        white: f32,
+    ) -> SequenceInput<'b> {
+        let (masks, measurement) = (self.masks.view(), self.measurement.view());
+        SequenceInput { masks, measurement, first: 0, white, solver, plan, runs, mosaic: None }
+    }
 }
 
 impl Bench {
@@ -158,27 +189,28 @@ impl Bench {
         })
     }
 
-    /// Reconstructs the clip as `key` says.
-    pub fn run(&self, measured: &Measured<'_>, key: Key) -> Result<Row, CliError> {
-        let Measured { masks, measurement, .. } = measured;
+    /// The first tile of a clip, reconstructed as `key` says, with what an assessment sees of it.
+    pub fn first_tile(&self, measured: &Measured<'_>, key: &Key) -> Result<FirstTile, CliError> {
         let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
         let runs = key.run.plan(0..key.snapshots)?;
-        let white = white(masks.view(), measurement.view())
-            .map_err(|error| CliError::Input(format!("clip {}: {error}", measured.clip)))?;
+        let white = measured.white()?;
+        let input = measured.input((&plan, &runs), Solver::Schedule(&key.schedule), white);
+        let mut solved = solve_on_all_cores(&input, &self.network)?;
+        let outcome = solved.runs.swap_remove(0).swap_remove(0);
+        Ok(FirstTile { outcome, white, pilot: solved.pilot })
+    }
+
+    /// Reconstructs the clip as `key` says.
+    pub fn run(&self, measured: &Measured<'_>, key: Key) -> Result<Row, CliError> {
+        let masks = measured.masks;
+        let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
+        let runs = key.run.plan(0..key.snapshots)?;
+        let white = measured.white()?;
         let solver = match &self.learned {
             Some(learned) if key.algorithm == Algorithm::Learned => Solver::Network(&learned.file),
             _ => Solver::Schedule(&key.schedule),
         };
-        let input = SequenceInput {
-            masks: masks.view(),
-            measurement: measurement.view(),
-            first: 0,
-            white,
-            solver,
-            plan: &plan,
-            runs: &runs,
-            mosaic: None,
-        };
+        let input = measured.input((&plan, &runs), solver, white);
         let (started, before) = (Instant::now(), cpu_seconds());
         let solved = solve_on_all_cores(&input, &self.network)?;
         let cpu_seconds = cpu_seconds() - before;

@@ -3,6 +3,7 @@
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use futures_util::StreamExt;
 use indicatif::ProgressBar;
@@ -12,6 +13,9 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use super::{Client, Result, again, refusal};
 use crate::cli::CliError;
 use crate::job::Sha256;
+
+/// Time between looks whether a file has been made.
+const MADE: Duration = Duration::from_secs(1);
 
 /// What became of a download.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,7 +35,12 @@ impl Client {
         sha256: Option<Sha256>,
         bar: &ProgressBar,
     ) -> Result<Fetched> {
-        let head = self.send(|| self.request(Method::HEAD, href)).await?;
+        let mut head = self.send(|| self.request(Method::HEAD, href)).await?;
+        while head.status() == StatusCode::ACCEPTED {
+            // A movie that a worker makes, now that it is asked for.
+            tokio::time::sleep(MADE).await;
+            head = self.send(|| self.request(Method::HEAD, href)).await?;
+        }
         let field = |name| head.headers().get(name).and_then(|value| value.to_str().ok());
         let size = field("content-length").and_then(|size| size.parse::<u64>().ok());
         let etag = field("etag").map(str::to_owned);

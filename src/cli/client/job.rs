@@ -4,10 +4,11 @@ use std::path::{Component, Path, PathBuf};
 
 use clap::ValueEnum;
 use indicatif::ProgressBar;
+use reqwest::StatusCode;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{Client, Result};
+use super::{Client, Result, refused};
 use crate::cli::CliError;
 use crate::cli::progress;
 use crate::job::{JobState, Sha256, SnapshotRange, Timestamp};
@@ -41,9 +42,15 @@ pub(in crate::cli) enum Wanted {
     /// The same as a BigTIFF for Fiji and napari.
     #[value(name = "stack.tif")]
     Tiff,
+    /// A movie of each snapshot.
+    #[value(name = "movie.mp4")]
+    Movie,
     /// The frames of a colour sensor as it saw them, float32.
     #[value(name = "mosaic.npy")]
     Mosaic,
+    /// The expected error of blocks of the frames, float32.
+    #[value(name = "error.npy")]
+    Error,
     /// Each frame as an EXR.
     #[value(name = "frames")]
     Frames,
@@ -59,6 +66,9 @@ pub(in crate::cli) enum Wanted {
     /// The same as a BigTIFF.
     #[value(name = "sequence.tif")]
     SequenceTiff,
+    /// The same as a movie.
+    #[value(name = "sequence.mp4")]
+    SequenceMovie,
     /// All files as one archive.
     #[value(name = "results.zip")]
     Archive,
@@ -78,10 +88,16 @@ impl Wanted {
             Self::Array => name == "frames.npy",
             Self::Stack => name == "stack.exr",
             Self::Mosaic => name == "mosaic.npy",
+            Self::Error => name == "error.npy",
             Self::Frames => name.starts_with("frames/"),
             Self::Pictures => name.starts_with("png/"),
             Self::Manifest => name == "manifest.json",
-            Self::Tiff | Self::SequenceArray | Self::SequenceTiff | Self::Archive => false,
+            Self::Tiff
+            | Self::Movie
+            | Self::SequenceArray
+            | Self::SequenceTiff
+            | Self::SequenceMovie
+            | Self::Archive => false,
         }
     }
 
@@ -91,6 +107,7 @@ impl Wanted {
             Self::Manifest => Some(("manifest.json", "manifest.json")),
             Self::SequenceArray => Some(("sequence/frames.npy", "sequence.npy")),
             Self::SequenceTiff => Some(("sequence/stack.tif", "sequence.tif")),
+            Self::SequenceMovie => Some(("sequence/movie.mp4", "sequence.mp4")),
             Self::Archive => Some(("results.zip", "results.zip")),
             _ => None,
         }
@@ -130,9 +147,19 @@ impl Client {
         Job::new(self.get(&format!("/v1/jobs/{id}?wait={wait}")).await?)
     }
 
-    /// Makes a thing with a key; gives its identifier.
+    /// Makes a thing with a key, and waits until its files are checked; gives its identifier.
     pub(in crate::cli) async fn made(&self, path: &str, body: &Value, key: &str) -> Result<String> {
-        id(&self.create(path, body, key).await?)
+        let mut made = self.create(path, body, key).await?;
+        let id = id(&made)?;
+        while made["state"] == "preparing" {
+            made = self.get(&format!("{path}/{id}?wait=20")).await?;
+        }
+        let problem = &made["problem"];
+        match problem["status"].as_u64().and_then(|status| u16::try_from(status).ok()) {
+            // Another attempt makes another one.
+            Some(status) => Err(refused(StatusCode::from_u16(status).unwrap_or_default(), problem)),
+            None => Ok(id),
+        }
     }
 
     /// Fetches files of a job into a folder: those of each snapshot into `snapshot_0000` and so on. Gives all
@@ -156,8 +183,10 @@ impl Client {
                     files.push((href.clone(), path, Some(file.sha256)));
                 }
             }
-            if wanted.contains(&Wanted::Tiff) {
-                files.push((format!("{of_snapshot}/stack.tif"), inside.join("stack.tif"), None));
+            for (made, name) in [(Wanted::Tiff, "stack.tif"), (Wanted::Movie, "movie.mp4")] {
+                if wanted.contains(&made) {
+                    files.push((format!("{of_snapshot}/{name}"), inside.join(name), None));
+                }
             }
         }
         for (place, name) in wanted.iter().filter_map(|wanted| wanted.of_job()) {

@@ -167,7 +167,10 @@ async fn again(error: ClientError, attempt: &mut u32) -> Result<()> {
 /// What an answer says that is no success.
 async fn refusal(response: Response) -> ClientError {
     let status = response.status();
-    let problem: Value = response.json().await.unwrap_or_default();
+    refused(status, &response.json().await.unwrap_or_default())
+}
+
+fn refused(status: StatusCode, problem: &Value) -> ClientError {
     let detail = problem["detail"].as_str().unwrap_or("no reason is given");
     let places = problem["errors"].as_array().into_iter().flatten();
     let places = places.map(|error| error["pointer"].as_str().unwrap_or_default());

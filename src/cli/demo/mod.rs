@@ -1,5 +1,6 @@
 //! `sci-recon demo`: a real clip through the real service.
 
+mod page;
 mod report;
 mod service;
 
@@ -19,13 +20,14 @@ use crate::cli::error::Result;
 use crate::formats::{Limits, exr};
 use crate::intake::sample;
 use crate::job::{Algorithm, JobState};
-use report::{Quality, Report};
+use page::Made;
+use report::{PAGE, Quality, Report};
 use service::Service;
 
 /// The file that tells a demo's folder from others.
 const REPORT: &str = "demo.json";
 /// What the demo makes in its folder.
-const PARTS: [&str; 4] = ["input", "service", "frames", "service.log"];
+const PARTS: [&str; 6] = ["input", "service", "frames", "service.log", page::PICTURES, PAGE];
 const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastdvdnet];
 /// Time between looks at the jobs.
 const POLL: Duration = Duration::from_millis(250);
@@ -63,23 +65,29 @@ async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
     say(format!("the service is at {}", service.url()));
     // 3. Over HTTP from here on, as a lab machine would.
     let client = Client::at(service.url(), None)?;
-    let reports = through_http(&client, out, &truth).await;
+    let results = through_http(&client, out, &truth).await;
     service.stop().await?;
-    let [gap_tv, pnp_tv_fastdvdnet] = reports?;
+    let ([gap_tv, pnp_tv_fastdvdnet], made) = results?;
     // 4. The comparison.
     let report = Report {
         gap_tv,
         pnp_tv_fastdvdnet,
+        frames,
         seconds: started.elapsed().as_secs_f64(),
         output_dir: out.to_owned(),
     };
     fs::write(out.join(REPORT), report.to_json()?)
         .map_err(|error| CliError::file("write", &out.join(REPORT), &error))?;
+    page::write(out, &truth, &made, &report)?;
     report.print(arguments.json)
 }
 
 /// Sends the files, asks for both algorithms, waits, and compares the frames that come back.
-async fn through_http(client: &Client, out: &Path, truth: &Array3<f32>) -> Result<[Quality; 2]> {
+async fn through_http(
+    client: &Client,
+    out: &Path,
+    truth: &Array3<f32>,
+) -> Result<([Quality; 2], Vec<Made>)> {
     let input = out.join("input");
     let masks = client.sent(&input.join("masks.npy")).await?;
     let measurement = client.sent(&input.join("measurement.npy")).await?;
@@ -92,13 +100,15 @@ async fn through_http(client: &Client, out: &Path, truth: &Array3<f32>) -> Resul
         jobs.push((name, made(client, "/v1/jobs", &body).await?));
     }
     watch(client, &jobs).await?;
-    let mut qualities = Vec::new();
+    let (mut qualities, mut results) = (Vec::new(), Vec::new());
     for (name, job) in &jobs {
         let folder = out.join("frames").join(name);
-        let frames = frames(client, job, &folder).await?;
+        let (frames, movie) = results_of(client, job, &folder).await?;
         qualities.push(report::compare(&frames, truth, cpu_seconds(client, job).await?)?);
+        let movie = movie.strip_prefix(out).unwrap_or(&movie).display().to_string();
+        results.push(Made { name, frames, movie });
     }
-    Ok([qualities[0], qualities[1]])
+    Ok(([qualities[0], qualities[1]], results))
 }
 
 /// Makes a calibration, a measurement or a job; gives its identifier.
@@ -106,14 +116,21 @@ async fn made(client: &Client, path: &str, body: &Value) -> Result<String> {
     Ok(client.made(path, body, &Uuid::now_v7().to_string()).await?)
 }
 
-/// Fetches the EXR frames of snapshot 0 into `folder`, and reads them: \[B,H,W\].
-async fn frames(client: &Client, job: &str, folder: &Path) -> Result<Array3<f32>> {
-    let files = client.fetch(&client.job(job, 0).await?, &[Wanted::Frames], folder).await?;
+/// Fetches the EXR frames of snapshot 0 and its movie into `folder`, and reads the frames: \[B,H,W\].
+async fn results_of(client: &Client, job: &str, folder: &Path) -> Result<(Array3<f32>, PathBuf)> {
+    let job = &client.job(job, 0).await?;
+    let files = client.fetch(job, &[Wanted::Frames, Wanted::Movie], folder).await?;
+    let (movies, files): (Vec<_>, Vec<_>) =
+        files.into_iter().partition(|file| file.extension().is_some_and(|kind| kind == "mp4"));
     let frames = files.iter().map(|file| exr::read_stack(file, &Limits::default()));
     let frames = frames.collect::<std::result::Result<Vec<_>, _>>()?;
     let views: Vec<_> = frames.iter().map(|(_, frame)| frame.view()).collect();
-    concatenate(Axis(0), &views)
-        .map_err(|error| CliError::Failure(format!("the frames of job {job}: {error}")))
+    let failed = |error: &dyn std::fmt::Display| {
+        CliError::Failure(format!("the results of job {}: {error}", job.id))
+    };
+    let frames = concatenate(Axis(0), &views).map_err(|error| failed(&error))?;
+    let movie = movies.into_iter().next().ok_or_else(|| failed(&"there is no movie"))?;
+    Ok((frames, movie))
 }
 
 /// Processor seconds that the job's computing took, from its manifest.

@@ -10,12 +10,15 @@ use crate::cli::error::Result;
 use crate::formats::Channels;
 use crate::pipeline::quality::{self, FrameQuality};
 
+/// The page that shows it.
+pub(super) const PAGE: &str = "report.html";
+
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Quality {
-    psnr_db: f64,
-    ssim: f64,
+    pub(super) psnr_db: f64,
+    pub(super) ssim: f64,
     /// Processor seconds of computing.
-    cpu_seconds: f64,
+    pub(super) cpu_seconds: f64,
 }
 
 /// What `--json` prints, and `demo.json`.
@@ -23,6 +26,9 @@ pub(super) struct Quality {
 pub(super) struct Report {
     pub(super) gap_tv: Quality,
     pub(super) pnp_tv_fastdvdnet: Quality,
+    /// Frames of the snapshot.
+    #[serde(skip)]
+    pub(super) frames: usize,
     /// Wall time of the whole demo.
     pub(super) seconds: f64,
     pub(super) output_dir: PathBuf,
@@ -48,6 +54,11 @@ impl Report {
             .map_err(|error| CliError::Failure(format!("the report: {error}")))
     }
 
+    /// The algorithms that were compared.
+    pub(super) fn rows(&self) -> [(&'static str, Quality); 2] {
+        [("gap-tv", self.gap_tv), ("pnp-tv-fastdvdnet", self.pnp_tv_fastdvdnet)]
+    }
+
     pub(super) fn print(&self, json: bool) -> Result<()> {
         if json {
             println!("{}", self.to_json()?);
@@ -55,7 +66,7 @@ impl Report {
         }
         let (tv, pnp) = (&self.gap_tv, &self.pnp_tv_fastdvdnet);
         println!("\n{:20}{:>10}{:>9}{:>14}", "", "PSNR", "SSIM", "CPU");
-        for (name, quality) in [("gap-tv", tv), ("pnp-tv-fastdvdnet", pnp)] {
+        for (name, quality) in self.rows() {
             let Quality { psnr_db, ssim, cpu_seconds } = quality;
             println!("{name:20}{psnr_db:>7.2} dB{ssim:>9.4}{cpu_seconds:>12.1} s");
         }
@@ -65,8 +76,9 @@ impl Report {
             self.seconds
         );
         let out = self.output_dir.display();
-        println!("The downloaded frames are in {out}/frames, the true ones in {out}/input/clip,");
-        println!("the service's own files in {out}/service.");
+        println!("To look at them: {out}/{PAGE}. The dashboard on the same data:");
+        println!("sci-recon serve --data {out}/service");
+        println!("The downloaded frames are in {out}/frames, the true ones in {out}/input/clip.");
         Ok(())
     }
 }

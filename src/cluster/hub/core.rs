@@ -58,12 +58,12 @@ pub struct Core {
 }
 
 impl Core {
-    pub fn new(store: Store, connection: Connection, ack_wait: Duration) -> Self {
+    pub fn new(store: Store, connection: Connection, program: Program, ack_wait: Duration) -> Self {
         Self {
             store,
             connection,
             id: WorkerId::new(),
-            program: Program::this(),
+            program,
             ack_wait,
             more: Notify::new(),
             presence: Mutex::default(),

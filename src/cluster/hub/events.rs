@@ -126,7 +126,7 @@ impl Core {
                     let last =
                         RemoteBeat { task, attempt, pool: pool.to_string(), progress, history };
                     self.store.remote_beats(&[last], &[]).await?;
-                    let product = Product::Tile(staged);
+                    let product = Product::File(staged);
                     let completion = Completion { progress, record, product };
                     match self.store.complete(&lease, completion).await? {
                         Heartbeat::Lost => figures::refused(1),

@@ -8,6 +8,7 @@ use tokio::task::JoinSet;
 
 use super::core::Core;
 use crate::cluster::connection::{Access, ClusterError, Connection};
+use crate::cluster::message::Program;
 use crate::store::Store;
 
 /// The shortest and the longest pause before the message server is tried again.
@@ -24,13 +25,13 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// Starts to hand tiles out, as soon as the message server answers. A message is delivered again when
+    /// Starts to hand tiles out to workers that are `program`, as soon as the message server answers. A message is delivered again when
     /// its worker was silent for `ack_wait`.
     #[must_use]
-    pub fn start(store: Store, access: Access, ack_wait: Duration) -> Self {
+    pub fn start(store: Store, access: Access, program: Program, ack_wait: Duration) -> Self {
         let mut running = JoinSet::new();
         let (tell, trouble) = watch::channel(Some("there is no connection to NATS yet".to_owned()));
-        running.spawn(run(store, access, ack_wait, tell));
+        running.spawn(run(store, access, (program, ack_wait), tell));
         Self { _running: running, trouble }
     }
 
@@ -44,11 +45,11 @@ impl Hub {
 async fn run(
     store: Store,
     access: Access,
-    ack_wait: Duration,
+    (program, ack_wait): (Program, Duration),
     tell: watch::Sender<Option<String>>,
 ) {
     let connection = persist(&tell, || access.connect()).await;
-    let core = Arc::new(Core::new(store, connection.clone(), ack_wait));
+    let core = Arc::new(Core::new(store, connection.clone(), program, ack_wait));
     persist(&tell, || core.find_streams()).await;
     let mut parts = persist(&tell, || parts(&core)).await;
     tracing::info!("handing tiles out to other machines");

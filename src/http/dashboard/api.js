@@ -54,6 +54,17 @@ export class Refused extends Error {
   }
 }
 
+/** Makes something of files and waits until they are checked; `during` is told how far that is. */
+export async function create(path, body, signal, during = () => {}) {
+  let made = await send("POST", path, body);
+  while (made.state === "preparing") {
+    during(made);
+    made = await get(`${path}/${made.id}?wait=0.7`, signal);
+  }
+  if (made.state !== "failed") return made;
+  throw made.problem ? new Refused(made.problem.status, made.problem) : new Error(made.error);
+}
+
 /** Answers that may still hold, by path. */
 export const known = new Map();
 const KNOWN = 60;
@@ -77,7 +88,8 @@ function remember(path, answer) {
   if (known.size > KNOWN) known.delete(known.keys().next().value);
 }
 
-async function refused(response) {
+/** The error of an answer that is no success. */
+export async function refused(response) {
   let problem = {};
   try {
     problem = await response.json();

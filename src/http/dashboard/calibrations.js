@@ -47,6 +47,7 @@ export function glance(item, signal) {
 /** What is to be said of a calibration whose masks are not there. */
 function unready(item) {
   if (item.state === "failed") return `No masks: ${item.error}`;
+  if (item.frames === null) return "The masks are being checked";
   return `Masks are being made of ${item.frames} patterns: ${Math.floor(item.percent)} %`;
 }
 

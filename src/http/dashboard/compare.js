@@ -210,6 +210,7 @@ function figures(jobs, manifests, measured) {
   const rows = [
     measured && ["PSNR", (_, index) => (measured[index].psnr === null ? "∞" : `${figure(measured[index].psnr, 4)} dB`), "quality"],
     measured && ["SSIM", (_, index) => figure(measured[index].ssim, 4), "quality"],
+    ["Expected PSNR", (job) => (job.assessment ? `${job.assessment.psnr_low_db} to ${job.assessment.psnr_high_db} dB` : "–")],
     ["State", (job) => job.state],
     ["Algorithm", (job) => job.algorithm],
     ["Planned iterations on a tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],

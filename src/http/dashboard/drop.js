@@ -82,7 +82,7 @@ export function askScale(again) {
 }
 
 /** The orders of an array's axes, in words. */
-const ORDERS = { "frame-row-column": "frame, row, column", "row-column-frame": "row, column, frame", "column-row-frame": "column, row, frame" };
+const ORDERS = { "frame-row-column": "frame, row, column", "row-column-frame": "row, column, frame", "column-row-frame": "column, row, frame", "frame-column-row": "frame, column, row" };
 
 /** Asks for the order of the axes, of those that a refusal says fit. */
 function askAxes(error, again) {

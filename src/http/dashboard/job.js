@@ -5,6 +5,7 @@ import { announce, h, put, trouble } from "./dom.js";
 import { bytes, nameOf, stageOf, timeOf } from "./format.js";
 import { gaveUp, get, send } from "./api.js";
 import { Made } from "./made.js";
+import { movieLink } from "./movie.js";
 import { TileMap } from "./tilemap.js";
 import { Verdict } from "./verdict.js";
 import { Viewer } from "./viewer.js";
@@ -66,7 +67,10 @@ export async function job(root, [id], signal) {
   const results = async (now) => {
     const written = await showFiles(files, now, snapshot.value(), signal);
     viewer.stand(now, written);
-    await Promise.all([verdict.show(now, written, snapshot.value()), made.show(now, snapshot.value())]);
+    const place = `/v1/jobs/${now.id}/snapshots/${snapshot.value()}/manifest.json`;
+    const manifest = written ? await get(place, signal).catch((error) => gaveUp(error) ? Promise.reject(error) : { error }) : null;
+    await verdict.show(now, manifest, snapshot.value());
+    made.show(now, manifest, place);
   };
   const open = async () => {
     await viewer.open(snapshot.value());
@@ -115,12 +119,14 @@ function line(now) {
   return now.state === "succeeded" ? text : [h("progress", { max: 100, value: percent, "aria-label": "Progress" }), text];
 }
 
-const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "mosaic.npy": "Mosaic (npy)", "manifest.json": "Manifest" };
+const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "mosaic.npy": "Mosaic (npy)", "error.npy": "Expected error (npy)", "manifest.json": "Manifest" };
 
 const ORDER = Object.keys(NAMES);
+/** Smaller frames have no movie. */
+const LEAST_MOVIE_SIDE = 16;
 
 /** Shows the files of a snapshot, and all of the job's once it has ended well; true if they are written. */
-async function showFiles(element, { id, state }, snapshot, signal) {
+async function showFiles(element, { id, state, shape, snapshots: { count } }, snapshot, signal) {
   const { ready, files } = await get(`/v1/jobs/${id}/snapshots/${snapshot}`, signal);
   const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
   const whole = files.filter((file) => !file.name.includes("/")).sort((one, other) => ORDER.indexOf(one.name) - ORDER.indexOf(other.name));
@@ -128,9 +134,12 @@ async function showFiles(element, { id, state }, snapshot, signal) {
   element.hidden = !ready;
   // Made as they are read: their sizes are not known beforehand.
   const made = (href, text) => h("a", { class: "button small", href, download: true }, text);
+  const moves = Math.min(shape.height, shape.width) >= LEAST_MOVIE_SIDE;
   const stack = whole.find((file) => file.name === "stack.exr")?.href;
   put(element, h("b", null, "Download"), whole.map((file) => link(file, file.name === "stack.exr")),
     stack && made(stack.replace(/exr$/, "tif"), "TIFF stack"),
+    stack && moves && movieLink(`/v1/jobs/${id}/snapshots/${snapshot}/movie.mp4`, "Movie", signal),
+    stack && moves && count > 1 && state === "succeeded" && movieLink(`/v1/jobs/${id}/sequence/movie.mp4`, "Movie of all", signal),
     stack && state === "succeeded" && made(stack.replace(/snapshots\/.*/, "results.zip"), "All as ZIP"),
     h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;

@@ -190,7 +190,7 @@ function columns(chosen, choose, done) {
     { title: h("span", { class: "unseen" }, "Picture"), class: "thumb", fill: thumb },
     { title: "Job", class: "name", fill: name },
     { title: "State", class: "state", fill: state },
-    { title: "Checks", class: "checks", fill: checks },
+    { title: "Quality", class: "checks", fill: checks },
     { title: "Frames", class: "shape", fill: (cell, job) => say(cell, shapeOf(job)) },
     { title: "Submitted", class: "created", fill: created },
     { title: h("span", { class: "unseen" }, "Actions"), class: "actions writes", fill: (cell, job, before) => buttons(cell, job, before, done) },
@@ -239,12 +239,14 @@ function state(cell, job, before) {
   say(cell.lastChild, [bar && `${Math.floor(job.progress.percent)} %`, bar && stageOf(job), timeOf(job)].filter(Boolean).join(" · "));
 }
 
-/** What the checks of measurement and calibration found. */
+/** What the checks of measurement and calibration found, and how good the frames are expected to be. */
 function checks(cell, job, before) {
-  if (before) return;
+  if (before && !before.assessment === !job.assessment) return;
   const found = doubts(job);
+  const told = job.assessment;
   put(cell, found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text));
-  if (!found) put(cell, h("span", { class: "mark fine" }, "nothing found"));
+  if (!found && !told) put(cell, h("span", { class: "mark fine" }, "nothing found"));
+  if (told) cell.append(h("span", { class: `sub grade ${told.grade}`, title: `Expected PSNR ${told.psnr_low_db} to ${told.psnr_high_db} dB` }, `about ${told.psnr_db.toFixed(0)} dB`));
 }
 
 function created(cell, job) {

@@ -2,9 +2,8 @@
 
 import { announce, facts, h, place, put, say } from "./dom.js";
 import { bytes, duration, figure, iterationsOf, momentInFull, shapeOf } from "./format.js";
-import { gaveUp, get } from "./api.js";
 
-/** The card; `show(job, snapshot)` adds what the manifest of a snapshot tells. */
+/** The card; `show` adds what the manifest of a snapshot tells. */
 export class Made {
   constructor(job, signal) {
     Object.assign(this, { job, signal });
@@ -29,14 +28,11 @@ export class Made {
     ]);
   }
 
-  async show(job, snapshot) {
+  /** With the manifest of a snapshot, or the error that came for it, and where it is. */
+  show(job, manifest, href) {
     if (job.state !== "succeeded") return;
-    let manifest;
-    try {
-      manifest = await get(`/v1/jobs/${job.id}/snapshots/${snapshot}/manifest.json`, this.signal);
-    } catch (error) {
-      if (gaveUp(error)) throw error;
-      put(this.body, this.plan(), h("p", { class: "warn" }, error.message));
+    if (manifest.error) {
+      put(this.body, this.plan(), h("p", { class: "warn" }, manifest.error.message));
       return;
     }
     const { content, run } = manifest;
@@ -51,7 +47,7 @@ export class Made {
       ["Residual ‖y − Hx‖ / ‖y‖", figure(content.summary.residual)],
     ]), h("p", { class: "muted" }, RESIDUAL),
     h("details", null, h("summary", null, "Manifest: all of it"),
-      h("div", { class: "row" }, h("a", { class: "button small", href: `/v1/jobs/${job.id}/snapshots/${snapshot}/manifest.json`, download: `${job.id}-manifest.json` }, "Download")),
+      h("div", { class: "row" }, h("a", { class: "button small", href, download: `${job.id}-manifest.json` }, "Download")),
       h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
   }
 }

@@ -53,6 +53,7 @@ const FILES: &[(&str, &[u8])] = &files![
     "keeping.js",
     "live.js",
     "made.js",
+    "movie.js",
     "pane.js",
     "player.js",
     "report.js",

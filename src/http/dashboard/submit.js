@@ -5,7 +5,7 @@ import { askAbout, askScale, dropZone, problem } from "./drop.js";
 import { bytes, duration, figure } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings } from "./report.js";
-import { gaveUp, get, send } from "./api.js";
+import { create, gaveUp, get, send } from "./api.js";
 import { given, numberField, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
@@ -93,9 +93,9 @@ function masks(told, sensor, use, verdict, signal) {
     use(null);
     put(verdict);
     try {
-      const made = await send("POST", "/v1/calibrations", { masks: sha256, ...told(), ...stated });
-      put(verdict, taken(made));
-      use(made);
+      const item = await create("/v1/calibrations", { masks: sha256, ...told(), ...stated }, signal);
+      put(verdict, taken(item));
+      use(item);
     } catch (error) {
       const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));
       if (!question) throw error;
@@ -115,17 +115,12 @@ function captures(told, use, verdict, signal) {
     button.disabled = true;
     use(null);
     try {
-      let made = await send("POST", "/v1/calibrations", { captures: found.value(), ...told() });
       const words = h("p", { class: "muted" });
       put(verdict, words);
-      while (made.state === "preparing" && !signal.aborted) {
-        say(words, `Masks are being made of ${made.frames} patterns: ${Math.floor(made.percent)} %`);
-        await new Promise((resolve) => setTimeout(resolve, 700));
-        made = await get(`/v1/calibrations/${made.id}`, signal);
-      }
-      if (made.state === "failed") throw new Error(made.error);
-      put(verdict, taken(made));
-      use(made);
+      const during = ({ frames, percent }) => say(words, `Masks are being made of ${frames} patterns: ${Math.floor(percent)} %`);
+      const item = await create("/v1/calibrations", { captures: found.value(), ...told() }, signal, during);
+      put(verdict, taken(item));
+      use(item);
     } catch (error) {
       if (!gaveUp(error)) put(verdict, problem(error));
     }
@@ -181,10 +176,11 @@ function measurementStep(form, changed, signal) {
     const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
     [last, known] = [sha256, stated];
     try {
-      const made = await send("POST", "/v1/measurements", { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) });
+      const asked = { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) };
+      const item = await create("/v1/measurements", asked, signal);
       // Something else was chosen meanwhile.
       if (mine !== turn) return;
-      form.measurement = made;
+      form.measurement = item;
     } catch (error) {
       if (mine !== turn) return;
       const question = askAbout(error, stated, again);

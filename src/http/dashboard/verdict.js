@@ -7,13 +7,14 @@ import { findings } from "./report.js";
 import { gaveUp, get, upload } from "./api.js";
 import { keepTruth, truthOf } from "./keeping.js";
 
-/** The card; `show(job, written, snapshot)` says what is known now. */
+/** The card; `show(job, manifest, snapshot)` says what is known now; a snapshot that is not written has no manifest. */
 export class Verdict {
   constructor(job, signal) {
     Object.assign(this, { job, signal, truth: truthOf(job.id) });
     this.title = h("p", { class: "judgement" });
     this.why = h("p", { class: "muted" });
     this.found = h("div", null, findings(job.warnings));
+    this.expected = h("div", { "aria-live": "polite" });
     this.measured = h("div", { "aria-live": "polite" });
     this.calibration = h("p", { class: "muted" });
     const input = h("input", { type: "file", id: "truth", class: "unseen" });
@@ -21,7 +22,7 @@ export class Verdict {
     this.attaching = h("label", { for: "truth", class: "button small filebutton" }, "Attach true frames", input);
     this.status = h("span", { class: "muted", "aria-live": "polite" });
     this.element = h("section", { class: "card verdictcard", "aria-label": "Is it good?" }, h("h2", null, "Is it good?"),
-      this.title, this.why, this.found, this.measured, h("div", { class: "row" }, this.attaching, this.status), this.calibration);
+      this.title, this.why, this.found, this.measured, this.expected, h("div", { class: "row" }, this.attaching, this.status), this.calibration);
     this.grade();
   }
 
@@ -38,17 +39,31 @@ export class Verdict {
     }
   }
 
-  async show(job, written, snapshot) {
+  async show(job, manifest, snapshot) {
+    const written = manifest !== null;
     Object.assign(this, { written, snapshot, state: job.state });
     this.attaching.hidden = !written;
     if (!written) {
       const words = { failed: ["It failed", "bad"], cancelled: ["It was cancelled", ""], cancelling: ["It is being cancelled", ""] }[job.state] ?? ["Not known yet", ""];
       this.judge(...words, job.state in { failed: 1, cancelled: 1, cancelling: 1 } ? "The frames are not complete: don’t rely on them." : "The frames are judged when they are written.");
       put(this.measured);
+      put(this.expected);
       return;
     }
+    this.tell(manifest.content?.assessment);
     if (this.truth) await this.compare();
     else this.unmeasured();
+  }
+
+  /** What is expected of the snapshot without a truth, as its manifest has it. */
+  tell(assessment) {
+    this.told = assessment;
+    const { psnr_db: psnr, psnr_low_db: low, psnr_high_db: high, reasons } = this.told ?? {};
+    const uneven = reasons?.filter((reason) => reason.code === "uneven_error") ?? [];
+    put(this.expected, this.told && [
+      h("p", { class: "quality" }, "about ", h("b", null, about(psnr)), " PSNR expected"),
+      h("p", { class: "muted" }, `Four times of five the true one lies between ${low.toFixed(0)} and ${about(high)}. Without a truth no more is known; “Expected error” above the frames shows where it is worst.`),
+      findings(uneven)]);
   }
 
   judge(text, kind, why) {
@@ -63,6 +78,7 @@ export class Verdict {
     const warned = this.job.warnings.length > 0;
     if (errors) this.judge("Not to be trusted", "bad", "The checks found what makes the frames wrong:");
     else if (warned) this.judge("With reservations", "usable", "The checks found what may spoil the frames:");
+    else if (this.told) this.judge(...EXPECTED[this.told.grade]);
     else if (poor) this.judge("With reservations", "usable", `The measurement fits its calibration, which is only ${this.graded}: its report says why.`);
     else this.judge("No faults found", "", "Measurement and calibration fit each other. That is no measure of quality: it is not known how near the frames are to the truth. True frames, where there are some, tell it.");
   }
@@ -102,6 +118,16 @@ export class Verdict {
     return true;
   }
 }
+
+/** Better than 40 dB is not told apart. */
+const about = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(0)} dB`);
+
+/** What an expected PSNR means where the checks found nothing. */
+const EXPECTED = {
+  good: ["Likely good", "good", "Measurement and calibration fit each other, and frames like these are near the truth."],
+  usable: ["Likely usable", "usable", "Measurement and calibration fit each other; frames like these have lost texture."],
+  bad: ["Likely poor", "bad", "Measurement and calibration fit each other, but in frames like these only coarse shapes are true."],
+};
 
 /** What a measured PSNR means for who looks at the frames, from the best down. */
 const LEVELS = [

@@ -8,7 +8,7 @@ import { Slice } from "./slice.js";
 import { View } from "./view.js";
 import { get, unanswered } from "./api.js";
 
-const MODES = [["frame", "Frames"], ["difference", "Difference to the frame before"], ["residual", "Residual |y − Hx|"]];
+const MODES = [["frame", "Frames"], ["difference", "Difference to the frame before"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
 
 export class Viewer {
   constructor(job, signal) {
@@ -80,12 +80,13 @@ export class Viewer {
   name(frame) {
     if (this.mode() === "frame") return `frame-${frame}`;
     // The first frame has none before it.
+    if (this.mode() === "error") return `error-${frame}`;
     return this.mode() === "difference" ? `difference-${Math.max(2, frame)}` : "residual";
   }
 
   source(frame) {
     const name = this.name(frame);
-    const label = { frame: `Frame ${frame} of ${this.player.count}`, difference: `Frame ${Math.max(2, frame)} without the one before`, residual: "Residual map" }[this.mode()];
+    const label = { frame: `Frame ${frame} of ${this.player.count}`, difference: `Frame ${Math.max(2, frame)} without the one before`, error: `Expected error of frame ${frame}`, residual: "Residual map" }[this.mode()];
     return { base: `${this.base()}/${name}`, levels: this.levels, tile: this.tile, label };
   }
 

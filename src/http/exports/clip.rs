@@ -25,10 +25,10 @@ const ARRAY: &str = "frames.npy";
 
 /// The clip that a path is about.
 pub(in crate::http) struct Clip {
-    app: App,
-    job: Job,
+    pub(super) app: App,
+    pub(super) job: Job,
     /// None for all snapshots of the job.
-    snapshot: Option<u32>,
+    pub(super) snapshot: Option<u32>,
 }
 
 #[derive(Deserialize)]
@@ -187,7 +187,7 @@ impl Clip {
         Ok(Piece { snapshot: Some(snapshot), file })
     }
 
-    async fn pieces(&self) -> Result<Vec<Piece>> {
+    pub(super) async fn pieces(&self) -> Result<Vec<Piece>> {
         let mut pieces = Vec::new();
         for snapshot in self.snapshots() {
             pieces.push(self.piece(snapshot).await?);

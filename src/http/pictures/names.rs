@@ -6,13 +6,14 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::render::Picture;
-use super::source::{DoneTile, Files, Stack, Unfinished, sent};
+use super::source::{DoneTile, Files, Stack, Unfinished, errors, sent};
 use crate::formats;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::intake;
 use crate::http::jobs::with_snapshot;
-use crate::job::{CalibrationId, JobId, Lab, MeasurementId, Sha256};
+use crate::http::results::result_file;
+use crate::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
 use crate::pipeline::records::TileTaskRecord;
 use crate::store::{Calibration, Job, Measurement, StoreError, TileResult};
 
@@ -25,6 +26,8 @@ enum JobPicture {
     /// `difference-2`: frame 2 without frame 1.
     Difference(usize),
     Residual,
+    /// `error-1`: the expected error of frame 1.
+    Error(usize),
     /// `slice-0`: all frames at row 0.
     Slice(usize),
 }
@@ -67,9 +70,11 @@ impl TryFrom<String> for JobPicture {
             "residual" => Some(Self::Residual),
             _ => (number("frame").map(Self::Frame))
                 .or_else(|| number("difference").map(Self::Difference))
+                .or_else(|| number("error").map(Self::Error))
                 .or_else(|| number("slice").map(Self::Slice)),
         };
-        found.ok_or_else(|| "pictures are frame-N, difference-N, slice-ROW and residual".into())
+        let names = "pictures are frame-N, difference-N, error-N, slice-ROW and residual";
+        found.ok_or_else(|| names.into())
     }
 }
 
@@ -140,6 +145,11 @@ impl Named for OfJob {
         let Self { job, snapshot, picture } = self;
         let job = with_snapshot(app, lab, job, snapshot).await?;
         let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
+        if let JobPicture::Error(k) = picture
+            && (1..=frames).contains(&k)
+        {
+            return errors_of(app, &job, snapshot, k - 1).await;
+        }
         let stack = frames_of(app, &job, snapshot).await?;
         match picture {
             JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
@@ -272,6 +282,14 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic })
 }
 
+/// The expected error of frame `k`, from 0.
+async fn errors_of(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<Picture> {
+    let SceneShape { height, width, .. } = job.spec.shape;
+    result_file(app, job, Some(snapshot), "error.npy").await?;
+    let (file, path, _) = app.store.open_result(job, Some(snapshot), "error.npy").await?;
+    Ok(errors(path, (height, width), (file.sha256, k)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::{CalibrationPicture, JobPicture, MeasurementPicture};
@@ -283,6 +301,7 @@ mod tests {
         assert_eq!(job("difference-2"), Ok(JobPicture::Difference(2)));
         assert_eq!(job("slice-0"), Ok(JobPicture::Slice(0)));
         assert_eq!(job("residual"), Ok(JobPicture::Residual));
+        assert_eq!(job("error-3"), Ok(JobPicture::Error(3)));
         for bad in ["frame-01", "frame-+1", "frame", "frame-", "../x", "residual-1", "slice--1", ""]
         {
             assert!(job(bad).is_err(), "{bad}");

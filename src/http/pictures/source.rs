@@ -11,6 +11,7 @@ use ndarray::{Array2, Array3, Axis, s};
 use super::render::Picture;
 use crate::formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
 use crate::job::{MARGIN, Mosaic, Sha256};
+use crate::pipeline::assessment::BLOCK;
 
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
@@ -233,6 +234,34 @@ pub(super) fn sent(
                 none => none.insert(nth_frame(&path, &limits, frame)?),
             };
             Ok(whole.slice(s![rows, columns]).to_owned())
+        }),
+    }
+}
+
+/// The expected error of frame `k`, from 0, of a picture of this size: each pixel has that of its block.
+pub(super) fn errors(
+    path: PathBuf,
+    (height, width): (usize, usize),
+    (sha256, k): (Sha256, usize),
+) -> Picture {
+    Picture {
+        height,
+        width,
+        identity: format!("{sha256} error {k}"),
+        settled: true,
+        channels: Channels::Grey,
+        depth: 1,
+        read: Box::new(move |rows, columns| {
+            let of_blocks = |range: &Range<usize>| range.start / BLOCK..range.end.div_ceil(BLOCK);
+            let (down, across) = (of_blocks(&rows), of_blocks(&columns));
+            let stored = npy::open_windows(&path, &Limits::default())?;
+            let blocks = first(stored.read_window(k..k + 1, down.clone(), across.clone())?);
+            Ok(Array2::from_shape_fn((rows.len(), columns.len()), |(i, j)| {
+                blocks[[
+                    (rows.start + i) / BLOCK - down.start,
+                    (columns.start + j) / BLOCK - across.start,
+                ]]
+            }))
         }),
     }
 }

@@ -1,5 +1,6 @@
 //! How a worker gets a task, with all that it needs to do it.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde_json::Value;
@@ -14,7 +15,7 @@ use crate::job::{
 };
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{sql, sql_as};
+use crate::store::rows::{sql, sql_as, sql_scalar};
 use crate::store::tables::calibrations::Calibration;
 use crate::store::tables::measurements::Measurement;
 use crate::store::tables::tasks::{self, Owner, TaskRecord, TileResult};
@@ -40,6 +41,7 @@ pub enum Work {
     Job(Box<JobTask>),
     /// A calibration's masks, or the report on them.
     Calibration(Box<CalibrationTask>),
+    Movie(Box<MovieWork>),
 }
 
 #[derive(Debug, Clone)]
@@ -67,6 +69,18 @@ pub struct CalibrationTask {
     pub captures: Option<Captures>,
     /// The masks, a planar array, if they are there.
     pub masks: Option<Sha256>,
+}
+
+/// A movie that is to be made.
+#[derive(Debug, Clone)]
+pub struct MovieWork {
+    pub job: JobId,
+    pub spec: JobSpec,
+    pub measurement: Measurement,
+    /// What the job's prepare task recorded.
+    pub prepared: Option<Value>,
+    /// Of each snapshot the array with its frames, and the hash that it should have.
+    pub arrays: Vec<(PathBuf, Sha256)>,
 }
 
 /// Who asks for a task, and so which tasks may be handed out.
@@ -125,7 +139,7 @@ impl Claimant<'_> {
                  ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
                      jobs.state = 'running' DESC, job, ordinal, tasks.id
                  LIMIT 1)
-             RETURNING id, job, calibration, lab, kind, snapshot, snapshots, tile, attempt, cost"
+             RETURNING id, job, calibration, movie, lab, kind, snapshot, snapshots, tile, attempt, cost"
         )
     }
 
@@ -206,6 +220,7 @@ impl Store {
         match owner {
             Owner::Job(job) => self.job_task(job, kind).await,
             Owner::Calibration(id) => self.calibration_task(id).await,
+            Owner::Movie(job) => self.movie_work(job, kind.snapshot()).await,
         }
     }
 
@@ -247,6 +262,25 @@ impl Store {
             tiles,
             records,
         })))
+    }
+
+    async fn movie_work(&self, job: JobId, snapshot: Option<u32>) -> Result<Work> {
+        let job = self.job_of_any_lab(job).await?;
+        let measurement = self.find_measurement(None, job.spec.measurement).await?;
+        let prepared: Option<Json<Value>> =
+            sql_scalar!("SELECT record FROM tasks WHERE job = ? AND kind = 'prepare'", [job.id])
+                .fetch_one(&self.readers)
+                .await?;
+        let mut arrays = Vec::new();
+        for snapshot in
+            snapshot.map_or_else(|| job.spec.snapshots.indices().collect(), |one| vec![one])
+        {
+            let (file, path) = self.result_file(&job, Some(snapshot), "frames.npy").await?;
+            arrays.push((path, file.sha256));
+        }
+        let prepared = prepared.map(|json| json.0);
+        let work = MovieWork { job: job.id, spec: job.spec, measurement, prepared, arrays };
+        Ok(Work::Movie(Box::new(work)))
     }
 
     async fn calibration_task(&self, id: CalibrationId) -> Result<Work> {

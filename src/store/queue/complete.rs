@@ -1,5 +1,6 @@
 //! How a task ends well: what it has made is stored, and what waited for it goes on.
 
+use serde::Deserialize;
 use serde_json::Value;
 use sqlx::SqliteConnection;
 use sqlx::types::Json;
@@ -7,8 +8,8 @@ use sqlx::types::Json;
 use super::lease::{self, Heartbeat, Lease, Outcome};
 use super::{graph, job};
 use crate::job::{
-    CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind, TaskProgress, TaskState,
-    Timestamp,
+    Assessment, CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind,
+    TaskProgress, TaskState, Timestamp,
 };
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::sql;
@@ -35,7 +36,8 @@ pub enum Product {
     Record,
     /// The share of their planned cost that the tiles still have, on \[0,1\] (pilot).
     TileCost(f64),
-    Tile(StagedBlob),
+    /// A tile, a preview or a movie.
+    File(StagedBlob),
     /// The files of a snapshot (assemble) or of the job (manifest), which are on the disk.
     Files(StagedDir, Vec<ResultFile>),
     Calibration(Box<CalibrationDone>),
@@ -65,7 +67,7 @@ impl Store {
             (Owner::Job(job), Product::TileCost(share)) => {
                 graph::scale_tiles(&mut transaction, job, share).await?;
             }
-            (Owner::Job(_), Product::Tile(staged)) => {
+            (Owner::Job(_) | Owner::Movie(_), Product::File(staged)) => {
                 result = Some(staged.sha256());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }
@@ -76,7 +78,8 @@ impl Store {
             (Owner::Calibration(id), Product::Calibration(done)) => {
                 self.calibrated(&mut transaction, id, *done).await?;
             }
-            (Owner::Job(_), Product::Calibration(_)) | (Owner::Calibration(_), _) => {
+            (Owner::Job(_), Product::Calibration(_))
+            | (Owner::Calibration(_) | Owner::Movie(_), _) => {
                 let value = kind.into_str().to_owned();
                 return Err(StoreError::Corrupt { column: "kind", value });
             }
@@ -85,7 +88,11 @@ impl Store {
         if let Owner::Job(job) = owner {
             graph::unblock(&mut transaction, job, kind).await?;
             if kind == TaskKind::Manifest {
-                self.succeed(&mut transaction, job).await?;
+                let record = &completion.record;
+                let assessment = Option::<Assessment>::deserialize(record).map_err(|_| {
+                    StoreError::Corrupt { column: "record", value: record.to_string() }
+                })?;
+                self.succeed(&mut transaction, job, assessment).await?;
             }
             job::settle(&mut transaction, job).await?;
             sums::recount(&mut transaction, job).await?;

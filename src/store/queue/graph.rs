@@ -81,7 +81,7 @@ pub async fn insert_calibration(
 /// The state of a task that waits for its turn alone, or for others.
 fn first_state(kind: TaskKind) -> TaskState {
     match kind {
-        TaskKind::Prepare | TaskKind::Calibration => TaskState::Ready,
+        TaskKind::Prepare | TaskKind::Calibration | TaskKind::Movie { .. } => TaskState::Ready,
         TaskKind::Preview { .. }
         | TaskKind::Pilot
         | TaskKind::Tile { .. }
@@ -135,7 +135,7 @@ pub(super) async fn unblock(
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1
                                    AND kind IN ('preview', 'assemble') AND state <> ?5)"
         }
-        TaskKind::Manifest | TaskKind::Calibration => return Ok(()),
+        TaskKind::Manifest | TaskKind::Calibration | TaskKind::Movie { .. } => return Ok(()),
     };
     sql!(
         query,

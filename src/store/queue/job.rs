@@ -1,9 +1,10 @@
 //! What users do with a job in the queue: cancel it, take it up again, delete it; and how it ends.
 
 use sqlx::SqliteConnection;
+use sqlx::types::Json;
 
 use super::graph;
-use crate::job::{IllegalTransition, JobId, JobState, Lab, TaskState};
+use crate::job::{Assessment, IllegalTransition, JobId, JobState, Lab, TaskState};
 use crate::store::error::{Result, StoreError};
 use crate::store::rows::{sql, sql_scalar};
 use crate::store::tables::jobs::{self, JobChanges};
@@ -74,6 +75,8 @@ impl Store {
         }
         jobs::set_state(&mut transaction, id, JobState::Queued, None).await?;
         graph::undo(&mut transaction, id, &damaged).await?;
+        // Of results that will be others.
+        self.drop_movies(&mut transaction, id, None).await?;
         graph::restart(&mut transaction, id).await?;
         sums::recount(&mut transaction, id).await?;
         transaction.commit().await?;
@@ -95,6 +98,7 @@ impl Store {
             return Err(StoreError::NotFinal(state));
         }
         self.drop_tiles(&mut transaction, id).await?;
+        self.drop_movies(&mut transaction, id, None).await?;
         sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
         // Under the lock and before the commit, so that no row is left whose files are gone for
         // longer than a crash takes; a second DELETE then removes the row.
@@ -108,9 +112,13 @@ impl Store {
         &self,
         transaction: &mut SqliteConnection,
         id: JobId,
+        assessment: Option<Assessment>,
     ) -> Result<()> {
         if jobs::state(transaction, id).await? == JobState::Running {
             jobs::set_state(transaction, id, JobState::Succeeded, None).await?;
+            sql!("UPDATE jobs SET assessment = ? WHERE id = ?", [assessment.map(Json), id])
+                .execute(&mut *transaction)
+                .await?;
             self.drop_tiles(transaction, id).await?;
         }
         Ok(())

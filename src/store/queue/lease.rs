@@ -235,7 +235,7 @@ pub(super) async fn held(
     lease: &Lease,
 ) -> Result<Option<(Owner, TaskKind)>> {
     let row = sql!(
-        "SELECT job, calibration, kind, snapshot, snapshots, tile FROM tasks
+        "SELECT job, calibration, movie, kind, snapshot, snapshots, tile FROM tasks
          WHERE id = ? AND attempt = ? AND state = ?",
         [lease.task, lease.attempt, TaskState::Running]
     )
@@ -280,8 +280,8 @@ pub(super) async fn lose(
     loss: &Loss,
 ) -> Result<()> {
     let row = sql!(
-        "SELECT job, calibration, kind, snapshot, snapshots, tile, failures, losses, starved FROM tasks
-          WHERE id = ?",
+        "SELECT job, calibration, movie, kind, snapshot, snapshots, tile, failures, losses, starved
+         FROM tasks WHERE id = ?",
         [task]
     )
     .fetch_one(&mut *connection)
@@ -292,7 +292,7 @@ pub(super) async fn lose(
     let wanted = match owner {
         Owner::Job(job) => job::is_wanted(connection, job).await?,
         // Its task would have been deleted with it.
-        Owner::Calibration(_) => true,
+        Owner::Calibration(_) | Owner::Movie(_) => true,
     };
     let (outcome, reason, mut hopeless) = match loss {
         Loss::Released if wanted => (Outcome::Released, None, false),
@@ -331,7 +331,7 @@ pub(super) async fn lose(
     )
     .execute(&mut *connection)
     .await?;
-    // A calibration has failed when its only task has; the reason is that of the task's last attempt.
+    // A calibration or a movie has failed when its only task has; the reason is that of the task's last attempt.
     let Owner::Job(job) = owner else { return Ok(()) };
     if state == TaskState::Failed {
         let kind = tasks::kind(&row)?;
@@ -357,6 +357,7 @@ fn failure_text(kind: TaskKind, attempts: u32, reason: &str) -> String {
         TaskKind::Pilot => "the pilot".into(),
         TaskKind::Manifest => "writing the manifest".into(),
         TaskKind::Calibration => "the calibration".into(),
+        TaskKind::Movie { .. } => "the movie".into(),
     };
     let times = if attempts > 1 { format!(" ({attempts} attempts)") } else { String::new() };
     format!("{place}: {reason}{times}")

@@ -11,12 +11,14 @@ mod forecast;
 pub(super) mod graph;
 mod job;
 mod lease;
+mod movie;
 mod progress;
 mod remote;
 
-pub use claim::{CalibrationTask, Claimant, ClaimedTask, JobTask, Work};
+pub use claim::{CalibrationTask, Claimant, ClaimedTask, JobTask, MovieWork, Work};
 pub use complete::{CalibrationDone, Completion, Product};
 pub(super) use forecast::Forecast;
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, WorkerEnd};
+pub use movie::Movie;
 pub use progress::{Estimate, JobMark, JobProgress, ProgressStage};
 pub use remote::{Begun, MessagePlace, RemoteBeat, RemoteTask};

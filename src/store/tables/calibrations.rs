@@ -18,6 +18,7 @@ use crate::store::error::{Result, StoreError};
 use crate::store::rows::{
     Filter, Page, Reference, integer, refuse_if_used, require, sql, sql_as, sql_scalar,
 };
+use crate::store::tables::checks;
 
 /// What is known of a calibration when its masks have been checked.
 #[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
@@ -61,12 +62,15 @@ pub struct Calibration {
 pub struct Unready {
     pub id: CalibrationId,
     pub name: Option<Label>,
-    pub frames: usize,
+    /// None while nobody has looked into the file.
+    pub frames: Option<usize>,
     /// How much of the work is done, on \[0,1\].
     pub fraction: f64,
     pub mosaic: Option<Mosaic>,
     /// Why there will be no masks; none while they are made.
     pub error: Option<String>,
+    /// The same as a problem in JSON, where a file did not pass its check.
+    pub problem: Option<String>,
     pub created_at: Timestamp,
 }
 
@@ -85,7 +89,8 @@ impl Store {
         match self.find_calibration(Some(lab), id).await {
             Err(missing @ StoreError::NotFound { .. }) => match self.unready(lab, id).await? {
                 Some(Unready { id, error, .. }) => Err(StoreError::Unready { id, error }),
-                None => Err(missing),
+                // They may have come between the two looks.
+                None => self.find_calibration(Some(lab), id).await.map_err(|_| missing),
             },
             found => found,
         }
@@ -129,12 +134,18 @@ impl Store {
         limit: u32,
     ) -> Result<Page<Unready>> {
         let rows = sql!(
-            "SELECT calibration, name, captures, mosaic, created_at, state, fraction,
-                 (SELECT reason FROM attempts
-                  WHERE task = tasks.id AND attempt = tasks.attempt) AS reason
-             FROM calibration_requests JOIN tasks USING (calibration)
-             WHERE calibration_requests.lab = ?1 AND captures IS NOT NULL AND state <> ?2
-               AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR calibration < ?4)
+            "WITH waiting AS (
+                 SELECT asked.lab, calibration, name, captures, mosaic, created_at, state, fraction,
+                     (SELECT reason FROM attempts
+                      WHERE task = tasks.id AND attempt = tasks.attempt) AS reason, NULL AS problem
+                 FROM calibration_requests AS asked JOIN tasks USING (calibration)
+                 WHERE captures IS NOT NULL AND state <> ?2
+                 UNION ALL
+                 SELECT lab, id, name, NULL, request ->> '$.mosaic', created_at,
+                     iif(problem IS NULL, ?8, ?9), 0.0, problem ->> '$.detail', problem
+                 FROM checks WHERE what = 'calibration')
+             SELECT * FROM waiting
+             WHERE lab = ?1 AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR calibration < ?4)
                AND (?6 IS NULL OR created_at >= ?6) AND (?7 IS NULL OR created_at < ?7)
              ORDER BY calibration DESC LIMIT ?5",
             [
@@ -144,7 +155,9 @@ impl Store {
                 filter.after,
                 i64::from(limit) + 1,
                 filter.created.from,
-                filter.created.before
+                filter.created.before,
+                TaskState::Running,
+                TaskState::Failed
             ]
         )
         .fetch_all(&self.readers)
@@ -174,9 +187,12 @@ impl Store {
     pub async fn calibration_marks(
         &self,
     ) -> Result<HashMap<(Lab, CalibrationId), CalibrationMark>> {
-        let rows: Vec<(Lab, CalibrationId, TaskState, f64, Option<Label>)> = sqlx::query_as(
+        let rows: Vec<(Lab, CalibrationId, TaskState, f64, Option<Label>)> = sql_as!(
             "SELECT asked.lab, calibration, state, fraction, name
-             FROM calibration_requests AS asked JOIN tasks USING (calibration)",
+             FROM calibration_requests AS asked JOIN tasks USING (calibration)
+             UNION ALL
+             SELECT lab, id, iif(problem IS NULL, ?, ?), 0.0, name FROM checks WHERE what = 'calibration'",
+            [TaskState::Running, TaskState::Failed]
         )
         .fetch_all(&self.readers)
         .await?;
@@ -200,7 +216,9 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
-        if renamed.rows_affected() == 0 {
+        if renamed.rows_affected() == 0
+            && !checks::rename(&mut transaction, (lab, id), name).await?
+        {
             return Err(StoreError::missing("calibration", id));
         }
         sql!("UPDATE calibrations SET name = ? WHERE id = ?", [name, id])
@@ -219,10 +237,17 @@ impl Store {
                 .execute(&mut *transaction)
                 .await?;
         if asked.rows_affected() == 0 {
+            if checks::delete_of(&mut transaction, lab, id).await? {
+                return Ok(transaction.commit().await?);
+            }
             return Err(StoreError::missing("calibration", id));
         }
         for users in [
-            ("measurements", "SELECT count(*) AS users FROM measurements WHERE calibration = ?"),
+            (
+                "measurements",
+                "SELECT (SELECT count(*) FROM measurements WHERE calibration = ?1)
+                     + (SELECT count(*) FROM checks WHERE calibration = ?1 AND problem IS NULL) AS users",
+            ),
             ("models", "SELECT count(*) AS users FROM models WHERE calibration = ?"),
         ] {
             refuse_if_used(&mut transaction, ("calibration", id.to_string()), users).await?;
@@ -335,16 +360,17 @@ pub async fn insert(
 }
 
 fn unready(row: &SqliteRow) -> Result<Unready> {
-    let Json(captures): Json<Captures> = row.try_get("captures")?;
+    let captures: Option<Json<Captures>> = row.try_get("captures")?;
     let failed = row.try_get::<TaskState, _>("state")? == TaskState::Failed;
     Ok(Unready {
         id: row.try_get("calibration")?,
         name: row.try_get("name")?,
-        frames: captures.masks.len(),
+        frames: captures.map(|Json(captures)| captures.masks.len()),
         mosaic: row.try_get("mosaic")?,
         fraction: row.try_get("fraction")?,
         // The reason of the last attempt; one that is tried again is none for a user.
         error: if failed { row.try_get("reason")? } else { None },
+        problem: row.try_get("problem")?,
         created_at: row.try_get("created_at")?,
     })
 }

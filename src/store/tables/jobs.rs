@@ -4,7 +4,8 @@ use sqlx::types::Json;
 use sqlx::{AssertSqlSafe, FromRow, SqliteConnection};
 
 use crate::job::{
-    CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256, Timestamp,
+    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
+    Timestamp,
 };
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
@@ -22,6 +23,9 @@ pub struct Job {
     /// When its first task was claimed.
     pub started_at: Option<Timestamp>,
     pub finished_at: Option<Timestamp>,
+    /// How good its frames are expected to be; none until they are there, and where nothing can be told.
+    #[sqlx(json(nullable))]
+    pub assessment: Option<Assessment>,
 }
 
 #[derive(Debug, Clone, Default)]

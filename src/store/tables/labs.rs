@@ -8,7 +8,7 @@ use strum::VariantArray;
 
 use crate::job::{JobState, Lab, Timestamp};
 use crate::store::Store;
-use crate::store::error::Result;
+use crate::store::error::{Result, StoreError};
 use crate::store::rows::{integer, sql, sql_as};
 
 #[derive(Debug, Clone, PartialEq, FromRow)]
@@ -32,7 +32,7 @@ pub struct LabUse {
     /// Uploads, and their bytes.
     pub uploads: u64,
     pub upload_bytes: u64,
-    /// Bytes of the frames and other files of its jobs.
+    /// Bytes of the frames, movies and other files of its jobs.
     pub result_bytes: u64,
     /// Jobs that wait and run.
     pub jobs: u64,
@@ -71,22 +71,37 @@ impl Store {
                  (SELECT count(*) FROM holdings WHERE lab = ?1) AS uploads,
                  (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
                   WHERE lab = ?1) AS upload_bytes,
-                 (SELECT coalesce(sum(size), 0) FROM result_files JOIN jobs ON jobs.id = job
-                  WHERE lab = ?1) AS result_bytes,
+                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE lab = ?1)
+                 + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
+                    WHERE lab = ?1 AND movie IS NOT NULL) AS result_bytes,
                  (SELECT count(*) FROM jobs WHERE lab = ?1 AND finished_at IS NULL) AS jobs",
             [lab]
         );
         Ok(found.fetch_one(&self.readers).await?)
     }
 
+    /// All labs, by name.
     pub async fn labs(&self) -> Result<Vec<LabRow>> {
-        let rows = sqlx::query_as(
+        self.find_labs(None).await
+    }
+
+    /// The lab of this name.
+    /// Errors: [`StoreError::NotFound`] if none is on record.
+    pub async fn lab(&self, name: &str) -> Result<LabRow> {
+        let found = self.find_labs(Some(name)).await?.pop();
+        found.ok_or_else(|| StoreError::missing("lab", name))
+    }
+
+    async fn find_labs(&self, name: Option<&str>) -> Result<Vec<LabRow>> {
+        let rows = sql_as!(
             "SELECT labs.lab, share, max_bytes, max_jobs, count(jobs.id) AS jobs,
                  coalesce(sum(tiles_left + others_left), 0.0) AS cost_left
              FROM labs
              LEFT JOIN jobs ON jobs.lab = labs.lab AND finished_at IS NULL
              LEFT JOIN job_sums ON job = jobs.id
+             WHERE ?1 IS NULL OR labs.lab = ?1
              GROUP BY labs.lab ORDER BY labs.lab",
+            [name]
         );
         Ok(rows.fetch_all(&self.readers).await?)
     }
@@ -95,14 +110,13 @@ impl Store {
     pub async fn lab_figures(&self) -> Result<Vec<LabFigures>> {
         let rows: Vec<(Lab, u64, f64, f64, u64, Option<Timestamp>)> = sqlx::query_as(
             "SELECT labs.lab, coalesce(jobs_begun, 0), coalesce(wait_seconds, 0.0),
-                 coalesce(cpu_seconds, 0.0), coalesce(bytes, 0),
+                 coalesce(cpu_seconds, 0.0),
+                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE jobs.lab = labs.lab)
+                 + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
+                    WHERE tasks.lab = labs.lab AND movie IS NOT NULL),
                  (SELECT min(created_at) FROM jobs
                   WHERE jobs.lab = labs.lab AND finished_at IS NULL AND started_at IS NULL)
-             FROM labs LEFT JOIN lab_totals USING (lab)
-             LEFT JOIN (SELECT jobs.lab AS lab, sum(size) AS bytes
-                        FROM result_files JOIN jobs ON jobs.id = job GROUP BY jobs.lab)
-                 USING (lab)
-             ORDER BY labs.lab",
+             FROM labs LEFT JOIN lab_totals USING (lab) ORDER BY labs.lab",
         )
         .fetch_all(&self.readers)
         .await?;

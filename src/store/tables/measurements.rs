@@ -10,7 +10,10 @@ use crate::job::{
 };
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{Filter, Page, integer, list, number, refuse_if_used, sql, sql_scalar};
+use crate::store::rows::{
+    Filter, Page, integer, list, listed, number, refuse_if_used, sql, sql_scalar,
+};
+use crate::store::tables::checks;
 
 /// What is known of a measurement when it has been checked.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -51,8 +54,19 @@ pub struct Measurement {
 }
 
 impl Store {
+    /// The lab's measurement with this identifier.
+    /// Errors: [`StoreError::Unchecked`] if it has not passed its check.
     pub async fn measurement(&self, lab: &Lab, id: MeasurementId) -> Result<Measurement> {
-        self.find_measurement(Some(lab), id).await
+        match self.find_measurement(Some(lab), id).await {
+            Err(missing @ StoreError::NotFound { .. }) => {
+                match self.measurement_check(lab, id).await? {
+                    Some(check) => Err(StoreError::Unchecked { id, error: check.error()? }),
+                    // It may have passed between the two looks.
+                    None => self.find_measurement(Some(lab), id).await.map_err(|_| missing),
+                }
+            }
+            found => found,
+        }
     }
 
     /// As [`Self::measurement`]; without a lab, for those who work for all of them.
@@ -76,22 +90,8 @@ impl Store {
         filter: Filter<MeasurementId>,
         limit: u32,
     ) -> Result<Page<Measurement>> {
-        let rows = sql!(
-            "SELECT * FROM measurements
-             WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
-               AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
-             ORDER BY id DESC LIMIT ?4",
-            [
-                lab,
-                filter.after,
-                filter.calibration,
-                i64::from(limit) + 1,
-                filter.created.from,
-                filter.created.before
-            ]
-        )
-        .fetch_all(&self.readers)
-        .await?;
+        let rows =
+            listed!(sql, "measurements WHERE", lab, filter, limit).fetch_all(&self.readers).await?;
         Ok(Page::cut(rows.iter().map(measurement).collect::<Result<_, _>>()?, limit))
     }
 
@@ -102,20 +102,28 @@ impl Store {
         id: MeasurementId,
         name: Option<&Label>,
     ) -> Result<()> {
+        let mut transaction = self.write().await?;
         let renamed =
             sql!("UPDATE measurements SET name = ? WHERE id = ? AND lab = ?", [name, id, lab])
-                .execute(&self.writer)
+                .execute(&mut *transaction)
                 .await?;
-        match renamed.rows_affected() {
-            0 => Err(StoreError::missing("measurement", id)),
-            _ => Ok(()),
+        if renamed.rows_affected() == 0
+            && !checks::rename(&mut transaction, (lab, id), name).await?
+        {
+            return Err(StoreError::missing("measurement", id));
         }
+        Ok(transaction.commit().await?)
     }
 
     /// Deletes a measurement that no job refers to.
     pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<()> {
-        self.measurement(lab, id).await?;
         let mut transaction = self.write().await?;
+        if checks::delete_of(&mut transaction, lab, id).await? {
+            return Ok(transaction.commit().await?);
+        }
+        let own = "SELECT 1 FROM measurements WHERE id = ? AND lab = ?";
+        let own = sql!(own, [id, lab]).fetch_optional(&mut *transaction).await?;
+        own.ok_or_else(|| StoreError::missing("measurement", id))?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE measurement = ?";
         refuse_if_used(&mut transaction, ("measurement", id.to_string()), ("jobs", jobs)).await?;
         let prepared =

@@ -2,6 +2,7 @@
 
 pub(super) mod blobs;
 pub(super) mod calibrations;
+pub(super) mod checks;
 pub(super) mod jobs;
 pub(super) mod keys;
 pub(super) mod labs;
@@ -18,6 +19,7 @@ pub(super) mod workers;
 
 pub use blobs::{Blob, BlobRow, Origin};
 pub use calibrations::{Calibration, CalibrationMark, NewCalibration, Unready};
+pub use checks::{Check, CheckMark, NewCheck, Source};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
 pub use labs::{Entitlement, LabFigures, LabRow, LabUse, share_error};

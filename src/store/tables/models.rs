@@ -7,7 +7,7 @@ use sqlx::types::Json;
 use crate::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 use crate::store::Store;
 use crate::store::error::{Result, StoreError};
-use crate::store::rows::{Filter, Page, Reference, refuse_if_used, require, sql, sql_as};
+use crate::store::rows::{Filter, Page, Reference, listed, refuse_if_used, require, sql, sql_as};
 use crate::store::tables::keys::{self, Inserted, Made, RequestKey};
 
 /// What is known of an end-to-end network when it has been checked.
@@ -77,22 +77,8 @@ impl Store {
         filter: Filter<ModelId>,
         limit: u32,
     ) -> Result<Page<Model>> {
-        let items = sql_as!(
-            "SELECT * FROM models
-             WHERE lab = ?1 AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR calibration = ?3)
-               AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
-             ORDER BY id DESC LIMIT ?4",
-            [
-                lab,
-                filter.after,
-                filter.calibration,
-                i64::from(limit) + 1,
-                filter.created.from,
-                filter.created.before
-            ]
-        )
-        .fetch_all(&self.readers)
-        .await?;
+        let items =
+            listed!(sql_as, "models WHERE", lab, filter, limit).fetch_all(&self.readers).await?;
         Ok(Page::cut(items, limit))
     }
 

@@ -81,8 +81,9 @@ async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Resul
 async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> {
     let text = format!(
         "SELECT {}
-              + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes,
-                     (SELECT coalesce(sum(size), 0) FROM result_files WHERE job = jobs.id))), 0)
+              + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
+                 WHERE lab = ?1 AND movie IS NOT NULL)
+              + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes, result_bytes)), 0)
                  FROM jobs WHERE lab = ?1)",
         files_of("lab")
     );

@@ -20,6 +20,8 @@ use crate::store::rows::{sql, sql_as, sql_scalar};
 pub enum Owner {
     Job(JobId),
     Calibration(CalibrationId),
+    /// The movie of a job, whose state does not follow it.
+    Movie(JobId),
 }
 
 #[derive(Debug, Clone, FromRow)]
@@ -218,8 +220,9 @@ pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
 
 /// What the task in this row belongs to.
 pub fn owner(row: &SqliteRow) -> Result<Owner> {
-    Ok(match row.try_get("job")? {
-        Some(job) => Owner::Job(job),
-        None => Owner::Calibration(row.try_get("calibration")?),
+    Ok(match (row.try_get("job")?, row.try_get("movie")?) {
+        (Some(job), _) => Owner::Job(job),
+        (None, Some(job)) => Owner::Movie(job),
+        (None, None) => Owner::Calibration(row.try_get("calibration")?),
     })
 }

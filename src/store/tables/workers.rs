@@ -34,7 +34,7 @@ pub struct WorkerPlace {
 
 #[derive(Debug, Clone, Serialize, FromRow)]
 pub struct WorkerTask {
-    /// The job; none for a calibration's.
+    /// The job, or that of which it makes a movie; none for a calibration's.
     pub job: Option<JobId>,
     /// The calibration; none for a job's.
     pub calibration: Option<CalibrationId>,
@@ -73,7 +73,7 @@ impl Store {
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>> {
         let rows = sql!(
             "SELECT workers.id, pid, version, host, pool, device, started_at, seen_at,
-                 job, calibration, kind, snapshot, tile, stage
+                 coalesce(job, movie) AS job, calibration, kind, snapshot, tile, stage
              FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
              WHERE seen_at >= ? ORDER BY workers.id",
             [TaskState::Running, since(age)]

@@ -58,7 +58,7 @@ impl Lab {
 
     /// Completes a calibration of captures as a worker would.
     async fn made(&self, task: &ClaimedTask) -> Heartbeat {
-        let Product::Tile(masks) = self.blob("masks of captures") else { panic!() };
+        let Product::File(masks) = self.blob("masks of captures") else { panic!() };
         let facts = NewCalibration {
             name: None,
             masks: masks.sha256(),
@@ -102,7 +102,7 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     let half = TaskProgress { fraction: 0.5, ..TaskProgress::START };
     assert_eq!(lab.store.heartbeat(&task.lease, half, None).await.unwrap(), Heartbeat::Continue);
     let shown = lab.unready(first).await.unwrap();
-    assert_eq!((shown.frames, shown.fraction, shown.error), (2, 0.5, None));
+    assert_eq!((shown.frames, shown.fraction, shown.error), (Some(2), 0.5, None));
     assert_eq!(shown.mosaic, Some(Mosaic::Gbrg));
     let refused = lab.store.calibration(&local, first).await;
     assert!(matches!(refused, Err(StoreError::Unready { error: None, .. })));

@@ -97,7 +97,7 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
         .collect();
     let three = (id(3), "three", 30, Some("no light"));
     assert_eq!(seen, [three, (id(2), "two", 20, None), (id(1), "one", 10, None)]);
-    assert_eq!((all[1].fraction, all[1].frames), (0.5, 1));
+    assert_eq!((all[1].fraction, all[1].frames), (0.5, Some(1)));
     assert_eq!(store.all_unready(&other, Filter::default(), 10).await.unwrap().items.len(), 1);
     assert!(store.calibration(&local, id(4).parse().unwrap()).await.is_ok());
 

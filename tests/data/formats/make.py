@@ -53,7 +53,7 @@ def main():
         file["calibrated/masks"] = masks.astype("u1")
         file["shots"] = snapshots.astype("<u2")
     with h5py.File(HERE / "axes.h5", "w") as file:
-        for axes, order in [("frame-row-column", (0, 1, 2)), ("row-column-frame", (1, 2, 0)), ("column-row-frame", (2, 1, 0))]:
+        for axes, order in [("frame-row-column", (0, 1, 2)), ("row-column-frame", (1, 2, 0)), ("column-row-frame", (2, 1, 0)), ("frame-column-row", (0, 2, 1))]:
             values = snapshots.transpose(order).astype("<u2")
             file[axes] = values
             file.create_dataset(f"packed/{axes}", data=values, chunks=(2, 2, 2), compression="gzip")

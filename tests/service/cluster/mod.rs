@@ -96,6 +96,7 @@ async fn a_job_over_the_network_gives_the_same_bytes() {
     let expected = local().await;
     let app = served(&nats, "5").await;
     let _workers = [worker(&nats, &[]), worker(&nats, &[])];
+    until("both workers are known", || async { workers(&app).await.len() == 2 }).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let id = app.submit(&job(&measurement)).await;
     busy(&app).await;

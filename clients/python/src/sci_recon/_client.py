@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _transfer as transfer
-from ._errors import CalibrationFailed, JobFailed
+from ._errors import ApiError, CalibrationFailed, JobFailed
 from ._transfer import Source
 
 Record = dict[str, Any]
@@ -82,7 +82,7 @@ class Client:
 
         `masks` are [B, H, W], `measurement` is [H, W] or [S, H, W]; arrays or file names. Their full scale, the stored
         number that means 1, is by default the maximum of an integer type, and 1 for floats. Axes in another order are
-        stated where several fit: "row-column-frame" or "column-row-frame". A colour sensor has a `mosaic`: "rggb",
+        stated where several fit: "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a `mosaic`: "rggb",
         "bggr", "grbg" or "gbrg". `job` goes on to `submit`.
         The frames come into `folder`, by default one that goes away with the result.
         """
@@ -265,13 +265,12 @@ class Entity:
         return list(self.record.get("warnings", []))
 
     def _ready(self, collection: str) -> None:
-        attempt = 0
         with self.client._bar(f"{self.__class__.__name__.lower()} {self.id}", "%") as bar:
             while self.record.get("state") == "preparing":
                 bar(int(self.record.get("percent", 0)), 100)
-                transfer.pause(min(attempt, 4))
-                attempt += 1
-                self.record = self.client._get(f"/v1/{collection}/{self.id}")
+                self.record = self.client._get(f"/v1/{collection}/{self.id}", wait=2)
+        if problem := self.record.get("problem"):
+            raise ApiError(problem["status"], problem)
         if self.record.get("state") == "failed":
             raise CalibrationFailed(self.record.get("error") or "no reason was given")
 
@@ -393,6 +392,21 @@ class Result:
         if not (path.is_file() and transfer.sha256(path) == file["sha256"]):
             with self.job.client._bar(f"download {name}") as bar:
                 transfer.download(self.job.client.http, file["href"], path, file["sha256"], bar)
+        return path
+
+    def movie(self, snapshot: int | None = None) -> Path:
+        """Fetches the movie (AV1 in MP4, ten frames a second) of a snapshot, or of all of them one after the other. The
+        service makes it when it is first asked for."""
+        http = self.job.client.http
+        part = "sequence" if snapshot is None else f"snapshots/{snapshot}"
+        href = f"/v1/jobs/{self.job.id}/{part}/movie.mp4"
+        while (answer := transfer.send(http, "HEAD", href)).status_code == 202:
+            transfer.pause(0, answer.headers.get("Retry-After"))
+        sha256 = answer.headers["ETag"].strip('"')
+        path = self.folder / ("sequence" if snapshot is None else f"snapshot_{snapshot:04d}") / "movie.mp4"
+        if not (path.is_file() and transfer.sha256(path) == sha256):
+            with self.job.client._bar("download movie.mp4") as bar:
+                transfer.download(http, href, path, sha256, bar)
         return path
 
     @property

@@ -1,5 +1,6 @@
 use ndarray::Array3;
 use proptest::prelude::{any, prop, proptest};
+use strum::VariantNames;
 
 use crate::formats::mat::SceneArray;
 use crate::formats::test_support::{assert_names, file, sample};
@@ -57,7 +58,8 @@ fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
 
 #[test]
 fn axes_in_every_order_are_read() {
-    for axes in [Axes::FrameRowColumn, Axes::RowColumnFrame, Axes::ColumnRowFrame] {
+    for name in Axes::VARIANTS {
+        let axes: Axes = name.parse().unwrap();
         for place in ["", "packed/", "matlab/"] {
             let name = format!("{place}{axes}");
             let expected = Expected { axes: Some(axes), ..Expected::default() };

@@ -78,8 +78,14 @@ impl ArrayHeader {
             13 => return Ok(SampleType::U32),
             14 => return Ok(SampleType::I64),
             15 => return Ok(SampleType::U64),
-            1 => "a cell array",
-            2 => "a struct",
+            1 => {
+                "a cell array (of a frame each: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                 numpy.stack(list(scipy.io.loadmat('in.mat')['mask'].ravel())))\")"
+            }
+            2 => {
+                "a struct (its first field: python -c \"import numpy, scipy.io; s = scipy.io.loadmat('in.mat', \
+                 simplify_cells=True)['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0], -1, 0))\")"
+            }
             3 => "an object",
             4 => "text",
             _ => "an array of an unknown class",

@@ -73,7 +73,13 @@ impl MatSamples {
         let arranged = expected.arrange((Format::Mat, Writer::Matlab), &header.dimensions)?;
         let arranged = arranged.ok_or_else(|| FormatError::Unsupported {
             format: Format::Mat,
-            found: format!("'{}' with {} dimensions", header.name, header.dimensions.len()),
+            found: format!(
+                "'{}' with {} dimensions (all pictures, one after the other: python -c \"import numpy, scipy.io; \
+                 a = scipy.io.loadmat('in.mat')['mask']; numpy.save('out.npy', \
+                 numpy.moveaxis(a.reshape(*a.shape[:2], -1, order='F'), -1, 0))\")",
+                header.name,
+                header.dimensions.len()
+            ),
             accepted: "(row, column, frame) or (row, column)",
         })?;
         let info = array::info(Format::Mat, sample, &arranged, limits)?;

@@ -6,8 +6,9 @@ mod state;
 
 use std::ops::Range;
 
-use ndarray::{Array3, ArrayView3};
+use ndarray::{Array3, Array4, ArrayView3};
 
+use super::assessment;
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
@@ -89,6 +90,8 @@ pub struct Outcome {
     pub residual: f32,
     /// Why it ended.
     pub stop_reason: StopReason,
+    /// What an [`assessment`] sees of the frames \[features, S B, rows, columns\], where it was asked for.
+    pub features: Option<Array4<f32>>,
 }
 
 /// Reconstructs the `S B` frames of a run of snapshots `y` \[S,H,W\], both on the scale on which the
@@ -107,6 +110,36 @@ pub fn reconstruct(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome> {
+    stages((op, y), schedule, networks, observer, |_, _| ())
+}
+
+/// As [`reconstruct`], with what an [`assessment`] sees of the frames.
+pub fn reconstruct_assessed(
+    op: &SensingOperator,
+    y: ArrayView3<'_, f32>,
+    schedule: &Schedule,
+    networks: &mut dyn Networks,
+    observer: &mut dyn Observer,
+) -> Result<Outcome> {
+    let mut early = None;
+    let mut outcome = stages((op, y), schedule, networks, observer, |stage, frames| {
+        if stage == 0 && schedule.stages.len() > 1 {
+            early = Some(frames.to_owned());
+        }
+    })?;
+    let early = early.as_ref().map(|early| early.view());
+    outcome.features = Some(assessment::features(op, early, outcome.frames.view()));
+    Ok(outcome)
+}
+
+/// Runs the stages, and tells after each of them its index and the frames.
+fn stages(
+    (op, y): (&SensingOperator, ArrayView3<'_, f32>),
+    schedule: &Schedule,
+    networks: &mut dyn Networks,
+    observer: &mut dyn Observer,
+    mut done: impl FnMut(usize, ArrayView3<'_, f32>),
+) -> Result<Outcome> {
     schedule.validate()?;
     if y.dim() != op.measurement_dim() {
         let (snapshots, height, width) = op.measurement_dim();
@@ -122,6 +155,7 @@ pub fn reconstruct(
     let mut stop_reason = StopReason::MaxIterations;
     for (index, stage) in schedule.stages.iter().enumerate() {
         stop_reason = run.stage(index, stage, observer)?;
+        done(index, run.frames());
     }
     let residual = run.residual();
     Ok(Outcome {
@@ -130,6 +164,7 @@ pub fn reconstruct(
         denoiser_passes: run.denoiser_passes,
         residual,
         stop_reason,
+        features: None,
     })
 }
 

@@ -1,0 +1,317 @@
+//! How good a result is, told without a truth: a predicted PSNR with its interval, a grade in words, and a
+//! map of the expected error.
+
+use ndarray::Array3;
+use serde::{Deserialize, Serialize};
+
+use crate::job::{Assessment, Finding, Grade, Severity};
+pub use crate::recon::assessment::BLOCK;
+use crate::recon::assessment::{FEATURES, Model, blocks};
+use crate::recon::schedule::Schedule;
+use crate::recon::sequence::RunShare;
+use crate::recon::solver::Outcome;
+use crate::recon::tile::TilePlan;
+
+/// What a tile's frames let expect, as it is kept with the record of its task.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TileAssessment {
+    /// Rows and columns of blocks.
+    size: (usize, usize),
+    /// The expected PSNR of each block \[S B, rows, columns\] on the scale on which the scene is on \[0,1\], in steps
+    /// of a quarter of a decibel from 0.
+    #[serde(with = "hex::serde")]
+    levels: Vec<u8>,
+    /// What was seen, on average; nothing of a tile that no light reaches.
+    seen: Vec<f32>,
+}
+
+/// Levels in a decibel.
+const STEPS: f32 = 4.0;
+
+impl TileAssessment {
+    /// Of a tile solved by this schedule; none for one that predictions were not fitted to. Of a tile that no light
+    /// reaches, whose frames are 0, no error is expected.
+    pub fn of(outcome: &Outcome, schedule: &Schedule) -> Option<Self> {
+        let model = Model::of(schedule)?;
+        let Some(features) = &outcome.features else {
+            let (frames, height, width) = outcome.frames.dim();
+            let size = blocks(height, width);
+            return Some(Self {
+                size,
+                levels: vec![u8::MAX; frames * size.0 * size.1],
+                seen: vec![],
+            });
+        };
+        let (_, frames, rows, columns) = features.dim();
+        let level = |(k, row, column)| {
+            let decibels = -10.0 * model.log_error(features, (k, row, column));
+            (decibels * STEPS).round().clamp(0.0, 255.0) as u8
+        };
+        let levels = ndarray::indices((frames, rows, columns)).into_iter().map(level).collect();
+        let mean = |plane: ndarray::ArrayView3<'_, f32>| plane.mean().unwrap_or(0.0);
+        let seen = features.outer_iter().map(mean).collect();
+        Some(Self { size: (rows, columns), levels, seen })
+    }
+
+    /// Expected squared error of a block, on the scale on which the scene is on \[0,1\].
+    fn error(&self, frame: usize, row: usize, column: usize) -> f64 {
+        let (rows, columns) = self.size;
+        let level = self.levels.get((frame * rows + row) * columns + column);
+        10f64.powf(-f64::from(*level.unwrap_or(&u8::MAX)) / f64::from(10.0 * STEPS))
+    }
+}
+
+/// What the pilot of an adaptive schedule tells; that of a fixed one is the default.
+#[derive(Debug, Clone, Copy)]
+pub struct Course {
+    /// Error at the held-out pixels after the first stage, relative to the measurement.
+    pub before: f64,
+    /// The same after the last one.
+    pub after: f64,
+    /// The part of the last stage's iterations that pay.
+    pub share: f64,
+}
+
+impl Default for Course {
+    fn default() -> Self {
+        Self { before: 1.0, after: 1.0, share: 1.0 }
+    }
+}
+
+/// What is expected of a snapshot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Expected {
+    pub assessment: Assessment,
+    /// Root of the mean squared error of each block \[B, rows, columns\], on the scale of the frames.
+    pub error: Array3<f32>,
+}
+
+/// Better is not told apart, in dB: nobody sees it, and the fit would follow it.
+const BEST: f64 = 40.0;
+/// How far above it a figure may lie that a prediction is made of, in dB.
+const SPARE: f64 = 4.0;
+
+/// From here on frames are good, from the second on usable, in dB.
+const GRADES: [(f64, Grade); 2] = [(28.0, Grade::Good), (22.0, Grade::Usable)];
+
+/// What the tiles of a snapshot tell together: of each run that has a share in it those of its tiles, in the
+/// plan's order. None if one of them tells nothing.
+pub fn expected(
+    plan: &TilePlan,
+    shares: &[(RunShare, Vec<Option<TileAssessment>>)],
+    (schedule, course): (&Schedule, Course),
+    (frames, white): (usize, f32),
+    warnings: &[Finding],
+) -> Option<Expected> {
+    let model = Model::of(schedule)?;
+    let (height, width) = plan.dim();
+    let (rows, columns) = blocks(height, width);
+    let mut squares = Array3::<f64>::zeros((frames, rows, columns));
+    let middle = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
+    let (mut seen, mut lit) = (vec![0.0f64; FEATURES.len()], 0.0);
+    for (share, tiles) in shares {
+        for (tile, assessed) in plan.tiles().zip(tiles) {
+            let assessed = assessed.as_ref()?;
+            if !assessed.seen.is_empty() {
+                lit += 1.0;
+            }
+            seen.iter_mut().zip(&assessed.seen).for_each(|(sum, value)| *sum += f64::from(*value));
+            let weights = plan.weights(&tile);
+            let inside = |at: usize, first: usize, length: usize| {
+                at.checked_sub(first).filter(|at| *at < length)
+            };
+            for row in 0..rows {
+                let Some(i) = inside(middle(row, height), tile.row, tile.height) else { continue };
+                for column in 0..columns {
+                    let at = inside(middle(column, width), tile.column, tile.width);
+                    let Some(j) = at else { continue };
+                    for k in 0..frames {
+                        let weight = f64::from(share.weights[k] * weights[[i, j]]);
+                        let error = assessed.error(share.frame(k), i / BLOCK, j / BLOCK);
+                        squares[[k, row, column]] += weight * error;
+                    }
+                }
+            }
+        }
+    }
+    if lit == 0.0 {
+        return None;
+    }
+    let white = f64::from(white);
+    let psnr = |frame: ndarray::ArrayView2<'_, f64>| {
+        -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * white * white).log10()
+    };
+    let of_map = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
+    let bounded = |decibels: f64| decibels.min(BEST + SPARE);
+    let error = |relative: f64| bounded(-20.0 * relative.max(1e-6).log10());
+    let mut known = vec![
+        bounded(of_map),
+        error(course.before),
+        error(course.after),
+        course.share,
+        white.log10(),
+    ];
+    known.extend(seen.iter().map(|sum| sum / lit));
+    let [low, psnr_db, high] = model.psnr(&known).map(|decibels| decibels.min(BEST));
+    let error = squares.mapv(|square| {
+        let decibels = -10.0 * square.max(1e-12).log10() + psnr_db - of_map;
+        (10f64.powf(-decibels / 20.0) * white) as f32
+    });
+    let reasons = reasons(&error, psnr_db, warnings);
+    let assessment = Assessment {
+        grade: grade(psnr_db, &reasons),
+        psnr_db: Assessment::round(psnr_db),
+        psnr_low_db: Assessment::round(low),
+        psnr_high_db: Assessment::round(high),
+        reasons,
+    };
+    Some(Expected { assessment, error })
+}
+
+/// What is expected, but never better than the findings allow.
+fn grade(psnr_db: f64, reasons: &[Finding]) -> Grade {
+    let expected = GRADES.into_iter().find(|(least, _)| psnr_db >= *least);
+    let expected = expected.map_or(Grade::Bad, |(_, grade)| grade);
+    let worst = reasons.iter().filter(|reason| reason.code != UNEVEN).map(|reason| reason.severity);
+    match worst.max() {
+        Some(Severity::Error) => Grade::Bad,
+        Some(Severity::Warning) if expected == Grade::Good => Grade::Usable,
+        _ => expected,
+    }
+}
+
+const UNEVEN: &str = "uneven_error";
+/// A part of the picture whose error is so far above that of the whole is named, in dB.
+const UNEVEN_DB: f64 = 4.0;
+
+/// The findings of the checks, and the part of the picture that is worst.
+fn reasons(error: &Array3<f32>, psnr_db: f64, warnings: &[Finding]) -> Vec<Finding> {
+    let mut reasons = warnings.to_vec();
+    let (_, rows, columns) = error.dim();
+    if rows < 3 || columns < 3 {
+        return reasons;
+    }
+    let thirds = |length: usize| {
+        [0..length / 3, length / 3..length - length / 3, length - length / 3..length]
+    };
+    let mut worst = (f64::INFINITY, "");
+    for (band, names) in thirds(rows).into_iter().zip(PARTS) {
+        for (across, name) in thirds(columns).into_iter().zip(names) {
+            let part = error.slice(ndarray::s![.., band.clone(), across]);
+            let mean = part.iter().map(|e| f64::from(*e).powi(2)).sum::<f64>() / part.len() as f64;
+            let decibels = -10.0 * mean.max(1e-12).log10();
+            if decibels < worst.0 {
+                worst = (decibels, name);
+            }
+        }
+    }
+    if worst.0 < psnr_db - UNEVEN_DB {
+        reasons.push(Finding {
+            code: UNEVEN.to_owned(),
+            severity: Severity::Warning,
+            detail: format!(
+                "{} is expected at {:.0} dB, the whole picture at {psnr_db:.0} dB: there is fine texture or fast motion \
+                 that the masks do not resolve",
+                worst.1, worst.0
+            ),
+            remedy: "Look at the map of the expected error before relying on this part.".to_owned(),
+            frames: Vec::new(),
+            snapshot: None,
+        });
+    }
+    reasons
+}
+
+const PARTS: [[&str; 3]; 3] = [
+    ["the upper left", "the upper middle", "the upper right"],
+    ["the left", "the middle", "the right"],
+    ["the lower left", "the lower middle", "the lower right"],
+];
+
+#[cfg(test)]
+mod tests {
+    use super::{Course, TileAssessment, expected, grade};
+    use crate::job::{Assessment, Finding, Grade, Severity};
+    use crate::recon::schedule::Schedule;
+    use crate::recon::sequence::SequencePlan;
+    use crate::recon::tile::TilePlan;
+
+    fn finding(severity: Severity) -> Finding {
+        let text = String::new;
+        let code = "any".to_owned();
+        Finding { code, severity, detail: text(), remedy: text(), frames: vec![], snapshot: None }
+    }
+
+    /// A tile of 2 frames of 32x32 pixels with this level in dB.
+    fn tile(decibels: u8) -> TileAssessment {
+        TileAssessment { size: (2, 2), levels: vec![4 * decibels; 8], seen: vec![-2.0; 11] }
+    }
+
+    #[test]
+    fn what_the_checks_found_bounds_the_grade() {
+        let of = |psnr, found: &[Finding]| grade(psnr, found);
+        assert_eq!(
+            (of(30.0, &[]), of(25.0, &[]), of(20.0, &[])),
+            (Grade::Good, Grade::Usable, Grade::Bad)
+        );
+        assert_eq!(of(30.0, &[finding(Severity::Warning)]), Grade::Usable);
+        assert_eq!(of(20.0, &[finding(Severity::Warning)]), Grade::Bad);
+        assert_eq!(of(30.0, &[finding(Severity::Error)]), Grade::Bad);
+    }
+
+    #[test]
+    fn tiles_are_joined_and_the_worst_part_is_named() {
+        // Two by two, which share 16 pixels.
+        let plan = TilePlan::new(48, 48, 32, 16).unwrap();
+        assert_eq!(plan.len(), 4);
+        let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
+        let map = |tiles: Vec<Option<TileAssessment>>| {
+            let of_run = [(shares[0].clone(), tiles)];
+            let by = (&Schedule::gap_tv(), Course::default());
+            expected(&plan, &of_run, by, (2, 0.5), &[])
+        };
+        let tiles =
+            |decibels: [u8; 4]| -> Vec<_> { decibels.map(|level| Some(tile(level))).into() };
+        let even = map(tiles([25; 4])).unwrap();
+        assert_eq!(even.error.dim(), (2, 3, 3));
+        let first = even.error[[0, 0, 0]];
+        assert!(
+            even.error.iter().all(|error| (error / first - 1.0).abs() < 1e-3),
+            "{}",
+            even.error
+        );
+        // The mean of the map is what is predicted.
+        let rms = -20.0 * f64::from(first).log10();
+        assert!((rms - even.assessment.psnr_db).abs() < 0.06, "{rms}: {:?}", even.assessment);
+        assert!(even.assessment.reasons.is_empty());
+        let uneven = map(tiles([15, 35, 35, 35])).unwrap().assessment;
+        assert!(uneven.reasons[0].detail.starts_with("the upper left"), "{uneven:?}");
+        // A tile of an older version tells nothing; one without light has no part in what is seen.
+        let mut partly = tiles([25; 4]);
+        partly[2] = None;
+        assert!(map(partly).is_none());
+        let dark = TileAssessment { size: (2, 2), levels: vec![u8::MAX; 8], seen: vec![] };
+        assert!(map(vec![Some(dark.clone()); 4]).is_none());
+        let mut lit = tiles([25; 4]);
+        lit[3] = Some(dark);
+        let lit = map(lit).unwrap();
+        assert!(lit.error[[0, 2, 2]] < 0.1 * lit.error[[0, 0, 0]]);
+    }
+
+    #[test]
+    fn a_job_is_as_good_as_its_worst_snapshot() {
+        let one = |psnr_db, grade, reasons: &[Finding]| Assessment {
+            grade,
+            psnr_db,
+            psnr_low_db: psnr_db - 3.0,
+            psnr_high_db: psnr_db + 3.0,
+            reasons: reasons.to_vec(),
+        };
+        let warned = [finding(Severity::Warning)];
+        let all = [one(30.0, Grade::Good, &warned), one(20.05, Grade::Bad, &warned)];
+        let job = Assessment::of_all(all.iter().map(Some)).unwrap();
+        assert_eq!((job.grade, job.psnr_db, job.reasons.len()), (Grade::Bad, 25.0, 1));
+        assert_eq!(Assessment::of_all([Some(&all[0]), None].into_iter()), None);
+        assert_eq!(Assessment::of_all(std::iter::empty()), None);
+    }
+}

@@ -1,0 +1,120 @@
+//! The page at the end of the demo: what went in, what came out, and how far it is from the truth.
+
+use std::fs;
+use std::path::Path;
+
+use maud::{DOCTYPE, Markup, html};
+use ndarray::{Array3, Axis};
+
+use super::report::{PAGE, Report};
+use crate::cli::CliError;
+use crate::cli::error::Result;
+use crate::formats::{Channels, Limits, png, read_stack};
+
+/// The folder of its pictures.
+pub(super) const PICTURES: &str = "pictures";
+/// Differences are shown so many times as bright.
+const BRIGHTER: f32 = 4.0;
+
+const STYLE: &str = "body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; \
+     background: #fff; color: #1b2026 } \
+     .row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0 } \
+     img, video { width: 256px; image-rendering: pixelated; background: #000; display: block } \
+     th, td { padding: .1rem 1.5rem .1rem 0; text-align: right } th:first-child, td:first-child { text-align: left }";
+
+/// What a job has made, and where its files are below the demo's folder.
+pub(super) struct Made {
+    pub(super) name: &'static str,
+    pub(super) frames: Array3<f32>,
+    pub(super) movie: String,
+}
+
+/// Writes `report.html` and its pictures: the measurement, the movies, and of the middle frame the truth, what came of it, and
+/// the difference.
+pub(super) fn write(out: &Path, truth: &Array3<f32>, made: &[Made], report: &Report) -> Result<()> {
+    let folder = out.join(PICTURES);
+    let unwritable = |path: &Path, error| CliError::file("write", path, &error);
+    fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, error))?;
+    let middle = truth.len_of(Axis(0)) / 2;
+    let picture =
+        |name: &str, values: ndarray::ArrayView2<'_, f32>, white: f32| -> Result<String> {
+            let name = format!("{name}.png");
+            let bytes = png::encode_u8(values, Channels::Grey, 0.0, white)?;
+            let path = folder.join(&name);
+            fs::write(&path, bytes).map_err(|error| unwritable(&path, error))?;
+            Ok(format!("{PICTURES}/{name}"))
+        };
+    let (_, measurement) = read_stack(&out.join("input/measurement.npy"), &Limits::default())?;
+    let measurement = measurement.index_axis(Axis(0), 0);
+    let brightest = measurement.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
+    let measured = picture("measurement", measurement, brightest)?;
+    let true_frame = truth.index_axis(Axis(0), middle);
+    let mut stills = vec![("truth", picture("truth", true_frame, 1.0)?, None)];
+    for Made { name, frames, .. } in made {
+        let frame = frames.index_axis(Axis(0), middle);
+        let difference = (&frame - &true_frame).mapv(f32::abs);
+        let difference = picture(&format!("{name}-difference"), difference.view(), 1.0 / BRIGHTER)?;
+        stills.push((name, picture(name, frame, 1.0)?, Some(difference)));
+    }
+    let text = page((middle, &measured), &stills, made, report).into_string();
+    let path = out.join(PAGE);
+    fs::write(&path, text).map_err(|error| unwritable(&path, error))
+}
+
+type Still<'a> = (&'a str, String, Option<String>);
+
+fn page(
+    (middle, measured): (usize, &str),
+    stills: &[Still<'_>],
+    made: &[Made],
+    report: &Report,
+) -> Markup {
+    html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                title { "sci-recon: the demo" }
+                style { (STYLE) }
+            }
+            body {
+                h1 { "One snapshot, " (report.frames) " frames" }
+                div class="row" {
+                    figure { img src=(measured) alt="The measurement"; figcaption { "the measurement" } }
+                    @for Made { name, movie, .. } in made {
+                        figure {
+                            video src=(movie) controls loop autoplay muted playsinline {}
+                            figcaption { (name) }
+                        }
+                    }
+                }
+                table {
+                    tr { th { "" } th { "PSNR" } th { "SSIM" } th { "CPU" } }
+                    @for (name, quality) in report.rows() {
+                        tr {
+                            td { (name) }
+                            td { (format!("{:.2} dB", quality.psnr_db)) }
+                            td { (format!("{:.4}", quality.ssim)) }
+                            td { (format!("{:.1} s", quality.cpu_seconds)) }
+                        }
+                    }
+                }
+                h2 { "Frame " (middle + 1) }
+                div class="row" {
+                    @for (name, still, _) in stills {
+                        figure { img src=(still) alt=(name); figcaption { (name) } }
+                    }
+                }
+                h2 { "Difference from the truth, " (BRIGHTER) " times as bright" }
+                div class="row" {
+                    @for (name, _, difference) in stills {
+                        @if let Some(difference) = difference {
+                            figure { img src=(difference) alt={ "Difference of " (name) }; figcaption { (name) } }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

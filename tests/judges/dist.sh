@@ -1,0 +1,62 @@
+#!/usr/bin/env bash
+# The archive of `make dist` where there is nothing but what it says it needs: an empty root with Debian's packages of
+# glibc and libstdc++. First token, health, the default job and a lab's own files, by the documented lines.
+#
+#   tests/judges/dist.sh dist/sci-recon-VERSION-x86_64-linux.tar.gz
+#
+# Needs root (chroot), apt-get, curl and jq. Ends with its figures as a line of JSON.
+set -euo pipefail
+archive=$(realpath "$1")
+[ "$(id -u)" = 0 ] || { echo "chroot is for root" >&2; exit 2; }
+root=$(mktemp -d)
+server=
+trap 'kill $server 2>/dev/null && wait $server; umount -q "$root/proc" || true; rm -rf "$root"' EXIT
+
+mkdir -p "$root"/{debs,proc,tmp,dev,opt,lab}
+(cd "$root/debs" && apt-get --quiet=2 --option APT::Sandbox::User=root download libc6 libgcc-s1 libstdc++6 && for deb in *.deb; do dpkg-deb --extract "$deb" "$root"; done)
+rm -r "$root/debs"
+mount -t proc proc "$root/proc"
+mknod -m 666 "$root/dev/null" c 1 3
+mknod -m 444 "$root/dev/urandom" c 1 9
+tar --extract --gzip --file "$archive" --directory "$root/opt" --strip-components 1 --one-top-level=sci-recon
+chroot=$(command -v chroot)
+run() { env -i RUST_LOG=warn "$chroot" "$root" /opt/sci-recon/bin/sci-recon "$@"; }
+
+start=$(date +%s%N)
+version=$(run --version)
+token=$(run token --data /data create --lab optics --new)
+env -i RUST_LOG=warn "$chroot" "$root" /opt/sci-recon/bin/sci-recon serve --data /data --listen 127.0.0.1:0 --workers 2 \
+  > "$root/announced" 2> "$root/serve.log" &
+server=$!
+until [ -s "$root/announced" ] && run health --data /data > /dev/null 2>&1; do
+  kill -0 $server || { cat "$root/serve.log" >&2; exit 1; }
+  sleep 0.1
+done
+up=$(( ($(date +%s%N) - start) / 1000000 ))
+api=$(jq -r .url "$root/announced")
+ask() { curl -sS --fail-with-body -H "Authorization: Bearer $token" "$@"; }
+[ "$(curl -sS -o /dev/null -w '%{http_code}' "$api/v1/jobs")" = 401 ] || { echo "it is open without a token" >&2; exit 1; }
+ready=$(curl -sS --fail-with-body "$api/readyz" | jq -c '{ready, degraded}')
+[ "$ready" = '{"ready":true,"degraded":false}' ] || { echo "readyz says $ready" >&2; exit 1; }
+
+start=$(date +%s%N)
+job=$(ask "$api/v1/samples" --json '{}' | jq -r .job.id)
+while state=$(ask "$api/v1/jobs/$job?wait=20" | jq -r .state); [ "$state" = queued ] || [ "$state" = running ]; do :; done
+took=$(( ($(date +%s%N) - start) / 1000000 ))
+ask "$api/v1/jobs/$job/snapshots/0/frames.npy" > "$root/lab/frames.npy"
+[ "$state" = succeeded ] || { ask "$api/v1/jobs/$job" >&2; exit 1; }
+
+# A lab's own machine: a simulated measurement, submitted, watched and fetched by the commands of the same archive.
+cp -R "$(dirname "$0")/../../demo/clip" "$root/lab/"
+lab() { env -i RUST_LOG=warn SCI_RECON_URL="$api" SCI_RECON_TOKEN="$token" "$chroot" "$root" /opt/sci-recon/bin/sci-recon "$@"; }
+lab simulate --frames /lab/clip --compression-ratio 8 --out /lab/sim > /dev/null
+own=$(lab submit /lab/sim/measurement.npy --masks /lab/sim/masks.npy --algorithm gap-tv)
+[ "$(lab watch "$own")" = "$own succeeded" ] || exit 1
+lab fetch "$own" --out /lab/out --file frames.npy > /dev/null
+fetched=$(find "$root/lab/out" -name frames.npy -size +0 | wc -l)
+[ "$fetched" = 1 ] || { echo "$fetched results were fetched" >&2; exit 1; }
+kill $server && wait $server
+server=
+jq --compact-output --null-input --arg version "$version" --argjson start_ms $up --argjson job_ms $took \
+  --argjson archive_bytes "$(stat -c %s "$archive")" --argjson frames_bytes "$(stat -c %s "$root/lab/frames.npy")" \
+  '{target: "dist", ok: true, $version, $start_ms, $job_ms, $archive_bytes, $frames_bytes}'

@@ -1,0 +1,78 @@
+//! How good frames are expected to be, without a truth.
+
+use serde_json::{Value, json};
+
+use crate::app::TestApp;
+use crate::pictures::decode;
+use crate::samples::Scene;
+
+#[tokio::test]
+async fn a_result_says_how_good_it_is_expected_to_be_and_where_it_is_worst() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // Two tiles, so that their maps are joined.
+    let wanted = json!({"measurement": measurement, "algorithm": "gap-tv", "tile": {"size": 32, "overlap": 8}});
+    let job = app.submit(&wanted).await;
+    let before = app.get(&format!("/v1/jobs/{job}")).await.json();
+    if before["state"] != "succeeded" {
+        assert_eq!(before["assessment"], Value::Null);
+    }
+    let ended = app.ended(&job).await;
+    let told = &ended["assessment"];
+    let figure = |name: &str| told[name].as_f64().unwrap();
+    assert!(
+        figure("psnr_low_db") < figure("psnr_db") && figure("psnr_db") <= figure("psnr_high_db")
+    );
+    assert!(figure("psnr_db") > 5.0 && figure("psnr_high_db") <= 40.0, "{told}");
+    assert!(["good", "usable", "bad"].contains(&told["grade"].as_str().unwrap()), "{told}");
+    let of_job = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    let snapshots = of_job["content"]["snapshots"].as_array().unwrap();
+    let mean =
+        snapshots.iter().map(|one| one["assessment"]["psnr_db"].as_f64().unwrap()).sum::<f64>();
+    assert!((mean / snapshots.len() as f64 - figure("psnr_db")).abs() < 0.06, "{of_job}");
+
+    let base = format!("/v1/jobs/{job}/snapshots/0");
+    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
+    assert_eq!(manifest["content"]["assessment"], snapshots[0]["assessment"]);
+    let Scene { frames, height, width, .. } = Scene::SMALL;
+    let blocks = (height.div_ceil(16), width.div_ceil(16));
+    let array = app.get(&format!("{base}/error.npy")).await.expect(200).bytes;
+    let header = String::from_utf8_lossy(&array[..128]).into_owned();
+    let shape = format!("({frames}, {}, {})", blocks.0, blocks.1);
+    assert!(header.contains(&shape), "{header}: {shape}");
+    let values: Vec<f32> =
+        array[128..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    assert_eq!(values.len(), frames * blocks.0 * blocks.1);
+    assert!(values.iter().all(|error| *error > 0.0 && *error < 1.0), "{values:?}");
+
+    // Each pixel of the picture shows its block.
+    let spread = app.get(&format!("{base}/pictures/error-2/spread")).await.expect(200).json();
+    assert_eq!(
+        (spread["height"].as_u64(), spread["width"].as_u64()),
+        (Some(height as u64), Some(width as u64))
+    );
+    let picture = format!("{base}/pictures/error-2/tiles/0/0/0?black=0&white=0.5");
+    let (_, columns, shown) = decode(&app.get(&picture).await.expect(200));
+    let second = &values[blocks.0 * blocks.1..];
+    for (row, column) in [(0, 0), (17, 3), (height - 1, width - 1)] {
+        let expected = (second[row / 16 * blocks.1 + column / 16] * 510.0).min(255.0);
+        let found = f32::from(shown[row * columns + column]);
+        assert!((found - expected).abs() <= 0.51, "{row}, {column}: {found} for {expected}");
+    }
+    app.get(&format!("{base}/pictures/error-{}", frames + 1)).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn where_nothing_can_be_told_nothing_is() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "admm-tv"})).await;
+    assert_eq!(app.ended(&job).await["assessment"], Value::Null);
+    let base = format!("/v1/jobs/{job}/snapshots/0");
+    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
+    assert_eq!(manifest["content"]["assessment"], Value::Null);
+    for path in ["error.npy", "pictures/error-1"] {
+        let why = app.get(&format!("{base}/{path}")).await.problem(404, "not_found");
+        assert!(why.contains("no error can be predicted"), "{why}");
+    }
+}

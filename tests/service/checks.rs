@@ -1,0 +1,196 @@
+//! Checks that outlast the requests for calibrations and measurements.
+
+use std::time::Duration;
+
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use crate::app::{Answer, TestApp, id};
+use crate::samples::{Scene, constant, npy_header};
+
+const CALIBRATIONS: &str = "/v1/calibrations";
+const MEASUREMENTS: &str = "/v1/measurements";
+
+/// Masks of 32 MB, whose check takes a while: half of the pixels are open.
+fn large_masks() -> Vec<u8> {
+    let mut file = npy_header("|u1", &[64, 512, 1024]);
+    let mut state = 1_u64;
+    file.extend((0..32 << 20).map(|_| {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        if state >> 63 == 1 { 255 } else { 0 }
+    }));
+    file
+}
+
+impl TestApp {
+    /// Asks for something without waiting for its check.
+    async fn ask(&self, path: &str, body: &Value, key: &str) -> Answer {
+        let request = self.request(Method::POST, path).json(body);
+        self.send(request.header("Prefer", "respond-async").header("Idempotency-Key", key)).await
+    }
+
+    /// Waits for the end of a check, and gives what is shown then.
+    async fn checked(&self, path: &str, id: &str) -> Value {
+        for _ in 0..6 {
+            let shown = self.get(&format!("{path}/{id}?wait=20")).await.expect(200).json();
+            if shown["state"] != "preparing" {
+                return shown;
+            }
+        }
+        panic!("{path}/{id} is still checked");
+    }
+}
+
+#[tokio::test]
+async fn a_long_check_goes_on_after_the_answer() {
+    let app = TestApp::start().await;
+    let masks = app.upload(large_masks()).await;
+    let body = json!({"masks": masks, "name": "before"});
+    let asked = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    let calibration = id(&asked);
+    assert_eq!(asked.header("location"), format!("{CALIBRATIONS}/{calibration}"));
+    let shown = asked.json();
+    assert_eq!((&shown["state"], &shown["frames"]), (&json!("preparing"), &Value::Null));
+    // Meanwhile: the key, what needs it, what it needs, its name, and the list.
+    let again = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    assert_eq!(id(&again), calibration);
+    let other = app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await;
+    other.problem(422, "idempotency_key_reused");
+    let data = app.upload(constant(&[1, 512, 1024], 8.0)).await;
+    let measurement = json!({"calibration": calibration, "data": data});
+    let early = app.post(MEASUREMENTS, &measurement).await;
+    early.problem(409, "calibration_not_ready");
+    assert_eq!(early.json()["retryable"], true);
+    app.delete(&format!("/v1/blobs/{masks}")).await.problem(409, "in_use");
+    let place = format!("{CALIBRATIONS}/{calibration}");
+    let named = app.request(Method::PATCH, &place).json(&json!({"name": "after"}));
+    assert_eq!(app.send(named).await.expect(200).json()["state"], "preparing");
+    let listed = app.get(CALIBRATIONS).await.expect(200).json();
+    assert_eq!(listed["items"][0]["state"], "preparing", "the check is too short for this test");
+
+    let shown = app.checked(CALIBRATIONS, &calibration).await;
+    assert_eq!((&shown["state"], &shown["frames"]), (&json!("ready"), &json!(64)));
+    assert_eq!((&shown["name"], &shown["problem"]), (&json!("after"), &Value::Null));
+    assert_eq!(shown["created_at"], asked.json()["created_at"]);
+    let listed = app.get(CALIBRATIONS).await.expect(200).json();
+    assert_eq!(listed["items"].as_array().unwrap().len(), 1);
+    assert_eq!(id(&app.ask(CALIBRATIONS, &body, "k").await.expect(200)), calibration);
+
+    // The same of a measurement.
+    let asked = app.ask(MEASUREMENTS, &measurement, "k").await.expect(202);
+    assert_eq!(asked.json()["state"], "preparing");
+    let job = json!({"measurement": id(&asked), "algorithm": "gap-tv"});
+    let early = app.post("/v1/jobs", &job).await;
+    early.problem(409, "measurement_not_ready");
+    assert_eq!(early.json()["retryable"], true);
+    app.delete(&place).await.problem(409, "in_use");
+    let listed = app.get(&format!("{MEASUREMENTS}?calibration={calibration}")).await.expect(200);
+    assert_eq!(listed.json()["items"][0]["id"], asked.json()["id"]);
+    let shown = app.checked(MEASUREMENTS, &id(&asked)).await;
+    assert_eq!((&shown["state"], &shown["snapshots"]), (&json!("ready"), &json!(1)));
+    app.post("/v1/jobs", &job).await.expect(201);
+    assert_eq!(id(&app.ask(MEASUREMENTS, &measurement, "k").await.expect(200)), id(&asked));
+}
+
+#[tokio::test]
+async fn what_does_not_pass_is_told_as_the_answer_would_have_told_it() {
+    let app = TestApp::start().await;
+    let masks = app.upload(constant(&[4, 48, 64], 3.0)).await;
+    let body = json!({"masks": masks});
+    let told = app.post(CALIBRATIONS, &body).await;
+    told.problem(422, "invalid_content");
+    let asked = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    let failed = app.checked(CALIBRATIONS, &id(&asked)).await;
+    assert_eq!((&failed["state"], &failed["error"]), (&json!("failed"), &told.json()["detail"]));
+    let same = |problem: &Value| {
+        let mut problem = problem.clone();
+        let instance = problem.as_object_mut().unwrap().remove("instance");
+        (problem, instance.unwrap().as_str().unwrap().to_owned())
+    };
+    let (later, request) = same(&failed["problem"]);
+    assert_eq!(later, same(&told.json()).0);
+    assert_eq!(request, format!("urn:sci-recon:request:{}", asked.header("x-request-id")));
+    // It is no use to wait for it.
+    let data = app.upload(constant(&[48, 64], 1.0)).await;
+    let needs = json!({"calibration": id(&asked), "data": data});
+    let refused = app.post(MEASUREMENTS, &needs).await;
+    refused.problem(409, "calibration_not_ready");
+    assert_eq!(refused.json()["retryable"], false);
+    // Its key and its file are free.
+    let again = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    assert_ne!(id(&again), id(&asked));
+    app.checked(CALIBRATIONS, &id(&again)).await;
+    app.delete(&format!("/v1/blobs/{masks}")).await.expect(204);
+    app.delete(&format!("{CALIBRATIONS}/{}", id(&asked))).await.expect(204);
+    app.get(&format!("{CALIBRATIONS}/{}", id(&asked))).await.problem(404, "not_found");
+
+    let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
+    let data = app.upload(constant(&[48, 48], 1.0)).await;
+    let body = json!({"calibration": calibration, "data": data});
+    let told = app.post(MEASUREMENTS, &body).await;
+    told.problem(422, "size_mismatch");
+    let asked = app.ask(MEASUREMENTS, &body, "k").await.expect(202);
+    let failed = app.checked(MEASUREMENTS, &id(&asked)).await;
+    assert_eq!(same(&failed["problem"]).0, same(&told.json()).0);
+    let job = json!({"measurement": id(&asked), "algorithm": "gap-tv"});
+    let refused = app.post("/v1/jobs", &job).await;
+    refused.problem(409, "measurement_not_ready");
+    assert_eq!(refused.json()["retryable"], false);
+    app.delete(&format!("{CALIBRATIONS}/{calibration}")).await.expect(204);
+    let place = format!("{MEASUREMENTS}/{}", id(&asked));
+    app.delete(&place).await.expect(204);
+    app.get(&place).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn a_check_survives_a_killed_server_but_not_its_deletion() {
+    let mut app = TestApp::start().await;
+    let masks = app.upload(large_masks()).await;
+    let body = json!({"masks": masks});
+    let calibration = id(&app.ask(CALIBRATIONS, &body, "k").await.expect(202));
+    app.restart();
+    let place = format!("{CALIBRATIONS}/{calibration}");
+    let shown = app.get(&place).await.expect(200).json();
+    assert_eq!(shown["state"], "preparing", "the check is too short for this test");
+    assert_eq!(app.checked(CALIBRATIONS, &calibration).await["state"], "ready");
+    assert_eq!(id(&app.ask(CALIBRATIONS, &body, "k").await.expect(200)), calibration);
+    app.delete(&place).await.expect(204);
+
+    // What is deleted is checked no longer, and its key is free.
+    let first = id(&app.ask(CALIBRATIONS, &body, "k").await.expect(202));
+    app.delete(&format!("{CALIBRATIONS}/{first}")).await.expect(204);
+    let second = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    assert_ne!(id(&second), first);
+    // A server that is stopped leaves the check to the next one.
+    assert!(app.stop().success());
+    app.restart();
+    assert_eq!(app.checked(CALIBRATIONS, &id(&second)).await["state"], "ready");
+    let listed = app.get(CALIBRATIONS).await.expect(200).json();
+    assert_eq!(listed["items"].as_array().unwrap().len(), 1);
+    app.get(&format!("{CALIBRATIONS}/{first}")).await.problem(404, "not_found");
+}
+
+#[tokio::test]
+async fn a_check_that_ends_the_service_is_given_up() {
+    let mut app = TestApp::start().await;
+    let masks = app.upload(large_masks()).await;
+    let calibration = id(&app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await.expect(202));
+    let place = format!("{CALIBRATIONS}/{calibration}");
+    for _ in 0..20 {
+        app.restart();
+        // Until it has begun again.
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        let shown = app.get(&place).await.expect(200).json();
+        match shown["state"].as_str().unwrap() {
+            "preparing" => {}
+            "failed" => {
+                assert_eq!(shown["problem"]["code"], "internal");
+                assert!(shown["error"].as_str().unwrap().contains("ended 5 times"), "{shown}");
+                return;
+            }
+            state => panic!("{state}: the check is too short for this test"),
+        }
+    }
+    panic!("it is begun again and again");
+}
