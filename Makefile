@@ -8,7 +8,7 @@ JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
 .PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
-	bench-peers bench-scale eval-models eval-loop evaluation-data
+	bench-latency bench-peers bench-scale eval-models eval-loop evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
@@ -106,17 +106,22 @@ bench-peers: runtime $(PEERS)/.stamp ## CPU seconds beside numpy, scikit-image a
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PEERS)/bin/python benches/peers/peers.py $${CARGO_TARGET_DIR:-target}/release/sci-recon
-# SIZE, FRAMES, ALGORITHM, DEVICE (cuda:0) and the image are yours to set.
+# SIZE, FRAMES, SNAPSHOTS, ALGORITHM, DEVICE (cuda:0) and the image are yours to set.
 IMAGE ?= ../shared/scenes/still_6720x4480.jpg
 SIZE ?= 3200
 FRAMES ?= 10
+SNAPSHOTS ?= 1
 ALGORITHM ?= gap-tv
 bench-scale: runtime $(PEERS)/.stamp ## ten megapixels through the service: time by stage, memory, disk; ends with one line of JSON
 	@test -f $(IMAGE) || { echo "no image at IMAGE=$(IMAGE): any photograph will do, best of 3400x3400 or more" >&2; exit 2; }
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PEERS)/bin/python benches/scale/scale.py $${CARGO_TARGET_DIR:-target}/release/sci-recon $(IMAGE) \
-		--size $(SIZE) --frames $(FRAMES) --algorithm $(ALGORITHM) $(if $(DEVICE),--device $(DEVICE) --workers 1)
+		--size $(SIZE) --frames $(FRAMES) --snapshots $(SNAPSHOTS) --algorithm $(ALGORITHM) $(if $(DEVICE),--device $(DEVICE) --workers 1)
+bench-latency: runtime $(PEERS)/.stamp ## a small job from its POST to the last byte of its EXR; ends with one line of JSON
+	@$(CARGO) build --release --quiet
+	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(PEERS)/bin/python benches/scale/latency.py $${CARGO_TARGET_DIR:-target}/release/sci-recon
 $(PEERS)/.stamp: benches/peers/requirements.txt
 	$(PYTHON) -m venv $(PEERS)
 	$(PEERS)/bin/python -m pip install --quiet --requirement $<

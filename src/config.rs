@@ -280,8 +280,9 @@ pub struct EngineArguments {
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,
 
-    /// Leaves workers all files and connections that their user may have. Otherwise those of this machine see
-    /// the data folder and the system's libraries alone, and make no connections.
+    /// Leaves workers, and the networks of users that they run, all files and connections that their user may have.
+    /// Otherwise workers of this machine see the data folder and the system's libraries alone, networks those
+    /// libraries alone, and neither makes connections.
     #[arg(long, env = "SCI_RECON_UNCONFINED")]
     pub unconfined: bool,
 

@@ -42,6 +42,7 @@ enum Command {
     Backup(cli::backup::Arguments),
     Verify(cli::verify::Arguments),
     CheckModel(cli::check_model::Arguments),
+    RunModel(cli::run_model::Arguments),
     #[cfg(feature = "nats")]
     Cluster(cli::cluster::Arguments),
     Health(cli::health::Arguments),
@@ -105,6 +106,7 @@ fn run(line: Vec<OsString>) -> ExitCode {
         Command::Backup(arguments) => cli::backup::run(&arguments),
         Command::Verify(arguments) => cli::verify::run(&arguments),
         Command::CheckModel(arguments) => cli::check_model::run(&arguments),
+        Command::RunModel(arguments) => cli::run_model::run(&arguments),
         #[cfg(feature = "nats")]
         Command::Cluster(arguments) => cli::cluster::run(&arguments),
         Command::Health(arguments) => cli::health::run(&arguments),

@@ -1,8 +1,8 @@
 """One job of any size through the real service: time by stage, memory and disk.
 
-    python scale.py SCI_RECON_BINARY IMAGE [--size 3200] [--frames 10] [--algorithm gap-tv] [--device cuda:0] ...
+    python scale.py SCI_RECON_BINARY IMAGE [--size 3200] [--frames 10] [--snapshots 1] [--algorithm gap-tv] [--device cuda:0] ...
 
-IMAGE, panned by a few pixels a frame, is the scene; masks and snapshot are simulated (random squares). Everything then goes over HTTP:
+IMAGE, panned by a few pixels a frame, is the scene; masks and snapshots are simulated (random squares). Everything then goes over HTTP:
 upload, calibration, measurement, job, download. Prints what happens and ends with one JSON line: seconds by stage, the greatest resident
 memory of the server and of each worker (VmHWM), the first remaining time that was promised beside the true one, disk and quality.
 """
@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+import urllib.error
 import urllib.request
 
 import numpy as np
@@ -45,8 +46,11 @@ class Service:
         if isinstance(body, dict):
             body, headers = json.dumps(body).encode(), {'Content-Type': 'application/json'}
         request = urllib.request.Request(self.url + path, method=method, data=body, headers=dict(headers))
-        with urllib.request.urlopen(request) as answer:
-            return json.load(answer)
+        try:
+            with urllib.request.urlopen(request) as answer:
+                return json.load(answer)
+        except urllib.error.HTTPError as error:
+            sys.exit(f'{method} {path}: {error.code} {error.read().decode()}')
 
     def upload(self, path):
         with open(path, 'rb') as file:   # streamed
@@ -78,6 +82,7 @@ def main():
     p.add_argument('image')
     p.add_argument('--size', type=int, default=3200)
     p.add_argument('--frames', type=int, default=10)
+    p.add_argument('--snapshots', type=int, default=1, help='that follow one another, and are reconstructed together')
     p.add_argument('--algorithm', default='gap-tv')
     p.add_argument('--schedule', help='a schedule as JSON [default: the algorithm\'s own]')
     p.add_argument('--workers', type=int, default=2)
@@ -95,10 +100,10 @@ def main():
         seconds[name], began = round(time.monotonic() - began, 1), time.monotonic()
         print(f'{name}: {seconds[name]} s', flush=True)
 
-    truth = pan(io.imread(a.image), a.frames, a.size)
+    truth = pan(io.imread(a.image), a.frames * a.snapshots, a.size)
     np.save(folder / 'frames.npy', truth)
     subprocess.run([a.binary, 'simulate', '--frames', folder / 'frames.npy', '--compression-ratio', str(a.frames), '--pattern', 'random-squares',
-                    '--seed', '1', '--out', folder / 'snapshot'], check=True, stdout=subprocess.DEVNULL)
+                    '--snapshots', str(a.snapshots), '--seed', '1', '--out', folder / 'snapshot'], check=True, stdout=subprocess.DEVNULL)
     (folder / 'frames.npy').unlink()
     lap('simulate')
     service = Service(a.binary, folder / 'service', ['--workers', str(a.workers), *(['--device', a.device] if a.device else [])])
@@ -111,7 +116,7 @@ def main():
             time.sleep(.2)
         measurement = service.call('POST', '/v1/measurements', {'calibration': calibration, 'data': measured})['id']
         lap('calibration and check')
-        wanted = {'measurement': measurement, 'algorithm': a.algorithm}
+        wanted = {'measurement': measurement, 'algorithm': a.algorithm, 'snapshots': 'all'}
         if a.schedule:
             wanted['schedule'] = json.loads(pathlib.Path(a.schedule).read_text())
         if a.tile:
@@ -134,17 +139,19 @@ def main():
             sys.exit(f"the job {state['state']}: {state['error']}")
         total = time.monotonic() - started
         manifest = service.call('GET', f'/v1/jobs/{job}/manifest.json')
-        result = folder / 'result.npy'
-        urllib.request.urlretrieve(f'{service.url}/v1/jobs/{job}/snapshots/0/frames.npy', result)
+        result, quality = folder / 'result.npy', []
+        for snapshot, true in enumerate(truth.reshape(a.snapshots, a.frames, a.size, a.size)):
+            urllib.request.urlretrieve(f'{service.url}/v1/jobs/{job}/snapshots/{snapshot}/frames.npy', result)
+            quality.append(psnr_by_frame(result, true))
         lap('download')
         service.look()
         disk = sum(path.stat().st_size for path in (folder / 'service').rglob('*') if path.is_file())
         memory = service.memory
         print(json.dumps({
-            'target': 'bench-scale', 'size': a.size, 'frames': a.frames, 'algorithm': a.algorithm, 'workers': a.workers, 'device': a.device,
+            'target': 'bench-scale', 'size': a.size, 'frames': a.frames, 'snapshots': a.snapshots, 'algorithm': a.algorithm, 'workers': a.workers, 'device': a.device,
             'seconds': seconds, 'run': manifest['run'], 'memory_bytes': memory, 'memory_sum_bytes': sum(memory.values()),
             'preview_seconds': preview, 'promised_seconds': promise and round(sum(promise), 1), 'true_seconds': round(total, 1), 'disk_bytes': disk,
-            'psnr_db': round(psnr_by_frame(result, truth), 3)}))
+            'psnr_db': round(float(np.mean(quality)), 3)}))
     finally:
         service.process.terminate()
         service.process.wait()
@@ -152,4 +159,5 @@ def main():
             shutil.rmtree(folder)
 
 
-main()
+if __name__ == '__main__':
+    main()

@@ -10,7 +10,7 @@ use ndarray::{Array2, Array3};
 
 use super::CliError;
 use super::arguments::NetworkArguments;
-use super::confine::{confine, folders_of, limit_memory};
+use super::confine::confine_network;
 use crate::cli::error::Result;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
@@ -55,17 +55,8 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
-    if let Some(bytes) = arguments.memory_bytes {
-        limit_memory(bytes).map_err(CliError::Failure)?;
-    }
-    // What the driver of a GPU opens is its own affair.
-    if !arguments.unconfined && arguments.engine.on_cpu() {
-        let library = folders_of(arguments.engine.library());
-        let readable = library.iter().map(PathBuf::as_path).chain([&*arguments.file]);
-        if let Err(why) = confine(&readable.collect::<Vec<_>>(), &[]) {
-            eprintln!("the check is not confined: {why}");
-        }
-    }
+    let Arguments { file, memory_bytes, unconfined, engine, .. } = arguments;
+    confine_network(*memory_bytes, *unconfined, engine, Some(file))?;
     let network = arguments.engine.network()?;
     // Without a library nothing can be said of the network.
     network.version()?;
@@ -89,7 +80,7 @@ fn facts(
     let length = |length: u32| usize::try_from(length).unwrap_or(usize::MAX);
     let (height, width) = (length(arguments.height), length(arguments.width));
     let frames = length(arguments.frames);
-    let mut network = network.end_to_end(file)?;
+    let mut network = network.end_to_end(&file.content()?)?;
     let interface = network.interface();
     let size = interface.check(frames, height, width)?;
     let trial = match size {

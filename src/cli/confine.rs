@@ -1,6 +1,7 @@
-//! What processes may do that run networks of users: native code works on what a stranger has sent. They
-//! get no more memory than was planned, make no connections, start no programs, and see the files that they
-//! need and no others (Landlock, seccomp), as far as the kernel has it.
+//! What workers may do, and the processes that run networks of users, where native code works on what a
+//! stranger has sent. They get no more memory than was planned, make no connections, and see the files that they
+//! need and no others; a network's process also starts no programs and sends no signals (Landlock, seccomp), as
+//! far as the kernel has it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,6 +13,9 @@ use landlock::{
 use rustix::process::{Resource, Rlimit, setrlimit};
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 
+use super::CliError;
+use super::arguments::NetworkArguments;
+use crate::config::EngineArguments;
 use crate::pipeline::networks::find_library;
 
 /// The newest version of Landlock that was tried; older kernels do what they can.
@@ -31,6 +35,18 @@ const SYSTEM: [&str; 11] = [
     "/etc/localtime",
 ];
 
+/// What leads to other processes.
+const CONNECTIONS: [i64; 4] =
+    [libc::SYS_socket, libc::SYS_ptrace, libc::SYS_process_vm_readv, libc::SYS_process_vm_writev];
+/// What a network does not need, either.
+const OTHERS: [i64; 5] = [
+    libc::SYS_execve,
+    libc::SYS_execveat,
+    libc::SYS_kill,
+    libc::SYS_tkill,
+    libc::SYS_pidfd_send_signal,
+];
+
 /// Lets this process take so many bytes of memory.
 pub(super) fn limit_memory(bytes: u64) -> Result<(), String> {
     let limit = Rlimit { current: Some(bytes), maximum: Some(bytes) };
@@ -38,11 +54,62 @@ pub(super) fn limit_memory(bytes: u64) -> Result<(), String> {
         .map_err(|error| format!("the memory can't be limited: {error}"))
 }
 
-/// Gives up what a worker or a check does not need: connections, programs, and all files but these and those
-/// of the system. Before it starts any thread. Says what could not be given up.
-pub(super) fn confine(readable: &[&Path], writable: &[&Path]) -> Result<(), String> {
+/// Gives up what a worker does not need: connections, and all files but these and those of the system. Before
+/// it starts any thread. Says what could not be given up.
+pub(super) fn confine_worker(readable: &[&Path], writable: &[&Path]) -> Result<(), String> {
+    confine(readable, writable, &CONNECTIONS)
+}
+
+/// Gives up what a network of a user's does not need: also programs and signals, and all files but the system's,
+/// the libonnxruntime and `readable`. What the driver of a GPU opens is its own affair. Before it starts any
+/// thread.
+/// Errors: the memory can't be limited. What else can't be given up is said on standard error.
+pub(super) fn confine_network(
+    memory_bytes: Option<u64>,
+    unconfined: bool,
+    engine: &NetworkArguments,
+    readable: Option<&Path>,
+) -> Result<(), CliError> {
+    if let Some(bytes) = memory_bytes {
+        limit_memory(bytes).map_err(CliError::Failure)?;
+    }
+    if unconfined || !engine.on_cpu() {
+        return Ok(());
+    }
+    let library = folders_of(engine.library());
+    let readable: Vec<_> = library.iter().map(PathBuf::as_path).chain(readable).collect();
+    if let Err(why) = confine(&readable, &[], &[&CONNECTIONS[..], &OTHERS].concat()) {
+        eprintln!("a network is not confined: {why}");
+    }
+    Ok(())
+}
+
+/// Whether files are kept from networks of users; if not, why.
+pub(super) fn confinement(engine: &EngineArguments) -> Result<(), String> {
+    let why = if engine.unconfined {
+        "--unconfined was given".to_owned()
+    } else if engine.device != "cpu" {
+        "the driver of a GPU opens what it wants".to_owned()
+    } else {
+        let Err(why) = files_can_be_kept() else { return Ok(()) };
+        why
+    };
+    Err(format!("networks of users can read every file that the service can: {why}"))
+}
+
+/// Whether this kernel can keep files from a process; if not, why. Tried on a thread, which ends.
+fn files_can_be_kept() -> Result<(), String> {
+    let tried = std::thread::spawn(|| restrict_files(&[], &[]).map_err(|error| error.to_string()));
+    enforced(tried.join().unwrap_or_else(|_| Err("Landlock can't be tried".into()))?)
+}
+
+fn confine(readable: &[&Path], writable: &[&Path], denied: &[i64]) -> Result<(), String> {
     let files = restrict_files(readable, writable).map_err(|error| error.to_string())?;
-    restrict_calls().map_err(|error| error.to_string())?;
+    deny(denied).map_err(|error| error.to_string())?;
+    enforced(files)
+}
+
+fn enforced(files: RulesetStatus) -> Result<(), String> {
     match files {
         RulesetStatus::NotEnforced => Err("this kernel has no Landlock".into()),
         RulesetStatus::FullyEnforced | RulesetStatus::PartiallyEnforced => Ok(()),
@@ -75,19 +142,62 @@ pub(super) fn folders_of(named: Option<&Path>) -> Vec<PathBuf> {
     paths.into_iter().flatten().filter_map(|path| Some(path.parent()?.to_owned())).collect()
 }
 
-fn restrict_calls() -> Result<(), Box<dyn std::error::Error>> {
-    let denied = [
-        libc::SYS_socket,
-        libc::SYS_execve,
-        libc::SYS_execveat,
-        libc::SYS_ptrace,
-        libc::SYS_process_vm_readv,
-        libc::SYS_process_vm_writev,
-    ];
-    let rules: BTreeMap<i64, _> = denied.into_iter().map(|call| (call, Vec::new())).collect();
+fn deny(calls: &[i64]) -> Result<(), Box<dyn std::error::Error>> {
+    let rules: BTreeMap<i64, _> = calls.iter().map(|&call| (call, Vec::new())).collect();
     let refuse = SeccompAction::Errno(u32::try_from(libc::EPERM)?);
     let here = std::env::consts::ARCH.try_into()?;
     let filter: BpfProgram =
         SeccompFilter::new(rules, SeccompAction::Allow, refuse, here)?.try_into()?;
     Ok(seccompiler::apply_filter(&filter)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::process::Command;
+
+    use super::{CONNECTIONS, OTHERS, confine, files_can_be_kept};
+
+    /// What a process finds that it can do, after it was confined: on a thread of its own, as both hold for a
+    /// thread and what it starts.
+    fn found<T: Send>(denied: &[i64], folder: &Path, what: impl FnOnce() -> T + Send) -> T {
+        std::thread::scope(|scope| {
+            let confined = scope.spawn(|| {
+                confine(&[folder], &[], denied).unwrap();
+                what()
+            });
+            confined.join().unwrap()
+        })
+    }
+
+    #[test]
+    fn a_network_reads_no_files_makes_no_connections_and_starts_nothing() {
+        if let Err(why) = files_can_be_kept() {
+            eprintln!("SKIPPED: {why}");
+            return;
+        }
+        let (own, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        for folder in [&own, &other] {
+            std::fs::write(folder.path().join("file"), "text").unwrap();
+        }
+        let read = |folder: &Path| std::fs::read(folder.join("file")).is_ok();
+        let may = || {
+            [
+                read(own.path()),
+                read(other.path()),
+                std::fs::write(own.path().join("new"), "text").is_ok(),
+                std::net::UdpSocket::bind("127.0.0.1:0").is_ok(),
+                Command::new("true").status().is_ok(),
+                rustix::process::test_kill_process(rustix::process::getpid()).is_ok(),
+            ]
+        };
+        assert_eq!(may(), [true; 6]);
+        let network = [&CONNECTIONS[..], &OTHERS].concat();
+        let found_by_network = found(&network, own.path(), may);
+        assert_eq!(found_by_network, [true, false, false, false, false, false]);
+        // A worker starts the processes of networks, and ends them.
+        let found_by_worker = found(&CONNECTIONS, own.path(), may);
+        assert_eq!(found_by_worker, [true, false, false, false, true, true]);
+        assert_eq!(may(), [true; 6], "another thread was confined");
+    }
 }

@@ -29,6 +29,7 @@ pub mod lab;
 pub mod ls;
 pub mod optics;
 pub mod reconstruct;
+pub mod run_model;
 pub mod schedule;
 pub mod serve;
 pub mod settings;

@@ -19,7 +19,7 @@ impl Model {
     /// Loads the network once, to see what it takes.
     pub fn open(path: &Path, network: &NetworkSource) -> Result<Self> {
         let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
-        let interface = network.end_to_end(&file)?.interface();
+        let interface = network.end_to_end(&file.content()?)?.interface();
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Ok(Self { name, file, interface })
     }

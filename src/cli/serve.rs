@@ -10,6 +10,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use super::confine::confinement;
 use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
@@ -75,6 +76,10 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
             "{missing}. Until then jobs with networks are refused; /readyz says so, too"
         );
     }
+    let confinement = confinement(&settings.engine);
+    if let Err(why) = &confinement {
+        tracing::warn!("{why}");
+    }
     tracing::info!(%address, data = %store.dir().root().display(), swept, "listening");
     announce(store.dir().root(), address)?;
     // 4. Workers and maintenance, until the signal.
@@ -108,7 +113,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. The API.
-    let app = App::new(store.clone(), settings, metrics, trouble, closing);
+    let app = App::new(store.clone(), settings, metrics, (trouble, confinement), closing);
     app.resume_checks().await?;
     let service = router(app);
     tokio::select! {

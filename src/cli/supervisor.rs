@@ -15,7 +15,7 @@ use tokio::task::JoinSet;
 
 use crate::config::WorkerArguments;
 use crate::job::WorkerId;
-use crate::pipeline::usage::peak_rss_of;
+use crate::pipeline::usage::{kills_for_memory, peak_rss_of};
 use crate::store::{Store, WorkerEnd};
 
 /// How long a worker may take to give its task back.
@@ -188,24 +188,6 @@ impl Memory {
             end => end,
         }
     }
-}
-
-/// How often the kernel has killed a process of this control group for want of memory; none if it does not
-/// tell.
-fn kills_for_memory() -> Option<u64> {
-    let groups = std::fs::read_to_string("/proc/self/cgroup").ok()?;
-    let file = groups.lines().find_map(|line| {
-        let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
-        let path = path.trim_end_matches('/');
-        match controllers {
-            "" => Some(format!("/sys/fs/cgroup{path}/memory.events")),
-            "memory" => Some(format!("/sys/fs/cgroup/memory{path}/memory.oom_control")),
-            _ => None,
-        }
-    })?;
-    let events = std::fs::read_to_string(file).ok()?;
-    let line = events.lines().find_map(|line| line.strip_prefix("oom_kill "))?;
-    line.trim().parse().ok()
 }
 
 async fn stopped(stop: &mut watch::Receiver<bool>) {

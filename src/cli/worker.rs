@@ -7,7 +7,7 @@ use tokio::io::AsyncReadExt;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use super::confine::{confine, folders_of, limit_memory};
+use super::confine::{confine_worker, folders_of, limit_memory};
 #[cfg(feature = "nats")]
 use super::guard::guard;
 use super::{CliError, logging};
@@ -21,7 +21,7 @@ use crate::job::WorkerId;
 use crate::pipeline::NetworkSource;
 use crate::recon::prior::onnx::Device;
 use crate::store::{Purpose, Store, StoreError};
-use crate::worker::{Local, Worker, WorkerError};
+use crate::worker::{Local, ModelCommand, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
 pub fn run(settings: &WorkerArguments) -> Result<()> {
@@ -35,13 +35,15 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     if let Some(data) = settings.data.as_deref().filter(|_| confined) {
         let library = folders_of(settings.engine.onnxruntime.as_deref());
         let readable: Vec<&Path> = library.iter().map(PathBuf::as_path).collect();
-        if let Err(why) = confine(&readable, &[data]) {
+        if let Err(why) = confine_worker(&readable, &[data]) {
             tracing::warn!(why, "the worker is not confined");
         }
     }
     let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
     let network = NetworkSource::new(library, Device::parse(&settings.engine.device)?);
     let failed = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
+    let program = std::env::current_exe().map_err(|error| failed(&error))?;
+    let model = model_command(settings, program);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -54,7 +56,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     let ended = runtime.block_on(async {
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
-        match work(settings, network, stop).await {
+        match work(settings, (network, model), stop).await {
             Err(WorkEnd::Worker(error @ WorkerError::Unfinished)) => {
                 tracing::info!("{error}");
                 Ok(())
@@ -84,7 +86,7 @@ enum WorkEnd {
 
 async fn work(
     settings: &WorkerArguments,
-    network: NetworkSource,
+    (network, model): (NetworkSource, ModelCommand),
     stop: CancellationToken,
 ) -> Result<(), WorkEnd> {
     let id = settings.id.unwrap_or_else(WorkerId::new);
@@ -93,14 +95,14 @@ async fn work(
     if settings.remote.nats.is_wanted() {
         let remote = remote_settings(settings);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
-        let ended = Worker::new(remote.clone(), network, stall, stop).run().await;
+        let ended = Worker::new(remote.clone(), network, model, stall, stop).run().await;
         remote.leave().await;
         return Ok(ended?);
     }
     let store =
         Store::open(settings.data.as_deref().unwrap_or(Path::new("")), Purpose::Use).await?;
     let local = Local::new(store.clone(), id, !settings.without_tiles);
-    let ended = Worker::new(local, network, stall, stop).run().await;
+    let ended = Worker::new(local, network, model, stall, stop).run().await;
     store.close().await;
     Ok(ended?)
 }
@@ -120,6 +122,22 @@ fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
         patience: Duration::from_secs(settings.engine.stall_seconds) / 2,
         idle: remote.exit_when_idle.map(Duration::from_secs),
     }
+}
+
+/// How the worker starts the process of a user's network: with its own limits.
+fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
+    let WorkerArguments { memory_bytes, engine, .. } = settings;
+    let mut arguments = vec!["run-model".into(), "--device".into(), engine.device.clone().into()];
+    if let Some(library) = &engine.onnxruntime {
+        arguments.extend(["--onnxruntime".into(), library.into()]);
+    }
+    if let Some(bytes) = memory_bytes {
+        arguments.extend(["--memory-bytes".into(), bytes.to_string().into()]);
+    }
+    if engine.unconfined {
+        arguments.push("--unconfined".into());
+    }
+    ModelCommand { program, arguments, memory_bytes: *memory_bytes }
 }
 
 /// Lowers the priority of this process, and so of all its threads.

@@ -49,16 +49,21 @@ pub struct Services {
     pub(super) pictures: Pictures,
     /// Why no tile can leave this machine, where tiles should.
     pub(super) cluster: Option<watch::Receiver<Option<String>>>,
+    /// Why networks of users can read files of labs, if they can.
+    pub(super) confinement: std::result::Result<(), String>,
 }
 
 impl App {
-    /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine; none if
-    /// none should. Answers that have no end of their own end with `closing`. Needs a runtime of tokio.
+    /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine, none if
+    /// none should; `confinement` why networks of users can read files of labs, if they can. Answers that have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
         settings: &ServeArguments,
         metrics: Metrics,
-        cluster: Option<watch::Receiver<Option<String>>>,
+        (cluster, confinement): (
+            Option<watch::Receiver<Option<String>>>,
+            std::result::Result<(), String>,
+        ),
         closing: CancellationToken,
     ) -> Self {
         Self(Arc::new(Services {
@@ -74,6 +79,7 @@ impl App {
             checker: Checker::new(settings),
             metrics,
             cluster,
+            confinement,
             settings: settings.clone(),
             store,
         }))

@@ -130,6 +130,8 @@ struct Readiness {
     cluster: Option<String>,
     /// What jobs with networks need.
     networks: String,
+    /// Whether files are kept from networks of users.
+    confinement: String,
 }
 
 /// `GET /livez`: the process answers.
@@ -152,7 +154,9 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
     let degraded = networks.is_err() || matches!(cluster, Some(Some(_)));
     let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
     let cluster = cluster.map(|trouble| trouble.unwrap_or_else(|| "ok".to_owned()));
-    let body = Readiness { ready, degraded, database, disk, workers, cluster, networks };
+    let confinement = app.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
+    let body =
+        Readiness { ready, degraded, database, disk, workers, cluster, networks, confinement };
     (status, Json(body)).into_response()
 }
 

@@ -4,6 +4,7 @@ use ndarray::Array3;
 use serde::Serialize;
 use serde_json::Value;
 
+use super::model_process::ModelProcesses;
 use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, TransportError};
 use crate::formats::planar::{self, Reader};
 use crate::formats::{Limits, StackInfo};
@@ -14,25 +15,32 @@ use crate::pipeline::arrays::Arrays;
 use crate::pipeline::assessment::TileAssessment;
 use crate::pipeline::blend::{self, StoredTile};
 use crate::pipeline::manifest::Recipe;
-use crate::pipeline::networks::{ModelFile, WarmNetworks};
+use crate::pipeline::networks::WarmNetworks;
 use crate::pipeline::pilot::{self, Pilot, full_schedule};
 use crate::pipeline::progress::Monitor;
 use crate::pipeline::records::{
     CostRecord, PilotRecord, PreparedRecord, RunRecord, SnapshotRecord, TileRecord, TileTaskRecord,
 };
-use crate::pipeline::tile::{TileInput, reconstruct_tile, run_network};
+use crate::pipeline::tile::{reconstruct_tile, run_network};
 use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use crate::pipeline::write::{write_manifest, write_result};
 use crate::pipeline::{movie, preview, scale};
 use crate::recon::sequence::RunShare;
-use crate::recon::solver::Outcome;
 use crate::store::{CalibrationDone, NewCalibration, StagedBlob};
+
+/// What computes, on its way between the loop of a worker and its computing thread.
+pub(super) struct Engines {
+    /// The networks of the program.
+    pub(super) networks: WarmNetworks,
+    /// Those of users.
+    pub(super) models: ModelProcesses,
+}
 
 /// Does a task. Blocks for as long as it takes.
 pub(super) fn perform(
     transport: &impl Transport,
     input: TaskInput,
-    networks: &mut WarmNetworks,
+    engines: &mut Engines,
     monitor: &Monitor,
 ) -> Result<Done, TaskError> {
     let (record, output) = match input {
@@ -52,6 +60,8 @@ pub(super) fn perform(
             let place = pilot::place(y.view(), mosaic);
             let first = snapshots.first as usize;
             let task = Pilot { first, place: &place, schedule: &schedule, runs: &runs };
+            engines.models.only(None, monitor)?;
+            let networks = &mut engines.networks;
             let record = run_pilot(&arrays, white, (snapshots, &task), networks, monitor)?;
             let decided = full_schedule(&schedule, record.as_ref());
             let share = decided.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
@@ -59,7 +69,7 @@ pub(super) fn perform(
             (json(&record)?, Output::TileCost(share))
         }
         TaskInput::Tile(task) => {
-            let (record, frames) = tile(transport, &task, networks, monitor)?;
+            let (record, frames) = tile(transport, &task, engines, monitor)?;
             (json(&record)?, Output::Stack(frames))
         }
         TaskInput::Assemble { job, recipe, snapshot, tiles, folder } => {
@@ -193,13 +203,23 @@ fn of_shares(
 fn tile(
     transport: &impl Transport,
     task: &TileTask,
-    networks: &mut WarmNetworks,
+    engines: &mut Engines,
     monitor: &Monitor,
 ) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
+    let Engines { networks, models } = engines;
+    let file = task.model.map(|sha256| transport.model(sha256));
+    monitor.reach(TaskStage::Reading, 0.0);
+    let mut process = models.only(file.as_ref(), monitor)?;
     let before = cpu_seconds();
     let input = transport.window(task)?;
-    let outcome = match task.model {
-        Some(sha256) => by_network(input, &transport.model(sha256), networks, monitor)?,
+    let outcome = match &mut process {
+        Some(process) => {
+            monitor.reach(TaskStage::Deep, 0.0);
+            let outcome = run_network(input, &mut process.watched(monitor))?;
+            let passes = TaskProgress { passes: 1, fraction: 1.0, ..monitor.progress() };
+            monitor.set_progress(passes);
+            outcome
+        }
         None => {
             let mut observer = monitor.observe(task.schedule.clone());
             reconstruct_tile(input, &task.schedule, networks, &mut observer)?
@@ -208,11 +228,12 @@ fn tile(
     monitor.reach(TaskStage::Writing, monitor.progress().fraction);
     let deep = task.model.is_some() || task.schedule.needs_network();
     let source = networks.source();
+    let (of_process, peak) = process.map_or((0.0, 0), |process| process.bill());
     let cost = CostRecord {
         provider: deep.then(|| source.provider().into()),
         onnxruntime: if deep { Some(source.version()?) } else { None },
-        cpu_seconds: cpu_seconds() - before,
-        peak_rss_bytes: peak_rss_bytes(),
+        cpu_seconds: cpu_seconds() - before + of_process,
+        peak_rss_bytes: peak_rss_bytes() + peak,
     };
     let solved = task.pieces.iter().flat_map(Clone::clone).collect();
     let assessment = match task.model {
@@ -221,20 +242,4 @@ fn tile(
     };
     let tile = TileRecord::from(&outcome);
     Ok((TileTaskRecord { tile, solved, assessment, cost }, outcome.frames))
-}
-
-/// One run of an end-to-end network, which can't be stopped on its way.
-fn by_network(
-    input: TileInput,
-    file: &ModelFile,
-    networks: &mut WarmNetworks,
-    monitor: &Monitor,
-) -> Result<Outcome, PipelineError> {
-    monitor.reach(TaskStage::Deep, 0.0);
-    let network = networks.end_to_end(file)?;
-    monitor.check()?;
-    let outcome = run_network(input, network)?;
-    monitor.check()?;
-    monitor.set_progress(TaskProgress { passes: 1, fraction: 1.0, ..monitor.progress() });
-    Ok(outcome)
 }

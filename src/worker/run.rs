@@ -13,7 +13,8 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::perform::perform;
+use super::model_process::{ModelCommand, ModelProcesses};
+use super::perform::{Engines, perform};
 use super::transport::{Claim, Done, TaskError, TaskInput, Transport, TransportError};
 use crate::intake::IntakeError;
 use crate::job::without_paths;
@@ -55,15 +56,16 @@ pub enum WorkerError {
 pub struct Worker<T> {
     transport: T,
     /// On their way between the loop and the computing thread.
-    networks: Option<WarmNetworks>,
+    engines: Option<Engines>,
     source: NetworkSource,
+    model: ModelCommand,
     /// See [`Worker::new`].
     stall: Duration,
     stop: CancellationToken,
 }
 
 /// What the computing thread hands back.
-type Computed = (WarmNetworks, Result<Done, TaskError>);
+type Computed = (Engines, Result<Done, TaskError>);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reason {
@@ -73,15 +75,17 @@ enum Reason {
 }
 
 impl<T: Transport> Worker<T> {
-    /// A worker that ends, and gives its task back, when `stop` is called. A task without progress for
-    /// `stall` on top of four times its planned time is held to hang.
+    /// A worker that ends, and gives its task back, when `stop` is called. The program's networks come from
+    /// `source`, those of users run as `model` says. A task without progress for `stall` on top of four
+    /// times its planned time is held to hang.
     pub fn new(
         transport: T,
         source: NetworkSource,
+        model: ModelCommand,
         stall: Duration,
         stop: CancellationToken,
     ) -> Self {
-        Self { transport, networks: None, source, stall, stop }
+        Self { transport, engines: None, source, model, stall, stop }
     }
 
     /// Works until it is told to stop.
@@ -131,8 +135,8 @@ impl<T: Transport> Worker<T> {
         let computing = self.start(input, &monitor, span.clone());
         let watched = async {
             match self.watch(computing, &lease, &monitor, patience).await {
-                Ok(((networks, outcome), reason)) => {
-                    self.networks = Some(networks);
+                Ok(((engines, outcome), reason)) => {
+                    self.engines = Some(engines);
                     self.end(&lease, outcome, reason, &monitor).await;
                     Ok(())
                 }
@@ -201,15 +205,16 @@ impl<T: Transport> Worker<T> {
         monitor: &Arc<Monitor>,
         span: tracing::Span,
     ) -> JoinHandle<Computed> {
-        let source = &self.source;
-        let mut networks =
-            self.networks.take().unwrap_or_else(|| WarmNetworks::new(source.clone()));
+        let mut engines = self.engines.take().unwrap_or_else(|| Engines {
+            networks: WarmNetworks::new(self.source.clone()),
+            models: ModelProcesses::new(self.model.clone()),
+        });
         let (transport, monitor) = (self.transport.clone(), monitor.clone());
         tokio::task::spawn_blocking(move || {
             let _entered = span.enter();
             let outcome =
-                input.and_then(|input| perform(&transport, input, &mut networks, &monitor));
-            (networks, outcome)
+                input.and_then(|input| perform(&transport, input, &mut engines, &monitor));
+            (engines, outcome)
         })
     }
 

@@ -401,4 +401,6 @@ export async function manage(page, checks, label) {
   await page.waitForSelector(row, { state: "detached" });
   const cut = await page.$$eval(".list td.shape, .list td.created, .list td.checks, .list th", (cells) => cells.filter((cell) => cell.scrollWidth > cell.clientWidth).map((cell) => cell.textContent));
   checks.that(cut.length === 0, `nothing is cut: ${cut}`);
+  const told = await page.$$eval(".list tr:has(.badge.succeeded) td.state", (cells) => cells.map((cell) => cell.textContent));
+  checks.that(told.length > 0 && told.every((text) => /took/.test(text)), `an ended job says how long it took: ${told}`);
 }

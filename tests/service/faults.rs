@@ -46,15 +46,7 @@ pub async fn results_of(app: &TestApp, job: &str, snapshots: usize) -> BTreeMap<
 impl TestApp {
     /// The processes of the workers, as the kernel has them.
     pub fn workers(&self) -> Vec<rustix::process::Pid> {
-        let path = format!("/proc/{0}/task", self.pid());
-        let threads = std::fs::read_dir(path).map(|entries| entries.flatten().collect());
-        let threads: Vec<std::fs::DirEntry> = threads.unwrap_or_default();
-        let children = threads
-            .iter()
-            .filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
-        let children = children.collect::<Vec<String>>().join(" ");
-        let pids = children.split_whitespace().filter_map(|pid| pid.parse().ok());
-        pids.filter_map(rustix::process::Pid::from_raw).collect()
+        children(self.pid())
     }
 
     /// SIGKILL for one worker.
@@ -65,6 +57,18 @@ impl TestApp {
             let _ = rustix::process::kill_process(*pid, rustix::process::Signal::KILL);
         }
     }
+}
+
+/// The processes that a process has started, as the kernel has them.
+pub fn children(process: u32) -> Vec<rustix::process::Pid> {
+    let threads = std::fs::read_dir(format!("/proc/{process}/task"));
+    let threads: Vec<_> = threads.map(|entries| entries.flatten().collect()).unwrap_or_default();
+    let children = threads
+        .iter()
+        .filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
+    let children = children.collect::<Vec<String>>().join(" ");
+    let pids = children.split_whitespace().filter_map(|pid| pid.parse().ok());
+    pids.filter_map(rustix::process::Pid::from_raw).collect()
 }
 
 /// How often to kill: `make faults` says 200.

@@ -3,9 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use sci_recon::pipeline::usage::peak_rss_of;
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
+use crate::faults::children;
 use crate::pipeline::{psnr, values};
 use crate::samples::Scene;
 
@@ -43,6 +45,26 @@ fn trivial(scene: Scene) -> f64 {
 pub async fn register(app: &TestApp, calibration: &str, file: &Path) -> crate::app::Answer {
     let file = app.upload(std::fs::read(file).unwrap()).await;
     app.post("/v1/models", &json!({"calibration": calibration, "file": file, "name": "tiny"})).await
+}
+
+/// The process of the network that the worker ran last is confined, and has no file of the service open.
+fn sees_nothing(app: &TestApp) {
+    let worker = app.workers()[0].as_raw_nonzero().get().unsigned_abs();
+    let [network] = children(worker)[..] else {
+        panic!("one process of a network should be there")
+    };
+    let proc = PathBuf::from(format!("/proc/{network}"));
+    let status = std::fs::read_to_string(proc.join("status")).unwrap();
+    let says = |line: &str| status.lines().any(|found| found == line);
+    assert!(says("NoNewPrivs:\t1") && says("Seccomp:\t2"), "{status}");
+    let open: Vec<PathBuf> = std::fs::read_dir(proc.join("fd"))
+        .unwrap()
+        .map(|entry| std::fs::read_link(entry.unwrap().path()).unwrap())
+        .collect();
+    let data = app.data().canonicalize().unwrap();
+    assert!(open.iter().all(|file| !file.starts_with(&data)), "{open:?}");
+    let sockets = open.iter().filter(|file| file.to_string_lossy().starts_with("socket:"));
+    assert_eq!(sockets.count(), 0, "{open:?}");
 }
 
 #[tokio::test]
@@ -88,6 +110,7 @@ async fn a_network_of_a_labs_own_gives_frames() {
         assert!(used.problem(409, "in_use").contains("1 jobs"));
         app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
     }
+    sees_nothing(&app);
     eprintln!("{:.2} dB trivially, {quality:.2?} by networks", trivial(scene));
     assert!(quality.iter().all(|quality| *quality > trivial(scene) + 1.0), "{quality:?}");
     for model in [&model, &free] {
@@ -171,14 +194,11 @@ async fn a_network_that_is_greedy_in_the_light_costs_its_own_job_and_no_more() {
     let model = register(&app, &calibration, &sly).await.expect(201).json();
     let body = json!({"measurement": measurement, "algorithm": "learned", "model": model["id"]});
     let job = app.submit(&body).await;
-    let mut peak = 0;
+    let (mut peak, workers) = (0, app.workers());
     let done = loop {
-        for worker in app.workers() {
-            let status = std::fs::read_to_string(format!("/proc/{worker}/status"));
-            let status = status.unwrap_or_default();
-            let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-            let kib = line.and_then(|rest| rest.split_whitespace().next()?.parse::<u64>().ok());
-            peak = peak.max(kib.unwrap_or_default() >> 10);
+        for process in children(workers[0].as_raw_nonzero().get().unsigned_abs()) {
+            let process = process.as_raw_nonzero().get().unsigned_abs();
+            peak = peak.max(peak_rss_of(process) >> 20);
         }
         let found = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
         if found["state"] == "failed" || found["state"] == "succeeded" {
@@ -187,13 +207,14 @@ async fn a_network_that_is_greedy_in_the_light_costs_its_own_job_and_no_more() {
         tokio::time::sleep(std::time::Duration::from_millis(5)).await;
     };
     let error = done["error"].as_str().unwrap_or_default();
-    eprintln!("the worker had {peak} MiB at most; the job says: {error}");
+    eprintln!("the network had {peak} MiB at most; the job says: {error}");
     assert_eq!(done["state"], "failed", "{done:#}");
     let words = error.to_lowercase();
     assert!(words.contains("alloc") || words.contains("memory"), "{error}");
-    assert!(peak < 1600, "{peak} MiB");
+    assert!((1..1600).contains(&peak), "{peak} MiB");
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert_eq!(app.workers(), workers, "the worker was spared");
 }
 
 #[test]

@@ -114,7 +114,9 @@ impl ModelFile {
         self.sha256
     }
 
-    fn read(&self) -> Result<Vec<u8>, NetworkError> {
+    /// The file's bytes.
+    /// Errors: it can't be read, or is not what its hash says.
+    pub fn content(&self) -> Result<Vec<u8>, NetworkError> {
         let bytes = read(&self.path)?;
         let found = Sha256::of(&bytes);
         if found == self.sha256 {
@@ -221,9 +223,9 @@ impl NetworkSource {
     }
 
     /// An end-to-end network with a session of its own, for one thread.
-    /// Errors: no library; a file that can't be read, or holds no network that can be run.
-    pub fn end_to_end(&self, file: &ModelFile) -> Result<EndToEndNetwork, NetworkError> {
-        Ok(EndToEndNetwork::load(&self.runtime()?, &file.read()?)?)
+    /// Errors: no library; these bytes of an ONNX file hold no network that can be run.
+    pub fn end_to_end(&self, content: &[u8]) -> Result<EndToEndNetwork, NetworkError> {
+        Ok(EndToEndNetwork::load(&self.runtime()?, content)?)
     }
 
     fn runtime(&self) -> Result<Runtime, NetworkError> {
@@ -281,7 +283,7 @@ impl WarmNetworks {
         let warm = self.end_to_end.take().filter(|(sha256, _)| *sha256 == file.sha256());
         let network = match warm {
             Some((_, network)) => network,
-            None => self.source.end_to_end(file)?,
+            None => self.source.end_to_end(&file.content()?)?,
         };
         Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
@@ -409,8 +411,8 @@ mod tests {
         let path = folder.path().join("network.onnx");
         std::fs::write(&path, "as it was").unwrap();
         let file = ModelFile::open(&path).unwrap();
-        assert_eq!(file.read().unwrap(), b"as it was");
+        assert_eq!(file.content().unwrap(), b"as it was");
         std::fs::write(&path, "as it is").unwrap();
-        assert!(file.read().unwrap_err().to_string().contains("damaged"));
+        assert!(file.content().unwrap_err().to_string().contains("damaged"));
     }
 }

@@ -10,16 +10,27 @@ use rustix::time::{ClockId, clock_gettime};
 pub fn cpu_seconds() -> f64 {
     let own = clock_gettime(ClockId::ProcessCPUTime);
     let own = own.tv_sec as f64 + own.tv_nsec as f64 * 1e-9;
-    own + children_ticks() as f64 / clock_ticks_per_second() as f64
+    own + ticks("/proc/self/stat", CUTIME)
 }
 
-/// Clock ticks of children that have been waited for; 0 where /proc can't be read.
-fn children_ticks() -> u64 {
-    let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // The second field is the program's name in parentheses and may hold spaces; cutime and
-    // cstime are fields 16 and 17, so the 14th and 15th after it.
+/// The same of another process without its children, to a hundredth of a second; 0 if it is gone.
+pub fn cpu_seconds_of(process: u32) -> f64 {
+    ticks(&format!("/proc/{process}/stat"), UTIME)
+}
+
+/// The fields of a process's time in user mode and of that of its ended children, counted from the one after
+/// its name; the time in the kernel follows each.
+const UTIME: usize = 11;
+const CUTIME: usize = 13;
+
+/// Seconds in two fields that count clock ticks; 0 where /proc can't be read.
+fn ticks(stat: &str, field: usize) -> f64 {
+    let stat = fs::read_to_string(stat).unwrap_or_default();
+    // The name stands in parentheses and may hold spaces.
     let after_name = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
-    after_name.split_whitespace().skip(13).take(2).filter_map(|f| f.parse::<u64>().ok()).sum()
+    let fields = after_name.split_whitespace().skip(field).take(2);
+    let ticks: u64 = fields.filter_map(|field| field.parse::<u64>().ok()).sum();
+    ticks as f64 / clock_ticks_per_second() as f64
 }
 
 /// Largest resident memory of this process so far in bytes (VmHWM); 0 where /proc can't be read.
@@ -39,9 +50,27 @@ fn peak_rss_in(status: &str) -> u64 {
     kibibytes.unwrap_or(0) * 1024
 }
 
+/// How often the kernel has killed a process of this control group for want of memory; none if it does not
+/// tell.
+pub fn kills_for_memory() -> Option<u64> {
+    let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
+    let file = groups.lines().find_map(|line| {
+        let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
+        let path = path.trim_end_matches('/');
+        match controllers {
+            "" => Some(format!("/sys/fs/cgroup{path}/memory.events")),
+            "memory" => Some(format!("/sys/fs/cgroup/memory{path}/memory.oom_control")),
+            _ => None,
+        }
+    })?;
+    let events = fs::read_to_string(file).ok()?;
+    let line = events.lines().find_map(|line| line.strip_prefix("oom_kill "))?;
+    line.trim().parse().ok()
+}
+
 #[cfg(test)]
 mod tests {
-    use super::{cpu_seconds, peak_rss_bytes};
+    use super::{cpu_seconds, cpu_seconds_of, peak_rss_bytes};
 
     #[test]
     fn work_shows() {
@@ -53,6 +82,8 @@ mod tests {
             sum += f64::from(number).sqrt();
         }
         assert!(sum > 0.0);
+        let (all, own) = (cpu_seconds(), cpu_seconds_of(std::process::id()));
+        assert!(own <= all + 0.02 && own > 0.0, "{own} of {all}");
         let big = std::hint::black_box(vec![1u8; 64 << 20]);
         assert!(peak_rss_bytes() > big.len() as u64);
     }

@@ -7,7 +7,7 @@ use std::fmt;
 
 use ndarray::{Array3, ArrayView2, ArrayView3};
 
-use super::error::{ReconError, Result};
+use super::error::{ReconError, Result, shape_text};
 
 /// A tensor that a network takes or gives.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -45,6 +45,17 @@ pub trait SnapshotNetwork {
     /// Errors: the network fails, or gives something else than B finite frames.
     fn frames(&mut self, y: ArrayView2<'_, f32>, masks: ArrayView3<'_, f32>)
     -> Result<Array3<f32>>;
+}
+
+/// Refuses frames \[B,H,W\] that no network should give.
+/// Errors: [`ReconError::Shape`]: some values are not finite.
+pub fn all_finite(frames: &Array3<f32>) -> Result<()> {
+    let Some(value) = frames.iter().find(|value| !value.is_finite()) else { return Ok(()) };
+    Err(ReconError::Shape {
+        what: "what the network gave",
+        found: format!("{value} among others"),
+        expected: format!("1x{} of finite numbers", shape_text(frames.shape())),
+    })
 }
 
 /// Name of the input that takes the measurement \[1,1,H,W\].

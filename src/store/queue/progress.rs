@@ -269,7 +269,8 @@ fn progress(job: &Job, row: &SqliteRow, forecast: Option<&Forecast>) -> Result<J
     let forecast = forecast.filter(|_| has_eta(job.state));
     let eta = forecast.and_then(|forecast| forecast.eta_seconds(job.id, left, own_rate));
     let waits = forecast.filter(|_| job.state == JobState::Queued);
-    let share = if cost > 0.0 { done / cost } else { 0.0 };
+    // Sums of fractions miss by a little.
+    let share = if cost > 0.0 { (done / cost).clamp(0.0, 1.0) } else { 0.0 };
     Ok(JobProgress {
         stage: stage(job.state, row)?,
         // Two digits: an ETag should not change with what nobody sees.

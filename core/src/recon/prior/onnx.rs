@@ -11,7 +11,9 @@ use ort::session::builder::GraphOptimizationLevel;
 use ort::value::{Outlet, Tensor, TensorElementType, TensorRef, ValueType};
 
 use crate::recon::error::{ReconError, Result, shape_text};
-use crate::recon::learned::{FRAMES, Interface, MASKS, MEASUREMENT, SnapshotNetwork, TensorInfo};
+use crate::recon::learned::{
+    FRAMES, Interface, MASKS, MEASUREMENT, SnapshotNetwork, TensorInfo, all_finite,
+};
 
 /// Where a network runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -207,16 +209,14 @@ impl SnapshotNetwork for EndToEndNetwork {
             .run(ort::inputs![MEASUREMENT => measurement, MASKS => stack])
             .map_err(failed)?;
         let (shape, values) = outputs[FRAMES].try_extract_tensor::<f32>().map_err(failed)?;
-        let wrong = |found: String| ReconError::Shape {
+        let frames = Array3::from_shape_vec(masks.raw_dim(), values.to_vec());
+        let frames = frames.map_err(|_| ReconError::Shape {
             what: "what the network gave",
-            found,
-            expected: format!("1x{} of finite numbers", shape_text(masks.shape())),
-        };
-        if let Some(value) = values.iter().find(|value| !value.is_finite()) {
-            return Err(wrong(format!("{value} among others")));
-        }
-        Array3::from_shape_vec(masks.raw_dim(), values.to_vec())
-            .map_err(|_| wrong(shape.to_string()))
+            found: shape.to_string(),
+            expected: format!("1x{}", shape_text(masks.shape())),
+        })?;
+        all_finite(&frames)?;
+        Ok(frames)
     }
 }
 
