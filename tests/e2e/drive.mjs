@@ -398,7 +398,8 @@ export async function manage(page, checks, label) {
   await page.click(".chip button");
   checks.that((await page.$(".chip")) === null, "a filter is kept, and forgotten");
   await page.goto(page.url().replace(/\?.*/, ""));
-  await page.waitForSelector(row, { state: "detached" });
+  await page.waitForSelector(".list tr:has(.badge.succeeded)");
+  checks.that((await page.$(row)) === null, "what was deleted is gone");
   const cut = await page.$$eval(".list td.shape, .list td.created, .list td.checks, .list th", (cells) => cells.filter((cell) => cell.scrollWidth > cell.clientWidth).map((cell) => cell.textContent));
   checks.that(cut.length === 0, `nothing is cut: ${cut}`);
   const told = await page.$$eval(".list tr:has(.badge.succeeded) td.state", (cells) => cells.map((cell) => cell.textContent));

@@ -33,7 +33,7 @@ export async function faults(browser, checks, program, services) {
   await page.waitForSelector(".onpicture:has-text('Preview')");
   await checks.look(page, "preview");
   await page.click("text=Cancel");
-  await page.waitForSelector(".onpicture:has-text('Cancelled')");
+  await page.waitForSelector(".onpicture:has-text('Cancelled:')");
   checks.that((await page.$(".downloads a")) === null, "nothing incomplete is offered");
   await checks.look(page, "cancelled");
   service.damage();
