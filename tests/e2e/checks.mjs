@@ -57,6 +57,13 @@ export class Checks {
         await page.screenshot({ path: join(this.folder, `${name}-${width}-${colorScheme}.png`) });
         this.screenshots += 1;
       }
+      const said = await page.evaluate(() => {
+        const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+        const odd = [];
+        while (walker.nextNode()) if (/^(null|undefined|NaN|false|\[object .*)$/.test(walker.currentNode.data.trim())) odd.push(walker.currentNode.data);
+        return odd;
+      });
+      this.that(said.length === 0, `${name} says ${said}`);
       const wider = await page.evaluate(() => Math.max(document.documentElement.scrollWidth - innerWidth, ...[...document.querySelectorAll("main, header")].map((part) => part.scrollWidth - part.clientWidth)));
       this.that(wider <= 0, `${name} is ${wider} pixels wider than a screen of ${width}`);
     }

@@ -84,8 +84,8 @@ export function timeOf(job) {
   if (job.state === "running") return eta === null ? "no worker lives" : `up to about ${duration(eta)} left`;
   if (job.state === "cancelling") return "its workers let go";
   if (!job.started_at || !job.finished_at) return "";
-  const took = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
-  return job.state === "succeeded" ? `took ${duration(took)}` : `after ${duration(took)}`;
+  const seconds = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
+  return `${job.state === "succeeded" ? "took" : "after"} ${seconds < 1 ? "less than 1 s" : duration(seconds)}`;
 }
 
 /** Iterations of a schedule on one tile: all that there may be. */

@@ -245,7 +245,7 @@ function checks(cell, job, before) {
   const found = doubts(job);
   const told = job.assessment;
   put(cell, found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text));
-  if (!found && !told) put(cell, h("span", { class: "mark fine" }, "nothing found"));
+  if (!found && !told) put(cell, h("span", { class: "mark fine" }, "no findings"));
   if (told) cell.append(h("span", { class: `sub grade ${told.grade}`, title: `Expected PSNR ${told.psnr_low_db} to ${told.psnr_high_db} dB` }, `about ${told.psnr_db.toFixed(0)} dB`));
 }
 

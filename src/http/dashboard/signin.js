@@ -62,7 +62,7 @@ export async function account(root, _, signal) {
   const { limits, use } = me;
   const labs = me.all_labs ? await get("/v1/labs", signal) : null;
   const quota = limits.token_bytes === null ? null : h("meter", { min: 0, max: limits.token_bytes, value: use.token_bytes, high: 0.9 * limits.token_bytes, "aria-label": "Quota used" });
-  root.append(h("div", { class: "row head" }, h("h1", null, `Lab ${me.lab}`), h("span", { class: "badge" }, me.role), h("span", { class: "grow" }), me.token && signOut()),
+  put(root, h("div", { class: "row head" }, h("h1", null, `Lab ${me.lab}`), h("span", { class: "badge" }, me.role), h("span", { class: "grow" }), me.token && signOut()),
     h("p", null, me.token ? ROLES[me.role] : "This service asks nobody to sign in: no token was made for it."),
     h("div", { class: "cards" },
       h("section", { class: "card", "aria-label": "Quota" }, h("h2", null, "Quota"), quota, facts([

@@ -32,7 +32,7 @@ function drawn(bitmap) {
   return canvas;
 }
 
-/** Draws `{width, height, at(index)}` from its darkest to its brightest value. */
+/** Draws `{width, height, at(index)}` from its darkest to its brightest value; grey where all are the same. */
 function grey(picture) {
   if (!picture) return null;
   const canvas = canvasOf(picture.width, picture.height);
@@ -45,9 +45,9 @@ function grey(picture) {
     }
   }
   const low = values.reduce((one, other) => Math.min(one, other), Infinity);
-  const span = values.reduce((one, other) => Math.max(one, other), -Infinity) - low || 1;
+  const span = values.reduce((one, other) => Math.max(one, other), -Infinity) - low;
   const image = new ImageData(width, height);
-  values.forEach((value, index) => image.data.set([0, 0, 0].map(() => (255 * (value - low)) / span).concat(255), 4 * index));
+  values.forEach((value, index) => image.data.set([0, 0, 0].map(() => (span > 0 ? (255 * (value - low)) / span : 128)).concat(255), 4 * index));
   canvas.getContext("2d").putImageData(image, 0, 0);
   return canvas;
 }
