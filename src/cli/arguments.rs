@@ -8,6 +8,7 @@ use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use super::CliError;
+use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
 use crate::formats::Axes;
 use crate::job::{Algorithm, InvalidField, Mosaic, Sequence};
@@ -117,14 +118,28 @@ impl Snapshots {
 }
 
 impl NetworkArguments {
-    /// Whether the network runs on the processor.
-    pub(super) fn on_cpu(&self) -> bool {
-        self.device == "cpu"
-    }
-
-    /// The libonnxruntime that was named.
-    pub(super) fn library(&self) -> Option<&Path> {
-        self.onnxruntime.as_deref()
+    /// Makes this the process of a user's network: with no more memory than that, no files but the system's, the
+    /// libonnxruntime and `readable`, unless it is to be left unconfined; and nothing to reach others by. What
+    /// the driver of a GPU opens is its own affair. Before the process starts any thread.
+    /// Errors: the memory can't be limited. What else can't be given up is said on standard error.
+    pub(super) fn confine(
+        &self,
+        memory_bytes: Option<u64>,
+        unconfined: bool,
+        readable: Option<&Path>,
+    ) -> Result<()> {
+        if let Some(bytes) = memory_bytes {
+            limit_memory(bytes).map_err(CliError::Failure)?;
+        }
+        if unconfined || self.device != "cpu" {
+            return Ok(());
+        }
+        let library = folders_of(self.onnxruntime.as_deref());
+        let readable: Vec<_> = library.iter().map(PathBuf::as_path).chain(readable).collect();
+        if let Err(why) = confine_network(&readable) {
+            eprintln!("a network is not confined: {why}");
+        }
+        Ok(())
     }
 
     pub fn network(&self) -> Result<NetworkSource> {

@@ -10,7 +10,6 @@ use ndarray::{Array2, Array3};
 
 use super::CliError;
 use super::arguments::NetworkArguments;
-use super::confine::confine_network;
 use crate::cli::error::Result;
 use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
@@ -56,7 +55,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
     let Arguments { file, memory_bytes, unconfined, engine, .. } = arguments;
-    confine_network(*memory_bytes, *unconfined, engine, Some(file))?;
+    engine.confine(*memory_bytes, *unconfined, Some(file))?;
     let network = arguments.engine.network()?;
     // Without a library nothing can be said of the network.
     network.version()?;

@@ -13,8 +13,6 @@ use landlock::{
 use rustix::process::{Resource, Rlimit, setrlimit};
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 
-use super::CliError;
-use super::arguments::NetworkArguments;
 use crate::config::EngineArguments;
 use crate::pipeline::networks::find_library;
 
@@ -60,28 +58,10 @@ pub(super) fn confine_worker(readable: &[&Path], writable: &[&Path]) -> Result<(
     confine(readable, writable, &CONNECTIONS)
 }
 
-/// Gives up what a network of a user's does not need: also programs and signals, and all files but the system's,
-/// the libonnxruntime and `readable`. What the driver of a GPU opens is its own affair. Before it starts any
-/// thread.
-/// Errors: the memory can't be limited. What else can't be given up is said on standard error.
-pub(super) fn confine_network(
-    memory_bytes: Option<u64>,
-    unconfined: bool,
-    engine: &NetworkArguments,
-    readable: Option<&Path>,
-) -> Result<(), CliError> {
-    if let Some(bytes) = memory_bytes {
-        limit_memory(bytes).map_err(CliError::Failure)?;
-    }
-    if unconfined || !engine.on_cpu() {
-        return Ok(());
-    }
-    let library = folders_of(engine.library());
-    let readable: Vec<_> = library.iter().map(PathBuf::as_path).chain(readable).collect();
-    if let Err(why) = confine(&readable, &[], &[&CONNECTIONS[..], &OTHERS].concat()) {
-        eprintln!("a network is not confined: {why}");
-    }
-    Ok(())
+/// Gives up what a network of a user's does not need: also programs and signals, and all files but the system's
+/// and `readable`. Before it starts any thread. Says what could not be given up.
+pub(super) fn confine_network(readable: &[&Path]) -> Result<(), String> {
+    confine(readable, &[], &[&CONNECTIONS[..], &OTHERS].concat())
 }
 
 /// Whether files are kept from networks of users; if not, why.
@@ -156,14 +136,18 @@ mod tests {
     use std::path::Path;
     use std::process::Command;
 
-    use super::{CONNECTIONS, OTHERS, confine, files_can_be_kept};
+    use super::{confine_network, confine_worker, files_can_be_kept};
 
     /// What a process finds that it can do, after it was confined: on a thread of its own, as both hold for a
     /// thread and what it starts.
-    fn found<T: Send>(denied: &[i64], folder: &Path, what: impl FnOnce() -> T + Send) -> T {
+    fn found<T: Send>(
+        confine: impl FnOnce(&[&Path]) -> Result<(), String> + Send,
+        folder: &Path,
+        what: impl FnOnce() -> T + Send,
+    ) -> T {
         std::thread::scope(|scope| {
             let confined = scope.spawn(|| {
-                confine(&[folder], &[], denied).unwrap();
+                confine(&[folder]).unwrap();
                 what()
             });
             confined.join().unwrap()
@@ -192,11 +176,10 @@ mod tests {
             ]
         };
         assert_eq!(may(), [true; 6]);
-        let network = [&CONNECTIONS[..], &OTHERS].concat();
-        let found_by_network = found(&network, own.path(), may);
+        let found_by_network = found(confine_network, own.path(), may);
         assert_eq!(found_by_network, [true, false, false, false, false, false]);
         // A worker starts the processes of networks, and ends them.
-        let found_by_worker = found(&CONNECTIONS, own.path(), may);
+        let found_by_worker = found(|readable| confine_worker(readable, &[]), own.path(), may);
         assert_eq!(found_by_worker, [true, false, false, false, true, true]);
         assert_eq!(may(), [true; 6], "another thread was confined");
     }

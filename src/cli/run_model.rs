@@ -6,7 +6,6 @@ use clap::Args;
 
 use super::CliError;
 use super::arguments::NetworkArguments;
-use super::confine::confine_network;
 use crate::cli::error::Result;
 use crate::worker::answer_worker;
 
@@ -27,7 +26,7 @@ pub struct Arguments {
 /// Answers until the worker closes standard input.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let Arguments { memory_bytes, unconfined, engine } = arguments;
-    confine_network(*memory_bytes, *unconfined, engine, None)?;
+    engine.confine(*memory_bytes, *unconfined, None)?;
     match answer_worker(&engine.network()?) {
         // The worker is gone.
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
