@@ -207,11 +207,14 @@ fn tile(
     monitor: &Monitor,
 ) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
     let Engines { networks, models } = engines;
-    let file = task.model.map(|sha256| transport.model(sha256));
-    monitor.reach(TaskStage::Reading, 0.0);
-    let mut process = models.only(file.as_ref(), monitor)?;
     let before = cpu_seconds();
+    // Brings all files of the task here, the network's too.
     let input = transport.window(task)?;
+    let spent = cpu_seconds() - before;
+    let file = task.model.map(|sha256| transport.model(sha256));
+    let mut process = models.only(file.as_ref(), monitor)?;
+    // A process that ended just now was counted when it worked.
+    let before = cpu_seconds() - spent;
     let outcome = match &mut process {
         Some(process) => {
             monitor.reach(TaskStage::Deep, 0.0);

@@ -84,10 +84,10 @@ pub trait Transport: Clone + Send + 'static {
     /// snapshot of its run, and its index.
     async fn redo(&self, lease: &Lease, tiles: &[(u32, u32)]) -> Result<(), TransportError>;
 
-    /// What a tile is made of. Blocks.
+    /// What a tile is made of. Brings the file of its network here, too. Blocks.
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError>;
 
-    /// The file of an end-to-end network, on this machine. Blocks.
+    /// The file of the network of a tile whose window was asked for, on this machine.
     fn model(&self, sha256: Sha256) -> ModelFile;
 }
 
