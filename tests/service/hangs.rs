@@ -157,7 +157,8 @@ async fn a_task_whose_workers_the_kernel_kills_for_their_memory_is_given_up_with
     assert!(error.contains("no memory left") && error.contains("(5 attempts)"), "{error}");
     let peak = error.split("seen at ").nth(1).and_then(|text| text.split(' ').next());
     let peak: u64 = peak.and_then(|peak| peak.parse().ok()).unwrap_or_default();
-    assert!((1..=300).contains(&peak), "{error}");
+    // Pages of the program's own file are counted too, and stand on the account of another group.
+    assert!((1..=450).contains(&peak), "{error}");
     // The service itself was spared, and goes on.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
