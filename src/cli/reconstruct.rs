@@ -478,9 +478,7 @@ impl Report {
                 stage.end,
                 stage.error_before,
                 stage.error_after,
-                stage.along_time().map_or_else(String::new, |fate| format!(
-                    ", total variation along time {fate}"
-                ))
+                stage.fates().iter().map(|fate| format!(", {fate}")).collect::<String>()
             );
         }
         for joint in self.pilot.iter().flat_map(|pilot| &pilot.joints) {

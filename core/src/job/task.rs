@@ -124,12 +124,16 @@ impl JobSpec {
         let joints = runs.joints().len() as f64;
         if self.schedule.adaptive || joints > 0.0 {
             let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
-            let decided = if self.schedule.adaptive { 1.0 } else { 0.0 };
+            let decided = if self.schedule.adaptive {
+                self.schedule.pilot_ns_per_voxel() * 1e-9
+            } else {
+                0.0
+            };
             // Of each joint both snapshots together, and the second one alone.
             let compared =
                 if joints > 0.0 { (3.0 * joints + 1.0) / joints::SHORTER as f64 } else { 0.0 };
             // The preview of the first snapshot is there at once; the others may wait.
-            tasks.insert(2, (TaskKind::Pilot, voxels * per_voxel * (decided + compared)));
+            tasks.insert(2, (TaskKind::Pilot, voxels * (decided + per_voxel * compared)));
         }
         let mut assembled = self.snapshots.first;
         for (index, run) in runs.runs().iter().enumerate() {

@@ -76,6 +76,8 @@ fn stage((stage, finding): (&Stage, StageFinding)) -> StageRecord {
         iterations: finding.iterations,
         planned_temporal_weight: stage.temporal_weight.unwrap_or(0.0),
         temporal_weight: finding.temporal_weight,
+        planned_static_variance: stage.static_variance,
+        static_variance: finding.static_variance,
         end: finding.end.to_string(),
         error_before: finding.before,
         error_after: finding.after,

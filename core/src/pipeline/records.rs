@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::{Course, TileAssessment};
 use crate::job::{Assessment, ResultFile, Timestamp};
+use crate::recon::pilot::Decision;
 use crate::recon::prior::Prior;
 use crate::recon::schedule::Schedule;
 use crate::recon::solver::Outcome;
@@ -35,8 +36,12 @@ impl PilotRecord {
         if self.stages.is_empty() {
             return schedule.clone();
         }
-        let found = self.stages.iter().map(|stage| (stage.iterations, stage.temporal_weight));
-        schedule.decided(&found.collect::<Vec<_>>())
+        let decision = |stage: &StageRecord| Decision {
+            iterations: stage.iterations,
+            temporal_weight: stage.temporal_weight,
+            static_variance: stage.static_variance,
+        };
+        schedule.decided(&self.stages.iter().map(decision).collect::<Vec<_>>())
     }
 
     /// What predictions are made of; none if the schedule was fixed.
@@ -84,6 +89,12 @@ pub struct StageRecord {
     /// The same if it pays; else 0.
     #[serde(default)]
     pub temporal_weight: f32,
+    /// Static variance of the projection that was asked for; none if it was not.
+    #[serde(default)]
+    pub planned_static_variance: Option<f32>,
+    /// The one that pays, if one does.
+    #[serde(default)]
+    pub static_variance: Option<f32>,
     /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
     pub end: String,
     /// Error at the held-out pixels before the stage, relative to the measurement.
@@ -93,10 +104,16 @@ pub struct StageRecord {
 }
 
 impl StageRecord {
-    /// What became of the total variation along time; none if it was not asked for.
-    pub fn along_time(&self) -> Option<&'static str> {
-        let kept = self.temporal_weight > 0.0;
-        (self.planned_temporal_weight > 0.0).then_some(if kept { "kept" } else { "left out" })
+    /// What became of the total variation along time and of the static variance, as far as they were asked for.
+    pub fn fates(&self) -> Vec<String> {
+        let kept = if self.temporal_weight > 0.0 { "kept" } else { "left out" };
+        let along_time = (self.planned_temporal_weight > 0.0)
+            .then(|| format!("total variation along time {kept}"));
+        let variance = self.planned_static_variance.map(|_| match self.static_variance {
+            Some(variance) => format!("static variance {variance}"),
+            None => "static variance left out".into(),
+        });
+        along_time.into_iter().chain(variance).collect()
     }
 }
 

@@ -54,6 +54,8 @@ pub struct StageFinding {
     pub iterations: usize,
     /// Weight of the total variation along time, if it pays; else 0.
     pub temporal_weight: f32,
+    /// Static variance of the projection, if one pays.
+    pub static_variance: Option<f32>,
     /// Error at the held-out pixels before the stage: `||y - Hv|| / ||y||` over them.
     pub before: f64,
     /// The same after so many iterations.
@@ -95,18 +97,17 @@ pub fn run(
     let mut courses: Vec<Course> = Vec::with_capacity(schedule.stages.len());
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
-        let start = stage.temporal_weight.filter(|weight| *weight > 0.0).map(|_| run.state());
+        let start = run.state();
         let mut course = watch.stage(stage, &mut run)?;
-        if let Some(start) = start {
-            let with = run.state();
-            run.restore(start);
-            let without = Stage { temporal_weight: None, ..stage.clone() };
-            let other = watch.stage(&without, &mut run)?;
-            if other.last() < course.last() {
-                course = other;
-            } else {
-                run.restore(with);
+        for other in alternatives(stage) {
+            let end = run.state();
+            run.restore(start.clone());
+            let found = watch.stage(&other, &mut run)?;
+            if found.least() < course.least() {
+                course = found;
+                break;
             }
+            run.restore(end);
         }
         let diverged = course.diverged;
         courses.push(course);
@@ -117,9 +118,27 @@ pub fn run(
     Ok(judge(schedule, &courses))
 }
 
+/// What a stage may be instead; the first that is better is taken.
+fn alternatives(stage: &Stage) -> Vec<Stage> {
+    let along_time = stage.temporal_weight.filter(|weight| *weight > 0.0);
+    let along_time = along_time.map(|_| Stage { temporal_weight: None, ..stage.clone() });
+    let variance = |variance| Stage { static_variance: variance, ..stage.clone() };
+    let halved = stage.static_variance.map(|whole| [Some(whole / 2.0), None].map(variance));
+    along_time.into_iter().chain(halved.into_iter().flatten()).collect()
+}
+
+impl Schedule {
+    /// The most that a pilot of it may cost, CPU-nanoseconds per voxel of the piece.
+    pub fn pilot_ns_per_voxel(&self) -> f64 {
+        let most = |stage: &Stage| stage.planned_ns() * (1 + alternatives(stage).len()) as f64;
+        self.stages.iter().map(most).sum()
+    }
+}
+
 /// The errors of a stage on its way.
 struct Course {
     temporal_weight: f32,
+    static_variance: Option<f32>,
     /// After each iteration; of a stage without a level after the last one alone.
     errors: Vec<f64>,
     /// Whether the next iteration left the finite numbers.
@@ -127,9 +146,8 @@ struct Course {
 }
 
 impl Course {
-    /// At its end.
-    fn last(&self) -> f64 {
-        self.errors.last().copied().unwrap_or(f64::INFINITY)
+    fn least(&self) -> f64 {
+        self.errors.iter().copied().fold(f64::INFINITY, f64::min)
     }
 }
 
@@ -142,7 +160,7 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
     let finding = |(index, stage): (usize, &Stage)| {
         let course = courses.get(index);
         let errors = course.map_or(&[][..], |course| &course.errors);
-        let near = errors.iter().copied().fold(f64::INFINITY, f64::min) * (1.0 + SLACK);
+        let near = course.map_or(f64::INFINITY, Course::least) * (1.0 + SLACK);
         let paid = errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1);
         let done = if last == Some(index) { paid } else { errors.len() };
         let diverged = course.is_none_or(|course| course.diverged) && done == errors.len();
@@ -154,24 +172,36 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
         };
         let after = errors[..done].last().copied().unwrap_or(before);
         let temporal_weight = course.map_or(0.0, |course| course.temporal_weight);
+        let static_variance = course.and_then(|course| course.static_variance);
         let before = std::mem::replace(&mut before, after);
-        StageFinding { iterations, temporal_weight, before, after, end }
+        StageFinding { iterations, temporal_weight, static_variance, before, after, end }
     };
     schedule.stages.iter().enumerate().map(finding).collect()
 }
 
+/// What becomes of a stage.
+#[derive(Debug, Clone, Copy)]
+pub struct Decision {
+    /// So many iterations of it.
+    pub iterations: usize,
+    /// The weight of its total variation along time; 0 for none.
+    pub temporal_weight: f32,
+    /// The static variance of its projection.
+    pub static_variance: Option<f32>,
+}
+
 impl Schedule {
-    /// The fixed schedule with so many iterations of each stage, and this weight of its total variation
-    /// along time: levels fall as they did, but end earlier. A stage of none is left out, unless no other
-    /// is left.
-    pub fn decided(&self, findings: &[(usize, f32)]) -> Self {
-        let stage = |(stage, &(iterations, temporal_weight)): (&Stage, &(usize, f32))| {
+    /// The fixed schedule that the pilot has decided on, stage by stage: levels fall as they did, but end
+    /// earlier. A stage of no iterations is left out, unless no other is left.
+    pub fn decided(&self, decisions: &[Decision]) -> Self {
+        let stage = |(stage, decision): (&Stage, &Decision)| {
+            let &Decision { iterations, temporal_weight, static_variance } = decision;
             let last = stage.sigma_at(iterations.checked_sub(1)?);
             let sigma = stage.sigma.zip(last).map(|([first, _], last)| [first, last]);
             let temporal_weight = (temporal_weight > 0.0).then_some(temporal_weight);
-            Some(Stage { iterations, temporal_weight, sigma, ..stage.clone() })
+            Some(Stage { iterations, temporal_weight, static_variance, sigma, ..stage.clone() })
         };
-        let mut stages: Vec<Stage> = self.stages.iter().zip(findings).filter_map(stage).collect();
+        let mut stages: Vec<Stage> = self.stages.iter().zip(decisions).filter_map(stage).collect();
         if stages.is_empty() {
             stages.clone_from(&self.stages);
         }
@@ -191,8 +221,10 @@ impl Watch<'_, '_> {
     fn stage(&mut self, stage: &Stage, run: &mut Run<'_>) -> Result<Course> {
         let fixed = stage.sigma.is_none();
         let temporal_weight = stage.temporal_weight.unwrap_or(0.0);
-        let mut course = Course { temporal_weight, errors: Vec::new(), diverged: false };
-        run.enter();
+        let static_variance = stage.static_variance;
+        let mut course =
+            Course { temporal_weight, static_variance, errors: Vec::new(), diverged: false };
+        run.enter(stage);
         for done in 1..=stage.iterations {
             let step = match run.iterate(stage, done - 1) {
                 Err(ReconError::Diverged { .. }) if !fixed => {
@@ -264,7 +296,7 @@ impl HeldOut {
 
 #[cfg(test)]
 mod tests {
-    use super::{StageEnd, StageFinding, piece, run};
+    use super::{Decision, StageEnd, StageFinding, piece, run};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
     use crate::recon::prior::{Denoiser, Network, Networks};
@@ -315,14 +347,18 @@ mod tests {
         (schedule, found)
     }
 
+    fn iterations(iterations: usize) -> Decision {
+        Decision { iterations, temporal_weight: 0.0, static_variance: None }
+    }
+
     #[test]
     fn passes_that_harm_are_left_out() {
         let (schedule, found) = find(60, 1..10, 0.7);
         assert_eq!((found[0].iterations, found[0].end), (60, StageEnd::Fixed));
         assert_eq!((found[1].iterations, found[1].end), (9, StageEnd::Converged));
         assert!(found[1].after < 0.5 * found[1].before && found[1].before == found[0].after);
-        let paid: Vec<_> = found.iter().map(|stage| (stage.iterations, 0.0)).collect();
-        let decided = schedule.decided(&paid);
+        let decisions: Vec<_> = found.iter().map(|stage| iterations(stage.iterations)).collect();
+        let decided = schedule.decided(&decisions);
         assert!(!decided.adaptive);
         let level = |schedule: &Schedule, index| schedule.stages[1].sigma_at(index);
         assert_eq!(level(&decided, 0), level(&schedule, 0));
@@ -360,6 +396,26 @@ mod tests {
         assert_eq!((Some(weight(false)), weight(true)), (asked, 0.0));
     }
 
+    /// Masks that are all but alike tell hardly anything of what changes: there the error is. Independent ones tell
+    /// as much of it as of the rest.
+    #[test]
+    fn the_projection_follows_the_changes_where_masks_are_alike() {
+        let independent = iid_masks(6, 64, 64, 3).unwrap();
+        let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
+            0.5 + 0.4 * ((i + 2 * k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+        });
+        let mut schedule = Schedule::pnp_nonlocal();
+        schedule.stages[1].iterations = 20;
+        let find = |contrast: f32| {
+            let masks = independent.mapv(|c| 0.7 + contrast * (c - 0.5));
+            let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+            let op = SensingOperator::new(masks).unwrap();
+            run(op, y.view(), &schedule, &mut (), &mut ()).unwrap()[1].static_variance
+        };
+        let planned = schedule.stages[1].static_variance.unwrap();
+        assert_eq!((find(0.4), find(1.0)), (Some(planned / 2.0), Some(planned)));
+    }
+
     #[test]
     fn divergence_ends_the_stage_before_it() {
         let (schedule, found) = find(60, 1..6, f32::INFINITY);
@@ -367,11 +423,15 @@ mod tests {
         let (_, none) = find(60, 1..1, f32::INFINITY);
         assert_eq!((none[1].iterations, none[1].end), (0, StageEnd::Diverged));
         assert_eq!(
-            schedule.decided(&[(60, 0.0), (0, 0.0)]).stages.len(),
+            schedule.decided(&[60, 0].map(iterations)).stages.len(),
             1,
             "a stage of none is left out"
         );
-        assert_eq!(schedule.decided(&[(0, 0.0); 2]).stages.len(), 2, "but not all of them");
+        assert_eq!(
+            schedule.decided(&[0, 0].map(iterations)).stages.len(),
+            2,
+            "but not all of them"
+        );
     }
 
     #[test]

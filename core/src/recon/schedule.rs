@@ -38,7 +38,8 @@ pub struct Schedule {
     pub stages: Vec<Stage>,
 }
 
-/// How projection and prior alternate. P(w) = w + H^T (H H^T + gamma)^-1 (y - H w).
+/// How projection and prior alternate. P(w) = w + R H^T (H R H^T + gamma)^-1 (y - H w), where R = 1 or by a stage's
+/// static_variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
@@ -88,6 +89,14 @@ pub struct Stage {
     #[serde(default)]
     #[schemars(transform = MOMENTUM.bounds())]
     pub momentum: f32,
+    /// Variance of the part of the frames' error that all frames of a snapshot share, in units of that of its
+    /// slowest change. The projection supposes then that errors change slowly from frame to frame, with
+    /// the covariance R, the variance of whose cosine m is this for m = 0 and m^-0.4 from m = 1 on; without it R = 1. Masks
+    /// that are alike tell little of the changes, which is where the error is. An adaptive schedule halves
+    /// it, or leaves it out, where that pays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = STATIC_VARIANCE.bounds())]
+    pub static_variance: Option<f32>,
     /// The stage ends early once ||v_k - v_(k-1)|| / ||v_k|| is below this; 0 never does.
     #[serde(default)]
     #[schemars(transform = TOLERANCE.bounds())]
@@ -125,6 +134,12 @@ const MEMORY: Parameter = Parameter {
     words: "from 0 to 1",
 };
 const MOMENTUM: Parameter = Parameter::share("momentum");
+const STATIC_VARIANCE: Parameter = Parameter {
+    name: "static_variance",
+    needed: false,
+    range: (Bound::Included(0.01), Bound::Included(1.0)),
+    words: "from 0.01 to 1",
+};
 const TOLERANCE: Parameter = Parameter::share("tolerance");
 
 impl Stage {
@@ -176,6 +191,7 @@ impl Stage {
         TOLERANCE.check(self.tolerance)?;
         MEMORY.check(self.memory)?;
         MOMENTUM.check(self.momentum)?;
+        self.static_variance.map_or(Ok(()), |variance| STATIC_VARIANCE.check(variance))?;
         // Where the prior passes everything (even brightness), an error `e` follows
         // `e_(k+1) = -memory momentum (e_k - e_(k-1))`.
         if self.memory * self.momentum > 0.5 {
@@ -185,6 +201,11 @@ impl Stage {
             ));
         }
         Ok(())
+    }
+
+    /// Planned cost of all its iterations, CPU-nanoseconds per voxel.
+    pub(super) fn planned_ns(&self) -> f64 {
+        self.iteration_ns() * self.iterations as f64
     }
 
     /// Cost of one iteration, CPU-nanoseconds per voxel.
@@ -300,7 +321,7 @@ impl Schedule {
 
     /// The planned cost, CPU-nanoseconds per voxel: the weight behind percent, remaining time and fair sharing.
     pub fn planned_ns_per_voxel(&self) -> f64 {
-        self.stages.iter().map(|stage| stage.iteration_ns() * stage.iterations as f64).sum()
+        self.stages.iter().map(Stage::planned_ns).sum()
     }
 
     /// The share of the planned cost, on \[0,1\], that is behind a run which has done `iteration` iterations of

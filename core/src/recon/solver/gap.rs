@@ -17,7 +17,8 @@ mod tests {
     use super::super::reconstruct;
     use super::super::reference::{Problem, furthest};
 
-    /// `x = P(v_k + momentum (v_k - v_(k-1)))`, `v = D(x)`, everything in 64 bits and voxel by voxel.
+    /// `x = P(v_k + momentum (v_k - v_(k-1)))`, `v = D(x)`, everything in 64 bits and voxel by voxel, with
+    /// GAP's own projection and with one that knows the error's covariance.
     #[test]
     fn iterations_are_those_of_the_equations() {
         for seed in 0..12 {

@@ -6,13 +6,13 @@ mod state;
 
 use std::ops::Range;
 
-use ndarray::{Array3, Array4, ArrayView3};
+use ndarray::{Array2, Array3, Array4, ArrayView3};
 
 use super::assessment;
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
-use super::sensing::SensingOperator;
+use super::sensing::{SensingOperator, error_covariance};
 use state::{Change, State};
 use strum::Display;
 
@@ -183,6 +183,8 @@ pub(super) struct Run<'a> {
     x: Array3<f32>,
     /// The prior of the stage, at work.
     pass: Option<Box<dyn Pass>>,
+    /// What the stage supposes of the error \[B,B\].
+    covariance: Option<Array2<f32>>,
     networks: &'a mut dyn Networks,
     done: usize,
     planned: usize,
@@ -206,6 +208,7 @@ impl<'a> Run<'a> {
             state: State::new(op, schedule),
             x: Array3::zeros(op.dim()),
             pass: None,
+            covariance: None,
             networks,
             done: 0,
             planned: schedule.planned_iterations(),
@@ -220,7 +223,7 @@ impl<'a> Run<'a> {
         stage: &Stage,
         observer: &mut dyn Observer,
     ) -> Result<StopReason> {
-        self.enter();
+        self.enter(stage);
         for iteration in 0..stage.iterations {
             let step = self.iterate(stage, iteration)?;
             let left = stage.iterations - iteration - 1;
@@ -237,9 +240,11 @@ impl<'a> Run<'a> {
     }
 
     /// To be called before the first iteration of a stage.
-    pub(super) fn enter(&mut self) {
+    pub(super) fn enter(&mut self, stage: &Stage) {
         // What a prior remembers belongs to the iterates of one stage.
         self.pass = None;
+        let frames = self.op.masks().dim().0;
+        self.covariance = stage.static_variance.map(|variance| error_covariance(frames, variance));
     }
 
     /// What the next iteration starts from.
@@ -309,12 +314,13 @@ impl<'a> Run<'a> {
     /// three while it is in cache. The new iterate is then in `x`. Returns `||y - H v||^2` of what the
     /// iteration started from.
     fn sweep(&mut self, stage: &Stage, settings: &Settings, rows: usize) -> Result<(f64, Change)> {
-        let Self { op, y, state, x, networks, .. } = self;
+        let Self { op, y, state, x, networks, covariance, .. } = self;
         let pass = self.pass.get_or_insert_with(|| stage.prior.begin(op.dim()));
         let (mut squares, mut change) = (0.0, Change::default());
+        let along = (stage.memory, covariance.as_ref());
         for first in (0..y.dim().1).step_by(rows) {
             let strip = first..y.dim().1.min(first + rows);
-            squares += state.project(op, strip.clone(), y, stage.memory, x);
+            squares += state.project(op, strip.clone(), y, along, x);
             admm::shift(state, x);
             pass.apply(x, strip, settings, &mut **networks, &mut |x, k, done| {
                 change.add(x, &state.v, k, done);
@@ -325,7 +331,7 @@ impl<'a> Run<'a> {
 
     fn residual(&mut self) -> f32 {
         let rows = 0..self.y.dim().1;
-        let squares = self.op.project(rows, &self.y, None, &self.state.v, &mut self.x);
+        let squares = self.op.project(rows, &self.y, None, None, &self.state.v, &mut self.x);
         (squares.sqrt() / self.y_norm) as f32
     }
 }
@@ -341,6 +347,7 @@ mod reference {
     use ndarray::{Array3, ArrayView3};
     use rand::{Rng, SeedableRng};
     use serde_json::json;
+    use std::f64::consts::PI;
 
     /// A small random problem, with a denoiser that pulls every voxel towards a grey.
     pub(super) struct Problem {
@@ -385,8 +392,9 @@ mod reference {
             let y = (snapshots, size.1, size.2);
             let y = Array3::from_shape_simple_fn(y, || 2.0 * rng.random::<f32>());
             let memory: f32 = rng.random();
+            let variance = rng.random::<bool>().then(|| rng.random_range(0.1..1.0f32));
             let stage = json!({"prior": "ffdnet", "iterations": 7, "sigma": [0.1, 0.1],
-                "memory": memory, "momentum": 0.5 * rng.random::<f32>()});
+                "memory": memory, "momentum": 0.5 * rng.random::<f32>(), "static_variance": variance});
             let schedule = json!({"method": method, "accelerated": rng.random::<bool>(),
                 "gamma": 0.3 * rng.random::<f32>(), "stages": [stage]});
             Self { schedule: serde_json::from_value(schedule).unwrap(), masks, y }
@@ -410,25 +418,45 @@ mod reference {
             x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
         }
 
-        /// `P(w)`, with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
+        /// `P(w)` along the masks, or along `R C` (an orthogonal cosine at a time), with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
         pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
             let plane = self.masks.dim().1 * self.masks.dim().2;
             let (gamma, memory) = (self.schedule.gamma, self.schedule.stages[0].memory);
             let mask: Vec<f64> = self.masks.iter().map(|&c| f64::from(c)).collect();
+            // `R C`.
+            let mut direction = mask.clone();
+            if let Some(variance) = self.schedule.stages[0].static_variance {
+                let frames = self.masks.dim().0;
+                let cosine =
+                    |m: usize, k: usize| (PI * m as f64 * (k as f64 + 0.5) / frames as f64).cos();
+                direction.fill(0.0);
+                for m in 0..frames {
+                    let square: f64 = (0..frames).map(|k| cosine(m, k).powi(2)).sum();
+                    let variance = if m == 0 { variance.into() } else { (m as f64).powf(-0.4) };
+                    for pixel in 0..plane {
+                        let part = |k: usize| cosine(m, k) * mask[k * plane + pixel];
+                        let part = variance / square * (0..frames).map(part).sum::<f64>();
+                        for k in 0..frames {
+                            direction[k * plane + pixel] += cosine(m, k) * part;
+                        }
+                    }
+                }
+            }
             let mut x = w.to_vec();
             for (p, &y) in self.y.iter().enumerate() {
                 // The snapshot's own frames at this pixel, and the masks there.
                 let (first, pixel) = (p / plane * mask.len(), p % plane);
                 let voxels = || (pixel..mask.len()).step_by(plane);
                 let seen: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
-                let gram: f64 = voxels().map(|voxel| mask[voxel].powi(2)).sum();
+                let gram: f64 = voxels().map(|voxel| mask[voxel] * direction[voxel]).sum();
                 let mut target = f64::from(y);
                 if self.schedule.accelerated {
                     y1[p] = target + f64::from(memory) * (y1[p] - seen);
                     target = y1[p];
                 }
                 for voxel in voxels() {
-                    x[first + voxel] += mask[voxel] * (target - seen) / (gram + f64::from(gamma));
+                    x[first + voxel] +=
+                        direction[voxel] * (target - seen) / (gram + f64::from(gamma));
                 }
             }
             x
@@ -467,7 +495,7 @@ mod tests {
         let settings = stage.settings(0);
 
         let (mut expected, mut y1) = (Array3::zeros(size), Array3::zeros(y.raw_dim()));
-        op.project(0..size.1, &y, Some((&mut y1, stage.memory)), &v, &mut expected);
+        op.project(0..size.1, &y, Some((&mut y1, stage.memory)), None, &v, &mut expected);
         let (weight, updates) = (settings.temporal_weight, settings.tv_updates);
         let mut temporal = TemporalVariation::new(size.0);
         temporal.denoise(&mut expected, 0..size.1, weight, updates);
