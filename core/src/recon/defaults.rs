@@ -72,7 +72,7 @@ impl Schedule {
 /// blurs what moves; where even this does, the pilot leaves it out.
 const TEMPORAL_WEIGHT: f32 = 0.004;
 
-/// Of 0.2 to 0.8 the best behind independent pixels (0.2 loses up to 3 dB there) and good behind the rotating circle; behind
+/// Of 0.2 to 0.6 the best behind independent pixels (0.2 loses up to 3 dB there) and good behind the rotating circle; behind
 /// random squares the pilot mostly takes the half of it, and where there is much noise it may leave it out.
 const STATIC_VARIANCE: f32 = 0.4;
 

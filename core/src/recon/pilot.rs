@@ -146,6 +146,7 @@ struct Course {
 }
 
 impl Course {
+    /// Where the frames predict the held-out pixels best.
     fn least(&self) -> f64 {
         self.errors.iter().copied().fold(f64::INFINITY, f64::min)
     }

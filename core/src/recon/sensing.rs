@@ -246,8 +246,8 @@ fn invert(gram: &Array2<f32>, gamma: f32, snapshots: usize) -> Array3<f32> {
 }
 
 /// How the variance of the error's changes falls from the slowest of them on: as `m^-DECAY` in the index `m` of
-/// the cosine. Measured after total variation and after the network, behind all kinds of masks, it falls faster
-/// (0.5 to 2.5); as the projection's, more than 0.5 gains less, and 0 loses where there is noise.
+/// the cosine. Measured after total variation and after the network, behind all kinds of masks, it falls by
+/// exponents of 0 to 2.6; as the projection's, more than 0.5 gains less, and 0 loses where there is noise.
 const DECAY: f32 = 0.4;
 
 /// Covariance `R = Psi^T diag(static_variance, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of the `B`
