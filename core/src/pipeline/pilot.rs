@@ -55,7 +55,6 @@ pub fn decide(
     let (_, height, width) = input.y.dim();
     let (height, width) = (height * place.step, width * place.step);
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
-    let op = op.with_gamma(schedule.gamma)?;
     let mut record =
         PilotRecord { snapshot: first, row, column, height, width, stages: vec![], joints: vec![] };
     if schedule.adaptive {
@@ -78,6 +77,7 @@ fn stage((stage, finding): (&Stage, StageFinding)) -> StageRecord {
         temporal_weight: finding.temporal_weight,
         planned_static_variance: stage.static_variance,
         static_variance: finding.static_variance,
+        gamma: finding.gamma,
         end: finding.end.to_string(),
         error_before: finding.before,
         error_after: finding.after,

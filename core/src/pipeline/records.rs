@@ -40,6 +40,7 @@ impl PilotRecord {
             iterations: stage.iterations,
             temporal_weight: stage.temporal_weight,
             static_variance: stage.static_variance,
+            gamma: stage.gamma,
         };
         schedule.decided(&self.stages.iter().map(decision).collect::<Vec<_>>())
     }
@@ -95,6 +96,9 @@ pub struct StageRecord {
     /// The one that pays, if one does.
     #[serde(default)]
     pub static_variance: Option<f32>,
+    /// Noise term of the projection, where it is not the schedule's: asked for, or one that pays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gamma: Option<f32>,
     /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
     pub end: String,
     /// Error at the held-out pixels before the stage, relative to the measurement.
@@ -104,7 +108,7 @@ pub struct StageRecord {
 }
 
 impl StageRecord {
-    /// What became of the total variation along time and of the static variance, as far as they were asked for.
+    /// What became of the total variation along time, of the static variance and of the noise term, as far as there are any.
     pub fn fates(&self) -> Vec<String> {
         let kept = if self.temporal_weight > 0.0 { "kept" } else { "left out" };
         let along_time = (self.planned_temporal_weight > 0.0)
@@ -113,7 +117,8 @@ impl StageRecord {
             Some(variance) => format!("static variance {variance}"),
             None => "static variance left out".into(),
         });
-        along_time.into_iter().chain(variance).collect()
+        let noise = self.gamma.map(|gamma| format!("noise term {gamma}"));
+        along_time.into_iter().chain(variance).chain(noise).collect()
     }
 }
 

@@ -59,7 +59,7 @@ impl TileInput {
     /// Has the pieces of the tile solved on the unit scale, one after the other, and multiplies the frames
     /// by the white level again. `solve` is told which share of all the work a piece is. A tile without
     /// light has frames of 0 and no iterations.
-    fn solved<F>(self, gamma: f32, mut solve: F) -> Result<Outcome, ReconError>
+    fn solved<F>(self, mut solve: F) -> Result<Outcome, ReconError>
     where
         F: FnMut(&SensingOperator, ArrayView3<'_, f32>, Range<f64>) -> Result<Outcome, ReconError>,
     {
@@ -73,8 +73,7 @@ impl TileInput {
             stop_reason: StopReason::Converged,
             features: None,
         };
-        let Some((op, y)) = self.on_unit_scale()? else { return Ok(whole) };
-        let mut op = op.with_gamma(gamma)?;
+        let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(whole) };
         let all: usize = pieces.iter().map(Range::len).sum();
         let share = |snapshots: usize| snapshots as f64 / all as f64;
         let mut done = 0;
@@ -120,7 +119,7 @@ pub fn reconstruct_tile(
         Some(_) => solver::reconstruct_assessed,
         None => solver::reconstruct,
     };
-    input.solved(schedule.gamma, |op, y, part| {
+    input.solved(|op, y, part| {
         observer.part(part);
         solve(op, y, schedule, networks, observer)
     })
@@ -132,7 +131,7 @@ pub fn run_network(
     network: &mut dyn SnapshotNetwork,
 ) -> Result<Outcome, ReconError> {
     let pieces = (0..input.y.dim().0).map(|snapshot| snapshot..snapshot + 1).collect();
-    TileInput { pieces, ..input }.solved(0.0, |op, y, _| {
+    TileInput { pieces, ..input }.solved(|op, y, _| {
         let frames = network.frames(y.index_axis(Axis(0), 0), op.masks())?;
         let rest = &y - &op.forward(frames.view())?;
         let norm = squares(y).max(f64::MIN_POSITIVE);

@@ -73,7 +73,7 @@ impl Schedule {
 const TEMPORAL_WEIGHT: f32 = 0.004;
 
 /// Of 0.2 to 0.6 the best behind independent pixels (0.2 loses up to 3 dB there) and good behind the rotating circle; behind
-/// random squares the pilot mostly takes the half of it, and where there is much noise it may leave it out.
+/// random squares the pilot mostly takes the half of it.
 const STATIC_VARIANCE: f32 = 0.4;
 
 /// What comes before the plugged-in priors.
@@ -92,6 +92,7 @@ fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
         memory: 1.0,
         momentum: 0.0,
         static_variance: None,
+        gamma: None,
         tolerance,
     }
 }
@@ -108,6 +109,7 @@ fn level_stage(prior: &'static dyn Prior, iterations: usize, first: f32, last: f
         memory: 0.85,
         momentum: 0.5,
         static_variance: None,
+        gamma: None,
         tolerance: 0.0,
     }
 }

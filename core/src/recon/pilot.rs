@@ -56,6 +56,8 @@ pub struct StageFinding {
     pub temporal_weight: f32,
     /// Static variance of the projection, if one pays.
     pub static_variance: Option<f32>,
+    /// Noise term of the projection, where it is not the schedule's.
+    pub gamma: Option<f32>,
     /// Error at the held-out pixels before the stage: `||y - Hv|| / ||y||` over them.
     pub before: f64,
     /// The same after so many iterations.
@@ -99,15 +101,17 @@ pub fn run(
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = run.state();
         let mut course = watch.stage(stage, &mut run)?;
-        for other in alternatives(stage) {
-            let end = run.state();
-            run.restore(start.clone());
-            let found = watch.stage(&other, &mut run)?;
-            if found.least() < course.least() {
-                course = found;
-                break;
+        for variants in VARIANTS {
+            for variant in variants(stage, &course) {
+                let end = run.state();
+                run.restore(start.clone());
+                let found = watch.stage(&variant, &mut run)?;
+                if found.surpasses(&course) {
+                    course = found;
+                    break;
+                }
+                run.restore(end);
             }
-            run.restore(end);
         }
         let diverged = course.diverged;
         courses.push(course);
@@ -118,29 +122,59 @@ pub fn run(
     Ok(judge(schedule, &courses))
 }
 
-/// What a stage may be instead; the first that is better is taken.
-fn alternatives(stage: &Stage) -> Vec<Stage> {
-    let along_time = stage.temporal_weight.filter(|weight| *weight > 0.0);
-    let along_time = along_time.map(|_| Stage { temporal_weight: None, ..stage.clone() });
-    let variance = |variance| Stage { static_variance: variance, ..stage.clone() };
-    let halved = stage.static_variance.map(|whole| [Some(whole / 2.0), None].map(variance));
-    along_time.into_iter().chain(halved.into_iter().flatten()).collect()
+/// What a stage, as planned, may be instead of what was run of it last, one question after the other: of each the
+/// first answer that is better is taken, and the next question is asked of that.
+const VARIANTS: [fn(&Stage, &Course) -> Vec<Stage>; 4] =
+    [without_time, with_other_variance, with_noise, with_more_noise];
+
+fn without_time(planned: &Stage, _: &Course) -> Vec<Stage> {
+    let weighs = planned.temporal_weight.is_some_and(|weight| weight > 0.0);
+    weighs.then(|| Stage { temporal_weight: None, ..planned.clone() }).into_iter().collect()
+}
+
+fn with_other_variance(planned: &Stage, run: &Course) -> Vec<Stage> {
+    let Some(whole) = planned.static_variance else { return vec![] };
+    [Some(whole / 2.0), None]
+        .map(|static_variance| Stage { static_variance, ..run.stage.clone() })
+        .into()
+}
+
+/// Noise terms in units of the variance of the error's slowest change. Less changes nothing.
+const NOISE: [f32; 3] = [0.3, 1.0, 3.0];
+
+/// Noise makes the error rise long before the stage ends. Without noise, a term only costs.
+fn with_noise(planned: &Stage, run: &Course) -> Vec<Stage> {
+    let supposes = planned.static_variance.is_some() && planned.gamma.is_none();
+    if !supposes || run.turn() * 10 > planned.iterations * 9 {
+        return vec![];
+    }
+    [NOISE[1], NOISE[0]].map(|gamma| Stage { gamma: Some(gamma), ..run.stage.clone() }).into()
+}
+
+fn with_more_noise(planned: &Stage, run: &Course) -> Vec<Stage> {
+    let more = planned.gamma.is_none() && run.stage.gamma == Some(NOISE[1]);
+    more.then(|| Stage { gamma: Some(NOISE[2]), ..run.stage.clone() }).into_iter().collect()
 }
 
 impl Schedule {
     /// The most that a pilot of it may cost, CPU-nanoseconds per voxel of the piece.
     pub fn pilot_ns_per_voxel(&self) -> f64 {
-        let most = |stage: &Stage| stage.planned_ns() * (1 + alternatives(stage).len()) as f64;
-        self.stages.iter().map(most).sum()
+        let runs = |stage: &Stage| {
+            1 + usize::from(stage.temporal_weight.is_some())
+                + stage.static_variance.map_or(0, |_| 2 + usize::from(stage.gamma.is_none()) * 2)
+        };
+        self.stages.iter().map(|stage| stage.planned_ns() * runs(stage) as f64).sum()
     }
 }
 
 /// The errors of a stage on its way.
 struct Course {
-    temporal_weight: f32,
-    static_variance: Option<f32>,
+    /// As it was run.
+    stage: Stage,
     /// After each iteration; of a stage without a level after the last one alone.
     errors: Vec<f64>,
+    /// `(y - Hv)^2` of each held-out pixel where their sum was least.
+    squares: Vec<f64>,
     /// Whether the next iteration left the finite numbers.
     diverged: bool,
 }
@@ -149,6 +183,31 @@ impl Course {
     /// Where the frames predict the held-out pixels best.
     fn least(&self) -> f64 {
         self.errors.iter().copied().fold(f64::INFINITY, f64::min)
+    }
+
+    /// Iterations up to where the error is least.
+    fn turn(&self) -> usize {
+        let least = self.least();
+        self.errors.iter().position(|error| *error == least).map_or(0, |index| index + 1)
+    }
+
+    /// Iterations up to where the error is about least.
+    fn paid(&self) -> usize {
+        let near = self.least() * (1.0 + SLACK);
+        self.errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1)
+    }
+
+    /// Whether its least error is below that of another by more than chance: by more than the standard error of
+    /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
+    fn surpasses(&self, other: &Self) -> bool {
+        if self.squares.is_empty() || other.squares.is_empty() {
+            return self.least() < other.least();
+        }
+        let gains = || other.squares.iter().zip(&self.squares).map(|(other, own)| other - own);
+        let count = self.squares.len() as f64;
+        let mean = gains().sum::<f64>() / count;
+        let variance = gains().map(|gain| (gain - mean).powi(2)).sum::<f64>() / count;
+        mean > (variance / count).sqrt()
     }
 }
 
@@ -161,9 +220,10 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
     let finding = |(index, stage): (usize, &Stage)| {
         let course = courses.get(index);
         let errors = course.map_or(&[][..], |course| &course.errors);
-        let near = course.map_or(f64::INFINITY, Course::least) * (1.0 + SLACK);
-        let paid = errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1);
-        let done = if last == Some(index) { paid } else { errors.len() };
+        let done = match course {
+            Some(course) if last == Some(index) => course.paid(),
+            _ => errors.len(),
+        };
         let diverged = course.is_none_or(|course| course.diverged) && done == errors.len();
         let (iterations, end) = match (stage.sigma.is_none(), diverged) {
             (true, _) => (stage.iterations, StageEnd::Fixed),
@@ -172,10 +232,11 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
             (false, false) => (done, StageEnd::Planned),
         };
         let after = errors[..done].last().copied().unwrap_or(before);
-        let temporal_weight = course.map_or(0.0, |course| course.temporal_weight);
-        let static_variance = course.and_then(|course| course.static_variance);
+        let temporal_weight = course.and_then(|course| course.stage.temporal_weight).unwrap_or(0.0);
+        let static_variance = course.and_then(|course| course.stage.static_variance);
+        let gamma = course.and_then(|course| course.stage.gamma);
         let before = std::mem::replace(&mut before, after);
-        StageFinding { iterations, temporal_weight, static_variance, before, after, end }
+        StageFinding { iterations, temporal_weight, static_variance, gamma, before, after, end }
     };
     schedule.stages.iter().enumerate().map(finding).collect()
 }
@@ -189,6 +250,8 @@ pub struct Decision {
     pub temporal_weight: f32,
     /// The static variance of its projection.
     pub static_variance: Option<f32>,
+    /// The noise term of its projection.
+    pub gamma: Option<f32>,
 }
 
 impl Schedule {
@@ -196,11 +259,19 @@ impl Schedule {
     /// earlier. A stage of no iterations is left out, unless no other is left.
     pub fn decided(&self, decisions: &[Decision]) -> Self {
         let stage = |(stage, decision): (&Stage, &Decision)| {
-            let &Decision { iterations, temporal_weight, static_variance } = decision;
+            let &Decision { iterations, temporal_weight, static_variance, gamma } = decision;
             let last = stage.sigma_at(iterations.checked_sub(1)?);
             let sigma = stage.sigma.zip(last).map(|([first, _], last)| [first, last]);
             let temporal_weight = (temporal_weight > 0.0).then_some(temporal_weight);
-            Some(Stage { iterations, temporal_weight, static_variance, sigma, ..stage.clone() })
+            let decided = Stage {
+                iterations,
+                temporal_weight,
+                static_variance,
+                gamma,
+                sigma,
+                ..stage.clone()
+            };
+            Some(decided)
         };
         let mut stages: Vec<Stage> = self.stages.iter().zip(decisions).filter_map(stage).collect();
         if stages.is_empty() {
@@ -221,15 +292,13 @@ struct Watch<'a, 'b> {
 impl Watch<'_, '_> {
     fn stage(&mut self, stage: &Stage, run: &mut Run<'_>) -> Result<Course> {
         let fixed = stage.sigma.is_none();
-        let temporal_weight = stage.temporal_weight.unwrap_or(0.0);
-        let static_variance = stage.static_variance;
-        let mut course =
-            Course { temporal_weight, static_variance, errors: Vec::new(), diverged: false };
+        let (mut errors, mut squares, mut diverged) = (vec![], vec![], false);
+        let mut least = f64::INFINITY;
         run.enter(stage);
         for done in 1..=stage.iterations {
             let step = match run.iterate(stage, done - 1) {
                 Err(ReconError::Diverged { .. }) if !fixed => {
-                    course.diverged = true;
+                    diverged = true;
                     break;
                 }
                 other => other?,
@@ -237,13 +306,18 @@ impl Watch<'_, '_> {
             run.tell((self.index, stage), done - 1, &step, &mut *self.observer)?;
             let last = done == stage.iterations || step.change < stage.tolerance;
             if !fixed || last {
-                course.errors.push(self.held_out.error(self.op, self.y, run.frames()));
+                let error = self.held_out.error(self.op, self.y, run.frames());
+                errors.push(error);
+                if error < least {
+                    least = error;
+                    squares = self.held_out.residuals(self.op, self.y, run.frames());
+                }
             }
             if fixed && last {
                 break;
             }
         }
-        Ok(course)
+        Ok(Course { stage: stage.clone(), errors, squares, diverged })
     }
 }
 
@@ -283,15 +357,23 @@ impl HeldOut {
         y: ArrayView3<'_, f32>,
         v: ArrayView3<'_, f32>,
     ) -> (f64, f64) {
+        let norm = self.pixels.iter().map(|&pixel| f64::from(y[pixel]).powi(2)).sum::<f64>();
+        (self.residuals(op, y, v).iter().sum(), norm.max(f64::MIN_POSITIVE))
+    }
+
+    /// `(y - Hv)^2` of each pixel.
+    fn residuals(
+        &self,
+        op: &SensingOperator,
+        y: ArrayView3<'_, f32>,
+        v: ArrayView3<'_, f32>,
+    ) -> Vec<f64> {
         let frames = op.masks().len_of(Axis(0));
-        let (mut rest, mut norm) = (0.0, f64::MIN_POSITIVE);
-        for &(s, i, j) in &self.pixels {
+        let residual = |&(s, i, j): &(usize, usize, usize)| {
             let seen = |k| op.masks()[[k, i, j]] * v[[s * frames + k, i, j]];
-            let seen = (0..frames).map(seen).sum::<f32>();
-            rest += f64::from(y[[s, i, j]] - seen).powi(2);
-            norm += f64::from(y[[s, i, j]]).powi(2);
-        }
-        (rest, norm)
+            f64::from(y[[s, i, j]] - (0..frames).map(seen).sum::<f32>()).powi(2)
+        };
+        self.pixels.iter().map(residual).collect()
     }
 }
 
@@ -304,6 +386,7 @@ mod tests {
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
     use ndarray::{Array2, Array3, Axis, s};
+    use rand::{Rng, SeedableRng};
     use std::ops::Range;
 
     /// Goes to the truth in some passes, counted from 1, and away from it in the others.
@@ -349,7 +432,7 @@ mod tests {
     }
 
     fn iterations(iterations: usize) -> Decision {
-        Decision { iterations, temporal_weight: 0.0, static_variance: None }
+        Decision { iterations, temporal_weight: 0.0, static_variance: None, gamma: None }
     }
 
     #[test]
@@ -415,6 +498,27 @@ mod tests {
         };
         let planned = schedule.stages[1].static_variance.unwrap();
         assert_eq!((find(0.4), find(1.0)), (Some(planned / 2.0), Some(planned)));
+    }
+
+    #[test]
+    fn a_noise_term_is_found_where_there_is_noise() {
+        let masks = iid_masks(6, 64, 64, 3).unwrap();
+        let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
+            0.5 + 0.4 * ((i + 2 * k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+        });
+        let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        let noise = y.mapv(|_| (0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0);
+        let op = SensingOperator::new(masks).unwrap();
+        let found = |schedule: &Schedule, sigma: f32| {
+            let y = &y + &(sigma * &noise);
+            run(op.clone(), y.view(), schedule, &mut (), &mut ()).unwrap()[1].gamma
+        };
+        let mut schedule = Schedule::pnp_nonlocal();
+        assert_eq!(found(&schedule, 0.0), None);
+        assert!(found(&schedule, 0.2).is_some_and(|gamma| gamma > 0.0));
+        schedule.stages[1].gamma = Some(0.1);
+        assert_eq!(found(&schedule, 0.2), Some(0.1), "what a schedule states is kept");
     }
 
     #[test]

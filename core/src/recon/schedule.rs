@@ -97,6 +97,12 @@ pub struct Stage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = STATIC_VARIANCE.bounds())]
     pub static_variance: Option<f32>,
+    /// Noise term of this stage in place of the schedule's: the variance of a measured pixel's noise, in units
+    /// of that of the slowest change of the frames' error at a pixel. Where it is left out, an adaptive schedule
+    /// finds one of 0.3, 1 and 3 for a stage with static_variance, if one pays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = GAMMA.bounds())]
+    pub gamma: Option<f32>,
     /// The stage ends early once ||v_k - v_(k-1)|| / ||v_k|| is below this; 0 never does.
     #[serde(default)]
     #[schemars(transform = TOLERANCE.bounds())]
@@ -192,6 +198,7 @@ impl Stage {
         MEMORY.check(self.memory)?;
         MOMENTUM.check(self.momentum)?;
         self.static_variance.map_or(Ok(()), |variance| STATIC_VARIANCE.check(variance))?;
+        self.gamma.map_or(Ok(()), |gamma| GAMMA.check(gamma))?;
         // Where the prior passes everything (even brightness), an error `e` follows
         // `e_(k+1) = -memory momentum (e_k - e_(k-1))`.
         if self.memory * self.momentum > 0.5 {

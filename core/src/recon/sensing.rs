@@ -21,7 +21,6 @@ pub struct SensingOperator {
     gram: Array2<f32>,
     /// Of each snapshot \[S,H,W\]: they differ where pixels are kept from the projection.
     inverse_gram: Array3<f32>,
-    gamma: f32,
 }
 
 impl SensingOperator {
@@ -50,8 +49,8 @@ impl SensingOperator {
         if gram.iter().all(|&g| g == 0.0) {
             return Err(ReconError::DarkMasks { frames });
         }
-        let inverse_gram = invert(&gram, 0.0, 1);
-        Ok(Self { masks, gram, inverse_gram, gamma: 0.0 })
+        let inverse_gram = invert(&gram, 1);
+        Ok(Self { masks, gram, inverse_gram })
     }
 
     /// The same for a run of so many snapshots, at least 1, behind these masks.
@@ -63,23 +62,8 @@ impl SensingOperator {
                 range: "at least 1",
             });
         }
-        let inverse_gram = invert(&self.gram, self.gamma, snapshots);
+        let inverse_gram = invert(&self.gram, snapshots);
         Ok(Self { inverse_gram, ..self })
-    }
-
-    /// Replaces `(H H^T)^-1` by `(H H^T + gamma)^-1`, for measurements with noise: plain GAP
-    /// then no longer forces `y = Hx`. `gamma` is in units of the gram diagonal, >= 0.
-    pub fn with_gamma(mut self, gamma: f32) -> Result<Self> {
-        if !gamma.is_finite() || gamma < 0.0 {
-            return Err(ReconError::Parameter {
-                name: "gamma",
-                value: gamma.to_string(),
-                range: "a finite number of at least 0",
-            });
-        }
-        self.inverse_gram = invert(&self.gram, gamma, self.snapshots());
-        self.gamma = gamma;
-        Ok(self)
     }
 
     /// Keeps some pixels of the measurement, given by snapshot, row and column, from the projection, as if
@@ -89,11 +73,6 @@ impl SensingOperator {
             self.inverse_gram[pixel] = 0.0;
         }
         self
-    }
-
-    /// The noise term that the projection adds to the gram diagonal.
-    pub fn gamma(&self) -> f32 {
-        self.gamma
     }
 
     /// The masks \[B,H,W\].
@@ -159,8 +138,7 @@ impl SensingOperator {
     /// `t = y`, or, accelerated, `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that
     /// is the published `y1 += y - H v` (Liao et al. 2014), with 0 it is plain GAP.
     ///
-    /// `R` \[B,B\] is the covariance of the frames' error at a pixel of a snapshot ([`error_covariance`]), up to
-    /// a factor if `gamma` is 0; without one it is the identity.
+    /// `R` and `gamma` are what is supposed of the frames' errors and of the noise.
     ///
     /// Only `rows` of each snapshot are done; they need no other. `y` and `y1` are \[S,H,W\], `v` and `x`
     /// \[S B,H,W\], all of the operator's size and in standard layout. Returns `||y - H v||^2` of the rows.
@@ -169,7 +147,7 @@ impl SensingOperator {
         rows: Range<usize>,
         y: &Array3<f32>,
         y1: Option<(&mut Array3<f32>, f32)>,
-        covariance: Option<&Array2<f32>>,
+        supposed: &Statistics,
         v: &Array3<f32>,
         x: &mut Array3<f32>,
     ) -> f64 {
@@ -185,7 +163,8 @@ impl SensingOperator {
             unreachable!("arrays of the solver are in standard layout")
         };
         let mut accelerated = y1.and_then(|(y1, memory)| Some((y1.as_slice_mut()?, memory)));
-        let covariance = covariance.and_then(|covariance| covariance.as_slice());
+        let covariance = supposed.covariance.as_ref().and_then(|covariance| covariance.as_slice());
+        let gamma = supposed.gamma;
         let mut sum = vec![0.0f32; width];
         // `R C` of a row of all frames, and the inverse that belongs to it.
         let mut directions = vec![0.0f32; if covariance.is_some() { frames * width } else { 0 }];
@@ -203,11 +182,15 @@ impl SensingOperator {
                     accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
                 let (y, inverse) = (&y[row.clone()], &inverse[row]);
                 let (step, inverse) = match covariance {
-                    None => ((masks, stack), inverse),
+                    None if gamma == 0.0 => ((masks, stack), inverse),
+                    None => {
+                        add_noise(gamma, inverse, &mut weights);
+                        ((masks, stack), &*weights)
+                    }
                     Some(covariance) => {
                         directions_of_row(
                             (masks, stack),
-                            covariance,
+                            (covariance, gamma),
                             inverse,
                             &mut directions,
                             &mut weights,
@@ -235,14 +218,23 @@ const DARKEST: f32 = 1e-3;
 /// The same where all pixels are dark.
 const BLACK: f32 = 1e-6;
 
-/// `(H H^T + gamma)^-1` \[S,H,W\], bounded where hardly any light comes through.
-fn invert(gram: &Array2<f32>, gamma: f32, snapshots: usize) -> Array3<f32> {
+/// `(H H^T)^-1` \[S,H,W\], bounded where hardly any light comes through.
+fn invert(gram: &Array2<f32>, snapshots: usize) -> Array3<f32> {
     let brightest = gram.iter().copied().fold(0.0, f32::max);
     let least = (DARKEST * brightest).max(BLACK);
-    let inverse = gram.mapv(|g| if g > 0.0 { 1.0 / (g.max(least) + gamma) } else { 0.0 });
+    let inverse = gram.mapv(|g| if g > 0.0 { 1.0 / g.max(least) } else { 0.0 });
     let mut all = Array3::zeros((snapshots, gram.nrows(), gram.ncols()));
     all.outer_iter_mut().for_each(|mut of_one| of_one.assign(&inverse));
     all
+}
+
+/// What a projection supposes of the frames' errors and of the noise, both in the same unit.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Statistics {
+    /// Covariance \[B,B\] of the frames' errors at a pixel of a snapshot; the identity where there is none.
+    pub(super) covariance: Option<Array2<f32>>,
+    /// Variance of a measured pixel's noise. With 0 plain GAP forces `y = Hx`.
+    pub(super) gamma: f32,
 }
 
 /// How the variance of the error's changes falls from the slowest of them on: as `m^-DECAY` in the index `m` of
@@ -278,20 +270,20 @@ struct Stack {
     frames: usize,
 }
 
-/// `R C` \[B,W\] of a row, and its `(H R H^T + gamma)^-1` \[W\] from `(H H^T + gamma)^-1`, with the bound of
+/// `R C` \[B,W\] of a row, and its `(H R H^T + gamma)^-1` \[W\] from `(H H^T)^-1`, with the bound of
 /// [`invert`] in it; 0 where that is 0.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn directions_of_row(
     (masks, stack): (&[f32], Stack),
-    covariance: &[f32],
+    (covariance, gamma): (&[f32], f32),
     inverse: &[f32],
     directions: &mut [f32],
     weights: &mut [f32],
 ) {
     let Stack { plane, start, width, frames } = stack;
     let mask = |k: usize| &masks[k * plane + start..][..width];
-    // `gamma` first, and what the bound has added.
-    weights.iter_mut().zip(inverse).for_each(|(weight, &inverse)| *weight = 1.0 / inverse);
+    // The noise first, and what the bound has added.
+    weights.iter_mut().zip(inverse).for_each(|(weight, &inverse)| *weight = 1.0 / inverse + gamma);
     for k in 0..frames {
         let direction = &mut directions[k * width..][..width];
         direction.fill(0.0);
@@ -306,6 +298,13 @@ fn directions_of_row(
     }
     for (weight, &inverse) in weights.iter_mut().zip(inverse) {
         *weight = if inverse > 0.0 { 1.0 / *weight } else { 0.0 };
+    }
+}
+
+/// `(H H^T + gamma)^-1` \[W\] of a row from `(H H^T)^-1`; 0 where that is 0.
+fn add_noise(gamma: f32, inverse: &[f32], weights: &mut [f32]) {
+    for (weight, &inverse) in weights.iter_mut().zip(inverse) {
+        *weight = inverse / (1.0 + gamma * inverse);
     }
 }
 
@@ -369,7 +368,7 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use super::SensingOperator;
+    use super::{SensingOperator, Statistics};
     use ndarray::Array3;
     use proptest::prelude::{any, proptest};
 
@@ -405,7 +404,7 @@ mod tests {
             let y = op.forward(truth.view()).unwrap();
             let v = random(seed ^ 2, op.dim());
             let mut x = Array3::zeros(op.dim());
-            let squares = op.project(0..dim.1, &y, None, None, &v, &mut x);
+            let squares = op.project(0..dim.1, &y, None, &Statistics::default(), &v, &mut x);
             let before = &y - &op.forward(v.view()).unwrap();
             let after = &y - &op.forward(x.view()).unwrap();
             let expected: f64 = before.iter().map(|&r| f64::from(r * r)).sum();
@@ -432,7 +431,7 @@ mod tests {
             0..3,
             &Array3::from_elem((1, 3, 3), 1.0),
             Some((&mut y1, 1.0)),
-            None,
+            &Statistics::default(),
             &v,
             &mut x,
         );
@@ -450,7 +449,7 @@ mod tests {
         let mut y = op.forward(v.view()).unwrap();
         y[[0, 1, 1]] += 0.04;
         let mut x = Array3::zeros((4, 3, 3));
-        op.project(0..3, &y, None, None, &v, &mut x);
+        op.project(0..3, &y, None, &Statistics::default(), &v, &mut x);
         let change = (&x - &v).mapv(f32::abs);
         assert!(change.iter().all(|change| *change < 1e-3), "{change}");
     }

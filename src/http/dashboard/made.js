@@ -83,6 +83,7 @@ function pilot(content) {
     const decided = [
       why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
       stage.planned_static_variance && `static variance ${stage.static_variance ?? "left out"}`,
+      stage.gamma != null && `noise term ${stage.gamma}`,
       stage.planned_temporal_weight > 0 && `total variation along time ${stage.temporal_weight > 0 ? "kept" : "left out"}`,
     ].filter(Boolean);
     const error = `error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`;

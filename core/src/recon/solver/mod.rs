@@ -6,13 +6,13 @@ mod state;
 
 use std::ops::Range;
 
-use ndarray::{Array2, Array3, Array4, ArrayView3};
+use ndarray::{Array3, Array4, ArrayView3};
 
 use super::assessment;
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
-use super::sensing::{SensingOperator, error_covariance};
+use super::sensing::{SensingOperator, Statistics, error_covariance};
 use state::{Change, State};
 use strum::Display;
 
@@ -99,8 +99,7 @@ pub struct Outcome {
 /// stays tied to its own `B`.
 ///
 /// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
-/// variation and the learned denoiser costs what the acceleration gained. With `gamma` > 0 the
-/// operator's regularised inverse is used. Networks are asked for when a stage needs them.
+/// variation and the learned denoiser costs what the acceleration gained. Networks are asked for when a stage needs them.
 /// Errors: sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
 /// [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct(
@@ -183,8 +182,10 @@ pub(super) struct Run<'a> {
     x: Array3<f32>,
     /// The prior of the stage, at work.
     pass: Option<Box<dyn Pass>>,
-    /// What the stage supposes of the error \[B,B\].
-    covariance: Option<Array2<f32>>,
+    /// What the stage supposes of the error and the noise.
+    supposed: Statistics,
+    /// The noise term of stages that have none of their own.
+    gamma: f32,
     networks: &'a mut dyn Networks,
     done: usize,
     planned: usize,
@@ -208,7 +209,8 @@ impl<'a> Run<'a> {
             state: State::new(op, schedule),
             x: Array3::zeros(op.dim()),
             pass: None,
-            covariance: None,
+            supposed: Statistics::default(),
+            gamma: schedule.gamma,
             networks,
             done: 0,
             planned: schedule.planned_iterations(),
@@ -244,7 +246,8 @@ impl<'a> Run<'a> {
         // What a prior remembers belongs to the iterates of one stage.
         self.pass = None;
         let frames = self.op.masks().dim().0;
-        self.covariance = stage.static_variance.map(|variance| error_covariance(frames, variance));
+        let covariance = stage.static_variance.map(|variance| error_covariance(frames, variance));
+        self.supposed = Statistics { covariance, gamma: stage.gamma.unwrap_or(self.gamma) };
     }
 
     /// What the next iteration starts from.
@@ -314,13 +317,12 @@ impl<'a> Run<'a> {
     /// three while it is in cache. The new iterate is then in `x`. Returns `||y - H v||^2` of what the
     /// iteration started from.
     fn sweep(&mut self, stage: &Stage, settings: &Settings, rows: usize) -> Result<(f64, Change)> {
-        let Self { op, y, state, x, networks, covariance, .. } = self;
+        let Self { op, y, state, x, networks, supposed, .. } = self;
         let pass = self.pass.get_or_insert_with(|| stage.prior.begin(op.dim()));
         let (mut squares, mut change) = (0.0, Change::default());
-        let along = (stage.memory, covariance.as_ref());
         for first in (0..y.dim().1).step_by(rows) {
             let strip = first..y.dim().1.min(first + rows);
-            squares += state.project(op, strip.clone(), y, along, x);
+            squares += state.project(op, strip.clone(), y, (stage.memory, supposed), x);
             admm::shift(state, x);
             pass.apply(x, strip, settings, &mut **networks, &mut |x, k, done| {
                 change.add(x, &state.v, k, done);
@@ -331,7 +333,14 @@ impl<'a> Run<'a> {
 
     fn residual(&mut self) -> f32 {
         let rows = 0..self.y.dim().1;
-        let squares = self.op.project(rows, &self.y, None, None, &self.state.v, &mut self.x);
+        let squares = self.op.project(
+            rows,
+            &self.y,
+            None,
+            &Statistics::default(),
+            &self.state.v,
+            &mut self.x,
+        );
         (squares.sqrt() / self.y_norm) as f32
     }
 }
@@ -394,7 +403,8 @@ mod reference {
             let memory: f32 = rng.random();
             let variance = rng.random::<bool>().then(|| rng.random_range(0.1..1.0f32));
             let stage = json!({"prior": "ffdnet", "iterations": 7, "sigma": [0.1, 0.1],
-                "memory": memory, "momentum": 0.5 * rng.random::<f32>(), "static_variance": variance});
+                "memory": memory, "momentum": 0.5 * rng.random::<f32>(), "static_variance": variance,
+                "gamma": rng.random::<bool>().then(|| 0.5 * rng.random::<f32>())});
             let schedule = json!({"method": method, "accelerated": rng.random::<bool>(),
                 "gamma": 0.3 * rng.random::<f32>(), "stages": [stage]});
             Self { schedule: serde_json::from_value(schedule).unwrap(), masks, y }
@@ -402,7 +412,7 @@ mod reference {
 
         pub(super) fn solve(&self, solver: Solver) -> Outcome {
             let op = SensingOperator::new(self.masks.clone()).unwrap();
-            let op = op.over(self.y.dim().0).unwrap().with_gamma(self.schedule.gamma).unwrap();
+            let op = op.over(self.y.dim().0).unwrap();
             solver(&op, self.y.view(), &self.schedule, &mut Pull, &mut ()).unwrap()
         }
 
@@ -421,7 +431,8 @@ mod reference {
         /// `P(w)` along the masks, or along `R C` (an orthogonal cosine at a time), with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
         pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
             let plane = self.masks.dim().1 * self.masks.dim().2;
-            let (gamma, memory) = (self.schedule.gamma, self.schedule.stages[0].memory);
+            let stage = &self.schedule.stages[0];
+            let (gamma, memory) = (stage.gamma.unwrap_or(self.schedule.gamma), stage.memory);
             let mask: Vec<f64> = self.masks.iter().map(|&c| f64::from(c)).collect();
             // `R C`.
             let mut direction = mask.clone();
@@ -476,7 +487,7 @@ mod tests {
     use crate::recon::prior::temporal::TemporalVariation;
     use crate::recon::prior::tv::TotalVariation;
     use crate::recon::schedule::Schedule;
-    use crate::recon::sensing::SensingOperator;
+    use crate::recon::sensing::{SensingOperator, Statistics};
     use ndarray::{Array3, ArrayView3, s};
     use rand::{Rng, SeedableRng};
 
@@ -495,7 +506,14 @@ mod tests {
         let settings = stage.settings(0);
 
         let (mut expected, mut y1) = (Array3::zeros(size), Array3::zeros(y.raw_dim()));
-        op.project(0..size.1, &y, Some((&mut y1, stage.memory)), None, &v, &mut expected);
+        op.project(
+            0..size.1,
+            &y,
+            Some((&mut y1, stage.memory)),
+            &Statistics::default(),
+            &v,
+            &mut expected,
+        );
         let (weight, updates) = (settings.temporal_weight, settings.tv_updates);
         let mut temporal = TemporalVariation::new(size.0);
         temporal.denoise(&mut expected, 0..size.1, weight, updates);

@@ -2,10 +2,10 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, Array3, Axis};
+use ndarray::{Array3, Axis};
 
 use crate::recon::schedule::{Method, Schedule};
-use crate::recon::sensing::SensingOperator;
+use crate::recon::sensing::{SensingOperator, Statistics};
 
 /// What an iteration starts from.
 #[derive(Clone)]
@@ -32,17 +32,17 @@ impl State {
         }
     }
 
-    /// Projects some rows, with this covariance of the error, into `x`; `||y - H v||^2` of them.
+    /// Projects some rows into `x`; `||y - H v||^2` of them.
     pub(super) fn project(
         &mut self,
         op: &SensingOperator,
         rows: Range<usize>,
         y: &Array3<f32>,
-        (memory, covariance): (f32, Option<&Array2<f32>>),
+        (memory, supposed): (f32, &Statistics),
         x: &mut Array3<f32>,
     ) -> f64 {
         let y1 = self.y1.as_mut().map(|y1| (y1, memory));
-        op.project(rows, y, y1, covariance, self.start.as_ref().unwrap_or(&self.v), x)
+        op.project(rows, y, y1, supposed, self.start.as_ref().unwrap_or(&self.v), x)
     }
 }
 
