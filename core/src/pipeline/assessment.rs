@@ -61,7 +61,7 @@ impl TileAssessment {
     }
 }
 
-/// What the pilot of an adaptive schedule tells; that of a fixed one is the default.
+/// What the pilot of an adaptive schedule tells.
 #[derive(Debug, Clone, Copy)]
 pub struct Course {
     /// Error at the held-out pixels after the first stage, relative to the measurement.
@@ -70,12 +70,6 @@ pub struct Course {
     pub after: f64,
     /// The part of the last stage's iterations that pay.
     pub share: f64,
-}
-
-impl Default for Course {
-    fn default() -> Self {
-        Self { before: 1.0, after: 1.0, share: 1.0 }
-    }
 }
 
 /// What is expected of a snapshot.
@@ -99,7 +93,7 @@ const GRADES: [(f64, Grade); 2] = [(28.0, Grade::Good), (22.0, Grade::Usable)];
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
-    (schedule, course): (&Schedule, Course),
+    (schedule, course): (&Schedule, Option<Course>),
     (frames, white): (usize, f32),
     warnings: &[Finding],
 ) -> Option<Expected> {
@@ -144,14 +138,15 @@ pub fn expected(
     let of_map = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
     let bounded = |decibels: f64| decibels.min(BEST + SPARE);
     let error = |relative: f64| bounded(-20.0 * relative.max(1e-6).log10());
+    let told = |value: fn(&Course) -> f64| course.as_ref().map(value);
     let mut known = vec![
-        bounded(of_map),
-        error(course.before),
-        error(course.after),
-        course.share,
-        white.log10(),
+        Some(bounded(of_map)),
+        told(|course| course.before).map(error),
+        told(|course| course.after).map(error),
+        told(|course| course.share),
+        Some(white.log10()),
     ];
-    known.extend(seen.iter().map(|sum| sum / lit));
+    known.extend(seen.iter().map(|sum| Some(sum / lit)));
     let [low, psnr_db, high] = model.psnr(&known).map(|decibels| decibels.min(BEST));
     let error = squares.mapv(|square| {
         let decibels = -10.0 * square.max(1e-12).log10() + psnr_db - of_map;
@@ -230,7 +225,7 @@ const PARTS: [[&str; 3]; 3] = [
 
 #[cfg(test)]
 mod tests {
-    use super::{Course, TileAssessment, expected, grade};
+    use super::{TileAssessment, expected, grade};
     use crate::job::{Assessment, Finding, Grade, Severity};
     use crate::recon::schedule::Schedule;
     use crate::recon::sequence::SequencePlan;
@@ -267,7 +262,7 @@ mod tests {
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
         let map = |tiles: Vec<Option<TileAssessment>>| {
             let of_run = [(shares[0].clone(), tiles)];
-            let by = (&Schedule::gap_tv(), Course::default());
+            let by = (&Schedule::gap_tv(), None);
             expected(&plan, &of_run, by, (2, 0.5), &[])
         };
         let tiles =

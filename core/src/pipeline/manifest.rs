@@ -110,7 +110,7 @@ impl Recipe {
         if self.shape.mosaic.is_some() {
             return None;
         }
-        let course = self.pilot.as_ref().and_then(PilotRecord::course).unwrap_or_default();
+        let course = self.pilot.as_ref().and_then(PilotRecord::course);
         let by = (&self.schedule, course);
         let scale = (self.shape.frames, self.scale.white);
         expected(&self.tile_plan, shares, by, scale, &self.warnings_of(snapshot))

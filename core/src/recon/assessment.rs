@@ -201,9 +201,10 @@ impl Model {
     }
 
     /// The expected PSNR of a snapshot between the ends of its interval, in dB, from what its map and its pilot
-    /// tell.
-    pub fn psnr(&self, known: &[f64]) -> [f64; 3] {
-        let middle = self.snapshot.value(known.iter().copied());
+    /// tell. What is not known counts as it mostly was.
+    pub fn psnr(&self, known: &[Option<f64>]) -> [f64; 3] {
+        let known = known.iter().zip(&self.snapshot.mean);
+        let middle = self.snapshot.value(known.map(|(known, mean)| known.unwrap_or(*mean)));
         [middle + self.interval[0], middle, middle + self.interval[1]]
     }
 }
@@ -268,6 +269,8 @@ mod tests {
             assert_eq!(model.block.coefficients.len(), 1 + inputs + inputs * (inputs + 1) / 2);
             assert_eq!(model.snapshot.coefficients.len(), 1 + 5 + inputs);
             assert!(model.interval[0] < 0.0 && model.interval[1] > 0.0);
+            let [_, mean, _] = model.psnr(&vec![None; 5 + inputs]);
+            assert_eq!(mean, model.snapshot.coefficients[0], "nothing known is the mean of all");
         }
     }
 

@@ -14,7 +14,7 @@ use rand::{Rng, SeedableRng};
 
 use super::error::{ReconError, Result};
 use super::prior::Networks;
-use super::schedule::{Schedule, Stage};
+use super::schedule::{MAX_STATIC_VARIANCE, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::solver::{Observer, Run};
 use strum::Display;
@@ -101,15 +101,14 @@ pub fn run(
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = run.state();
         let mut course = watch.stage(stage, &mut run)?;
-        for variants in VARIANTS {
-            for variant in variants(stage, &course) {
-                let end = run.state();
-                run.restore(start.clone());
-                let found = watch.stage(&variant, &mut run)?;
-                if found.surpasses(&course) {
-                    course = found;
-                    break;
-                }
+        for variant in VARIANTS {
+            let Some(variant) = variant(stage, &course) else { continue };
+            let end = run.state();
+            run.restore(start.clone());
+            let found = watch.stage(&variant, &mut run)?;
+            if found.surpasses(&course) {
+                course = found;
+            } else {
                 run.restore(end);
             }
         }
@@ -122,44 +121,48 @@ pub fn run(
     Ok(judge(schedule, &courses))
 }
 
-/// What a stage, as planned, may be instead of what was run of it last, one question after the other: of each the
-/// first answer that is better is taken, and the next question is asked of that.
-const VARIANTS: [fn(&Stage, &Course) -> Vec<Stage>; 4] =
-    [without_time, with_other_variance, with_noise, with_more_noise];
+/// What a stage, as planned, may be instead of what was taken last. One after the other is run, and taken if it is
+/// better.
+const VARIANTS: [fn(&Stage, &Course) -> Option<Stage>; 5] =
+    [without_time, with_more_variance, without_variance, with_noise, with_other_noise];
 
-fn without_time(planned: &Stage, _: &Course) -> Vec<Stage> {
+fn without_time(planned: &Stage, _: &Course) -> Option<Stage> {
     let weighs = planned.temporal_weight.is_some_and(|weight| weight > 0.0);
-    weighs.then(|| Stage { temporal_weight: None, ..planned.clone() }).into_iter().collect()
+    weighs.then(|| Stage { temporal_weight: None, ..planned.clone() })
 }
 
-fn with_other_variance(planned: &Stage, run: &Course) -> Vec<Stage> {
-    let Some(whole) = planned.static_variance else { return vec![] };
-    [Some(whole / 2.0), None]
-        .map(|static_variance| Stage { static_variance, ..run.stage.clone() })
-        .into()
+fn with_more_variance(planned: &Stage, taken: &Course) -> Option<Stage> {
+    let double = (2.0 * planned.static_variance?).min(MAX_STATIC_VARIANCE);
+    Some(Stage { static_variance: Some(double), ..taken.stage.clone() })
+}
+
+fn without_variance(planned: &Stage, taken: &Course) -> Option<Stage> {
+    planned.static_variance?;
+    Some(Stage { static_variance: None, ..taken.stage.clone() })
 }
 
 /// Noise terms in units of the variance of the error's slowest change. Less changes nothing.
 const NOISE: [f32; 3] = [0.3, 1.0, 3.0];
 
 /// Noise makes the error rise long before the stage ends. Without noise, a term only costs.
-fn with_noise(planned: &Stage, run: &Course) -> Vec<Stage> {
+fn with_noise(planned: &Stage, taken: &Course) -> Option<Stage> {
     let supposes = planned.static_variance.is_some() && planned.gamma.is_none();
-    if !supposes || run.turn() * 10 > planned.iterations * 9 {
-        return vec![];
-    }
-    [NOISE[1], NOISE[0]].map(|gamma| Stage { gamma: Some(gamma), ..run.stage.clone() }).into()
+    let early = taken.turn() * 10 <= planned.iterations * 9;
+    (supposes && early).then(|| Stage { gamma: Some(NOISE[1]), ..taken.stage.clone() })
 }
 
-fn with_more_noise(planned: &Stage, run: &Course) -> Vec<Stage> {
-    let more = planned.gamma.is_none() && run.stage.gamma == Some(NOISE[1]);
-    more.then(|| Stage { gamma: Some(NOISE[2]), ..run.stage.clone() }).into_iter().collect()
+/// More, if that was taken; else, if it was tried, less.
+fn with_other_noise(planned: &Stage, taken: &Course) -> Option<Stage> {
+    if planned.gamma.is_none() && taken.stage.gamma.is_some() {
+        return Some(Stage { gamma: Some(NOISE[2]), ..taken.stage.clone() });
+    }
+    Some(Stage { gamma: Some(NOISE[0]), ..with_noise(planned, taken)? })
 }
 
 impl Schedule {
     /// The most that a pilot of it may cost, CPU-nanoseconds per voxel of the piece.
     pub fn pilot_ns_per_voxel(&self) -> f64 {
-        // Of the questions in `VARIANTS`: noise has two answers, as 3 is only tried in place of 0.3.
+        // As many as `VARIANTS` may ask for.
         let runs = |stage: &Stage| {
             1 + usize::from(stage.temporal_weight.is_some())
                 + stage.static_variance.map_or(0, |_| 2 + usize::from(stage.gamma.is_none()) * 2)
@@ -479,24 +482,23 @@ mod tests {
         assert_eq!((Some(weight(false)), weight(true)), (asked, 0.0));
     }
 
-    /// Masks that are all but alike tell hardly anything of what changes: there the error is. Independent ones tell
-    /// as much of it as of the rest.
+    /// In a still scene all of the error is common to the frames.
     #[test]
-    fn the_projection_follows_the_changes_where_masks_are_alike() {
-        let independent = iid_masks(6, 64, 64, 3).unwrap();
-        let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
-            0.5 + 0.4 * ((i + 2 * k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
-        });
+    fn a_static_variance_that_is_too_small_is_not_kept() {
+        let masks = iid_masks(6, 64, 64, 3).unwrap();
+        let op = SensingOperator::new(masks.clone()).unwrap();
         let mut schedule = Schedule::pnp_nonlocal();
         schedule.stages[1].iterations = 20;
-        let find = |contrast: f32| {
-            let masks = independent.mapv(|c| 0.7 + contrast * (c - 0.5));
+        let mut found = |motion: f32, planned: f32| {
+            let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
+                0.5 + 0.4 * ((i as f32 + motion * k as f32) * 0.3).sin() * (j as f32 * 0.2).cos()
+            });
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
-            let op = SensingOperator::new(masks).unwrap();
-            run(op, y.view(), &schedule, &mut (), &mut ()).unwrap()[1].static_variance
+            schedule.stages[1].static_variance = Some(planned);
+            run(op.clone(), y.view(), &schedule, &mut (), &mut ()).unwrap()[1].static_variance
         };
-        let planned = schedule.stages[1].static_variance.unwrap();
-        assert_eq!((find(0.4), find(1.0)), (Some(planned / 2.0), Some(planned)));
+        assert_eq!(found(2.0, 0.5), Some(0.5));
+        assert_ne!(found(0.0, 0.05), Some(0.05));
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::assessment;
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
-use super::sensing::{SensingOperator, Statistics, error_covariance};
+use super::sensing::{SensingOperator, Statistics};
 use state::{Change, State};
 use strum::Display;
 
@@ -245,8 +245,7 @@ impl<'a> Run<'a> {
     pub(super) fn enter(&mut self, stage: &Stage) {
         // What a prior remembers belongs to the iterates of one stage.
         self.pass = None;
-        let frames = self.op.masks().dim().0;
-        let covariance = stage.static_variance.map(|variance| error_covariance(frames, variance));
+        let covariance = stage.static_variance.map(|variance| self.op.error_covariance(variance));
         self.supposed = Statistics { covariance, gamma: stage.gamma.unwrap_or(self.gamma) };
     }
 
@@ -438,12 +437,19 @@ mod reference {
             let mut direction = mask.clone();
             if let Some(variance) = self.schedule.stages[0].static_variance {
                 let frames = self.masks.dim().0;
+                let sum = |pixel: usize, power: i32| -> f64 {
+                    (0..frames).map(|k| mask[k * plane + pixel].powi(power)).sum()
+                };
+                let gram: f64 = (0..plane).map(|pixel| sum(pixel, 2)).sum();
+                let steady: f64 = (0..plane).map(|pixel| sum(pixel, 1).powi(2)).sum();
+                let contrast = 1.0 - steady / (frames as f64 * gram);
+                let variance = f64::from(variance) * (contrast / 0.16).min(1.0);
                 let cosine =
                     |m: usize, k: usize| (PI * m as f64 * (k as f64 + 0.5) / frames as f64).cos();
                 direction.fill(0.0);
                 for m in 0..frames {
                     let square: f64 = (0..frames).map(|k| cosine(m, k).powi(2)).sum();
-                    let variance = if m == 0 { variance.into() } else { (m as f64).powf(-0.4) };
+                    let variance = if m == 0 { variance.max(0.01) } else { (m as f64).powf(-0.4) };
                     for pixel in 0..plane {
                         let part = |k: usize| cosine(m, k) * mask[k * plane + pixel];
                         let part = variance / square * (0..frames).map(part).sum::<f64>();
