@@ -111,8 +111,8 @@ impl SensingOperator {
     }
 
     /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a snapshot's frames
-    /// at a pixel, with the cosines `Psi` of the DCT-II, and `s` = `static_variance` where masks differ much, less in proportion to
-    /// their contrast where they are alike.
+    /// at a pixel, with the cosines `Psi` of the DCT-II, and `s` = `static_variance` where masks differ much, less where they are
+    /// alike: by the power 1.5 of their contrast.
     ///
     /// Where masks are alike a measurement says well what all frames have in common, and hardly what changes from
     /// one to the next: so this is where the error is, slow changes first. The projection along the masks
@@ -120,7 +120,7 @@ impl SensingOperator {
     /// out again.
     pub(super) fn error_covariance(&self, static_variance: f32) -> Array2<f32> {
         let frames = self.masks.dim().0;
-        let part = (self.contrast() / HIGH_CONTRAST).min(1.0);
+        let part = (self.contrast() / HIGH_CONTRAST).min(1.0).powf(1.5);
         let common = (static_variance * part).max(LEAST_STATIC_VARIANCE);
         let count = frames as f32;
         let cosine = |m: usize, k: usize| {
@@ -274,10 +274,9 @@ pub(super) struct Statistics {
 /// exponents of 0 to 2.6; as the projection's, more than 0.5 gains less, and 0 loses where there is noise.
 const DECAY: f32 = 0.4;
 
-/// From this contrast of the masks on the static variance is as stated. Of fixed ones the best is about 2.8 times
-/// the contrast (0.07 at 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06, 0.2 to 0.3 at 0.084), and 0.4 to 0.6 behind
-/// independent pixels (0.45).
-const HIGH_CONTRAST: f32 = 0.16;
+/// From this contrast of the masks on the static variance is as stated. Of fixed ones the best is 0.07 at a contrast
+/// of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06, 0.3 at 0.084, and 0.4 to 0.6 behind independent pixels (0.45).
+const HIGH_CONTRAST: f32 = 0.11;
 /// Of masks that are all alike nothing else than what frames have in common can be told, so it must not be 0.
 const LEAST_STATIC_VARIANCE: f32 = 0.01;
 
@@ -448,7 +447,7 @@ mod tests {
         // Of the variance of four frames 3/4 shows as change: contrasts of 0.19, 0.058 and 0.
         let (high, low, none) = (common(2.0), common(1.0), common(0.0));
         assert!((high - 0.5).abs() < 1e-3, "{high}");
-        assert!((low - 0.5 * 0.0577 / 0.16).abs() < 0.02, "{low}");
+        assert!((low - 0.5 * (0.0577f32 / 0.11).powf(1.5)).abs() < 0.02, "{low}");
         assert!((none - 0.01).abs() < 1e-3, "{none}");
     }
 
