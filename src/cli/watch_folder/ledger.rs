@@ -119,6 +119,13 @@ impl Ledger {
     }
 }
 
+impl Drop for Ledger {
+    fn drop(&mut self) {
+        // Closing it is not enough: a process that is just being started has a copy of the file, which keeps the lock.
+        self.file.unlock().ok();
+    }
+}
+
 /// The name of a ledger in its folder.
 pub(super) fn place(folder: &Path) -> PathBuf {
     folder.join(".sci-recon.ledger")
