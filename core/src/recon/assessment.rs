@@ -88,11 +88,10 @@ pub fn features(
 /// their own.
 fn of_masks(op: &SensingOperator) -> (Block, Block) {
     let masks = op.masks();
-    let (count, height, width) = masks.dim();
-    let gram = op.gram();
-    let mean = masks.mean_axis(Axis(0)).unwrap_or_default();
+    let (_, height, width) = masks.dim();
+    let (gram, steady) = (op.gram(), op.steady_gram());
     let energy = Block::of(height, width, |i, j| gram[[i, j]]);
-    let steady = Block::of(height, width, |i, j| count as f32 * mean[[i, j]].powi(2));
+    let steady = Block::of(height, width, |i, j| steady[[i, j]]);
     let steps = Block::of(height, width, |i, j| {
         masks.outer_iter().map(|mask| gradient(mask, i, j)).sum::<f32>()
     });
@@ -201,7 +200,7 @@ impl Model {
     }
 
     /// The expected PSNR of a snapshot between the ends of its interval, in dB, from what its map and its pilot
-    /// tell. What is not known counts as it mostly was.
+    /// tell. What is not known counts as in the mean of the fit.
     pub fn psnr(&self, known: &[Option<f64>]) -> [f64; 3] {
         let known = known.iter().zip(&self.snapshot.mean);
         let middle = self.snapshot.value(known.map(|(known, mean)| known.unwrap_or(*mean)));

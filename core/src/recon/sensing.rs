@@ -104,10 +104,14 @@ impl SensingOperator {
     /// The share of the masks' energy that changes from frame to frame: 0 where all masks are alike, about 1/2 where
     /// each opens half of its pixels by chance.
     fn contrast(&self) -> f32 {
+        (1.0 - self.steady_gram().sum() / self.gram.sum()).max(0.0)
+    }
+
+    /// The part of the gram diagonal that masks have in common \[H,W\]: `B` times the square of their mean.
+    pub(super) fn steady_gram(&self) -> Array2<f32> {
         let frames = self.masks.dim().0 as f32;
         let mean = self.masks.mean_axis(Axis(0)).unwrap_or_default();
-        let steady = frames * mean.iter().map(|mean| mean * mean).sum::<f32>();
-        (1.0 - steady / self.gram.sum()).max(0.0)
+        mean.mapv(|mean| frames * mean.powi(2))
     }
 
     /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a snapshot's frames
