@@ -73,7 +73,7 @@ impl Schedule {
 const TEMPORAL_WEIGHT: f32 = 0.004;
 
 /// The best behind independent pixels, at Cr 6 to 24; for masks that are alike the projection takes less.
-const STATIC_VARIANCE: f32 = 0.5;
+const STATIC_VARIANCE: f32 = 0.55;
 
 /// What comes before the plugged-in priors.
 fn first_stage() -> Stage {

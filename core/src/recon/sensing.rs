@@ -107,6 +107,11 @@ impl SensingOperator {
         (1.0 - self.steady_gram().sum() / self.gram.sum()).max(0.0)
     }
 
+    /// Whether masks differ so much that a measurement tells the changes from what frames have in common.
+    pub(super) fn differ_much(&self) -> bool {
+        self.contrast() >= HIGH_CONTRAST
+    }
+
     /// The part of the gram diagonal that masks have in common \[H,W\]: `B` times the square of their mean.
     pub(super) fn steady_gram(&self) -> Array2<f32> {
         let frames = self.masks.dim().0 as f32;
@@ -115,7 +120,7 @@ impl SensingOperator {
     }
 
     /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a snapshot's frames
-    /// at a pixel, with the cosines `Psi` of the DCT-II, and `s = static_variance min(10 / B, (c / 0.12)^1.5)` of the masks'
+    /// at a pixel, with the cosines `Psi` of the DCT-II, and `s = static_variance min((10 / B)^0.5, (c / 0.125)^1.5)` of the masks'
     /// contrast `c`.
     ///
     /// Where masks are alike a measurement says well what all frames have in common, and hardly what changes from
@@ -124,7 +129,8 @@ impl SensingOperator {
     /// out again.
     pub(super) fn error_covariance(&self, static_variance: f32) -> Array2<f32> {
         let frames = self.masks.dim().0;
-        let (alike, many) = ((self.contrast() / HIGH_CONTRAST).powf(1.5), 10.0 / frames as f32);
+        let alike = (self.contrast() / HIGH_CONTRAST).powf(1.5);
+        let many = (10.0 / frames as f32).sqrt();
         let common = (static_variance * alike.min(many)).max(LEAST_STATIC_VARIANCE);
         let count = frames as f32;
         let cosine = |m: usize, k: usize| {
@@ -280,8 +286,8 @@ const DECAY: f32 = 0.4;
 
 /// The contrast of masks at which they no longer set bounds to the static variance at Cr 10. Of fixed ones the best is
 /// 0.07 at a contrast of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06, and 0.3 at 0.084; behind independent pixels
-/// (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.4 at Cr 16.
-const HIGH_CONTRAST: f32 = 0.12;
+/// (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from Cr 16 on.
+const HIGH_CONTRAST: f32 = 0.125;
 /// Of masks that are all alike nothing else than what frames have in common can be told, so it must not be 0.
 const LEAST_STATIC_VARIANCE: f32 = 0.01;
 
@@ -454,11 +460,11 @@ mod tests {
         };
         let masks = |contrast: f32| random(3, (4, 32, 32)).mapv(|c| 1.0 + contrast * (c - 0.5));
         // Of the variance of four frames 3/4 shows as change.
-        near(common(masks(1.0)), 0.5 * (0.0577f32 / 0.12).powf(1.5));
+        near(common(masks(1.0)), 0.5 * (0.0577f32 / 0.125).powf(1.5));
         near(common(masks(0.0)), 0.01);
         let binary = |frames: usize| random(3, (frames, 32, 32)).mapv(f32::round);
-        near(common(binary(4)), 0.5 * 10.0 / 4.0);
-        near(common(binary(20)), 0.5 * 10.0 / 20.0);
+        near(common(binary(4)), 0.5 * 2.5f32.sqrt());
+        near(common(binary(20)), 0.5 * 0.5f32.sqrt());
     }
 
     #[test]

@@ -443,7 +443,7 @@ mod reference {
                 let gram: f64 = (0..plane).map(|pixel| sum(pixel, 2)).sum();
                 let steady: f64 = (0..plane).map(|pixel| sum(pixel, 1).powi(2)).sum();
                 let contrast = 1.0 - steady / (frames as f64 * gram);
-                let part = (contrast / 0.12).powf(1.5).min(10.0 / frames as f64);
+                let part = (contrast / 0.125).powf(1.5).min((10.0 / frames as f64).sqrt());
                 let variance = f64::from(variance) * part;
                 let cosine =
                     |m: usize, k: usize| (PI * m as f64 * (k as f64 + 0.5) / frames as f64).cos();
