@@ -106,7 +106,7 @@ pub fn run(
             let end = run.state();
             run.restore(start.clone());
             let found = watch.stage(&variant, &mut run)?;
-            if found.surpasses(&course, &held_out) {
+            if found.surpasses(&course) {
                 course = found;
             } else {
                 run.restore(end);
@@ -206,19 +206,20 @@ impl Course {
     }
 
     /// Whether its least error is below that of another by more than chance: by more than the standard error of
-    /// the difference. Where noise outweighs the frames' error, few pixels could tell anything.
-    fn surpasses(&self, other: &Self, held_out: &HeldOut) -> bool {
+    /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
+    ///
+    /// A static variance gives up changes for what frames have in common, of which a measurement tells more than
+    /// it counts in the frames: so for another one the difference must be twice as clear.
+    fn surpasses(&self, other: &Self) -> bool {
         if self.squares.is_empty() || other.squares.is_empty() {
             return self.least() < other.least();
         }
-        let gains = other.squares.iter().zip(&self.squares).map(|(other, own)| other - own);
-        let gains: Vec<f64> = gains.collect();
+        let gains = || other.squares.iter().zip(&self.squares).map(|(other, own)| other - own);
+        let count = self.squares.len() as f64;
+        let mean = gains().sum::<f64>() / count;
+        let variance = gains().map(|gain| (gain - mean).powi(2)).sum::<f64>() / count;
         let exchanges = self.stage.static_variance != other.stage.static_variance;
-        let (gain, deviation) = match held_out.gain_of_frames(&gains).filter(|_| exchanges) {
-            Some(told) => told,
-            None => mean(&gains),
-        };
-        gain > deviation
+        mean > if exchanges { 2.0 } else { 1.0 } * (variance / count).sqrt()
     }
 }
 
@@ -331,30 +332,17 @@ impl Watch<'_, '_> {
     }
 }
 
-/// The mean and its standard error.
-fn mean(values: &[f64]) -> (f64, f64) {
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
-    (mean, (variance / count).sqrt())
-}
-
 /// Pixels that the solver does not see.
 pub(super) struct HeldOut {
     /// Snapshots, rows and columns.
     pub(super) pixels: Vec<(usize, usize, usize)>,
-    /// The gram's part at each pixel that masks have in common and the rest, where masks differ enough to tell errors
-    /// of the one from those of the other.
-    parts: Option<Vec<[f64; 2]>>,
-    /// Of a snapshot.
-    frames: f64,
 }
 
 impl HeldOut {
     /// Drawn from those that a mask reaches; always the same for the same masks and the same snapshot, of
     /// which the operator's first has the index `first`.
     pub(super) fn of(op: &SensingOperator, first: usize) -> Self {
-        let (gram, steady) = (op.gram(), op.steady_gram());
+        let gram = op.gram();
         let mut pixels = Vec::new();
         for snapshot in 0..op.snapshots() {
             let mut random = rand_chacha::ChaCha8Rng::seed_from_u64((first + snapshot) as u64);
@@ -364,39 +352,7 @@ impl HeldOut {
                 }
             }
         }
-        let part = |&(_, row, column): &(usize, usize, usize)| {
-            let steady = f64::from(steady[[row, column]]);
-            [steady, f64::from(gram[[row, column]]) - steady]
-        };
-        let parts = op.differ_much().then(|| pixels.iter().map(part).collect());
-        Self { pixels, parts, frames: op.masks().len_of(Axis(0)) as f64 }
-    }
-
-    /// What the mean squared error of the frames loses, and the standard error of that, where `(y - Hv)^2` at the
-    /// pixels loses so much; None where masks are too much alike to tell.
-    ///
-    /// A measurement tells far more of what the `B` frames have in common, one part of `B`, than of their changes:
-    /// errors of variance `a` and `b` let expect `(y - Hv)^2 = a S + b D` of the two parts of the gram. Where the
-    /// supposed covariance exchanges one for the other, the sum tells nothing. So `a` and `b` are found by
-    /// least squares, and the frames' error is `(a + (B - 1) b) / B`.
-    fn gain_of_frames(&self, gains: &[f64]) -> Option<(f64, f64)> {
-        let parts = self.parts.as_ref()?;
-        let sum = |value: &dyn Fn(&[f64; 2], f64) -> f64| -> f64 {
-            parts.iter().zip(gains).map(|(part, gain)| value(part, *gain)).sum()
-        };
-        let (ss, sd, dd) =
-            (sum(&|[s, _], _| s * s), sum(&|[s, d], _| s * d), sum(&|[_, d], _| d * d));
-        let determinant = ss * dd - sd * sd;
-        if determinant <= 1e-9 * ss * dd {
-            return None;
-        }
-        let (sg, dg) = (sum(&|[s, _], gain| s * gain), sum(&|[_, d], gain| d * gain));
-        let a = (dd * sg - sd * dg) / determinant;
-        let b = (ss * dg - sd * sg) / determinant;
-        let left = sum(&|[s, d], gain| (gain - a * s - b * d).powi(2)) / gains.len() as f64;
-        let [u, v] = [1.0 / self.frames, 1.0 - 1.0 / self.frames];
-        let variance = left * (u * u * dd - 2.0 * u * v * sd + v * v * ss) / determinant;
-        Some((u * a + v * b, variance.sqrt()))
+        Self { pixels }
     }
 
     /// `||y - Hv||^2` and `||y||^2` over the pixels.
@@ -433,7 +389,7 @@ impl HeldOut {
 
 #[cfg(test)]
 mod tests {
-    use super::{Decision, HeldOut, StageEnd, StageFinding, mean, piece, run};
+    use super::{Decision, StageEnd, StageFinding, piece, run};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
     use crate::recon::prior::{Denoiser, Network, Networks};
@@ -551,28 +507,6 @@ mod tests {
         };
         assert_eq!(found(2.0, 0.5), Some(0.5));
         assert_ne!(found(0.0, 0.05), Some(0.05));
-    }
-
-    /// What frames have in common gets better by 1, their changes worse by 1/2: most of the frames' error is in the
-    /// latter, most of the measurement's in the former.
-    #[test]
-    fn gains_of_the_measurement_are_told_from_gains_of_the_frames() {
-        let masks = iid_masks(4, 64, 64, 3).unwrap();
-        let op = SensingOperator::new(masks.clone()).unwrap();
-        let held_out = HeldOut::of(&op, 0);
-        let steady = op.steady_gram();
-        let gain = |&(_, i, j): &(usize, usize, usize)| {
-            let (common, all) = (f64::from(steady[[i, j]]), f64::from(op.gram()[[i, j]]));
-            common - 0.5 * (all - common)
-        };
-        let gains: Vec<f64> = held_out.pixels.iter().map(gain).collect();
-        let (measured, _) = mean(&gains);
-        let (frames, deviation) = held_out.gain_of_frames(&gains).unwrap();
-        assert!(measured > 0.5, "{measured}");
-        assert!((frames + 0.125).abs() < 1e-6 && deviation < 1e-6, "{frames}, {deviation}");
-        let alike = SensingOperator::new(masks.mapv(|c| 1.0 + 0.1 * c)).unwrap();
-        let held_out = HeldOut::of(&alike, 0);
-        assert!(held_out.gain_of_frames(&gains).is_none());
     }
 
     #[test]
