@@ -121,9 +121,11 @@ pub fn run(
     Ok(judge(schedule, &courses))
 }
 
-/// What a stage, as planned, may be instead of what was taken last. One after the other is run, and taken if it is
-/// better.
-const VARIANTS: [fn(&SensingOperator, &Stage, &Course) -> Option<Stage>; 5] =
+/// What a stage, as planned, may be instead of what was taken last.
+type Variant = fn(&SensingOperator, &Stage, &Course) -> Option<Stage>;
+
+/// One after the other is run, and taken if it is better.
+const VARIANTS: [Variant; 5] =
     [without_time, with_more_variance, without_variance, with_noise, with_other_noise];
 
 fn without_time(_: &SensingOperator, planned: &Stage, _: &Course) -> Option<Stage> {
