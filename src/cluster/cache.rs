@@ -9,6 +9,7 @@ use std::time::SystemTime;
 
 use super::connection::ClusterError;
 use crate::job::Sha256;
+use crate::store::LockedFile;
 
 /// A folder of files that can be had again.
 #[derive(Debug)]
@@ -20,7 +21,7 @@ pub struct Cache {
     files: HashMap<Sha256, (u64, u64)>,
     turn: u64,
     /// Locked as long as this lives.
-    _lock: fs::File,
+    _lock: LockedFile,
 }
 
 impl Cache {
@@ -35,7 +36,7 @@ impl Cache {
         };
         fs::create_dir_all(folder).map_err(failed)?;
         let lock = fs::File::create(folder.join(LOCK)).map_err(failed)?;
-        lock.try_lock().map_err(|error| match error {
+        let lock = LockedFile::take(lock).map_err(|error| match error {
             fs::TryLockError::Error(error) => failed(error),
             fs::TryLockError::WouldBlock => failed(io::Error::other(
                 "it is another worker's; give each worker a folder of its own (--cache)",

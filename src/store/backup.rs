@@ -14,6 +14,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{ConnectOptions, Connection};
 
 use super::error::{Result, StoreError};
+use super::locked::LockedFile;
 use super::records::{self, Record};
 use super::rows::sql;
 use super::{DataDir, Store, dir, identity, on_files};
@@ -175,8 +176,7 @@ impl Store {
 /// The folder of a copy that is not finished, next to where it will be.
 struct Draft {
     folder: DataDir,
-    /// Open for its lock alone.
-    _lock: File,
+    lock: LockedFile,
 }
 
 impl Draft {
@@ -199,12 +199,12 @@ impl Draft {
         }
         fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
         let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
-        lock.lock().map_err(StoreError::io("lock", &path))?;
+        let lock = LockedFile::wait(lock).map_err(StoreError::io("lock", &path))?;
         fs::write(&marker, identity::UNFINISHED).map_err(StoreError::io("write", &marker))?;
         dir::restrict(&path)?;
         let folder = DataDir::find(&path)?;
         folder.fill()?;
-        Ok(Self { folder, _lock: lock })
+        Ok(Self { folder, lock })
     }
 
     /// Brings all to the disk and gives the folder its name.
@@ -212,7 +212,7 @@ impl Draft {
         let root = self.folder.root();
         identity::write(root, &root.join("sci-recon.json.new"), marker)?;
         // One call for all: a sync of each of many small files would take hours.
-        rustix::fs::syncfs(&self._lock)
+        rustix::fs::syncfs(&*self.lock)
             .map_err(|error| StoreError::io("write to the disk", root)(error.into()))?;
         if to.exists() {
             return Err(StoreError::Refused {

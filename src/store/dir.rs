@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::error::{Result, StoreError};
+use super::locked::LockedFile;
 use crate::job::{JobId, PartialId, Sha256};
 
 /// The folder with all that the service keeps.
@@ -104,11 +105,11 @@ impl DataDir {
     }
 
     /// Takes the lock of the server, of which there is one for each folder.
-    pub(crate) fn lock_server(&self) -> Result<File> {
+    pub(crate) fn lock_server(&self) -> Result<LockedFile> {
         let path = self.root.join("server.lock");
         let file = File::create(&path).map_err(StoreError::io("make", &path))?;
-        match file.try_lock() {
-            Ok(()) => Ok(file),
+        match LockedFile::take(file) {
+            Ok(file) => Ok(file),
             Err(TryLockError::WouldBlock) => Err(StoreError::Taken(self.root.to_path_buf())),
             Err(TryLockError::Error(error)) => Err(StoreError::io("lock", &path)(error)),
         }

@@ -22,6 +22,7 @@ mod error;
 mod hashes;
 mod identity;
 mod integrity;
+mod locked;
 mod queue;
 mod records;
 mod rows;
@@ -33,7 +34,6 @@ mod tests;
 mod upgrade;
 mod watch;
 
-use std::fs::File;
 use std::path::Path;
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -50,6 +50,7 @@ pub(crate) use dir::on_files;
 pub use error::StoreError;
 pub use identity::Purpose;
 pub use integrity::Audit;
+pub use locked::LockedFile;
 pub use queue::{
     Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Estimate,
     Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
@@ -84,7 +85,7 @@ pub struct Store {
     /// What was last found wrong with the database.
     damage: Arc<Mutex<Option<String>>>,
     /// The lock of the server, if this is its store.
-    _server: Option<Arc<File>>,
+    _server: Option<Arc<LockedFile>>,
 }
 
 static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!();

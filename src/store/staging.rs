@@ -14,6 +14,7 @@ use uuid::Uuid;
 
 use super::Store;
 use super::error::{Result, StoreError};
+use super::locked::LockedFile;
 use super::{dir, on_files};
 use crate::job::{ResultFile, Sha256};
 
@@ -22,14 +23,14 @@ use crate::job::{ResultFile, Sha256};
 struct Temporary {
     path: PathBuf,
     /// Open for the lock alone.
-    _lock: File,
+    _lock: LockedFile,
     /// Set when the content has found its place.
     moved: bool,
 }
 
 impl Temporary {
     fn new(path: PathBuf, lock: File) -> Result<Self> {
-        lock.lock().map_err(StoreError::io("lock", &path))?;
+        let lock = LockedFile::wait(lock).map_err(StoreError::io("lock", &path))?;
         Ok(Self { path, _lock: lock, moved: false })
     }
 }

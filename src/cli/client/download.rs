@@ -13,6 +13,7 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use super::{Client, Result, again, refusal};
 use crate::cli::CliError;
 use crate::job::Sha256;
+use crate::store::LockedFile;
 
 /// Time between looks whether a file has been made.
 const MADE: Duration = Duration::from_secs(1);
@@ -68,10 +69,10 @@ impl Client {
         let unwritable = |error: std::io::Error| CliError::file("write", part, &error);
         let folder = part.parent().unwrap_or(Path::new("."));
         fs::create_dir_all(folder).map_err(unwritable)?;
-        let mut file =
-            OpenOptions::new().create(true).append(true).open(part).map_err(unwritable)?;
+        let file = OpenOptions::new().create(true).append(true).open(part).map_err(unwritable)?;
         // Two processes would write one behind the other.
-        file.try_lock().map_err(|error| CliError::file("lock", part, &error))?;
+        let mut file =
+            LockedFile::take(file).map_err(|error| CliError::file("lock", part, &error))?;
         let mut attempt = 0;
         loop {
             let have = file.metadata().map_err(unwritable)?.len();

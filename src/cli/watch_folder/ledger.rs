@@ -2,7 +2,7 @@
 //! A line is on the disk before what it says is done, so that nothing is done twice under another key.
 
 use std::collections::HashMap;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::cli::CliError;
 use crate::cli::error::Result;
 use crate::cli::submission::Recipe;
+use crate::store::LockedFile;
 
 /// A file as it was when it was taken up: another size or time is another file.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -61,7 +62,7 @@ pub(super) struct Entry {
 
 pub(super) struct Ledger {
     path: PathBuf,
-    file: File,
+    file: LockedFile,
     entries: HashMap<Shot, Entry>,
 }
 
@@ -72,7 +73,7 @@ impl Ledger {
         let failed = |error: std::io::Error| CliError::file("open", &path, &error);
         let mut options = OpenOptions::new();
         let file = options.create(true).read(true).append(true).open(&path).map_err(failed)?;
-        file.try_lock().map_err(|error| {
+        let file = LockedFile::take(file).map_err(|error| {
             let text = "another watch-folder is at it";
             CliError::Input(format!("{}: {text} ({error})", path.display()))
         })?;
@@ -116,13 +117,6 @@ impl Ledger {
         self.file.sync_data().map_err(failed)?;
         self.entries.insert(entry.shot.clone(), entry);
         Ok(())
-    }
-}
-
-impl Drop for Ledger {
-    fn drop(&mut self) {
-        // Closing it is not enough: a process that is just being started has a copy of the file, which keeps the lock.
-        self.file.unlock().ok();
     }
 }
 

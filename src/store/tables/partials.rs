@@ -10,6 +10,7 @@ use sqlx::FromRow;
 
 use crate::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 use crate::store::error::{Result, StoreError};
+use crate::store::locked::LockedFile;
 use crate::store::rows::{Page, integer, sql, sql_as, sql_scalar};
 use crate::store::tables::keys::{self, Inserted, Made, RequestKey};
 use crate::store::tables::quota;
@@ -53,7 +54,7 @@ const EMPTY: Duration = Duration::from_secs(3600);
 #[derive(Debug)]
 pub struct PartialFile {
     upload: Partial,
-    file: File,
+    file: LockedFile,
     path: PathBuf,
 }
 
@@ -81,7 +82,7 @@ impl PartialFile {
 
     /// Drops what was written without being recorded. A file that lacks bytes on record is refused: to
     /// extend it would make zeros of them.
-    fn ready(mut file: File, path: PathBuf, upload: Partial) -> Result<Self> {
+    fn ready(mut file: LockedFile, path: PathBuf, upload: Partial) -> Result<Self> {
         let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
         if bytes < upload.received {
             return Err(short(&upload, bytes));
@@ -104,9 +105,9 @@ impl PartialFile {
     }
 }
 
-/// The lock of a partial file, which is free again when the file is closed.
+/// The lock of a partial file.
 enum Lock {
-    Taken(File),
+    Taken(LockedFile),
     Busy,
     Gone,
 }
@@ -116,11 +117,11 @@ fn lock(path: &Path) -> Result<Lock> {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Lock::Gone),
         file => file.map_err(StoreError::io("open", path))?,
     };
-    match file.try_lock() {
-        Ok(()) => {}
+    let file = match LockedFile::take(file) {
+        Ok(file) => file,
         Err(TryLockError::WouldBlock) => return Ok(Lock::Busy),
         Err(TryLockError::Error(error)) => return Err(StoreError::io("lock", path)(error)),
-    }
+    };
     // Whoever had the lock before may have stored or ended the upload: the file that was opened may be
     // a blob by now, which nobody may write to.
     let opened = file.metadata().map_err(StoreError::io("read", path))?;
@@ -145,7 +146,7 @@ impl Store {
         let made = path.clone();
         let _lock = on_files(move || {
             let file = File::create_new(&path).map_err(StoreError::io("make", &path))?;
-            file.lock().map_err(StoreError::io("lock", &path))?;
+            let file = LockedFile::wait(file).map_err(StoreError::io("lock", &path))?;
             path.parent().map_or(Ok(()), dir::sync_dir)?;
             Ok(file)
         })
