@@ -40,14 +40,16 @@ fn with_iterations(measurement: &str, iterations: u32) -> Value {
 /// What that job gives on this machine alone.
 async fn local() -> &'static BTreeMap<String, String> {
     static RESULTS: OnceCell<BTreeMap<String, String>> = OnceCell::const_new();
-    let run = || async {
-        let app = TestApp::with(&["--workers", "2"]).await;
-        let (_, measurement) = app.scene(&Scene::SMALL).await;
-        let job = app.submit(&job(&measurement)).await;
-        assert_eq!(app.ended(&job).await["state"], "succeeded");
-        results(&app, &job).await
-    };
-    RESULTS.get_or_init(run).await
+    RESULTS.get_or_init(|| alone(job)).await
+}
+
+/// What a job for the measurement of [`Scene::SMALL`] gives on this machine alone.
+async fn alone(job: impl Fn(&str) -> Value) -> BTreeMap<String, String> {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&job(&measurement)).await;
+    assert_eq!(app.ended(&id).await["state"], "succeeded");
+    results(&app, &id).await
 }
 
 /// A server whose tiles leave the machine.
