@@ -18,7 +18,7 @@ import urllib.parse
 
 import numpy as np
 
-from scale import Service
+from service import Service
 
 
 def scene(rng, frames, size):

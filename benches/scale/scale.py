@@ -8,18 +8,16 @@ memory of the server and of each worker (VmHWM), the first remaining time that w
 """
 import argparse
 import json
-import os
 import pathlib
 import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-import urllib.error
 import urllib.request
 
 import numpy as np
+from service import Service
 from skimage import io, transform
 
 
@@ -32,41 +30,6 @@ def pan(image, frames, size, step=(3, 5)):
         gray = transform.rescale(gray, factor * 1.001, preserve_range=True)
     gray = gray.clip(0, 255).astype(np.uint8)
     return np.stack([gray[k * step[0]:k * step[0] + size, k * step[1]:k * step[1] + size] for k in range(frames)])
-
-
-class Service:
-    def __init__(self, binary, folder, options):
-        self.process = subprocess.Popen([binary, 'serve', '--data', folder, '--listen', '127.0.0.1:0', *options], stdout=subprocess.PIPE,
-                                        stderr=subprocess.DEVNULL, text=True)
-        self.url = json.loads(self.process.stdout.readline())['url']
-        threading.Thread(target=self.process.stdout.read, daemon=True).start()
-        self.memory = {}
-
-    def call(self, method, path, body=None, headers=()):
-        if isinstance(body, dict):
-            body, headers = json.dumps(body).encode(), {'Content-Type': 'application/json'}
-        request = urllib.request.Request(self.url + path, method=method, data=body, headers=dict(headers))
-        try:
-            with urllib.request.urlopen(request) as answer:
-                return json.load(answer)
-        except urllib.error.HTTPError as error:
-            sys.exit(f'{method} {path}: {error.code} {error.read().decode()}')
-
-    def upload(self, path):
-        with open(path, 'rb') as file:   # streamed
-            headers = {'Content-Type': 'application/octet-stream', 'Content-Length': os.path.getsize(path)}
-            return self.call('POST', '/v1/blobs', file, headers)['sha256']
-
-    def look(self):
-        """Greatest resident memory so far, by process."""
-        children = pathlib.Path(f'/proc/{self.process.pid}/task').glob('*/children')
-        workers = ' '.join(path.read_text() for path in children).split()
-        for name, pid in [('server', self.process.pid), *((f'worker {pid}', pid) for pid in workers)]:
-            try:
-                line = next(line for line in open(f'/proc/{pid}/status') if line.startswith('VmHWM'))
-            except (OSError, StopIteration):
-                continue
-            self.memory[name] = int(line.split()[1]) * 1024
 
 
 def psnr_by_frame(path, truth):

@@ -152,7 +152,7 @@ pub fn expected(
         let decibels = -10.0 * square.max(1e-12).log10() + psnr_db - of_map;
         (10f64.powf(-decibels / 20.0) * white) as f32
     });
-    let reasons = reasons(&error, psnr_db, warnings);
+    let reasons = reasons(&error, (psnr_db, white), warnings);
     let assessment = Assessment {
         grade: grade(psnr_db, &reasons),
         psnr_db: Assessment::round(psnr_db),
@@ -179,9 +179,30 @@ const UNEVEN: &str = "uneven_error";
 /// A part of the picture whose error is so far above that of the whole is named, in dB.
 const UNEVEN_DB: f64 = 4.0;
 
-/// The findings of the checks, and the part of the picture that is worst.
-fn reasons(error: &Array3<f32>, psnr_db: f64, warnings: &[Finding]) -> Vec<Finding> {
+const LEVEL: &str = "level";
+/// A scene whose white is below this is hardly exposed, or its full scale is another one.
+const DIM: f64 = 0.12;
+
+/// The findings of the checks, a scale that looks wrong, and the part of the picture that is worst.
+fn reasons(
+    error: &Array3<f32>,
+    (psnr_db, white): (f64, f64),
+    warnings: &[Finding],
+) -> Vec<Finding> {
     let mut reasons = warnings.to_vec();
+    if white < DIM && reasons.iter().all(|reason| reason.code != LEVEL) {
+        reasons.push(Finding {
+            code: LEVEL.to_owned(),
+            severity: Severity::Warning,
+            detail: format!(
+                "the brightest parts of the scene are at {white:.3} times the full scale, and errors are told on that \
+                 scale"
+            ),
+            remedy: "State the measurement's full_scale for its exposure and its bits.".to_owned(),
+            frames: Vec::new(),
+            snapshot: None,
+        });
+    }
     let (_, rows, columns) = error.dim();
     if rows < 3 || columns < 3 {
         return reasons;
@@ -260,11 +281,12 @@ mod tests {
         let plan = TilePlan::new(48, 48, 32, 16).unwrap();
         assert_eq!(plan.len(), 4);
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
-        let map = |tiles: Vec<Option<TileAssessment>>| {
+        let of = |white, tiles: Vec<Option<TileAssessment>>| {
             let of_run = [(shares[0].clone(), tiles)];
             let by = (&Schedule::gap_tv(), None);
-            expected(&plan, &of_run, by, (2, 0.5), &[])
+            expected(&plan, &of_run, by, (2, white), &[])
         };
+        let map = |tiles| of(0.5, tiles);
         let tiles =
             |decibels: [u8; 4]| -> Vec<_> { decibels.map(|level| Some(tile(level))).into() };
         let even = map(tiles([25; 4])).unwrap();
@@ -281,6 +303,9 @@ mod tests {
         assert!(even.assessment.reasons.is_empty());
         let uneven = map(tiles([15, 35, 35, 35])).unwrap().assessment;
         assert!(uneven.reasons[0].detail.starts_with("the upper left"), "{uneven:?}");
+        // On a scale that is ten times too large every error is small.
+        let dim = of(0.05, tiles([25; 4])).unwrap().assessment;
+        assert_eq!((dim.reasons[0].code.as_str(), dim.grade), ("level", Grade::Usable), "{dim:?}");
         // A tile of an older version tells nothing; one without light has no part in what is seen.
         let mut partly = tiles([25; 4]);
         partly[2] = None;
