@@ -63,8 +63,8 @@ pub(super) async fn job_manifest(
     send(&app, &job, None, "manifest.json", (&method, &headers)).await
 }
 
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `stack.exr`,
-/// `frames.npy`, `mosaic.npy` or `error.npy`, as the routes have them.
+/// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `frames.npy`,
+/// `mosaic.npy` or `error.npy`, as the routes have them.
 pub(super) async fn file(
     Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
@@ -110,7 +110,7 @@ fn frame_file(frame: &str, frames: usize) -> Option<String> {
 }
 
 /// Answers with a result file, or the part of it that is asked for.
-async fn send(
+pub(super) async fn send(
     app: &App,
     job: &Job,
     snapshot: Option<u32>,

@@ -56,7 +56,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}").get(results::snapshot),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::file),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(results::file),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(exports::exr),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::file),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/mosaic.npy").get(results::file),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/error.npy").get(results::file),

@@ -1,10 +1,12 @@
 """Reads a result folder with the official OpenEXR package and compares it bit for bit.
 
-usage: read_exr.py FOLDER [--attribute NAME]...
+usage: read_exr.py FOLDER [--attribute NAME]... [--sigma FILE]
 
 FOLDER holds frames.npy (float32, [frame, row, column], or of colours [frame, row, column, 3]),
 frames/frame_0001.exr and so on, and stack.exr with one part a frame. Every EXR part must have the one
 channel Y, or R, G and B, float32, with the bits of its frame. With --attribute every part must carry that string attribute, not empty.
+With --sigma, FILE must be the same stack with one channel sigma.Y more, whose pixels have the values of error.npy ([frame, row, column]
+of blocks of 16x16 pixels).
 Prints one line; exit status 1 on any difference.
 
 Needs the PyPI packages OpenEXR (3.5) and numpy.
@@ -18,26 +20,33 @@ import numpy
 import OpenEXR
 
 
-def differences(part, expected, attributes, where):
+def differences(part, expected, attributes, where, sigma=None):
     """Says what is wrong with one part."""
     names = ["Y"] if expected.ndim == 2 else ["R", "G", "B"]
-    if sorted(part.channels) != sorted(names):
-        yield f"{where}: channels {list(part.channels)}, expected {names}"
+    layer = [] if sigma is None else ["sigma.Y"]
+    if sorted(part.channels) != sorted(names + layer):
+        yield f"{where}: channels {list(part.channels)}, expected {names + layer}"
         return
     channels = [part.channels[name].pixels for name in names]
-    pixels = channels[0] if expected.ndim == 2 else numpy.stack(channels, axis=-1)
-    if pixels.dtype != numpy.float32 or pixels.shape != expected.shape:
-        yield f"{where}: {pixels.dtype} {pixels.shape}, expected float32 {expected.shape}"
-    elif not numpy.array_equal(pixels.view(numpy.uint32), expected.view(numpy.uint32)):
-        wrong = numpy.count_nonzero(pixels.view(numpy.uint32) != expected.view(numpy.uint32))
-        yield f"{where}: {wrong} of {expected.size} values differ"
+    yield from unequal(channels[0] if expected.ndim == 2 else numpy.stack(channels, axis=-1), expected, where)
+    if sigma is not None:
+        yield from unequal(part.channels["sigma.Y"].pixels, sigma, f"{where} sigma")
     for name in attributes:
         value = part.header.get(name)
         if not isinstance(value, str) or not value:
             yield f"{where}: attribute {name} is {value!r}"
 
 
-def judge(folder, attributes):
+def unequal(pixels, expected, where):
+    """Says what is wrong with the values of a part."""
+    if pixels.dtype != numpy.float32 or pixels.shape != expected.shape:
+        yield f"{where}: {pixels.dtype} {pixels.shape}, expected float32 {expected.shape}"
+    elif not numpy.array_equal(pixels.view(numpy.uint32), expected.view(numpy.uint32)):
+        wrong = numpy.count_nonzero(pixels.view(numpy.uint32) != expected.view(numpy.uint32))
+        yield f"{where}: {wrong} of {expected.size} values differ"
+
+
+def judge(folder, attributes, sigma=None):
     """All differences between the EXR files of a folder and its frames.npy."""
     frames = numpy.ascontiguousarray(numpy.load(folder / "frames.npy"))
     if frames.dtype != numpy.float32 or frames.ndim not in (3, 4):
@@ -53,21 +62,32 @@ def judge(folder, attributes):
         if len(parts) != 1:
             found.append(f"{name}.exr: {len(parts)} parts")
         found.extend(differences(parts[0], frame, attributes, f"{name}.exr"))
-    stack = OpenEXR.File(str(folder / "stack.exr"), separate_channels=True).parts
-    if [part.header.get("name") for part in stack] != names:
-        found.append(f"stack.exr: parts {[part.header.get('name') for part in stack]}")
-        return found, len(frames)
-    for name, part, frame in zip(names, stack, frames):
-        found.extend(differences(part, frame, attributes, f"stack.exr {name}"))
+    found.extend(stack_differences(folder / "stack.exr", names, frames, attributes))
+    if sigma is not None:
+        errors = numpy.load(folder / "error.npy").repeat(16, axis=1).repeat(16, axis=2)
+        errors = numpy.ascontiguousarray(errors[:, : frames.shape[1], : frames.shape[2]])
+        found.extend(stack_differences(sigma, names, frames, attributes, errors))
     return found, len(frames)
+
+
+def stack_differences(path, names, frames, attributes, sigma=None):
+    """All differences between a stack and its frames."""
+    parts = OpenEXR.File(str(path), separate_channels=True).parts
+    if [part.header.get("name") for part in parts] != names:
+        yield f"{path.name}: parts {[part.header.get('name') for part in parts]}"
+        return
+    for k, (name, part, frame) in enumerate(zip(names, parts, frames)):
+        layer = None if sigma is None else sigma[k]
+        yield from differences(part, frame, attributes, f"{path.name} {name}", layer)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--attribute", action="append", default=[])
+    parser.add_argument("--sigma", type=pathlib.Path)
     arguments = parser.parse_args()
-    found, frames = judge(arguments.folder, arguments.attribute)
+    found, frames = judge(arguments.folder, arguments.attribute, arguments.sigma)
     for difference in found:
         print(difference)
     verdict = "equal" if not found else f"{len(found)} differences"

@@ -1,8 +1,9 @@
 //! How good frames are expected to be, without a truth.
 
+use reqwest::Method;
 use serde_json::{Value, json};
 
-use crate::app::TestApp;
+use crate::app::{TestApp, judges};
 use crate::pictures::decode;
 use crate::samples::Scene;
 
@@ -71,8 +72,62 @@ async fn where_nothing_can_be_told_nothing_is() {
     let base = format!("/v1/jobs/{job}/snapshots/0");
     let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
     assert_eq!(manifest["content"]["assessment"], Value::Null);
-    for path in ["error.npy", "pictures/error-1"] {
+    for path in ["error.npy", "pictures/error-1", "stack.exr?layers=sigma"] {
         let why = app.get(&format!("{base}/{path}")).await.problem(404, "not_found");
         assert!(why.contains("no error can be predicted"), "{why}");
     }
+}
+
+#[tokio::test]
+async fn the_expected_error_is_a_layer_of_the_exr_on_request() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let scene = Scene { height: 41, width: 35, ..Scene::SMALL };
+    let (_, measurement) = app.scene(&scene).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let folder = app.data().join("results").join(&job).join("snapshot_0001");
+    let plain = format!("/v1/jobs/{job}/snapshots/1/stack.exr");
+    let path = format!("{plain}?layers=sigma");
+    let whole = app.get(&path).await.expect(200);
+    let (size, etag) = (whole.bytes.len(), whole.header("etag").to_owned());
+    assert_eq!(whole.header("content-type"), "image/x-exr");
+    assert!(whole.header("content-disposition").ends_with("_0001_stack-sigma.exr\""), "{whole:?}");
+
+    // Other readers find the frames as they are, and the layer beside them.
+    let made = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(made.path(), &whole.bytes).unwrap();
+    if let Some(python) = judges() {
+        let mut judge = tokio::process::Command::new(python);
+        judge.arg("tests/judges/read_exr.py").arg(&folder).args(["--attribute", "algorithm"]);
+        let output = judge.arg("--sigma").arg(made.path()).output().await.unwrap();
+        let told = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{told}{}", String::from_utf8_lossy(&output.stderr));
+    }
+
+    // It is cached and cut like a file.
+    let head = app.send(app.request(Method::HEAD, &path)).await.expect(200);
+    assert_eq!((head.header("content-length"), head.header("etag")), (&*size.to_string(), &*etag));
+    app.send(app.request(Method::GET, &path).header("if-none-match", &etag)).await.expect(304);
+    for first in [0, 1, size / 3, size / 2 + 5, size - 2] {
+        let last = (first + size / 4).min(size - 1);
+        let part = app.request(Method::GET, &path).header("range", format!("bytes={first}-{last}"));
+        let part = app.send(part.header("if-range", &etag)).await.expect(206);
+        assert!(part.bytes == whole.bytes[first..=last], "{first} to {last}");
+    }
+
+    // Without the word it is the file.
+    let stored = app.get(&plain).await.expect(200);
+    assert!(stored.bytes == std::fs::read(folder.join("stack.exr")).unwrap());
+    assert_ne!(stored.header("etag"), etag);
+    for wrong in ["layers=depth", "layers=", "layer=sigma"] {
+        let why = app.get(&format!("{plain}?{wrong}")).await.problem(400, "invalid_query");
+        assert!(why.contains("sigma") || why.contains("layers"), "{why}");
+    }
+
+    // What is damaged is not sent.
+    let mut bytes = std::fs::read(folder.join("error.npy")).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    std::fs::write(folder.join("error.npy"), bytes).unwrap();
+    app.get(&path).await.problem(500, "file_damaged");
+    app.get(&plain).await.expect(200);
 }

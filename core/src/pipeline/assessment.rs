@@ -5,8 +5,8 @@ use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
 use crate::job::{Assessment, Finding, Grade, Severity};
-pub use crate::recon::assessment::BLOCK;
-use crate::recon::assessment::{FEATURES, Model, blocks};
+pub use crate::recon::assessment::{BLOCK, blocks};
+use crate::recon::assessment::{FEATURES, Model};
 use crate::recon::schedule::Schedule;
 use crate::recon::sequence::RunShare;
 use crate::recon::solver::Outcome;

@@ -197,10 +197,7 @@ impl Clip {
 
     /// Where the frames of a snapshot begin in its file: behind its header.
     fn start(&self, piece: &Piece) -> Result<u64> {
-        let frames = self.job.spec.shape.frames as u64 * self.frame_bytes();
-        piece.file.size.checked_sub(frames).ok_or_else(|| {
-            ApiError::internal(&std::io::Error::other("an array has fewer frames than its job"))
-        })
+        behind_header(piece, self.job.spec.shape.frames as u64 * self.frame_bytes())
     }
 
     /// Answers with these bytes and all frames behind them.
@@ -244,6 +241,13 @@ impl Clip {
             Times { interval_s, starts_s }
         }))
     }
+}
+
+/// Where the values of an array begin, which end its file and have so many bytes.
+pub(super) fn behind_header(piece: &Piece, values: u64) -> Result<u64> {
+    piece.file.size.checked_sub(values).ok_or_else(|| {
+        ApiError::internal(&std::io::Error::other("an array has fewer frames than its job"))
+    })
 }
 
 /// True if frames follow one another at this interval, without a pause.

@@ -10,10 +10,14 @@ use axum::http::{HeaderMap, Method};
 use axum::response::Response;
 use futures_util::stream::{self, BoxStream, StreamExt, TryStreamExt};
 use sha2::Digest;
+use tokio::fs::File;
+use tokio::io::Take;
+use tokio_util::io::ReaderStream;
 
 use super::super::app::App;
 use super::super::download::{self, Download};
 use super::super::error::{ApiError, Result};
+use super::lines::Lines;
 use crate::job::{ResultFile, Sha256};
 use crate::store::{Job, StoreError};
 
@@ -42,6 +46,12 @@ pub(super) enum Part {
         length: u64,
         make: Framing,
     },
+    /// Lines that are made of those of a result file, and of bytes of another one: where they begin, and how many.
+    Lines {
+        piece: Piece,
+        shared: (Piece, u64, u64),
+        lines: Lines,
+    },
 }
 
 impl fmt::Debug for Part {
@@ -55,6 +65,16 @@ impl Part {
         match self {
             Self::Bytes(bytes) => bytes.len() as u64,
             Self::File { length, .. } | Self::Framing { length, .. } => *length,
+            Self::Lines { lines, .. } => lines.length(),
+        }
+    }
+
+    /// The result files whose bytes are in it.
+    fn pieces(&self) -> Vec<&Piece> {
+        match self {
+            Self::Bytes(_) | Self::Framing { .. } => Vec::new(),
+            Self::File { piece, .. } => vec![piece],
+            Self::Lines { piece, shared: (shared, ..), .. } => vec![piece, shared],
         }
     }
 
@@ -72,6 +92,10 @@ impl Part {
                 hasher.update(format!("framing {length}\n"));
                 pieces.iter().for_each(|piece| hasher.update(format!("{}\n", piece.file.sha256)));
             }
+            Self::Lines { piece, shared: (shared, start, length), lines } => {
+                hasher.update(format!("{lines:?} {} {}\n", lines.start, piece.file.sha256));
+                hasher.update(format!("{start} {length} {}\n", shared.file.sha256));
+            }
         }
     }
 
@@ -80,10 +104,7 @@ impl Part {
         match self {
             Self::Bytes(bytes) => Ok(once(&bytes, skip, take)),
             Self::File { piece, start, .. } => {
-                let file = open(&app, &job, &piece).await.map_err(told)?;
-                let bytes = download::part(file, start + skip, take).await;
-                let bytes = bytes.map_err(|_| io::Error::other("a stored file can't be read"))?;
-                Ok(bytes.boxed())
+                Ok(part(&app, &job, (&piece, start + skip, take)).await?.boxed())
             }
             Self::Framing { pieces, length, make } => {
                 let mut sums = Vec::with_capacity(pieces.len());
@@ -95,6 +116,12 @@ impl Part {
                 let bytes = Bytes::from(make(&sums));
                 debug_assert_eq!(bytes.len() as u64, length);
                 Ok(once(&bytes, skip, take))
+            }
+            Self::Lines { piece, shared: (shared, start, length), lines } => {
+                let shared = part(&app, &job, (&shared, start, length)).await?;
+                let shared: Vec<Bytes> = shared.try_collect().await?;
+                let file = open(&app, &job, &piece).await.map_err(told)?;
+                Ok(lines.read(file, shared.concat().into(), (skip, take)).await?.boxed())
             }
         }
     }
@@ -114,6 +141,17 @@ async fn open(app: &App, job: &Job, piece: &Piece) -> Result<std::fs::File, Stor
     if file.sha256 == piece.file.sha256 { Ok(opened) } else { Err(StoreError::Interrupted) }
 }
 
+/// Bytes of a result file: where they begin, and how many.
+async fn part(
+    app: &App,
+    job: &Job,
+    (piece, start, length): (&Piece, u64, u64),
+) -> io::Result<ReaderStream<Take<File>>> {
+    let file = open(app, job, piece).await.map_err(told)?;
+    let bytes = download::part(file, start, length).await;
+    bytes.map_err(|_| io::Error::other("a stored file can't be read"))
+}
+
 /// An answer that has begun can only break off; why, the log says.
 fn told(error: StoreError) -> io::Error {
     tracing::error!(%error, "a download breaks off");
@@ -131,7 +169,7 @@ pub(super) struct Composed {
 
 impl Composed {
     /// Answers with the file or the part of it that is asked for.
-    /// Errors: 500 if the first result file in it is damaged; where a later one is, the answer breaks off.
+    /// Errors: 500 if the first result files in it are damaged; where a later one is, the answer breaks off.
     pub(super) async fn send(
         self,
         app: &App,
@@ -150,11 +188,9 @@ impl Composed {
         let parts = self.parts;
         let read = async |start, length| {
             let wanted = within(parts, start, length);
-            let first = wanted.iter().find_map(|(part, ..)| match part {
-                Part::File { piece, .. } => Some(piece),
-                _ => None,
-            });
-            if let Some(piece) = first {
+            let first =
+                wanted.iter().map(|(part, ..)| part.pieces()).find(|found| !found.is_empty());
+            for piece in first.unwrap_or_default() {
                 open(app, &job, piece).await?;
             }
             let (app, job) = (app.clone(), Arc::new(job));

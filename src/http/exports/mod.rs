@@ -3,8 +3,11 @@
 mod archive;
 mod clip;
 mod composed;
+mod exr;
+mod lines;
 mod movie;
 
 pub(super) use archive::archive;
 pub(super) use clip::{array, chunk, tiff, zarr};
+pub(super) use exr::exr;
 pub(super) use movie::movie;

@@ -2,10 +2,13 @@
 //!
 //! Every part has one channel `Y`, or the channels `R`, `G` and `B`, in scan lines. Values survive bit for bit.
 
+mod head;
+mod layer;
 mod order;
 mod read;
 mod write;
 
+pub use layer::{Layered, SIGMA};
 pub use read::{Part, read_stack};
 pub use write::{Attributes, write_frame, write_stack};
 
