@@ -24,6 +24,7 @@ use crate::pipeline::movie::MovieTask;
 use crate::pipeline::networks::ModelFile;
 use crate::pipeline::tile::TileInput;
 use crate::recon::sequence::SequencePlan;
+use crate::recon::signs::Signs;
 use crate::recon::tile::Tile;
 use crate::store::{
     BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath, StoreError,
@@ -169,6 +170,9 @@ pub struct TileTask {
     /// The schedule, after the pilot; without stages if there is a model.
     pub schedule: Schedule,
     pub model: Option<Sha256>,
+    /// What the pilot tells of the error of the frames.
+    #[serde(default)]
+    pub signs: Option<Signs>,
 }
 
 #[derive(Debug)]

@@ -5,10 +5,11 @@ use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
 use crate::job::{Assessment, Finding, Grade, Severity};
+use crate::recon::assessment::Model;
 pub use crate::recon::assessment::{BLOCK, blocks};
-use crate::recon::assessment::{FEATURES, Model};
 use crate::recon::schedule::Schedule;
 use crate::recon::sequence::RunShare;
+use crate::recon::signs::Signs;
 use crate::recon::solver::Outcome;
 use crate::recon::tile::TilePlan;
 
@@ -21,55 +22,43 @@ pub struct TileAssessment {
     /// of a quarter of a decibel from 0.
     #[serde(with = "hex::serde")]
     levels: Vec<u8>,
-    /// What was seen, on average; nothing of a tile that no light reaches.
-    seen: Vec<f32>,
 }
 
 /// Levels in a decibel.
 const STEPS: f32 = 4.0;
+/// The level where no light is, and no error.
+const DARK: u8 = u8::MAX;
 
 impl TileAssessment {
-    /// Of a tile solved by this schedule; none for one that predictions were not fitted to. Of a tile that no light
-    /// reaches, whose frames are 0, no error is expected.
-    pub fn of(outcome: &Outcome, schedule: &Schedule) -> Option<Self> {
+    /// Of a tile solved by this schedule, with what the pilot tells of it, and the scene's white level; none for a
+    /// schedule that predictions were not fitted to. Of a tile that no light reaches, whose frames are 0, no error is
+    /// expected.
+    pub fn of(
+        outcome: &Outcome,
+        (schedule, signs, white): (&Schedule, Option<Signs>, f32),
+    ) -> Option<Self> {
         let model = Model::of(schedule)?;
         let Some(features) = &outcome.features else {
             let (frames, height, width) = outcome.frames.dim();
             let size = blocks(height, width);
-            return Some(Self {
-                size,
-                levels: vec![u8::MAX; frames * size.0 * size.1],
-                seen: vec![],
-            });
+            return Some(Self { size, levels: vec![DARK; frames * size.0 * size.1] });
         };
-        let (_, frames, rows, columns) = features.dim();
-        let level = |(k, row, column)| {
-            let decibels = -10.0 * model.log_error(features, (k, row, column));
-            (decibels * STEPS).round().clamp(0.0, 255.0) as u8
-        };
-        let levels = ndarray::indices((frames, rows, columns)).into_iter().map(level).collect();
-        let mean = |plane: ndarray::ArrayView3<'_, f32>| plane.mean().unwrap_or(0.0);
-        let seen = features.outer_iter().map(mean).collect();
-        Some(Self { size: (rows, columns), levels, seen })
+        let errors = model.log_errors(features, outcome.signs.or(signs).as_ref(), white);
+        let level = |error: &f32| (-10.0 * error * STEPS).round().clamp(0.0, 254.0) as u8;
+        let (_, rows, columns) = errors.dim();
+        Some(Self { size: (rows, columns), levels: errors.iter().map(level).collect() })
+    }
+
+    fn is_dark(&self) -> bool {
+        self.levels.iter().all(|level| *level == DARK)
     }
 
     /// Expected squared error of a block, on the scale on which the scene is on \[0,1\].
     fn error(&self, frame: usize, row: usize, column: usize) -> f64 {
         let (rows, columns) = self.size;
         let level = self.levels.get((frame * rows + row) * columns + column);
-        10f64.powf(-f64::from(*level.unwrap_or(&u8::MAX)) / f64::from(10.0 * STEPS))
+        10f64.powf(-f64::from(*level.unwrap_or(&DARK)) / f64::from(10.0 * STEPS))
     }
-}
-
-/// What the pilot of an adaptive schedule tells.
-#[derive(Debug, Clone, Copy)]
-pub struct Course {
-    /// Error at the held-out pixels after the first stage, relative to the measurement.
-    pub before: f64,
-    /// The same after the last one.
-    pub after: f64,
-    /// The part of the last stage's iterations that pay.
-    pub share: f64,
 }
 
 /// What is expected of a snapshot.
@@ -82,8 +71,6 @@ pub struct Expected {
 
 /// Better is not told apart, in dB: nobody sees it, and the fit would follow it.
 const BEST: f64 = 40.0;
-/// How far above it a figure may lie that a prediction is made of, in dB.
-const SPARE: f64 = 4.0;
 
 /// From here on frames are good, from the second on usable, in dB.
 const GRADES: [(f64, Grade); 2] = [(28.0, Grade::Good), (22.0, Grade::Usable)];
@@ -93,7 +80,7 @@ const GRADES: [(f64, Grade); 2] = [(28.0, Grade::Good), (22.0, Grade::Usable)];
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
-    (schedule, course): (&Schedule, Option<Course>),
+    schedule: &Schedule,
     (frames, white): (usize, f32),
     warnings: &[Finding],
 ) -> Option<Expected> {
@@ -102,14 +89,11 @@ pub fn expected(
     let (rows, columns) = blocks(height, width);
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
     let middle = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
-    let (mut seen, mut lit) = (vec![0.0f64; FEATURES.len()], 0.0);
+    let mut lit = false;
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
-            if !assessed.seen.is_empty() {
-                lit += 1.0;
-            }
-            seen.iter_mut().zip(&assessed.seen).for_each(|(sum, value)| *sum += f64::from(*value));
+            lit |= !assessed.is_dark();
             let weights = plan.weights(&tile);
             let inside = |at: usize, first: usize, length: usize| {
                 at.checked_sub(first).filter(|at| *at < length)
@@ -128,30 +112,18 @@ pub fn expected(
             }
         }
     }
-    if lit == 0.0 {
+    if !lit {
         return None;
     }
     let white = f64::from(white);
     let psnr = |frame: ndarray::ArrayView2<'_, f64>| {
         -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * white * white).log10()
     };
-    let of_map = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
-    let bounded = |decibels: f64| decibels.min(BEST + SPARE);
-    let error = |relative: f64| bounded(-20.0 * relative.max(1e-6).log10());
-    let told = |value: fn(&Course) -> f64| course.as_ref().map(value);
-    let mut known = vec![
-        Some(bounded(of_map)),
-        told(|course| course.before).map(error),
-        told(|course| course.after).map(error),
-        told(|course| course.share),
-        Some(white.log10()),
-    ];
-    known.extend(seen.iter().map(|sum| Some(sum / lit)));
-    let [low, psnr_db, high] = model.psnr(&known).map(|decibels| decibels.min(BEST));
-    let error = squares.mapv(|square| {
-        let decibels = -10.0 * square.max(1e-12).log10() + psnr_db - of_map;
-        (10f64.powf(-decibels / 20.0) * white) as f32
-    });
+    let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
+    let end = |further: f64| (psnr_db + further).min(BEST);
+    let (low, high) = (end(model.interval[0]), end(model.interval[1]));
+    let error = squares.mapv(|square| (square.sqrt() * white) as f32);
+    let psnr_db = psnr_db.min(BEST);
     let reasons = reasons(&error, (psnr_db, white), warnings);
     let assessment = Assessment {
         grade: grade(psnr_db, &reasons),
@@ -246,7 +218,7 @@ const PARTS: [[&str; 3]; 3] = [
 
 #[cfg(test)]
 mod tests {
-    use super::{TileAssessment, expected, grade};
+    use super::{DARK, TileAssessment, expected, grade};
     use crate::job::{Assessment, Finding, Grade, Severity};
     use crate::recon::schedule::Schedule;
     use crate::recon::sequence::SequencePlan;
@@ -260,7 +232,7 @@ mod tests {
 
     /// A tile of 2 frames of 32x32 pixels with this level in dB.
     fn tile(decibels: u8) -> TileAssessment {
-        TileAssessment { size: (2, 2), levels: vec![4 * decibels; 8], seen: vec![-2.0; 11] }
+        TileAssessment { size: (2, 2), levels: vec![4 * decibels; 8] }
     }
 
     #[test]
@@ -283,8 +255,7 @@ mod tests {
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
         let of = |white, tiles: Vec<Option<TileAssessment>>| {
             let of_run = [(shares[0].clone(), tiles)];
-            let by = (&Schedule::gap_tv(), None);
-            expected(&plan, &of_run, by, (2, white), &[])
+            expected(&plan, &of_run, &Schedule::gap_tv(), (2, white), &[])
         };
         let map = |tiles| of(0.5, tiles);
         let tiles =
@@ -310,7 +281,7 @@ mod tests {
         let mut partly = tiles([25; 4]);
         partly[2] = None;
         assert!(map(partly).is_none());
-        let dark = TileAssessment { size: (2, 2), levels: vec![u8::MAX; 8], seen: vec![] };
+        let dark = TileAssessment { size: (2, 2), levels: vec![DARK; 8] };
         assert!(map(vec![Some(dark.clone()); 4]).is_none());
         let mut lit = tiles([25; 4]);
         lit[3] = Some(dark);

@@ -110,10 +110,8 @@ impl Recipe {
         if self.shape.mosaic.is_some() {
             return None;
         }
-        let course = self.pilot.as_ref().and_then(PilotRecord::course);
-        let by = (&self.schedule, course);
         let scale = (self.shape.frames, self.scale.white);
-        expected(&self.tile_plan, shares, by, scale, &self.warnings_of(snapshot))
+        expected(&self.tile_plan, shares, &self.schedule, scale, &self.warnings_of(snapshot))
     }
 
     /// The manifest of a snapshot, by its index in the measurement, but for its files.

@@ -55,11 +55,20 @@ pub fn decide(
     let (_, height, width) = input.y.dim();
     let (height, width) = (height * place.step, width * place.step);
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
-    let mut record =
-        PilotRecord { snapshot: first, row, column, height, width, stages: vec![], joints: vec![] };
+    let mut record = PilotRecord {
+        snapshot: first,
+        row,
+        column,
+        height,
+        width,
+        stages: vec![],
+        joints: vec![],
+        signs: None,
+    };
     if schedule.adaptive {
         let y = y.slice(s![..1, .., ..]);
-        let findings = pilot::run(op.clone(), y, schedule, networks, observer)?;
+        let (findings, signs) = pilot::run(op.clone(), y, schedule, networks, observer)?;
+        record.signs = signs;
         record.stages = schedule.stages.iter().zip(findings).map(stage).collect();
     }
     let decided = record.decide(schedule);

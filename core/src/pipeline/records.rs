@@ -2,11 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::assessment::{Course, TileAssessment};
+use super::assessment::TileAssessment;
 use crate::job::{Assessment, ResultFile, Timestamp};
 use crate::recon::pilot::Decision;
 use crate::recon::prior::Prior;
 use crate::recon::schedule::Schedule;
+use crate::recon::signs::Signs;
 use crate::recon::solver::Outcome;
 
 /// The record of the task that prepares a job.
@@ -29,6 +30,9 @@ pub struct PilotRecord {
     /// Whether snapshots that follow one another belong together, joint by joint.
     #[serde(default)]
     pub joints: Vec<JointRecord>,
+    /// What its held-out pixels tell of the error of an adaptive schedule's frames.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub signs: Option<Signs>,
 }
 
 impl PilotRecord {
@@ -43,16 +47,6 @@ impl PilotRecord {
             gamma: stage.gamma,
         };
         schedule.decided(&self.stages.iter().map(decision).collect::<Vec<_>>())
-    }
-
-    /// What predictions are made of; none if the schedule was fixed.
-    pub fn course(&self) -> Option<Course> {
-        let (first, last) = (self.stages.first()?, self.stages.last()?);
-        Some(Course {
-            before: first.error_after,
-            after: last.error_after,
-            share: last.iterations as f64 / last.planned.max(1) as f64,
-        })
     }
 
     /// The joints that are taken apart, each given by the snapshot before it.

@@ -100,9 +100,11 @@ impl Solved {
         schedule: &Schedule,
     ) -> Vec<(RunShare, Vec<Option<TileAssessment>>)> {
         let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
+        let signs = self.pilot.as_ref().and_then(|pilot| pilot.signs);
+        let by = (schedule, signs, input.white);
         let of = |share: RunShare| {
             let tiles = self.runs[share.run].iter();
-            let found = tiles.map(|tile| TileAssessment::of(tile, schedule)).collect();
+            let found = tiles.map(|tile| TileAssessment::of(tile, by)).collect();
             (share, found)
         };
         shares.into_iter().map(of).collect()

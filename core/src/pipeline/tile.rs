@@ -7,6 +7,7 @@ use ndarray::{Array3, Array4, ArrayView3, Axis, s};
 use crate::recon::ReconError;
 use crate::recon::assessment::Model;
 use crate::recon::learned::SnapshotNetwork;
+use crate::recon::pilot;
 use crate::recon::prior::Networks;
 use crate::recon::schedule::Schedule;
 use crate::recon::sensing::SensingOperator;
@@ -72,6 +73,7 @@ impl TileInput {
             residual: 0.0,
             stop_reason: StopReason::Converged,
             features: None,
+            signs: None,
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(whole) };
         let all: usize = pieces.iter().map(Range::len).sum();
@@ -88,6 +90,7 @@ impl TileInput {
             }
             let place = s![piece.start * frames..piece.end * frames, .., ..];
             whole.frames.slice_mut(place).assign(&outcome.frames);
+            whole.signs = whole.signs.or(outcome.signs);
             if let Some(seen) = outcome.features {
                 let (features, _, rows, columns) = seen.dim();
                 let none = || Array4::zeros((features, whole.frames.dim().0, rows, columns));
@@ -115,13 +118,19 @@ pub fn reconstruct_tile(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome, ReconError> {
-    let solve = match Model::of(schedule) {
-        Some(_) => solver::reconstruct_assessed,
-        None => solver::reconstruct,
-    };
+    let assessed = Model::of(schedule).is_some();
+    // Of more than total variation the pilot tells.
+    let quick = schedule.stages.len() == 1;
     input.solved(|op, y, part| {
         observer.part(part);
-        solve(op, y, schedule, networks, observer)
+        if !assessed {
+            return solver::reconstruct(op, y, schedule, networks, observer);
+        }
+        let mut outcome = solver::reconstruct_assessed(op, y, schedule, networks, observer)?;
+        if quick {
+            outcome.signs = pilot::signs(op, y, schedule, networks)?;
+        }
+        Ok(outcome)
     })
 }
 
@@ -137,6 +146,7 @@ pub fn run_network(
         let norm = squares(y).max(f64::MIN_POSITIVE);
         Ok(Outcome {
             features: None,
+            signs: None,
             frames,
             tv_iterations: 0,
             denoiser_passes: 1,

@@ -1,18 +1,20 @@
 //! How near frames come to the truth, told without it.
 //!
 //! A lab has no truth. What can be seen are the frames themselves: how much changes in them from pixel to pixel
-//! and from frame to frame, how far the priors have moved them since total variation, and how well the masks
-//! can tell frames apart. Block by block the expected error follows from these by a regression that was fitted
-//! to simulated snapshots of many scenes; `docs/benchmarks.md` says how well it does on others.
+//! and from frame to frame, how far the priors have moved them since total variation, how well the masks
+//! can tell frames apart, and the [`super::signs`] of pixels that were held out. Block by block the expected error
+//! follows from these by a small network that was fitted to simulated snapshots of many scenes; `docs/benchmarks.md` says
+//! how well it does on others.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
-use ndarray::{Array2, Array4, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView3, Axis, s};
 use serde::Deserialize;
 
 use super::schedule::{Method, Schedule, Stage};
 use super::sensing::SensingOperator;
+use super::signs::Signs;
 
 /// Side of the blocks in pixels.
 pub const BLOCK: usize = 16;
@@ -143,26 +145,33 @@ impl Block {
     }
 }
 
-/// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits.
+/// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some networks of a
+/// few neurons, of what is seen of a block, of the mean of that over all blocks, of the white level, and of the signs.
 #[derive(Debug, Deserialize)]
 pub struct Model {
-    block: Regression,
-    snapshot: Regression,
+    features: Scaling,
+    signs: Scaling,
+    networks: Vec<Vec<Layer>>,
     /// What is added to the predicted PSNR for the ends of its interval, in dB.
-    interval: [f64; 2],
+    pub interval: [f64; 2],
 }
 
-/// A polynomial of inputs that are shifted, scaled and bounded first.
+/// Inputs are shifted, scaled and bounded first.
 #[derive(Debug, Deserialize)]
-struct Regression {
-    mean: Vec<f64>,
-    scale: Vec<f64>,
-    /// Of 1, of the inputs, and, if there are as many, of all products of two of them.
-    coefficients: Vec<f64>,
+struct Scaling {
+    mean: Vec<f32>,
+    scale: Vec<f32>,
+}
+
+/// Neurons, each with as many weights as there are inputs.
+#[derive(Debug, Deserialize)]
+struct Layer {
+    weights: Vec<Vec<f32>>,
+    bias: Vec<f32>,
 }
 
 /// Inputs further from the mean than in any fit, in their scale, count as that far.
-const FARTHEST: f64 = 3.0;
+const FARTHEST: f32 = 3.0;
 
 static MODELS: LazyLock<BTreeMap<String, Model>> = LazyLock::new(|| {
     #[allow(clippy::expect_used)] // a test reads it
@@ -189,35 +198,63 @@ impl Model {
         }
     }
 
-    /// The decimal logarithm of the expected squared error of a block, given by frame, row and column.
-    pub fn log_error(
+    /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is seen of
+    /// them. Signs that are not known count as in the mean of the fit. `white` is the scene's white level.
+    pub fn log_errors(
         &self,
         features: &Array4<f32>,
-        (k, row, column): (usize, usize, usize),
-    ) -> f32 {
-        let seen = features.slice(s![.., k, row, column]);
-        self.block.value(seen.iter().map(|&value| f64::from(value))) as f32
-    }
-
-    /// The expected PSNR of a snapshot between the ends of its interval, in dB, from what its map and its pilot
-    /// tell. What is not known counts as in the mean of the fit.
-    pub fn psnr(&self, known: &[Option<f64>]) -> [f64; 3] {
-        let known = known.iter().zip(&self.snapshot.mean);
-        let middle = self.snapshot.value(known.map(|(known, mean)| known.unwrap_or(*mean)));
-        [middle + self.interval[0], middle, middle + self.interval[1]]
+        signs: Option<&Signs>,
+        white: f32,
+    ) -> Array3<f32> {
+        let (count, frames, rows, columns) = features.dim();
+        let blocks = frames * rows * columns;
+        let seen = |block: usize| {
+            let (k, place) = (block / (rows * columns), block % (rows * columns));
+            let of_block = features.slice(s![.., k, place / columns, place % columns]);
+            self.features.of(of_block.iter().copied().collect())
+        };
+        let mut mean = vec![0.0; count];
+        for block in 0..blocks {
+            let values = seen(block);
+            mean.iter_mut().zip(values).for_each(|(mean, value)| *mean += value / blocks as f32);
+        }
+        let mut known = vec![20.0 * white.log10()];
+        known.extend(signs.map_or(self.signs.mean[1..].to_vec(), |signs| signs.0.to_vec()));
+        let rest = [mean, self.signs.of(known)].concat();
+        let errors = (0..blocks).map(|block| {
+            let inputs = [seen(block), rest.clone()].concat();
+            let told = self.networks.iter().map(|layers| output(layers, inputs.clone()));
+            told.sum::<f32>() / self.networks.len() as f32
+        });
+        let errors = Array3::from_shape_vec((frames, rows, columns), errors.collect());
+        errors.unwrap_or_else(|_| unreachable!("as many errors as blocks"))
     }
 }
 
-impl Regression {
-    fn value(&self, inputs: impl Iterator<Item = f64>) -> f64 {
-        let scaled = inputs.zip(self.mean.iter().zip(&self.scale));
-        let inputs: Vec<f64> = scaled
-            .map(|(x, (mean, scale))| ((x - mean) / scale).clamp(-FARTHEST, FARTHEST))
-            .collect();
-        let products = (0..inputs.len()).flat_map(|i| (i..inputs.len()).map(move |j| (i, j)));
-        let products = products.map(|(i, j)| inputs[i] * inputs[j]);
-        let terms = std::iter::once(1.0).chain(inputs.iter().copied()).chain(products);
-        terms.zip(&self.coefficients).map(|(term, coefficient)| term * coefficient).sum()
+impl Scaling {
+    fn of(&self, values: Vec<f32>) -> Vec<f32> {
+        let scaled = values.iter().zip(self.mean.iter().zip(&self.scale));
+        scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST)).collect()
+    }
+}
+
+/// What the last of some layers gives.
+fn output(layers: &[Layer], inputs: Vec<f32>) -> f32 {
+    let outputs = layers
+        .iter()
+        .enumerate()
+        .fold(inputs, |inputs, (index, layer)| layer.outputs(&inputs, index + 1 < layers.len()));
+    outputs.first().copied().unwrap_or_default()
+}
+
+impl Layer {
+    /// `W x + b`, and of all layers but the last its product with its sigmoid.
+    fn outputs(&self, inputs: &[f32], inner: bool) -> Vec<f32> {
+        let neuron = |(weights, bias): (&Vec<f32>, &f32)| {
+            let sum = bias + weights.iter().zip(inputs).map(|(w, x)| w * x).sum::<f32>();
+            if inner { sum / (1.0 + (-sum).exp()) } else { sum }
+        };
+        self.weights.iter().zip(&self.bias).map(neuron).collect()
     }
 }
 
@@ -227,6 +264,7 @@ mod tests {
     use crate::optics::iid_masks;
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
+    use crate::recon::signs::{SIGNS, Signs};
     use ndarray::{Array3, s};
 
     /// A ramp of 0.01 a column that brightens by 0.02 a frame.
@@ -264,12 +302,25 @@ mod tests {
         assert!(has(Schedule::gap_tv()) && has(Schedule::pnp_tv_fastdvdnet()));
         assert!(!has(Schedule::admm_tv()) && !has(Schedule::pnp_ffdnet()));
         for model in MODELS.values() {
-            let inputs = FEATURES.len();
-            assert_eq!(model.block.coefficients.len(), 1 + inputs + inputs * (inputs + 1) / 2);
-            assert_eq!(model.snapshot.coefficients.len(), 1 + 5 + inputs);
+            let inputs = 2 * FEATURES.len() + 1 + SIGNS.len();
+            assert_eq!(
+                (model.features.mean.len(), model.features.scale.len()),
+                (FEATURES.len(), FEATURES.len())
+            );
+            assert_eq!(
+                (model.signs.mean.len(), model.signs.scale.len()),
+                (1 + SIGNS.len(), 1 + SIGNS.len())
+            );
+            for layers in &model.networks {
+                let mut before = inputs;
+                for layer in layers {
+                    assert!(layer.weights.iter().all(|weights| weights.len() == before));
+                    assert_eq!(layer.weights.len(), layer.bias.len());
+                    before = layer.bias.len();
+                }
+                assert_eq!(before, 1, "the last layer has one neuron");
+            }
             assert!(model.interval[0] < 0.0 && model.interval[1] > 0.0);
-            let [_, mean, _] = model.psnr(&vec![None; 5 + inputs]);
-            assert_eq!(mean, model.snapshot.coefficients[0], "nothing known is the mean of all");
         }
     }
 
@@ -286,9 +337,23 @@ mod tests {
             let early = frames.mapv(|x| 0.5 + 0.8 * (x - 0.5));
             let seen = features(&op, Some(early.view()), frames.view());
             let model = Model::of(&Schedule::pnp_tv_fastdvdnet()).unwrap();
-            model.log_error(&seen, (1, 1, 1))
+            model.log_errors(&seen, None, 1.0)[[1, 1, 1]]
         };
         let (much, little) = (error(0.1), error(0.01));
         assert!(much > little + 0.3 && much < -1.0 && little > -6.0, "{much}, {little}");
+    }
+
+    /// What held-out pixels say of the error moves the prediction.
+    #[test]
+    fn a_larger_held_out_error_lets_expect_more_error() {
+        let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
+        let seen = features(&op, Some(ramp().view()), ramp().view());
+        for model in MODELS.values() {
+            let error = |decibels: f32| {
+                let signs = Signs([decibels; SIGNS.len()]);
+                model.log_errors(&seen, Some(&signs), 1.0).mean().unwrap()
+            };
+            assert!(error(-20.0) > error(-35.0) + 0.1, "{}, {}", error(-20.0), error(-35.0));
+        }
     }
 }

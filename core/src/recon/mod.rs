@@ -21,6 +21,7 @@ pub mod scale;
 pub mod schedule;
 pub mod sensing;
 pub mod sequence;
+pub mod signs;
 pub mod solver;
 pub mod tile;
 

@@ -9,14 +9,15 @@
 
 use std::ops::Range;
 
-use ndarray::{ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 use rand::{Rng, SeedableRng};
 
 use super::error::{ReconError, Result};
 use super::prior::Networks;
 use super::schedule::{MAX_STATIC_VARIANCE, Schedule, Stage};
 use super::sensing::SensingOperator;
-use super::solver::{Observer, Run};
+use super::signs::Signs;
+use super::solver::{self, Observer, Run};
 use strum::Display;
 
 /// Side of the piece that the pilot is run on: a tenth of a tile.
@@ -84,6 +85,7 @@ pub enum StageEnd {
 /// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],
 /// and tells where it should end. Stages of total variation alone, which cost next to nothing, are taken
 /// as they are, but for their part along time: it is left out if the stage's error is less without.
+/// With what its held-out pixels tell of the error of the frames.
 /// Errors: as [`super::solver::reconstruct`].
 pub fn run(
     op: SensingOperator,
@@ -91,12 +93,13 @@ pub fn run(
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-) -> Result<Vec<StageFinding>> {
+) -> Result<(Vec<StageFinding>, Option<Signs>)> {
     schedule.validate()?;
     let held_out = HeldOut::of(&op, 0);
     let op = op.without(&held_out.pixels);
     let mut run = Run::new(&op, y, schedule, networks);
     let mut courses: Vec<Course> = Vec::with_capacity(schedule.stages.len());
+    let mut early = None;
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = run.state();
@@ -114,11 +117,43 @@ pub fn run(
         }
         let diverged = course.diverged;
         courses.push(course);
+        early.get_or_insert_with(|| run.frames().to_owned());
         if diverged {
             break;
         }
     }
-    Ok(judge(schedule, &courses))
+    let last = courses.iter().rev().find_map(|course| course.best.as_ref());
+    let signs = early
+        .as_ref()
+        .zip(last)
+        .and_then(|(early, last)| Signs::of((&op, y), &held_out, early.view(), last.view()));
+    Ok((judge(schedule, &courses), signs))
+}
+
+/// What held-out pixels of the first snapshot tell of the error of a fixed schedule's frames, on the piece of it that
+/// [`piece`] gives, and both on the scale on which the scene is on \[0,1\]. Costs a run of the schedule on that piece.
+/// Errors: as [`super::solver::reconstruct`].
+pub fn signs(
+    op: &SensingOperator,
+    y: ArrayView3<'_, f32>,
+    schedule: &Schedule,
+    networks: &mut dyn Networks,
+) -> Result<Option<Signs>> {
+    let (rows, columns) = piece(y.index_axis(Axis(0), 0));
+    let masks = op.masks().slice(s![.., rows.clone(), columns.clone()]).to_owned();
+    let op = match SensingOperator::new(masks) {
+        Err(ReconError::DarkMasks { .. }) => return Ok(None),
+        other => other?,
+    };
+    let held_out = HeldOut::of(&op, 0);
+    let op = op.without(&held_out.pixels);
+    let y = y.slice(s![..1, rows, columns]);
+    let mut early: Option<Array3<f32>> = None;
+    let outcome = solver::stages((&op, y), schedule, networks, &mut (), |_, frames| {
+        early.get_or_insert_with(|| frames.to_owned());
+    })?;
+    let early = early.unwrap_or_else(|| outcome.frames.clone());
+    Ok(Signs::of((&op, y), &held_out, early.view(), outcome.frames.view()))
 }
 
 /// What a stage, as planned, may be instead of what was taken last.
@@ -185,6 +220,8 @@ struct Course {
     errors: Vec<f64>,
     /// `(y - Hv)^2` of each held-out pixel where their sum was least.
     squares: Vec<f64>,
+    /// The frames then.
+    best: Option<Array3<f32>>,
     /// Whether the next iteration left the finite numbers.
     diverged: bool,
 }
@@ -306,6 +343,7 @@ impl Watch<'_, '_> {
     fn stage(&mut self, stage: &Stage, run: &mut Run<'_>) -> Result<Course> {
         let fixed = stage.sigma.is_none();
         let (mut errors, mut squares, mut diverged) = (vec![], vec![], false);
+        let mut best = None;
         let (mut least, norm) = (f64::INFINITY, self.held_out.norm(self.y));
         run.enter(stage);
         for done in 1..=stage.iterations {
@@ -324,13 +362,14 @@ impl Watch<'_, '_> {
                 errors.push(error);
                 if error < least {
                     (least, squares) = (error, residuals);
+                    best = Some(run.frames().to_owned());
                 }
             }
             if fixed && last {
                 break;
             }
         }
-        Ok(Course { stage: stage.clone(), errors, squares, diverged })
+        Ok(Course { stage: stage.clone(), errors, squares, best, diverged })
     }
 }
 
@@ -374,7 +413,7 @@ impl HeldOut {
     }
 
     /// `(y - Hv)^2` of each pixel.
-    fn residuals(
+    pub(super) fn residuals(
         &self,
         op: &SensingOperator,
         y: ArrayView3<'_, f32>,
@@ -439,7 +478,7 @@ mod tests {
         // So that each pass helps.
         schedule.stages[1].memory = 0.0;
         let mut network = Moody { truth, good, passes: 0, harm };
-        let found = run(op, y.view(), &schedule, &mut network, &mut ()).unwrap();
+        let (found, _) = run(op, y.view(), &schedule, &mut network, &mut ()).unwrap();
         (schedule, found)
     }
 
@@ -486,7 +525,7 @@ mod tests {
             });
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
             let op = SensingOperator::new(masks.clone()).unwrap();
-            run(op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap()[0].temporal_weight
+            run(op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().0[0].temporal_weight
         };
         let asked = Schedule::gap_tv3d().stages[0].temporal_weight;
         assert_eq!((Some(weight(false)), weight(true)), (asked, 0.0));
@@ -505,7 +544,7 @@ mod tests {
             });
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
             schedule.stages[1].static_variance = Some(planned);
-            run(op.clone(), y.view(), &schedule, &mut (), &mut ()).unwrap()[1].static_variance
+            run(op.clone(), y.view(), &schedule, &mut (), &mut ()).unwrap().0[1].static_variance
         };
         assert_eq!(found(2.0, 0.5), Some(0.5));
         assert_ne!(found(0.0, 0.05), Some(0.05));
@@ -523,7 +562,7 @@ mod tests {
         let op = SensingOperator::new(masks).unwrap();
         let found = |schedule: &Schedule, sigma: f32| {
             let y = &y + &(sigma * &noise);
-            run(op.clone(), y.view(), schedule, &mut (), &mut ()).unwrap()[1].gamma
+            run(op.clone(), y.view(), schedule, &mut (), &mut ()).unwrap().0[1].gamma
         };
         let mut schedule = Schedule::pnp_nonlocal();
         assert_eq!(found(&schedule, 0.0), None);

@@ -92,6 +92,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         writer.finish()?;
         let about = json!({"clip": clip.name, "setting": setting, "cr": frames, "features": FEATURES,
             "algorithm": arguments.algorithm, "psnr_db": psnr, "white": tile.white,
+            "signs": tile.outcome.signs.or(tile.pilot.as_ref().and_then(|pilot| pilot.signs)),
             "pilot": tile.pilot});
         let path = out.join(format!("{}.json", clip.name));
         fs::write(&path, about.to_string())

@@ -13,6 +13,7 @@ use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
 use super::sensing::{SensingOperator, Statistics};
+use super::signs::Signs;
 use state::{Change, State};
 use strum::Display;
 
@@ -92,6 +93,8 @@ pub struct Outcome {
     pub stop_reason: StopReason,
     /// What an [`assessment`] sees of the frames \[features, S B, rows, columns\], where it was asked for.
     pub features: Option<Array4<f32>>,
+    /// What pixels held out of a piece tell of the frames' error, where that was asked for.
+    pub signs: Option<Signs>,
 }
 
 /// Reconstructs the `S B` frames of a run of snapshots `y` \[S,H,W\], both on the scale on which the
@@ -132,7 +135,7 @@ pub fn reconstruct_assessed(
 }
 
 /// Runs the stages, and tells after each of them its index and the frames.
-fn stages(
+pub(super) fn stages(
     (op, y): (&SensingOperator, ArrayView3<'_, f32>),
     schedule: &Schedule,
     networks: &mut dyn Networks,
@@ -164,6 +167,7 @@ fn stages(
         residual,
         stop_reason,
         features: None,
+        signs: None,
     })
 }
 
