@@ -8,7 +8,7 @@ JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
 .PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
-	bench-latency bench-peers bench-scale eval-models eval-loop evaluation-data
+	bench-latency bench-peers bench-scale eval-models eval-loop eval-wrong-inputs evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
@@ -148,6 +148,13 @@ eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop
 		$(TRAINING)/bin/python training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
 		--data $(DATA) --scenes $(SCENES) --white $(WHITE) $(if $(MODELS),--models $(MODELS)) \
 		$(if $(FULL),--full) $(if $(CACHED),--cached) $(if $(FRESH),--fresh) $(if $(JSON),--json)
+
+eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## wrong inputs beside good ones through the service: which are flagged; ALGORITHM=gap-tv GOOD=60
+	@$(CARGO) build --release --quiet
+	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(TRAINING)/bin/python benches/assessment/wrong_inputs.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		--data $(DATA) --algorithm $(ALGORITHM) --good $(GOOD)
+GOOD ?= 60
 
 evaluation-data:
 	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \

@@ -4,7 +4,8 @@
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
 `make` simulates snapshots of 128x128 pixels (photographs that a camera moves over, half of them with a part that moves by itself, and
-clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped. `fit` fits small
+clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is
+a mixture of all. `fit` fits small
 networks to all cases, and tells how they do on scenes that were left out (ten folds, no scene in two of them).
 """
 import argparse
@@ -23,7 +24,7 @@ SIDE, LONGEST = 128, 24
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
 RATIOS = 6, 8, 10, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
-ALGORITHMS = 'pnp-tv-fastdvdnet', 'gap-tv'
+ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
 FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
 SPARE = 10.0        # dB above it up to which the fit follows
@@ -74,56 +75,52 @@ def cropped(rng, clip):
     return np.stack([cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for frame in part])
 
 
-def scenes(a, rng):
-    """Name of the scene and frames [count,H,W], uint8, of each case."""
-    photos = {part: sorted(glob.glob(f'{a.data}/photos/{part}/*.jpg')) for part in ('train', 'val')}
-    every = photos['train'] + photos['val']
-    for file in every:
-        for _ in range(2 if file in photos['val'] else 1):
-            yield os.path.basename(file), panned(rng, file, every)
+def cases(a):
+    """Name, scene, frames [B,H,W] (uint8), kind of masks, noise and seed of each case, in an order that mixes all of them."""
+    photos = sorted(glob.glob(f'{a.data}/photos/train/*.jpg')) + sorted(glob.glob(f'{a.data}/photos/val/*.jpg'))
     clips = {os.path.basename(folder): pictures(folder) for folder in sorted(glob.glob(f'{a.data}/clips/*/*'))}
     clips['traffic'] = scipy.io.loadmat(f'{a.scenes}/traffic48_cacti.mat')['orig'].transpose(2, 0, 1).round().astype(np.uint8)
     clips['city'] = pictures(os.path.join(os.path.dirname(os.path.abspath(__file__)), '../demo/clip'))
     with np.load(f'{a.scenes}/street_1024x1024x20.npz') as archive:
         street = next(archive[k] for k in archive.files if archive[k].ndim == 3)
     clips['street'] = street if street.dtype == np.uint8 else (street * 255).round().astype(np.uint8)
-    for name, clip in clips.items():
-        for _ in range(4):
-            yield name, cropped(rng, clip)
+    all_of = [(photo, None) for photo in photos for _ in range(4)] + [(name, clip) for name, clip in clips.items() for _ in range(8)]
+    for number, index in enumerate(np.random.default_rng(11).permutation(len(all_of))):
+        (scene, clip), rng = all_of[index], np.random.default_rng([5, int(index)])
+        frames = panned(rng, scene, photos) if clip is None else cropped(rng, clip)
+        ratio = int(rng.choice([ratio for ratio in RATIOS if ratio <= len(frames)]))
+        pattern, sigma = PATTERNS[rng.integers(len(PATTERNS))], int(rng.choice(SIGMAS))
+        seeds = {algorithm: int(rng.integers(1e6)) for algorithm in ALGORITHMS}
+        yield f'c{number:04d}', os.path.basename(scene), frames[:ratio], pattern, sigma, seeds
 
 
 def make(a):
-    rng, groups, about = np.random.default_rng(7), {}, {}
-    for index, (scene, frames) in enumerate(scenes(a, rng)):
-        ratio = int(rng.choice([ratio for ratio in RATIOS if ratio <= len(frames)]))
-        group = f'{PATTERNS[rng.integers(len(PATTERNS))]}_{ratio}_{int(rng.choice(SIGMAS))}'
-        groups.setdefault(group, []).append((f'c{index:03d}', frames[:ratio]))
-        about[f'c{index:03d}'] = scene
-    for group, cases in groups.items():
-        os.makedirs(f'{a.out}/clips/{group}', exist_ok=True)
-        for name, frames in cases:
-            np.save(f'{a.out}/clips/{group}/{name}.npy', frames)
-    with open(f'{a.out}/scenes.json', 'w') as f:
-        json.dump(about, f)
-    for algorithm in ALGORITHMS:
-        for group in sorted(groups, key=lambda group: int(group.split('_')[1])):
-            pattern, ratio, sigma = group.split('_')
-            out = f'{a.out}/{algorithm}/{group}'
-            if not os.path.exists(f'{out}/done'):
-                subprocess.run([a.binary, 'assess', '--clips', f'{a.out}/clips/{group}', '--pattern', pattern, '--cr', ratio, '--noise-sigma', sigma,
-                                '--algorithm', algorithm, '--scale', str(SIDE), '--out', out], check=True)
-                open(f'{out}/done', 'w').close()
+    part, parts = (int(number) for number in a.part.split('/'))
+    for number, (name, scene, frames, pattern, sigma, seeds) in enumerate(cases(a)):
+        folder = f'{a.out}/{name}'
+        if number % parts != part or os.path.exists(f'{folder}/scene.json'):
+            continue
+        os.makedirs(f'{folder}/clip', exist_ok=True)
+        np.save(f'{folder}/clip/{name}.npy', frames)
+        for algorithm, seed in seeds.items():
+            subprocess.run([a.binary, 'assess', '--clips', f'{folder}/clip', '--pattern', pattern, '--cr', str(len(frames)), '--noise-sigma', str(sigma),
+                            '--algorithm', algorithm, '--scale', str(SIDE), '--seed', str(seed), '--out', f'{folder}/{algorithm}'], check=True)
+        with open(f'{folder}/scene.json', 'w') as f:
+            json.dump(scene, f)
 
 
 # ---------------------------------------------------------------- networks
 class Case:
     """What is seen of a snapshot, and its true error."""
 
-    def __init__(self, path, scene):
-        with open(path[:-3] + 'json') as f:
+    def __init__(self, folder, algorithm):
+        path = f'{folder}/{algorithm}/{os.path.basename(folder)}'
+        with open(path + '.json') as f:
             about = json.load(f)
-        seen = np.load(path).astype(np.float32)             # [features and the true error, frame, block]
-        self.scene, self.psnr, self.frames = scene, about['psnr_db'], seen.shape[1]
+        with open(f'{folder}/scene.json') as f:
+            self.scene = json.load(f)
+        seen = np.load(path + '.npy').astype(np.float32)    # [features and the true error, frame, block]
+        self.psnr, self.frames = about['psnr_db'], seen.shape[1]
         self.white = 20 * np.log10(about['white'])
         self.features = torch.from_numpy(seen[:-1].reshape(len(seen) - 1, -1).T.copy())
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
@@ -199,11 +196,11 @@ class Model:
 
 def fit(a):
     models = {}
-    with open(f'{a.out}/scenes.json') as f:
-        about = json.load(f)
-    for algorithm in ALGORITHMS:
-        paths = sorted(glob.glob(f'{a.out}/{algorithm}/*/*.npy'))
-        cases = [Case(path, about[os.path.basename(path)[:-4]]) for path in paths if os.path.exists(path[:-3] + 'json')]
+    if a.write and os.path.exists(a.write):
+        with open(a.write) as f:
+            models = json.load(f)
+    for algorithm in [a.algorithm] if a.algorithm else ALGORITHMS:
+        cases = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))]
         names = sorted({case.scene for case in cases})
         fold = {name: index % FOLDS for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
@@ -246,7 +243,9 @@ def main():
     p.add_argument('--scenes', default='../../shared/scenes')
     p.add_argument('--out', default='assessment-output')
     p.add_argument('--write', help='the file of the models')
+    p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')
     p.add_argument('--epochs', type=int, default=24)
+    p.add_argument('--algorithm', choices=ALGORITHMS, help='fit this one alone')
     p.add_argument('--networks', type=int, default=3, help='whose mean is taken')
     a = p.parse_args()
     {'make': make, 'fit': fit}[a.what](a)

@@ -90,7 +90,6 @@ impl TileInput {
             }
             let place = s![piece.start * frames..piece.end * frames, .., ..];
             whole.frames.slice_mut(place).assign(&outcome.frames);
-            whole.signs = whole.signs.or(outcome.signs);
             if let Some(seen) = outcome.features {
                 let (features, _, rows, columns) = seen.dim();
                 let none = || Array4::zeros((features, whole.frames.dim().0, rows, columns));
@@ -121,17 +120,19 @@ pub fn reconstruct_tile(
     let assessed = Model::of(schedule).is_some();
     // Of more than total variation the pilot tells.
     let quick = schedule.stages.len() == 1;
-    input.solved(|op, y, part| {
+    let mut signs = None;
+    let mut outcome = input.solved(|op, y, part| {
         observer.part(part);
         if !assessed {
             return solver::reconstruct(op, y, schedule, networks, observer);
         }
-        let mut outcome = solver::reconstruct_assessed(op, y, schedule, networks, observer)?;
-        if quick {
-            outcome.signs = pilot::signs(op, y, schedule, networks)?;
+        if quick && signs.is_none() {
+            signs = pilot::signs(op, y, schedule, networks)?;
         }
-        Ok(outcome)
-    })
+        solver::reconstruct_assessed(op, y, schedule, networks, observer)
+    })?;
+    outcome.signs = signs;
+    Ok(outcome)
 }
 
 /// Reconstructs one tile by an end-to-end network, snapshot by snapshot.

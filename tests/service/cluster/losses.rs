@@ -17,9 +17,9 @@ async fn repaired(app: &TestApp) -> f64 {
 async fn what_the_message_server_loses_is_handed_out_again() {
     let Some(mut nats) = Nats::start(1) else { return };
     // Two workers have twelve tiles left for longer than the sweep needs to find what is lost of the first four.
-    let long = |measurement: &str| with_iterations(measurement, 12_000);
+    let long = |measurement: &str| with_iterations(measurement, 2_000);
     let expected = alone(long).await;
-    let app = served(&nats, "1").await;
+    let app = served(&nats, "2").await;
     let _workers = [worker(&nats, &[]), worker(&nats, &[])];
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let id = app.submit(&long(&measurement)).await;
