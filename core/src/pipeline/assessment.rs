@@ -69,7 +69,7 @@ pub struct Expected {
     pub error: Array3<f32>,
 }
 
-/// Better is not told apart, in dB: nobody sees it, and the fit would follow it.
+/// Better is not told apart, in dB: nobody sees it.
 const BEST: f64 = 40.0;
 
 /// From here on frames are good, from the second on usable, in dB.

@@ -9,7 +9,7 @@ use std::ops::Range;
 use ndarray::{ArrayView3, s};
 
 use super::error::{ReconError, Result};
-use super::pilot::HeldOut;
+use super::held_out::HeldOut;
 use super::prior::Networks;
 use super::schedule::Schedule;
 use super::sensing::SensingOperator;

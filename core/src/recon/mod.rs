@@ -11,6 +11,7 @@
 pub mod assessment;
 mod defaults;
 pub mod error;
+mod held_out;
 pub mod joints;
 pub mod learned;
 pub mod metrics;

@@ -10,7 +10,7 @@
 use ndarray::{Array2, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
 
-use super::pilot::HeldOut;
+use super::held_out::HeldOut;
 use super::sensing::SensingOperator;
 
 /// What is told, in dB, of the mean square of a voxel.
@@ -185,7 +185,7 @@ fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
 mod tests {
     use super::{Signs, variances};
     use crate::optics::iid_masks;
-    use crate::recon::pilot::HeldOut;
+    use crate::recon::held_out::HeldOut;
     use crate::recon::sensing::SensingOperator;
     use ndarray::Array3;
     use rand::{Rng, SeedableRng};
