@@ -225,11 +225,11 @@ async fn a_copy_that_was_killed_is_no_service() {
     let (mut killed, mut at) = (0, 1);
     loop {
         let output = disturbed(&shim, app.data(), &out, "kill", at).output().unwrap();
-        if output.status.success() {
+        // One that is killed behind the renaming has left a whole copy, which is looked at below.
+        if output.status.success() || out.exists() {
             break;
         }
         killed += 1;
-        assert!(!out.exists(), "a part of a copy has its name");
         assert!(killed < 200, "{}", String::from_utf8_lossy(&output.stderr));
         if unfinished.join("blobs").exists() && killed % 5 == 0 {
             let said = refused(&unfinished);
