@@ -211,30 +211,36 @@ mod tests {
         );
     }
 
-    /// Independent errors of a known size behind independent pixels, with noise and without.
+    /// Errors of a known size where there is texture, in the left half, with noise everywhere and without.
     #[test]
     fn the_error_of_frames_is_told_from_noise() {
-        let (frames, side) = (8, 256);
+        let (frames, side) = (8, 192);
         let masks = iid_masks(frames, side, side, 3).unwrap();
         let op = SensingOperator::new(masks).unwrap();
         let held_out = HeldOut::of(&op, 0);
-        let size = (frames, side, side);
-        for (error, noise) in [(0.03, 0.0), (0.03, 0.06), (0.1, 0.06)] {
+        let left = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
+        let truth = Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
+            0.5 + 0.2 * left(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+        });
+        for (error, noise) in [(0.03f32, 0.0f32), (0.03, 0.06), (0.1, 0.06)] {
             let mut random = random();
-            let truth = Array3::from_shape_fn(size, |(k, i, j)| {
-                0.5 + 0.2 * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
-            });
             let mut normal = |deviation: f32| deviation * random.sample::<f32, _>(StandardNormal);
-            let found = truth.mapv(|x| x + normal(error));
+            let mut found = truth.clone();
+            found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * left(j));
             let y = op.forward(truth.view()).unwrap().mapv(|y| y + normal(noise));
             let told = Signs::of((&op, y.view()), &held_out, found.view(), found.view()).unwrap();
-            let expected = 20.0 * error.log10();
-            assert!((told.0[2] - expected).abs() < 2.0, "{error}, {noise}: {told:?}");
-            assert_eq!(told.0[0], told.0[1]);
+            let decibels = |square: f32| 10.0 * square.log10();
+            let expected = decibels(error.powi(2) / 2.0);
+            let Signs([early, late, both, _, without_noise, by_texture, quiet, _]) = told;
+            assert_eq!(early, late);
+            assert!((by_texture - expected).abs() < 2.5, "{error}, {noise}: {told:?}");
+            assert!((both - expected).abs() < 4.0, "{error}, {noise}: {told:?}");
             if noise == 0.0 {
-                assert!((told.0[4] - expected).abs() < 1.0, "{told:?}");
+                assert!(quiet < expected - 10.0, "{told:?}");
             } else {
-                assert!(told.0[4] > expected + 1.0, "noise counts as an error there: {told:?}");
+                // Half of the pixels are open.
+                assert!((quiet - decibels(noise.powi(2) / 4.0)).abs() < 1.5, "{told:?}");
+                assert!(without_noise > expected + 2.0, "noise is taken for an error: {told:?}");
             }
         }
     }
