@@ -108,6 +108,9 @@ impl TileInput {
     }
 }
 
+/// Iterations of total variation after which its error hardly changes. More would hold up those who cancel the job.
+const MOST_FOR_SIGNS: usize = 200;
+
 /// Reconstructs one tile by the iterations of a schedule. The frames \[S B,h,w\] are on the scale of
 /// the measurement.
 /// Errors: as [`solver::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
@@ -127,7 +130,11 @@ pub fn reconstruct_tile(
             return solver::reconstruct(op, y, schedule, networks, observer);
         }
         if quick && signs.is_none() {
-            signs = pilot::signs(op, y, schedule, networks)?;
+            let bounded = match schedule.planned_iterations() {
+                ..=MOST_FOR_SIGNS => schedule.clone(),
+                _ => schedule.clone().with_iterations(MOST_FOR_SIGNS),
+            };
+            signs = pilot::signs(op, y, &bounded, networks)?;
         }
         solver::reconstruct_assessed(op, y, schedule, networks, observer)
     })?;
