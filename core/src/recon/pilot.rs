@@ -9,6 +9,8 @@
 
 use std::ops::Range;
 
+use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
+
 use super::error::{ReconError, Result};
 use super::held_out::HeldOut;
 use super::prior::Networks;
@@ -16,7 +18,6 @@ use super::schedule::{MAX_STATIC_VARIANCE, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
 use super::solver::{self, Observer, Run};
-use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 use strum::Display;
 
 /// Side of the piece that the pilot is run on: a tenth of a tile.
