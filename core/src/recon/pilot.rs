@@ -129,7 +129,8 @@ pub fn run(
 }
 
 /// What held-out pixels of the first snapshot tell of the error of a fixed schedule's frames, on the piece of it that
-/// [`piece`] gives, and both on the scale on which the scene is on \[0,1\]. Costs a run of the schedule on that piece.
+/// [`piece`] gives, and both on the scale on which the scene is on \[0,1\]; none if no light reaches it, or the iteration diverges. Costs
+/// a run of the schedule on that piece.
 /// Errors: as [`super::solver::reconstruct`].
 pub fn signs(
     op: &SensingOperator,
@@ -147,9 +148,14 @@ pub fn signs(
     let op = op.without(&held_out.pixels);
     let y = y.slice(s![..1, rows, columns]);
     let mut early: Option<Array3<f32>> = None;
-    let outcome = solver::stages((&op, y), schedule, networks, &mut (), |_, frames| {
+    let solved = solver::stages((&op, y), schedule, networks, &mut (), |_, frames| {
         early.get_or_insert_with(|| frames.to_owned());
-    })?;
+    });
+    let outcome = match solved {
+        // Nothing is told then; whether the frames themselves diverge is the solver's to say.
+        Err(ReconError::Diverged { .. }) => return Ok(None),
+        other => other?,
+    };
     let early = early.unwrap_or_else(|| outcome.frames.clone());
     Ok(Signs::of((&op, y), &held_out, early.view(), outcome.frames.view()))
 }
