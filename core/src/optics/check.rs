@@ -19,6 +19,8 @@ const MOSAIC: f64 = 0.02;
 const SURE_OF_MOSAIC: f64 = 8.0;
 /// The share of a measurement's light that its masks need not explain.
 const OFFSET: f64 = 0.03;
+/// The share of the mean by which a block is below 0 whatever the noise: that of a block's mean is an eighth of a pixel's.
+const DEEP: f64 = 0.05;
 /// Where the mean brightness of a scene lies.
 const LEVELS: std::ops::RangeInclusive<f64> = 0.05..=1.05;
 /// Side of the blocks in which the scene is taken to be even.
@@ -36,8 +38,8 @@ pub struct MeasurementStudy {
     mask_sums: Array1<f64>,
     sum: f64,
     pixels: f64,
-    values: u64,
-    negative: u64,
+    /// The means of those blocks of the measurement that are below 0.
+    negative: Vec<f32>,
     /// Of each row of blocks.
     phases: Vec<Phases>,
 }
@@ -55,7 +57,7 @@ struct Phases {
 pub struct MeasurementFigures {
     /// Mean of the measurement.
     pub mean: f64,
-    /// Share of values below 0.
+    /// Share of the blocks of [`BLOCK`] x [`BLOCK`] pixels whose mean is so far below 0 that noise can't be the reason.
     pub negative: f64,
     /// Mean brightness of each frame, where the masks are 1.
     pub brightness: Vec<f64>,
@@ -94,8 +96,7 @@ impl MeasurementStudy {
             mask_sums: Array1::zeros(frames),
             sum: 0.0,
             pixels: 0.0,
-            values: 0,
-            negative: 0,
+            negative: Vec::new(),
             phases: Vec::new(),
         }
     }
@@ -104,8 +105,6 @@ impl MeasurementStudy {
     /// [`REACH`] pixels on each side that only masks are read from, and begins at an even row and column.
     /// Windows too small for a block tell nothing.
     pub fn add(&mut self, masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) {
-        self.values += y.len() as u64;
-        self.negative += y.iter().filter(|value| **value < 0.0).count() as u64;
         let (frames, height, width) = masks.dim();
         let inner = |length: usize| length.saturating_sub(2 * REACH) / BLOCK * BLOCK;
         let (rows, columns) = (inner(height), inner(width));
@@ -121,6 +120,8 @@ impl MeasurementStudy {
         }
         self.pixels += y.len() as f64;
         self.sum += y.iter().map(|&value| f64::from(value)).sum::<f64>();
+        let means = y.exact_chunks((BLOCK, BLOCK)).into_iter().filter_map(|block| block.mean());
+        self.negative.extend(means.filter(|mean| *mean < 0.0));
         let y = less_block_means(y);
         self.square += y.iter().map(|&value| f64::from(value).powi(2)).sum::<f64>();
         let flat = |array: &Array2<f32>| array.iter().copied().collect::<Array1<f32>>();
@@ -142,7 +143,6 @@ impl MeasurementStudy {
 
     /// The figures; none if the windows were too small or have no structure.
     pub fn finish(self) -> Option<MeasurementFigures> {
-        let negative = self.negative as f64 / (self.values as f64).max(1.0);
         if self.pixels == 0.0 || self.square <= 0.0 {
             return None;
         }
@@ -162,6 +162,8 @@ impl MeasurementStudy {
             (0..self.frames).map(|k| (scatter * inverse[[k, k]]).max(0.0).sqrt()).collect();
         let means = &self.mask_sums / self.pixels;
         let mean = self.sum / self.pixels;
+        let deep = self.negative.iter().filter(|below| f64::from(**below) < -DEEP * mean.abs());
+        let negative = (deep.count() * BLOCK * BLOCK) as f64 / self.pixels;
         let error = (scatter * means.dot(&inverse.dot(&means))).max(0.0).sqrt();
         let place = |index: usize| REACH as i32 - index as i32;
         let mosaic = mosaic(&self.phases, &brightness, mean);
@@ -310,7 +312,10 @@ pub fn judge_measurement(
         findings.push(Finding::new(
             "negative",
             if figures.negative > 0.1 { Severity::Error } else { Severity::Warning },
-            format!("{:.1} % of the values are below 0", figures.negative * 100.0),
+            format!(
+                "{:.1} % of the picture is below 0, by more than noise",
+                figures.negative * 100.0
+            ),
             if darkened {
                 "the dark was brighter than the measurement: take scene_black at the measurement's exposure"
             } else {
@@ -574,6 +579,20 @@ mod tests {
         let moved = y.slice(s![.., 1..]).to_owned();
         let seen = codes(&masks.slice(s![.., .., ..139]).to_owned(), &moved);
         assert_eq!(seen, ["shifted_masks"]);
+    }
+
+    /// A scene that is black in its left half.
+    #[test]
+    fn noise_where_it_is_black_is_not_taken_for_a_dark_that_is_too_bright() {
+        let masks = fine_masks(8, 208);
+        let mut scene = scene(8, 208);
+        scene.slice_mut(s![.., .., ..104]).fill(0.0);
+        let y = noisy(measure(masks.view(), scene.view()).unwrap(), 0.08, 1).unwrap();
+        let negative = y.iter().filter(|value| **value < 0.0).count() as f64 / y.len() as f64;
+        assert!(negative > 0.2, "{negative}");
+        assert!(codes(&masks, &y).is_empty(), "{:?}", codes(&masks, &y));
+        let lowered = codes(&masks, &(&y - 0.15 * y.mean().unwrap()));
+        assert!(lowered.contains(&"negative"), "{lowered:?}");
     }
 
     #[test]

@@ -251,10 +251,26 @@ fn dark_patterns(figures: &MaskFigures) -> Vec<Finding> {
     findings
 }
 
-/// Masks that are the same.
+/// Masks that correlate with more are the same.
+const SAME: f64 = 0.98;
+/// What masks of neighbouring frames lack to a correlation of 1, in the median, if they turn by little.
+const TURNING: f64 = 0.05;
+/// The share of that which a mask lacks that was taken twice.
+const TWICE: f64 = 0.3;
+
+/// Masks that are the same. Where patterns turn by little from frame to frame, all neighbours are nearly the same, and
+/// one that was taken twice is much more so.
 fn alike(figures: &MaskFigures) -> Option<Finding> {
-    let same = |((k, l), value): ((usize, usize), &f64)| (k < l && *value > 0.98).then_some((k, l));
-    let pairs: Vec<(usize, usize)> = figures.correlation.indexed_iter().filter_map(same).collect();
+    let correlation = &figures.correlation;
+    let count = correlation.nrows();
+    let mut apart: Vec<f64> = (1..count).map(|k| 1.0 - correlation[[k - 1, k]]).collect();
+    apart.sort_by(f64::total_cmp);
+    let step = apart.get(apart.len() / 2).copied().unwrap_or(1.0);
+    let turning =
+        step < TURNING && figures.correlations().is_some_and(|(mean, _)| mean < 1.0 - TURNING);
+    let most = if turning { 1.0 - TWICE * step } else { SAME };
+    let same = |((k, l), value): ((usize, usize), &f64)| (k < l && *value > most).then_some((k, l));
+    let pairs: Vec<(usize, usize)> = correlation.indexed_iter().filter_map(same).collect();
     let frames: std::collections::BTreeSet<usize> =
         pairs.iter().flat_map(|&(k, l)| [k, l]).collect();
     if pairs.is_empty() {
@@ -410,4 +426,44 @@ fn wrong_dark(figures: &CaptureFigures) -> Vec<Finding> {
         ));
     }
     findings
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array3, Axis, concatenate, s};
+
+    use super::judge_masks;
+    use crate::optics::{Circle, HybridAperture, MaskStudy, Method, Placement, generator};
+
+    fn repeated(masks: &Array3<f32>) -> Option<Vec<usize>> {
+        let (frames, height, width) = masks.dim();
+        let mut study = MaskStudy::new(frames, height, width);
+        study.add(masks.view()).unwrap();
+        let found = judge_masks(&study.finish().unwrap(), None);
+        found
+            .into_iter()
+            .find(|finding| finding.code == "repeated_pattern")
+            .map(|found| found.frames)
+    }
+
+    /// In 24 frames each pattern of a turning circle is nearly the one before it.
+    #[test]
+    fn a_pattern_that_was_taken_twice_is_told_from_one_that_turns_by_little() {
+        let optics = HybridAperture {
+            placement: Placement::Geometric,
+            method: Method::Convolution,
+            ..HybridAperture::default()
+        };
+        for count in [6, 24, 48] {
+            let patterns = Circle::default().patterns(count, &optics.geometry).unwrap();
+            let masks = optics.masks(patterns.view(), (96, 96), &mut generator(3)).unwrap().masks;
+            assert_eq!(repeated(&masks), None, "{count}");
+            let mut twice = masks.clone();
+            twice.slice_mut(s![3, .., ..]).assign(&masks.slice(s![2, .., ..]));
+            assert_eq!(repeated(&twice), Some(vec![2, 3]), "{count}");
+            let first = masks.slice(s![..1, .., ..]);
+            let all = concatenate(Axis(0), &[first; 4]).unwrap();
+            assert_eq!(repeated(&all), Some(vec![0, 1, 2, 3]), "{count}");
+        }
+    }
 }
