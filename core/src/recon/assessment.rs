@@ -7,9 +7,10 @@
 //! how well it does on others.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::LazyLock;
 
-use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis, s};
 use serde::Deserialize;
 
 use super::schedule::{Method, Schedule, Stage};
@@ -19,11 +20,19 @@ use super::signs::Signs;
 /// Side of the blocks in pixels.
 pub const BLOCK: usize = 16;
 
-/// What is seen of a block, each the decimal logarithm of an energy or of a ratio.
-pub const FEATURES: [&str; 11] = [
+/// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames of the
+/// result, and of those that total variation alone had left, where other priors followed. Nothing betrays frames that are
+/// wrong as much as motion that does not explain how they change.
+pub const FEATURES: [&str; 26] = [
     "gradient",
     "curvature",
     "change in time",
+    "variance over time",
+    "gradient of the mean over time",
+    "motion",
+    "change that is no motion",
+    "gradient beside other frames",
+    "change in time beside other frames",
     "distance from total variation",
     "brightness",
     "mask contrast",
@@ -32,7 +41,22 @@ pub const FEATURES: [&str; 11] = [
     "gradient of the whole frame",
     "change in time of the whole frame",
     "distance of the whole frame",
+    "gradient after total variation",
+    "curvature after total variation",
+    "change in time after total variation",
+    "variance over time after total variation",
+    "gradient of the mean over time after total variation",
+    "motion after total variation",
+    "change that is no motion after total variation",
+    "gradient beside other frames after total variation",
+    "change in time beside other frames after total variation",
 ];
+
+/// How many are seen of the frames of a clip by themselves, and the first ones of the other kinds.
+const OF_CLIP: usize = 9;
+const OF_RESULT: usize = 9;
+const OF_WHOLE: usize = 14;
+const OF_EARLY: usize = 17;
 
 /// Below this, energies are rounding.
 const FLOOR: f32 = 1e-7;
@@ -43,7 +67,7 @@ pub fn blocks(height: usize, width: usize) -> (usize, usize) {
 }
 
 /// What is seen of each block of each frame \[features, S B, rows, columns\], of the frames \[S B,H,W\] of a
-/// reconstruction and those that total variation alone had left, if others priors followed; all on the scale on which the
+/// reconstruction and those that total variation alone had left, if other priors followed; all on the scale on which the
 /// scene is on \[0,1\].
 pub fn features(
     op: &SensingOperator,
@@ -52,58 +76,195 @@ pub fn features(
 ) -> Array4<f32> {
     let (count, height, width) = frames.dim();
     let (rows, columns) = blocks(height, width);
+    let ratio = op.masks().len_of(Axis(0));
     let mut all = Array4::zeros((FEATURES.len(), count, rows, columns));
+    of_clip(frames, ratio, all.slice_mut(s![..OF_CLIP, .., .., ..]));
+    if let Some(early) = early {
+        of_clip(early, ratio, all.slice_mut(s![OF_EARLY.., .., .., ..]));
+    }
     let (contrast, roughness) = of_masks(op);
-    let ratio = (op.masks().len_of(Axis(0)) as f32).log10();
+    let ratio = (ratio as f32).log10();
     for (k, frame) in frames.outer_iter().enumerate() {
-        let neighbours = [k.checked_sub(1), Some(k + 1).filter(|next| *next < count)];
-        let beside = neighbours.into_iter().flatten().map(|at| frames.index_axis(Axis(0), at));
-        let beside: Vec<_> = beside.collect();
         let early = early.map(|early| early.index_axis_move(Axis(0), k));
-        let mut put = |feature: usize, whole: Option<usize>, energy: Block| {
-            all.slice_mut(s![feature, k, .., ..]).assign(&energy.0.mapv(logarithm));
-            if let Some(whole) = whole {
-                let mean = logarithm(energy.0.mean().unwrap_or(0.0));
-                all.slice_mut(s![whole, k, .., ..]).fill(mean);
-            }
+        let distance = over_blocks((height, width), |i, j| {
+            early.map_or(0.0, |early| (frame[[i, j]] - early[[i, j]]).powi(2))
+        });
+        let brightness = over_blocks((height, width), |i, j| frame[[i, j]].powi(2));
+        let of_block = [
+            distance.mapv(logarithm),
+            brightness.mapv(logarithm),
+            contrast.clone(),
+            roughness.clone(),
+        ];
+        for (index, value) in of_block.into_iter().enumerate() {
+            all.slice_mut(s![OF_RESULT + index, k, .., ..]).assign(&value);
+        }
+        all.slice_mut(s![OF_RESULT + 4, k, .., ..]).fill(ratio);
+        let whole = |feature: usize| {
+            let of_blocks = all.slice(s![feature, k, .., ..]).mapv(|energy| 10f32.powf(energy));
+            logarithm(of_blocks.mean().unwrap_or(0.0))
         };
-        put(0, Some(8), Block::of(height, width, |i, j| gradient(frame, i, j)));
-        put(1, None, Block::of(height, width, |i, j| curvature(frame, i, j)));
-        let change = |i, j| {
-            let sum = beside.iter().map(|other| (frame[[i, j]] - other[[i, j]]).powi(2));
-            sum.sum::<f32>() / beside.len().max(1) as f32
-        };
-        put(2, Some(9), Block::of(height, width, change));
-        let distance = |i: usize, j: usize| {
-            early.map_or(0.0, |early: ArrayView2<'_, f32>| (frame[[i, j]] - early[[i, j]]).powi(2))
-        };
-        put(3, Some(10), Block::of(height, width, distance));
-        put(4, None, Block::of(height, width, |i, j| frame[[i, j]].powi(2)));
-        all.slice_mut(s![5, k, .., ..]).assign(&contrast.0);
-        all.slice_mut(s![6, k, .., ..]).assign(&roughness.0);
-        all.slice_mut(s![7, k, .., ..]).fill(ratio);
+        for (index, value) in [whole(0), whole(2), whole(OF_RESULT)].into_iter().enumerate() {
+            all.slice_mut(s![OF_WHOLE + index, k, .., ..]).fill(value);
+        }
     }
     all
 }
 
-/// The part of the gram diagonal that changes from mask to mask, and the energy of the masks' gradient relative to
-/// their own.
-fn of_masks(op: &SensingOperator) -> (Block, Block) {
+/// What is seen of the frames of snapshots of `ratio` frames by themselves, into \[features, S B, rows, columns\].
+fn of_clip(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f32>) {
+    let (count, height, width) = clip.dim();
+    for first in (0..count).step_by(ratio) {
+        let snapshot = first..count.min(first + ratio);
+        let frames = snapshot.len() as f32;
+        let mut mean = Array2::zeros((height, width));
+        for k in snapshot.clone() {
+            mean.scaled_add(1.0 / frames, &clip.index_axis(Axis(0), k));
+        }
+        let energies: Vec<Array2<Energies>> =
+            snapshot.clone().map(|k| Energies::of_blocks(clip, k, mean.view())).collect();
+        let of_mean = over_blocks((height, width), |i, j| gradient(mean.view(), i, j));
+        for ((row, column), of_mean) in of_mean.indexed_iter() {
+            let here = |k: usize| &energies[k - first][[row, column]];
+            let beside = |energy: fn(&Energies) -> f32| {
+                snapshot.clone().map(|k| energy(here(k))).sum::<f32>() / frames
+            };
+            let (gradients, changes) = (beside(Energies::gradient), beside(|e| e.change));
+            for k in snapshot.clone() {
+                let energies = here(k);
+                let (speed, rest) = energies.motion();
+                let (gradient, change) =
+                    (logarithm(energies.gradient()), logarithm(energies.change));
+                let values = [
+                    gradient,
+                    logarithm(energies.curvature),
+                    change,
+                    logarithm(energies.variance),
+                    logarithm(*of_mean),
+                    speed,
+                    rest,
+                    gradient - logarithm(gradients),
+                    change - logarithm(changes),
+                ];
+                all.slice_mut(s![.., k, row, column]).assign(&ArrayView1::from(&values));
+            }
+        }
+    }
+}
+
+/// Energies of a block of a frame, in the mean over its pixels.
+#[derive(Debug, Clone, Copy, Default)]
+struct Energies {
+    /// Of the steps to the next row and to the next column, and their product.
+    down: f32,
+    right: f32,
+    both: f32,
+    curvature: f32,
+    /// Of the steps to the frames beside.
+    change: f32,
+    /// Of the slope along time, and its products with the steps down and right.
+    slope: f32,
+    slope_down: f32,
+    slope_right: f32,
+    /// Of what differs from the mean over time.
+    variance: f32,
+}
+
+/// The square of the least motion that is told from rest, in pixels a frame, and the least share of the change that is
+/// told from none.
+const REST: f32 = 1e-4;
+const LEFT: f32 = 1e-3;
+/// The share of the gradient's energy that is taken to be along an edge.
+const EDGE: f32 = 0.01;
+
+impl Energies {
+    /// Of the blocks of frame `k`, whose snapshot has this mean over time.
+    fn of_blocks(clip: ArrayView3<'_, f32>, k: usize, mean: ArrayView2<'_, f32>) -> Array2<Self> {
+        let (count, height, width) = clip.dim();
+        let frame = clip.index_axis(Axis(0), k);
+        let before = k.checked_sub(1).map(|k| clip.index_axis(Axis(0), k));
+        let after = (k + 1 < count).then(|| clip.index_axis(Axis(0), k + 1));
+        let pixel = |sum: &mut Self, i: usize, j: usize| {
+            let here = frame[[i, j]];
+            let down = if i + 1 < height { frame[[i + 1, j]] - here } else { 0.0 };
+            let right = if j + 1 < width { frame[[i, j + 1]] - here } else { 0.0 };
+            let back = before.map(|before| here - before[[i, j]]);
+            let forth = after.map(|after| after[[i, j]] - here);
+            let (slope, change) = match (back, forth) {
+                (Some(a), Some(b)) => ((a + b) / 2.0, (a * a + b * b) / 2.0),
+                (Some(step), None) | (None, Some(step)) => (step, step * step),
+                (None, None) => (0.0, 0.0),
+            };
+            sum.down += down * down;
+            sum.right += right * right;
+            sum.both += down * right;
+            sum.curvature += curvature(frame, i, j);
+            sum.change += change;
+            sum.slope += slope * slope;
+            sum.slope_down += slope * down;
+            sum.slope_right += slope * right;
+            sum.variance += (here - mean[[i, j]]).powi(2);
+        };
+        Array2::from_shape_fn(blocks(height, width), |(row, column)| {
+            let mut sum = Self::default();
+            let pixels = pixels_of((row, column), (height, width));
+            for i in pixels.0.clone() {
+                pixels.1.clone().for_each(|j| pixel(&mut sum, i, j));
+            }
+            sum.over((pixels.0.len() * pixels.1.len()) as f32)
+        })
+    }
+
+    fn over(self, pixels: f32) -> Self {
+        Self {
+            down: self.down / pixels,
+            right: self.right / pixels,
+            both: self.both / pixels,
+            curvature: self.curvature / pixels,
+            change: self.change / pixels,
+            slope: self.slope / pixels,
+            slope_down: self.slope_down / pixels,
+            slope_right: self.slope_right / pixels,
+            variance: self.variance / pixels,
+        }
+    }
+
+    fn gradient(&self) -> f32 {
+        0.5 * (self.down + self.right)
+    }
+
+    /// Logarithms of the squared speed of the motion that explains the slope along time best (Lucas and Kanade, 1981),
+    /// and of the share of the slope that it leaves.
+    fn motion(&self) -> (f32, f32) {
+        // Along an edge nothing is known of it, and none is supposed.
+        let ridge = EDGE * (self.down + self.right) + FLOOR;
+        let (down, right) = (self.down + ridge, self.right + ridge);
+        let determinant = down * right - self.both * self.both;
+        let rows = (self.both * self.slope_right - right * self.slope_down) / determinant;
+        let columns = (self.both * self.slope_down - down * self.slope_right) / determinant;
+        let rest = (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
+        let share = rest / self.slope.max(FLOOR);
+        ((rows * rows + columns * columns + REST).log10(), (share + LEFT).log10())
+    }
+}
+
+/// The part of the gram diagonal that changes from mask to mask, and the energy of the masks' gradient, both relative to
+/// the masks' energy, of each block.
+fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
     let masks = op.masks();
     let (_, height, width) = masks.dim();
     let (gram, steady) = (op.gram(), op.steady_gram());
-    let energy = Block::of(height, width, |i, j| gram[[i, j]]);
-    let steady = Block::of(height, width, |i, j| steady[[i, j]]);
-    let steps = Block::of(height, width, |i, j| {
+    let energy = over_blocks((height, width), |i, j| gram[[i, j]]);
+    let steady = over_blocks((height, width), |i, j| steady[[i, j]]);
+    let steps = over_blocks((height, width), |i, j| {
         masks.outer_iter().map(|mask| gradient(mask, i, j)).sum::<f32>()
     });
     let share = |part: &Array2<f32>| {
         ndarray::Zip::from(part)
-            .and(&energy.0)
+            .and(&energy)
             .map_collect(|part, all| logarithm(part / all.max(FLOOR)))
     };
-    let varying = &energy.0 - &steady.0;
-    (Block(share(&varying)), Block(share(&steps.0)))
+    (share(&(&energy - &steady)), share(&steps))
 }
 
 fn logarithm(energy: f32) -> f32 {
@@ -129,20 +290,26 @@ fn curvature(frame: ArrayView2<'_, f32>, i: usize, j: usize) -> f32 {
     0.5 * (down * down + right * right)
 }
 
-/// Means over blocks \[rows, columns\].
-struct Block(Array2<f32>);
+/// Rows and columns of the pixels of a block of a picture of `height` x `width` pixels.
+fn pixels_of(
+    (row, column): (usize, usize),
+    (height, width): (usize, usize),
+) -> (Range<usize>, Range<usize>) {
+    let of = |at: usize, length: usize| at * BLOCK..length.min((at + 1) * BLOCK);
+    (of(row, height), of(column, width))
+}
 
-impl Block {
-    fn of(height: usize, width: usize, value: impl Fn(usize, usize) -> f32) -> Self {
-        let (rows, columns) = blocks(height, width);
-        Self(Array2::from_shape_fn((rows, columns), |(r, c)| {
-            let (across, down) =
-                (c * BLOCK..width.min((c + 1) * BLOCK), r * BLOCK..height.min((r + 1) * BLOCK));
-            let pixels = across.len() * down.len();
-            let row = |i: usize| across.clone().map(|j| value(i, j)).sum::<f32>();
-            down.map(row).sum::<f32>() / pixels as f32
-        }))
-    }
+/// The means of a value over the pixels of each block \[rows, columns\].
+fn over_blocks(
+    (height, width): (usize, usize),
+    value: impl Fn(usize, usize) -> f32,
+) -> Array2<f32> {
+    Array2::from_shape_fn(blocks(height, width), |at| {
+        let (down, across) = pixels_of(at, (height, width));
+        let pixels = down.len() * across.len();
+        let row = |i: usize| across.clone().map(|j| value(i, j)).sum::<f32>();
+        down.map(row).sum::<f32>() / pixels as f32
+    })
 }
 
 /// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some networks of a
@@ -260,7 +427,7 @@ impl Layer {
 
 #[cfg(test)]
 mod tests {
-    use super::{FEATURES, MODELS, Model, features};
+    use super::{FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, features};
     use crate::optics::iid_masks;
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
@@ -288,11 +455,26 @@ mod tests {
         near(0, (1, 2, 2), 0.5 * 1e-4 * 0.75);
         near(2, (0, 1, 1), 4e-4);
         near(2, (2, 1, 1), 4e-4);
-        near(3, (3, 2, 0), 1e-2);
+        // 0.02 times -1.5, -0.5, 0.5 and 1.5 from the mean over time, whose gradient is that of each frame.
+        near(3, (0, 0, 0), 9e-4);
+        near(4, (1, 0, 0), 0.5 * 1e-4);
+        // A ramp of 0.01 a column that brightens by 0.02 a frame moves by two columns a frame, but where the last column
+        // has no next one.
+        assert!((seen[[5, 2, 0, 0]] - 4f32.log10()).abs() < 0.02, "{}", seen[[5, 2, 0, 0]]);
+        assert!(seen[[6, 2, 0, 0]] < -1.8 && seen[[6, 2, 0, 2]] > -1.0, "{seen:?}");
+        near(7, (2, 1, 0), 1.0);
+        near(8, (2, 1, 0), 1.0);
+        near(9, (3, 2, 0), 1e-2);
         // One mask of four is open: 1 - 4 * (1/4)^2 of the gram differs from mask to mask.
-        near(5, (0, 0, 0), 0.75);
-        near(7, (0, 0, 0), 4.0);
-        assert!(seen.slice(s![6, .., .., ..]).iter().all(|&gradient| gradient == -7.0));
+        near(11, (0, 0, 0), 0.75);
+        near(13, (0, 0, 0), 4.0);
+        assert!(seen.slice(s![12, .., .., ..]).iter().all(|&gradient| gradient == -7.0));
+        // The frames before are as far from each other as those of the result.
+        for feature in 0..OF_CLIP {
+            let early = seen.slice(s![OF_EARLY + feature, .., .., ..]);
+            let difference = &early - &seen.slice(s![feature, .., .., ..]);
+            assert!(difference.iter().all(|d| d.abs() < 1e-3), "{}", FEATURES[feature]);
+        }
     }
 
     #[test]
