@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::job::{Assessment, Finding, Grade, Severity};
 use crate::recon::assessment::Model;
 pub use crate::recon::assessment::{BLOCK, blocks};
+use crate::recon::motion::fastest;
 use crate::recon::schedule::Schedule;
 use crate::recon::sequence::RunShare;
 use crate::recon::signs::Signs;
@@ -22,6 +23,9 @@ pub struct TileAssessment {
     /// of a quarter of a decibel from 0.
     #[serde(with = "hex::serde")]
     levels: Vec<u8>,
+    /// How fast the frames move at most, in pixels a frame.
+    #[serde(default)]
+    motion: f32,
 }
 
 /// Levels in a decibel.
@@ -41,12 +45,15 @@ impl TileAssessment {
         let Some(features) = &outcome.features else {
             let (frames, height, width) = outcome.frames.dim();
             let size = blocks(height, width);
-            return Some(Self { size, levels: vec![DARK; frames * size.0 * size.1] });
+            let levels = vec![DARK; frames * size.0 * size.1];
+            return Some(Self { size, levels, motion: 0.0 });
         };
         let errors = model.log_errors(features, outcome.signs.or(signs).as_ref(), white);
         let level = |error: &f32| (-10.0 * error * STEPS).round().clamp(0.0, 254.0) as u8;
         let (_, rows, columns) = errors.dim();
-        Some(Self { size: (rows, columns), levels: errors.iter().map(level).collect() })
+        // On the scale on which the scene is on [0,1].
+        let motion = fastest((&outcome.frames / white).view());
+        Some(Self { size: (rows, columns), levels: errors.iter().map(level).collect(), motion })
     }
 
     fn is_dark(&self) -> bool {
@@ -89,11 +96,12 @@ pub fn expected(
     let (rows, columns) = blocks(height, width);
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
     let middle = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
-    let mut lit = false;
+    let (mut lit, mut motion) = (false, 0.0f32);
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
             lit |= !assessed.is_dark();
+            motion = motion.max(assessed.motion);
             let weights = plan.weights(&tile);
             let inside = |at: usize, first: usize, length: usize| {
                 at.checked_sub(first).filter(|at| *at < length)
@@ -124,7 +132,8 @@ pub fn expected(
     let (low, high) = (end(model.interval[0]), end(model.interval[1]));
     let error = squares.mapv(|square| (square.sqrt() * white) as f32);
     let psnr_db = psnr_db.min(BEST);
-    let reasons = reasons(&error, (psnr_db, white), warnings);
+    let mut reasons = reasons(&error, (psnr_db, white), warnings);
+    reasons.extend(too_fast(motion));
     let assessment = Assessment {
         grade: grade(psnr_db, &reasons),
         psnr_db: Assessment::round(psnr_db),
@@ -210,6 +219,24 @@ fn reasons(
     reasons
 }
 
+/// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up to 4.9; motion
+/// by 10 as 10 to 12 where it is resolved, and as 4 to 10 where it is not.
+const FAST: f32 = 5.3;
+
+fn too_fast(motion: f32) -> Option<Finding> {
+    (motion > FAST).then(|| Finding {
+        code: "fast_motion".to_owned(),
+        severity: Severity::Warning,
+        detail: format!(
+            "there is motion of about {motion:.0} pixels from frame to frame: what moves so fast may come out smoother than \
+             it is, and no measurement tells"
+        ),
+        remedy: "Take shorter frames, or fewer of them in a snapshot.".to_owned(),
+        frames: Vec::new(),
+        snapshot: None,
+    })
+}
+
 const PARTS: [[&str; 3]; 3] = [
     ["the upper left", "the upper middle", "the upper right"],
     ["the left", "the middle", "the right"],
@@ -232,7 +259,7 @@ mod tests {
 
     /// A tile of 2 frames of 32x32 pixels with this level in dB.
     fn tile(decibels: u8) -> TileAssessment {
-        TileAssessment { size: (2, 2), levels: vec![4 * decibels; 8] }
+        TileAssessment { size: (2, 2), levels: vec![4 * decibels; 8], motion: 4.0 }
     }
 
     #[test]
@@ -277,11 +304,17 @@ mod tests {
         // On a scale that is ten times too large every error is small.
         let dim = of(0.05, tiles([25; 4])).unwrap().assessment;
         assert_eq!((dim.reasons[0].code.as_str(), dim.grade), ("level", Grade::Usable), "{dim:?}");
+        // One tile that moves is enough.
+        let mut fast = tiles([25; 4]);
+        fast[1] = fast[1].clone().map(|tile| TileAssessment { motion: 8.6, ..tile });
+        let fast = map(fast).unwrap().assessment;
+        assert_eq!((fast.reasons[0].code.as_str(), fast.grade), ("fast_motion", Grade::Usable));
+        assert!(fast.reasons[0].detail.contains("about 9 pixels"), "{fast:?}");
         // A tile of an older version tells nothing; one without light has no part in what is seen.
         let mut partly = tiles([25; 4]);
         partly[2] = None;
         assert!(map(partly).is_none());
-        let dark = TileAssessment { size: (2, 2), levels: vec![DARK; 8] };
+        let dark = TileAssessment { size: (2, 2), levels: vec![DARK; 8], motion: 0.0 };
         assert!(map(vec![Some(dark.clone()); 4]).is_none());
         let mut lit = tiles([25; 4]);
         lit[3] = Some(dark);

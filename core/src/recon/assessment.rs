@@ -13,6 +13,7 @@ use std::sync::LazyLock;
 use ndarray::{Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis, s};
 use serde::Deserialize;
 
+use super::motion::Steps;
 use super::schedule::{Method, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
@@ -155,17 +156,10 @@ fn of_clip(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f
 /// Energies of a block of a frame, in the mean over its pixels.
 #[derive(Debug, Clone, Copy, Default)]
 struct Energies {
-    /// Of the steps to the next row and to the next column, and their product.
-    down: f32,
-    right: f32,
-    both: f32,
+    steps: Steps,
     curvature: f32,
     /// Of the steps to the frames beside.
     change: f32,
-    /// Of the slope along time, and its products with the steps down and right.
-    slope: f32,
-    slope_down: f32,
-    slope_right: f32,
     /// Of what differs from the mean over time.
     variance: f32,
 }
@@ -174,8 +168,6 @@ struct Energies {
 /// told from none.
 const REST: f32 = 1e-4;
 const LEFT: f32 = 1e-3;
-/// The share of the gradient's energy that is taken to be along an edge.
-const EDGE: f32 = 0.01;
 
 impl Energies {
     /// Of the blocks of frame `k`, whose snapshot has this mean over time.
@@ -195,56 +187,39 @@ impl Energies {
                 (Some(step), None) | (None, Some(step)) => (step, step * step),
                 (None, None) => (0.0, 0.0),
             };
-            sum.down += down * down;
-            sum.right += right * right;
-            sum.both += down * right;
+            sum.steps.add(down, right, slope);
             sum.curvature += curvature(frame, i, j);
             sum.change += change;
-            sum.slope += slope * slope;
-            sum.slope_down += slope * down;
-            sum.slope_right += slope * right;
             sum.variance += (here - mean[[i, j]]).powi(2);
         };
-        Array2::from_shape_fn(blocks(height, width), |(row, column)| {
+        Array2::from_shape_fn(blocks(height, width), |at| {
             let mut sum = Self::default();
-            let pixels = pixels_of((row, column), (height, width));
-            for i in pixels.0.clone() {
-                pixels.1.clone().for_each(|j| pixel(&mut sum, i, j));
+            let (rows, columns) = pixels_of(at, (height, width));
+            for i in rows.clone() {
+                columns.clone().for_each(|j| pixel(&mut sum, i, j));
             }
-            sum.over((pixels.0.len() * pixels.1.len()) as f32)
+            sum.over((rows.len() * columns.len()) as f32)
         })
     }
 
     fn over(self, pixels: f32) -> Self {
         Self {
-            down: self.down / pixels,
-            right: self.right / pixels,
-            both: self.both / pixels,
+            steps: self.steps.over(pixels),
             curvature: self.curvature / pixels,
             change: self.change / pixels,
-            slope: self.slope / pixels,
-            slope_down: self.slope_down / pixels,
-            slope_right: self.slope_right / pixels,
             variance: self.variance / pixels,
         }
     }
 
     fn gradient(&self) -> f32 {
-        0.5 * (self.down + self.right)
+        0.5 * (self.steps.down + self.steps.right)
     }
 
-    /// Logarithms of the squared speed of the motion that explains the slope along time best (Lucas and Kanade, 1981),
-    /// and of the share of the slope that it leaves.
+    /// Logarithms of the squared speed of the motion that explains the slope along time best, and of the share of the
+    /// slope that it leaves.
     fn motion(&self) -> (f32, f32) {
-        // Along an edge nothing is known of it, and none is supposed.
-        let ridge = EDGE * (self.down + self.right) + FLOOR;
-        let (down, right) = (self.down + ridge, self.right + ridge);
-        let determinant = down * right - self.both * self.both;
-        let rows = (self.both * self.slope_right - right * self.slope_down) / determinant;
-        let columns = (self.both * self.slope_down - down * self.slope_right) / determinant;
-        let rest = (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
-        let share = rest / self.slope.max(FLOOR);
-        ((rows * rows + columns * columns + REST).log10(), (share + LEFT).log10())
+        let (square, share) = self.steps.motion();
+        ((square + REST).log10(), (share + LEFT).log10())
     }
 }
 

@@ -15,6 +15,7 @@ mod held_out;
 pub mod joints;
 pub mod learned;
 pub mod metrics;
+pub mod motion;
 pub mod pilot;
 pub mod preview;
 pub mod prior;

@@ -1,0 +1,152 @@
+//! How fast a picture moves, told from reconstructed frames.
+//!
+//! What moves fast comes out smooth, and looks as good as a smooth scene. Its coarse structure survives, and how that
+//! moves from frame to frame tells the speed: frames are averaged over cells of some pixels, and of each window the one
+//! motion is found that explains the change best (Lucas and Kanade, 1981).
+
+use ndarray::{Array3, ArrayView3, Axis, s};
+
+/// Side of the cells in pixels: motion by more than that from frame to frame is told too small.
+const CELL: usize = 8;
+/// Side of the windows in cells.
+const WINDOW: usize = 16;
+/// The share of the change that a motion explains at the least, else there is none.
+const EXPLAINED: f32 = 0.1;
+/// The share of the gradient's energy that is taken to be along an edge, where nothing is known of a motion.
+const EDGE: f32 = 0.01;
+/// Below this, energies are rounding.
+const FLOOR: f32 = 1e-7;
+
+/// Energies of the steps to the next row and column and of the slope along time, and their products.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Steps {
+    pub down: f32,
+    pub right: f32,
+    pub both: f32,
+    pub slope: f32,
+    pub slope_down: f32,
+    pub slope_right: f32,
+}
+
+impl Steps {
+    pub(super) fn add(&mut self, down: f32, right: f32, slope: f32) {
+        self.down += down * down;
+        self.right += right * right;
+        self.both += down * right;
+        self.slope += slope * slope;
+        self.slope_down += slope * down;
+        self.slope_right += slope * right;
+    }
+
+    pub(super) fn over(self, count: f32) -> Self {
+        Self {
+            down: self.down / count,
+            right: self.right / count,
+            both: self.both / count,
+            slope: self.slope / count,
+            slope_down: self.slope_down / count,
+            slope_right: self.slope_right / count,
+        }
+    }
+
+    /// The squared speed, in steps, of the motion that explains the slope best, and the share of the slope that it
+    /// leaves. These are of means over pixels.
+    pub(super) fn motion(&self) -> (f32, f32) {
+        let ridge = EDGE * (self.down + self.right) + FLOOR;
+        let (down, right) = (self.down + ridge, self.right + ridge);
+        let determinant = down * right - self.both * self.both;
+        let rows = (self.both * self.slope_right - right * self.slope_down) / determinant;
+        let columns = (self.both * self.slope_down - down * self.slope_right) / determinant;
+        let rest = (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
+        (rows * rows + columns * columns, rest / self.slope.max(FLOOR))
+    }
+}
+
+/// The speed of the fastest window of frames \[K,H,W\] on the scale on which the scene is on \[0,1\], in pixels a frame.
+pub fn fastest(frames: ArrayView3<'_, f32>) -> f32 {
+    let coarse = averaged(frames);
+    let (count, rows, columns) = coarse.dim();
+    if count < 2 || rows < 3 || columns < 3 {
+        return 0.0;
+    }
+    // Halves the windows' sides at most, and leaves none smaller.
+    let parts = |length: usize| (length / WINDOW).max(1);
+    let range = |part: usize, length: usize| {
+        part * length / parts(length)..(part + 1) * length / parts(length)
+    };
+    let mut most = 0.0f32;
+    for row in 0..parts(rows) {
+        for column in 0..parts(columns) {
+            let window = coarse.slice(s![.., range(row, rows), range(column, columns)]);
+            let (square, rest) = steps(window).motion();
+            if rest <= 1.0 - EXPLAINED {
+                most = most.max(square.sqrt() * CELL as f32);
+            }
+        }
+    }
+    most
+}
+
+/// Means over cells \[K, H / CELL, W / CELL\], without what is left at the far edges.
+fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
+    let (count, height, width) = frames.dim();
+    Array3::from_shape_fn((count, height / CELL, width / CELL), |(k, row, column)| {
+        let (i, j) = (row * CELL, column * CELL);
+        frames.slice(s![k, i..i + CELL, j..j + CELL]).sum() / (CELL * CELL) as f32
+    })
+}
+
+/// In the mean over a window, by central differences in the middle between two frames.
+fn steps(window: ArrayView3<'_, f32>) -> Steps {
+    let (count, rows, columns) = window.dim();
+    let mut sums = Steps::default();
+    for k in 0..count - 1 {
+        let (frame, next) = (window.index_axis(Axis(0), k), window.index_axis(Axis(0), k + 1));
+        for i in 1..rows - 1 {
+            for j in 1..columns - 1 {
+                let across =
+                    |a: [usize; 2], b: [usize; 2]| (frame[b] - frame[a] + next[b] - next[a]) / 4.0;
+                let down = across([i - 1, j], [i + 1, j]);
+                let right = across([i, j - 1], [i, j + 1]);
+                sums.add(down, right, next[[i, j]] - frame[[i, j]]);
+            }
+        }
+    }
+    sums.over(((count - 1) * (rows - 2) * (columns - 2)) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::fastest;
+    use ndarray::{Array3, s};
+
+    /// Coarse and fine texture that moves by so many rows and columns a frame.
+    fn moving(rows: f32, columns: f32) -> Array3<f32> {
+        Array3::from_shape_fn((8, 160, 300), |(k, i, j)| {
+            let (i, j) = (i as f32 - rows * k as f32, j as f32 - columns * k as f32);
+            let coarse = (i / 11.0).sin() * (j / 14.0).cos() + (i / 17.0 + j / 23.0).sin();
+            0.5 + 0.15 * coarse + 0.1 * (i * 1.3).sin() * (j * 1.1).sin()
+        })
+    }
+
+    #[test]
+    fn the_speed_of_coarse_structure_is_found() {
+        for (rows, columns) in [(0.0, 0.0), (0.0, 3.0), (-2.0, 2.0), (6.0, 8.0), (10.0, 0.0)] {
+            let (expected, told) =
+                (f32::hypot(rows, columns), fastest(moving(rows, columns).view()));
+            assert!((told - expected).abs() < 0.25 * expected + 0.1, "{rows}, {columns}: {told}");
+        }
+    }
+
+    #[test]
+    fn a_part_that_moves_is_seen_beside_one_at_rest_and_a_light_that_changes_is_no_motion() {
+        let mut frames = moving(0.0, 0.0);
+        frames.slice_mut(s![.., .., 150..]).assign(&moving(0.0, 9.0).slice(s![.., .., 150..]));
+        assert!(fastest(frames.view()) > 6.0, "{}", fastest(frames.view()));
+        let mut lit = moving(0.0, 0.0);
+        lit.outer_iter_mut().enumerate().for_each(|(k, mut frame)| frame *= 1.0 - 0.1 * k as f32);
+        assert!(fastest(lit.view()) < 2.0, "{}", fastest(lit.view()));
+        // Too small for cells.
+        assert_eq!(fastest(moving(0.0, 9.0).slice(s![.., ..20, ..])), 0.0);
+    }
+}
