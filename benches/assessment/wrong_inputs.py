@@ -131,6 +131,7 @@ def main():
             what = flags(right, true=true)
             if what:
                 alarms.append(f'{pathlib.Path(file).stem} {pattern} Cr {ratio} sigma {sigma:g}: {what}')
+                print('   ', *(reason['detail'] for reason in right['reasons']), sep='\n    ')
             print(f'{pathlib.Path(file).stem[:30]:30} {pattern:16} {ratio:2} {sigma:4} true {true:5.1f} predicted {right["psnr_db"]:5.1f} {right["grade"]} {what}', flush=True)
             if index < a.scenes:
                 moved = panned(photo, ratio, a.side, 10, scale)

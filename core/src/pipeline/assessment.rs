@@ -51,8 +51,7 @@ impl TileAssessment {
         let errors = model.log_errors(features, outcome.signs.or(signs).as_ref(), white);
         let level = |error: &f32| (-10.0 * error * STEPS).round().clamp(0.0, 254.0) as u8;
         let (_, rows, columns) = errors.dim();
-        // On the scale on which the scene is on [0,1].
-        let motion = fastest((&outcome.frames / white).view());
+        let motion = fastest(outcome.frames.view(), white);
         Some(Self { size: (rows, columns), levels: errors.iter().map(level).collect(), motion })
     }
 

@@ -62,9 +62,9 @@ impl Steps {
     }
 }
 
-/// The speed of the fastest window of frames \[K,H,W\] on the scale on which the scene is on \[0,1\], in pixels a frame.
-pub fn fastest(frames: ArrayView3<'_, f32>) -> f32 {
-    let coarse = averaged(frames);
+/// The speed of the fastest window of frames \[K,H,W\], whose white level this is, in pixels a frame.
+pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
+    let coarse = averaged(frames) / white;
     let (count, rows, columns) = coarse.dim();
     if count < 2 || rows < 3 || columns < 3 {
         return 0.0;
@@ -133,7 +133,7 @@ mod tests {
     fn the_speed_of_coarse_structure_is_found() {
         for (rows, columns) in [(0.0, 0.0), (0.0, 3.0), (-2.0, 2.0), (6.0, 8.0), (10.0, 0.0)] {
             let (expected, told) =
-                (f32::hypot(rows, columns), fastest(moving(rows, columns).view()));
+                (f32::hypot(rows, columns), fastest(moving(rows, columns).view(), 1.0));
             assert!((told - expected).abs() < 0.25 * expected + 0.1, "{rows}, {columns}: {told}");
         }
     }
@@ -142,11 +142,11 @@ mod tests {
     fn a_part_that_moves_is_seen_beside_one_at_rest_and_a_light_that_changes_is_no_motion() {
         let mut frames = moving(0.0, 0.0);
         frames.slice_mut(s![.., .., 150..]).assign(&moving(0.0, 9.0).slice(s![.., .., 150..]));
-        assert!(fastest(frames.view()) > 6.0, "{}", fastest(frames.view()));
+        assert!(fastest(frames.view(), 1.0) > 6.0, "{}", fastest(frames.view(), 1.0));
         let mut lit = moving(0.0, 0.0);
         lit.outer_iter_mut().enumerate().for_each(|(k, mut frame)| frame *= 1.0 - 0.1 * k as f32);
-        assert!(fastest(lit.view()) < 2.0, "{}", fastest(lit.view()));
+        assert!(fastest(lit.view(), 1.0) < 2.0, "{}", fastest(lit.view(), 1.0));
         // Too small for cells.
-        assert_eq!(fastest(moving(0.0, 9.0).slice(s![.., ..20, ..])), 0.0);
+        assert_eq!(fastest(moving(0.0, 9.0).slice(s![.., ..20, ..]), 1.0), 0.0);
     }
 }
