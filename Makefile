@@ -149,12 +149,13 @@ eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop
 		--data $(DATA) --scenes $(SCENES) --white $(WHITE) $(if $(MODELS),--models $(MODELS)) \
 		$(if $(FULL),--full) $(if $(CACHED),--cached) $(if $(FRESH),--fresh) $(if $(JSON),--json)
 
-eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## wrong inputs beside good ones through the service: which are flagged; ALGORITHM=gap-tv GOOD=60
+eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## wrong inputs beside good ones through the service: which are flagged; ALGORITHM=gap-tv GOOD=60 WRONG=6
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python benches/assessment/wrong_inputs.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
-		--data $(DATA) --algorithm $(ALGORITHM) --good $(GOOD)
+		--data $(DATA) --algorithm $(ALGORITHM) --good $(GOOD) --scenes $(WRONG)
 GOOD ?= 60
+WRONG ?= 6
 
 evaluation-data:
 	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \

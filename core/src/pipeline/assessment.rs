@@ -218,9 +218,9 @@ fn reasons(
     reasons
 }
 
-/// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up to 4.9; motion
-/// by 10 as 10 to 12 where it is resolved, and as 4 to 10 where it is not.
-const FAST: f32 = 5.3;
+/// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up to 5.3, motion
+/// by 10 as 7 to 14 (`docs/benchmarks.md`).
+const FAST: f32 = 6.0;
 
 fn too_fast(motion: f32) -> Option<Finding> {
     (motion > FAST).then(|| Finding {
