@@ -78,7 +78,7 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
 
     assert_eq!(lab.text(&["watch", &job]).await, format!("{job} succeeded"));
     let everything = [
-        "frames.npy,stack.exr,stack.tif,movie.mp4,frames,png,manifest.json",
+        "frames.npy,stack.exr,stack-sigma.exr,stack.tif,movie.mp4,frames,png,manifest.json",
         "sequence.npy,sequence.mp4",
     ];
     let line =
@@ -86,11 +86,12 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     let fetched = lab.json(&line).await;
     // The array, the stacks, the movie, the manifest, EXR and PNG of each frame of each snapshot; the manifest, the array and
     // the movie of all.
-    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (5 + 2 * 8) + 3, "{fetched:#}");
+    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (6 + 2 * 8) + 3, "{fetched:#}");
     for file in [
         "snapshot_0001/frames.npy",
         "snapshot_0000/png/frame_0003.png",
         "snapshot_0001/movie.mp4",
+        "snapshot_0001/stack-sigma.exr",
         "sequence.npy",
         "sequence.mp4",
     ] {
@@ -99,7 +100,9 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
             ("", "sequence.npy") => "sequence/frames.npy".to_owned(),
             ("", _) => "sequence/movie.mp4".to_owned(),
             _ => {
-                format!("snapshots/{}/{}", &place[12..], name.replace("png/frame_0003", "frames/3"))
+                let name = name.replace("png/frame_0003", "frames/3");
+                let name = name.replace("stack-sigma.exr", "stack.exr?layers=sigma");
+                format!("snapshots/{}/{name}", &place[12..])
             }
         };
         let served = app.get(&format!("/v1/jobs/{job}/{path}")).await.expect(200).bytes;

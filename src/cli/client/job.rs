@@ -39,6 +39,9 @@ pub(in crate::cli) enum Wanted {
     /// The same as a multi-part EXR.
     #[value(name = "stack.exr")]
     Stack,
+    /// The same with the expected error as a layer `sigma`.
+    #[value(name = "stack-sigma.exr")]
+    StackWithError,
     /// The same as a BigTIFF for Fiji and napari.
     #[value(name = "stack.tif")]
     Tiff,
@@ -92,7 +95,8 @@ impl Wanted {
             Self::Frames => name.starts_with("frames/"),
             Self::Pictures => name.starts_with("png/"),
             Self::Manifest => name == "manifest.json",
-            Self::Tiff
+            Self::StackWithError
+            | Self::Tiff
             | Self::Movie
             | Self::SequenceArray
             | Self::SequenceTiff
@@ -183,9 +187,14 @@ impl Client {
                     files.push((href.clone(), path, Some(file.sha256)));
                 }
             }
-            for (made, name) in [(Wanted::Tiff, "stack.tif"), (Wanted::Movie, "movie.mp4")] {
+            let made = [
+                (Wanted::StackWithError, "stack.exr?layers=sigma", "stack-sigma.exr"),
+                (Wanted::Tiff, "stack.tif", "stack.tif"),
+                (Wanted::Movie, "movie.mp4", "movie.mp4"),
+            ];
+            for (made, place, name) in made {
                 if wanted.contains(&made) {
-                    files.push((format!("{of_snapshot}/{name}"), inside.join(name), None));
+                    files.push((format!("{of_snapshot}/{place}"), inside.join(name), None));
                 }
             }
         }

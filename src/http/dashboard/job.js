@@ -137,6 +137,7 @@ async function showFiles(element, { id, state, shape, snapshots: { count } }, sn
   const moves = Math.min(shape.height, shape.width) >= LEAST_MOVIE_SIDE;
   const stack = whole.find((file) => file.name === "stack.exr")?.href;
   put(element, h("b", null, "Download"), whole.map((file) => link(file, file.name === "stack.exr")),
+    stack && whole.some((file) => file.name === "error.npy") && made(`${stack}?layers=sigma`, "EXR stack with expected error"),
     stack && made(stack.replace(/exr$/, "tif"), "TIFF stack"),
     stack && moves && movieLink(`/v1/jobs/${id}/snapshots/${snapshot}/movie.mp4`, "Movie", signal),
     stack && moves && count > 1 && state === "succeeded" && movieLink(`/v1/jobs/${id}/sequence/movie.mp4`, "Movie of all", signal),

@@ -59,11 +59,12 @@ export class Verdict {
   tell(assessment) {
     this.told = assessment;
     const { psnr_db: psnr, psnr_low_db: low, psnr_high_db: high, reasons } = this.told ?? {};
-    const uneven = reasons?.filter((reason) => reason.code === "uneven_error") ?? [];
+    const warned = new Set(this.job.warnings.map((warning) => warning.code));
+    const own = reasons?.filter((reason) => !warned.has(reason.code)) ?? [];
     put(this.expected, this.told && [
       h("p", { class: "quality" }, "about ", h("b", null, about(psnr)), " PSNR expected"),
       h("p", { class: "muted" }, `Four times of five the true one lies between ${low.toFixed(0)} and ${about(high)}. Without a truth no more is known; “Expected error” above the frames shows where it is worst.`),
-      findings(uneven)]);
+      findings(own)]);
   }
 
   judge(text, kind, why) {
