@@ -57,7 +57,7 @@ struct Phases {
 pub struct MeasurementFigures {
     /// Mean of the measurement.
     pub mean: f64,
-    /// Share of the blocks of [`BLOCK`] x [`BLOCK`] pixels whose mean is so far below 0 that noise can't be the reason.
+    /// Share of the blocks of 8x8 pixels whose mean is so far below 0 that noise can't be the reason.
     pub negative: f64,
     /// Mean brightness of each frame, where the masks are 1.
     pub brightness: Vec<f64>,
