@@ -447,9 +447,8 @@ mod tests {
     use ndarray::{Array2, Array3, s};
 
     use super::{MeasurementStudy, judge_measurement};
-    use crate::optics::{
-        Circle, HybridAperture, Method, Placement, generator, measure, noisy, random_squares,
-    };
+    use crate::optics::masks::turning_circle;
+    use crate::optics::{measure, noisy, random_squares};
 
     /// A scene with a moving disc on a textured ground.
     fn scene(frames: usize, side: usize) -> Array3<f32> {
@@ -566,13 +565,7 @@ mod tests {
 
     #[test]
     fn a_shift_of_one_pixel_is_seen_behind_a_turning_circle() {
-        let optics = HybridAperture {
-            placement: Placement::Geometric,
-            method: Method::Convolution,
-            ..HybridAperture::default()
-        };
-        let patterns = Circle::default().patterns(10, &optics.geometry).unwrap();
-        let masks = optics.masks(patterns.view(), (140, 140), &mut generator(3)).unwrap().masks;
+        let masks = turning_circle(10, 140, 3);
         let scene = scene(10, 140);
         let y = noisy(measure(masks.view(), scene.view()).unwrap(), 0.02, 3).unwrap();
         assert!(codes(&masks, &y).is_empty(), "{:?}", codes(&masks, &y));

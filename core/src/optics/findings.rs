@@ -255,7 +255,7 @@ fn dark_patterns(figures: &MaskFigures) -> Vec<Finding> {
 const SAME: f64 = 0.98;
 /// What masks of neighbouring frames lack to a correlation of 1, in the median, if they turn by little.
 const TURNING: f64 = 0.05;
-/// The share of that which a mask lacks that was taken twice.
+/// A mask that was taken twice lacks less than this share of that.
 const TWICE: f64 = 0.3;
 
 /// Masks that are the same. Where patterns turn by little from frame to frame, all neighbours are nearly the same, and
@@ -433,7 +433,8 @@ mod tests {
     use ndarray::{Array3, Axis, concatenate, s};
 
     use super::judge_masks;
-    use crate::optics::{Circle, HybridAperture, MaskStudy, Method, Placement, generator};
+    use crate::optics::MaskStudy;
+    use crate::optics::masks::turning_circle;
 
     fn repeated(masks: &Array3<f32>) -> Option<Vec<usize>> {
         let (frames, height, width) = masks.dim();
@@ -449,14 +450,8 @@ mod tests {
     /// In 24 frames each pattern of a turning circle is nearly the one before it.
     #[test]
     fn a_pattern_that_was_taken_twice_is_told_from_one_that_turns_by_little() {
-        let optics = HybridAperture {
-            placement: Placement::Geometric,
-            method: Method::Convolution,
-            ..HybridAperture::default()
-        };
         for count in [6, 24, 48] {
-            let patterns = Circle::default().patterns(count, &optics.geometry).unwrap();
-            let masks = optics.masks(patterns.view(), (96, 96), &mut generator(3)).unwrap().masks;
+            let masks = turning_circle(count, 96, 3);
             assert_eq!(repeated(&masks), None, "{count}");
             let mut twice = masks.clone();
             twice.slice_mut(s![3, .., ..]).assign(&masks.slice(s![2, .., ..]));

@@ -121,14 +121,26 @@ impl HybridAperture {
     }
 }
 
+/// Masks \[frames,side,side\] of a circle that turns once, sharply projected.
+#[cfg(test)]
+pub(super) fn turning_circle(frames: usize, side: usize, seed: u64) -> Array3<f32> {
+    use super::{Circle, generator};
+    let optics = HybridAperture {
+        placement: Placement::Geometric,
+        method: Method::Convolution,
+        ..HybridAperture::default()
+    };
+    let patterns = Circle::default().patterns(frames, &optics.geometry).unwrap();
+    optics.masks(patterns.view(), (side, side), &mut generator(seed)).unwrap().masks
+}
+
 #[cfg(test)]
 mod tests {
     use ndarray::{Array2, Array3, Axis};
 
-    use super::{HybridAperture, Normalisation};
+    use super::{HybridAperture, Normalisation, turning_circle};
     use crate::optics::{
-        ApertureGrid, Circle, Draw, Geometry, Method, Multiplexing, Placement, generator,
-        single_apertures,
+        ApertureGrid, Draw, Geometry, Multiplexing, Placement, generator, single_apertures,
     };
 
     const GRID: ApertureGrid = ApertureGrid { rows: 3, columns: 4 };
@@ -202,16 +214,10 @@ mod tests {
 
     #[test]
     fn a_turning_circle_gives_masks_that_are_alike_in_turn() {
-        let optics = HybridAperture {
-            placement: Placement::Geometric,
-            method: Method::Convolution,
-            ..HybridAperture::default()
-        };
-        let patterns = Circle::default().patterns(6, &optics.geometry).unwrap();
-        let made = optics.masks(patterns.view(), (96, 96), &mut generator(3)).unwrap();
-        let means: Vec<f32> = made.masks.axis_iter(Axis(0)).map(|m| m.mean().unwrap()).collect();
+        let all = turning_circle(6, 96, 3);
+        let means: Vec<f32> = all.axis_iter(Axis(0)).map(|m| m.mean().unwrap()).collect();
         assert!(means.iter().all(|mean| (mean / means[0] - 1.0).abs() < 0.02), "{means:?}");
-        let masks = |k: [usize; 2]| made.masks.select(Axis(0), &k);
+        let masks = |k: [usize; 2]| all.select(Axis(0), &k);
         let (near, far) = (correlation(&masks([0, 1])), correlation(&masks([0, 3])));
         assert!(near > far + 0.1, "{near} {far}");
     }

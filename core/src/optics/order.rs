@@ -165,10 +165,8 @@ mod tests {
     use ndarray::{Array2, Array3, Axis};
 
     use super::{Expected, pattern_likeness, reordered};
-    use crate::optics::{
-        ApertureGrid, Circle, HybridAperture, MaskStudy, Method, Placement, generator,
-        random_squares,
-    };
+    use crate::optics::masks::turning_circle;
+    use crate::optics::{ApertureGrid, MaskStudy, random_squares};
 
     fn correlation(masks: &Array3<f32>) -> Array2<f64> {
         let (frames, height, width) = masks.dim();
@@ -202,17 +200,11 @@ mod tests {
 
     #[test]
     fn a_swap_among_turning_patterns_is_found_without_them() {
-        let optics = HybridAperture {
-            placement: Placement::Geometric,
-            method: Method::Convolution,
-            ..HybridAperture::default()
-        };
         for frames in [6, 10, 20] {
-            let patterns = Circle::default().patterns(frames, &optics.geometry).unwrap();
-            let made = optics.masks(patterns.view(), (96, 96), &mut generator(5)).unwrap();
-            let seen = correlation(&made.masks);
+            let masks = turning_circle(frames, 96, 5);
+            let seen = correlation(&masks);
             assert_eq!(reordered(seen.view(), &Expected::Turning), None);
-            let seen = correlation(&swapped(&made.masks, 1, 4));
+            let seen = correlation(&swapped(&masks, 1, 4));
             let found = reordered(seen.view(), &Expected::Turning).unwrap();
             assert_eq!(found.swaps, [(1, 4)], "{frames} frames: {found:?}");
         }

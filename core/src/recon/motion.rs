@@ -6,7 +6,7 @@
 
 use ndarray::{Array3, ArrayView3, Axis, s};
 
-/// Side of the cells in pixels: motion by more than that from frame to frame is told too small.
+/// Side of the cells in pixels: motion by much more than that from frame to frame is told wrongly.
 const CELL: usize = 8;
 /// Side of the windows in cells.
 const WINDOW: usize = 16;
@@ -69,7 +69,7 @@ pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
     if count < 2 || rows < 3 || columns < 3 {
         return 0.0;
     }
-    // Halves the windows' sides at most, and leaves none smaller.
+    // Windows are larger where the sides are no multiples, and none is smaller but in a smaller picture.
     let parts = |length: usize| (length / WINDOW).max(1);
     let range = |part: usize, length: usize| {
         part * length / parts(length)..(part + 1) * length / parts(length)
