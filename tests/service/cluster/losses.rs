@@ -1,7 +1,7 @@
 //! What is not there, or gets lost on the side of the message server.
 
 use rustix::process::{Pid, Signal, kill_process};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::nodes::Nats;
 use super::{alone, busy, figure, served, until, with_iterations, worker};
@@ -16,13 +16,14 @@ async fn repaired(app: &TestApp) -> f64 {
 #[tokio::test]
 async fn what_the_message_server_loses_is_handed_out_again() {
     let Some(mut nats) = Nats::start(1) else { return };
-    // Two workers have twelve tiles left for longer than the sweep needs to find what is lost of the first four.
     let long = |measurement: &str| with_iterations(measurement, 2_000);
     let expected = alone(long).await;
     let app = served(&nats, "2").await;
     let _workers = [worker(&nats, &[]), worker(&nats, &[])];
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let id = app.submit(&long(&measurement)).await;
+    // Until the end there are more tiles than the workers hold, however late the sweep comes.
+    let behind = app.submit(&with_iterations(&measurement, 9000)).await;
     busy(&app).await;
     // Tiles that wait, and the windows of all.
     nats.purge("SCI_TASKS").await;
@@ -39,6 +40,7 @@ async fn what_the_message_server_loses_is_handed_out_again() {
     assert_eq!(done["state"], "succeeded", "{done:#}");
     assert_eq!(results(&app, &id).await, expected);
     eprintln!("{} tiles were handed out again", repaired(&app).await);
+    app.post(&format!("/v1/jobs/{behind}/cancel"), &json!({})).await.expect(202);
     nats.emptied().await;
 }
 
