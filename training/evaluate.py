@@ -96,13 +96,14 @@ def main():
     p.add_argument('--last', type=float, default=6, help='last sigma (/255)')
     p.add_argument('--tv-weight', type=float, default=0, help='TV before each deep pass')
     p.add_argument('--memory', type=float, default=.7, help='of the accumulated residual in the deep passes: 1 accelerated, 0 plain GAP')
+    p.add_argument('--size', type=int, default=96, help='sides of the held-out clips, in pixels')
     p.add_argument('--no-white', action='store_true')
     a = p.parse_args()
-    scenes = LoopScenes(a.data, a.scene)
+    scenes = LoopScenes(a.data, a.scene, a.size)
     print(json.dumps({'model': 'tv', 'loop': scenes.tv()}), flush=True)
     for path in a.weights:
         net = export.load(path)
-        row = {'model': path} if a.no_white else {'model': path, 'white': white(net, a.data)}
+        row = {'model': path} if a.no_white else {'model': path, 'white': white(net, a.data, size=a.size)}
         if not isinstance(net, model.Block):
             row['loop'] = scenes.run(net, solver.geometric(a.first, a.last, a.passes), a.tv_weight, a.memory)
         print(json.dumps(row), flush=True)

@@ -88,7 +88,7 @@ def test_pipeline():
         common = ('--data', data, '--crop', 32, '--frames', 8, '--steps', 3, '--every', 0)
         run('train.py', *common, '--stage', 'block', '--out', out('block.pt'))
         run('train.py', *common, '--stage', 'full', '--init', out('block.pt'), '--out', out('full.pt'))
-        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2, '--every', 15)   # one run with evaluations
+        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2, '--every', 15, '--evaluation-size', 32)   # one run with evaluations
         run('train.py', *common, '--stage', 'ffdnet', '--out', out('white.pt'))
         run('train.py', *common, '--stage', 'ffdnet-loop', '--init', out('white.pt'), '--out', out('ffdnet.pt'), '--runs', 2)
         run('train.py', *common, '--stage', 'loop', '--out', out('loop.pt'), '--runs', 2, '--unroll', 2)
@@ -108,7 +108,7 @@ def test_pipeline():
         assert 0 < change < .05, change
         size = lambda name: os.path.getsize(os.path.join(out(name), 'stage1.onnx'))
         assert size('int8') < .3 * size('loop')
-        rows = [json.loads(line) for line in run('evaluate.py', '--data', data, out('loop'), out('ffdnet'), '--passes', 2).splitlines()]
+        rows = [json.loads(line) for line in run('evaluate.py', '--data', data, out('loop'), out('ffdnet'), '--passes', 2, '--size', 32).splitlines()]
         assert [os.path.basename(r['model']) for r in rows] == ['tv', 'loop', 'ffdnet']
         assert all(np.isfinite(list(r['loop'].values())).all() for r in rows)
 

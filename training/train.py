@@ -259,6 +259,7 @@ def main():
     p.add_argument('--threads', type=int, default=1)
     p.add_argument('--scene', help='a .mat scene that evaluation also runs')
     p.add_argument('--every', type=float, default=15, help='minutes between evaluations, the first before the first step and one at the end; 0 for none')
+    p.add_argument('--evaluation-size', type=int, default=96, help='sides of the held-out clips, in pixels')
     a = p.parse_args()
     if a.unroll < 1:
         p.error(f'--unroll {a.unroll}: a step needs at least 1 pass')
@@ -275,7 +276,7 @@ def main():
         snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop)
         loop = Iterates(snapshots, device, a.runs, DEFAULTS[a.stage])
     if a.stage != 'block' and a.every:
-        scenes = evaluate.LoopScenes(a.data, a.scene, device=device)
+        scenes = evaluate.LoopScenes(a.data, a.scene, a.evaluation_size, device)
         print('TV', json.dumps(scenes.tv()), flush=True)
 
     def report():
@@ -283,7 +284,7 @@ def main():
         if not a.every:
             return
         net = t.averaged()
-        row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device)}
+        row = {'step': t.step, 'minutes': round(t.seconds / 60, 1), 'white': evaluate.white(net, a.data, device, size=a.evaluation_size)}
         if scenes:
             row['loop'] = scenes.run(net, solver.geometric(20, 6, 12), memory=.7)
         print('evaluation', json.dumps(row), flush=True)

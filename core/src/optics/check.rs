@@ -5,7 +5,7 @@
 //! mean brightness x_k of each frame; what the means then leave over is an offset, and masks that are
 //! moved against the measurement explain it better when they are moved back.
 
-use ndarray::{Array1, Array2, ArrayView2, ArrayView3, s};
+use ndarray::{Array1, Array2, ArrayView2, ArrayView3, Axis, s};
 
 use super::findings::{Finding, Severity};
 
@@ -30,26 +30,30 @@ const BLOCK: usize = 8;
 #[derive(Debug)]
 pub struct MeasurementStudy {
     frames: usize,
-    /// `sum C_k' C_l'`, each less its block's mean.
-    products: Array2<f64>,
-    /// `sum C_k'(p + shift) y'(p)`, by shift and frame.
+    /// `sum C_k'(p + shift) y'(p)`, by shift and frame, each less its block's mean.
     matches: Vec<Array1<f64>>,
     square: f64,
-    mask_sums: Array1<f64>,
-    sum: f64,
     pixels: f64,
     /// The means of those blocks of the measurement that are below 0.
     negative: Vec<f32>,
-    /// Of each row of blocks.
-    phases: Vec<Phases>,
+    strips: Vec<Strip>,
 }
 
-/// What pixels of odd and even rows and columns have more than their mean, by (row, column) modulo 2: of a
-/// measurement \[4\], and of its masks \[B,4\].
+/// Sums over a row of blocks.
 #[derive(Debug)]
-struct Phases {
-    y: [f64; 4],
-    masks: Vec<[f64; 4]>,
+struct Strip {
+    /// `sum y`.
+    sum: f64,
+    /// `sum C_k`.
+    mask_sums: Array1<f64>,
+    /// `sum C_k' C_l'`, each less its block's mean.
+    products: Array2<f64>,
+    /// `sum C_k' y'`.
+    matches: Array1<f64>,
+    /// What pixels of odd and even rows and columns have more than their mean, by (row, column) modulo 2: of the
+    /// measurement \[4\], and of its masks \[B,4\].
+    y_phases: [f64; 4],
+    mask_phases: Vec<[f64; 4]>,
 }
 
 /// What a measurement tells about its masks. Values have the measurement's full scale divided out.
@@ -90,14 +94,11 @@ impl MeasurementStudy {
     pub fn new(frames: usize) -> Self {
         Self {
             frames,
-            products: Array2::zeros((frames, frames)),
             matches: shifts().map(|_| Array1::zeros(frames)).collect(),
             square: 0.0,
-            mask_sums: Array1::zeros(frames),
-            sum: 0.0,
             pixels: 0.0,
             negative: Vec::new(),
-            phases: Vec::new(),
+            strips: Vec::new(),
         }
     }
 
@@ -113,24 +114,16 @@ impl MeasurementStudy {
         }
         let part = |row: usize, column: usize| s![row..row + rows, column..column + columns];
         let y = y.slice(part(REACH, REACH));
-        for row in (0..rows).step_by(BLOCK) {
-            let strip = |image: ArrayView2<'_, f32>| phases(image.slice(s![row..row + BLOCK, ..]));
-            let here = |mask: ArrayView2<'_, f32>| strip(mask.slice(part(REACH, REACH)));
-            self.phases.push(Phases { y: strip(y), masks: masks.outer_iter().map(here).collect() });
-        }
         self.pixels += y.len() as f64;
-        self.sum += y.iter().map(|&value| f64::from(value)).sum::<f64>();
         let means = y.exact_chunks((BLOCK, BLOCK)).into_iter().filter_map(|block| block.mean());
         self.negative.extend(means.filter(|mean| *mean < 0.0));
+        for row in (0..rows).step_by(BLOCK) {
+            let here = s![.., REACH + row..REACH + row + BLOCK, REACH..REACH + columns];
+            self.strips.push(Strip::of(masks.slice(here), y.slice(s![row..row + BLOCK, ..])));
+        }
         let y = less_block_means(y);
         self.square += y.iter().map(|&value| f64::from(value).powi(2)).sum::<f64>();
-        let flat = |array: &Array2<f32>| array.iter().copied().collect::<Array1<f32>>();
-        let y = flat(&y);
-        let mut unmoved = Array2::zeros((frames, rows * columns));
         for (k, mask) in masks.outer_iter().enumerate() {
-            let here = mask.slice(part(REACH, REACH));
-            self.mask_sums[k] += here.iter().map(|&value| f64::from(value)).sum::<f64>();
-            unmoved.row_mut(k).assign(&flat(&less_block_means(here)));
             for ((row, column), matches) in shifts().zip(&mut self.matches) {
                 // Only y has to be less its mean for this: it makes a mean of the mask drop out.
                 let moved = mask.slice(part(row, column));
@@ -138,7 +131,6 @@ impl MeasurementStudy {
                 matches[k] += f64::from(product);
             }
         }
-        self.products += &unmoved.dot(&unmoved.t()).mapv(f64::from);
     }
 
     /// The figures; none if the windows were too small or have no structure.
@@ -146,7 +138,15 @@ impl MeasurementStudy {
         if self.pixels == 0.0 || self.square <= 0.0 {
             return None;
         }
-        let inverse = inverse(&self.products)?;
+        let mut products = Array2::zeros((self.frames, self.frames));
+        let mut means = Array1::zeros(self.frames);
+        for strip in &self.strips {
+            products += &strip.products;
+            means += &strip.mask_sums;
+        }
+        means /= self.pixels;
+        let mean = self.strips.iter().map(|strip| strip.sum).sum::<f64>() / self.pixels;
+        let inverse = inverse(&products)?;
         let explained = |matches: &Array1<f64>| matches.dot(&inverse.dot(matches)) / self.square;
         let best = shifts()
             .zip(&self.matches)
@@ -160,18 +160,17 @@ impl MeasurementStudy {
         let scatter = self.square * (1.0 - unmoved).max(0.0) / self.pixels;
         let errors: Vec<f64> =
             (0..self.frames).map(|k| (scatter * inverse[[k, k]]).max(0.0).sqrt()).collect();
-        let means = &self.mask_sums / self.pixels;
-        let mean = self.sum / self.pixels;
         let deep = self.negative.iter().filter(|below| f64::from(**below) < -DEEP * mean.abs());
         let negative = (deep.count() * BLOCK * BLOCK) as f64 / self.pixels;
-        let error = (scatter * means.dot(&inverse.dot(&means))).max(0.0).sqrt();
+        let offset = mean - brightness.dot(&means);
+        let sure = self.offset_uncertainty(&brightness, offset, &inverse.dot(&means));
         let place = |index: usize| REACH as i32 - index as i32;
-        let mosaic = mosaic(&self.phases, &brightness, mean);
+        let mosaic = mosaic(&self.strips, &brightness, mean);
         Some(MeasurementFigures {
             mean,
             negative,
-            offset: mean - brightness.dot(&means),
-            offset_uncertainty: error,
+            offset,
+            offset_uncertainty: sure,
             brightness: brightness.to_vec(),
             uncertainty: errors,
             mosaic,
@@ -180,6 +179,45 @@ impl MeasurementStudy {
             explained_unmoved: unmoved,
             certainty: gain * self.pixels / (1.0 - best.1).max(1e-3) / self.frames as f64,
         })
+    }
+
+    /// The standard error of the offset, given the brightness of the frames and what of their fine structure the
+    /// masks' means weigh. What masks do not explain of a pixel is much like that of its neighbours, so it is taken from
+    /// how the strips differ, each as a whole (Liang and Zeger, Biometrika 1986).
+    fn offset_uncertainty(
+        &self,
+        brightness: &Array1<f64>,
+        offset: f64,
+        weights: &Array1<f64>,
+    ) -> f64 {
+        let count = self.strips.len() as f64;
+        let share = |strip: &Strip| {
+            let coarse = strip.sum - brightness.dot(&strip.mask_sums);
+            let fine = &strip.matches - &strip.products.dot(brightness);
+            coarse / self.pixels - offset / count - weights.dot(&fine)
+        };
+        let square = self.strips.iter().map(|strip| share(strip).powi(2)).sum::<f64>();
+        (square * count / (count - 1.0).max(1.0)).sqrt()
+    }
+}
+
+impl Strip {
+    /// Of masks \[B,8,w\] and the measurement \[8,w\].
+    fn of(masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) -> Self {
+        let sum = |image: ArrayView2<'_, f32>| image.iter().map(|&value| f64::from(value)).sum();
+        let fine = |image| less_block_means(image).into_iter().collect::<Array1<f32>>();
+        let mut fine_masks = Array2::zeros((masks.len_of(Axis(0)), y.len()));
+        for (mask, mut row) in masks.outer_iter().zip(fine_masks.outer_iter_mut()) {
+            row.assign(&fine(mask));
+        }
+        Self {
+            sum: sum(y),
+            mask_sums: masks.outer_iter().map(sum).collect(),
+            products: fine_masks.dot(&fine_masks.t()).mapv(f64::from),
+            matches: fine_masks.dot(&fine(y)).mapv(f64::from),
+            y_phases: phases(y),
+            mask_phases: masks.outer_iter().map(phases).collect(),
+        }
     }
 }
 
@@ -195,15 +233,16 @@ fn phases(image: ArrayView2<'_, f32>) -> [f64; 4] {
 
 /// The largest share of the mean by which a phase differs from what the masks explain, and the standard
 /// errors that this is: a sensor's mosaic is the same everywhere, and what a scene does changes its sign.
-fn mosaic(phases: &[Phases], brightness: &Array1<f64>, mean: f64) -> (f64, f64) {
-    let count = phases.len() as f64;
+fn mosaic(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> (f64, f64) {
+    let count = strips.len() as f64;
     let of_phase = |phase: usize| {
-        let rest = |strip: &Phases| {
-            let explained = strip.masks.iter().zip(brightness).map(|(mask, x)| mask[phase] * x);
-            (strip.y[phase] - explained.sum::<f64>()) / mean
+        let rest = |strip: &Strip| {
+            let explained =
+                strip.mask_phases.iter().zip(brightness).map(|(mask, x)| mask[phase] * x);
+            (strip.y_phases[phase] - explained.sum::<f64>()) / mean
         };
-        let average = phases.iter().map(rest).sum::<f64>() / count;
-        let scatter = phases.iter().map(|strip| (rest(strip) - average).powi(2)).sum::<f64>();
+        let average = strips.iter().map(rest).sum::<f64>() / count;
+        let scatter = strips.iter().map(|strip| (rest(strip) - average).powi(2)).sum::<f64>();
         let error = (scatter / (count - 1.0).max(1.0) / count).sqrt();
         (average.abs(), average.abs() / error.max(1e-9))
     };
