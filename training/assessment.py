@@ -119,7 +119,8 @@ class Case:
             about = json.load(f)
         with open(f'{folder}/scene.json') as f:
             self.scene = json.load(f)
-        seen = np.load(path + '.npy').astype(np.float32)    # [features and the true error, frame, block]
+        # [features and the true error, frame, block]; what is not known counts as in the mean, as the program has it.
+        seen = np.nan_to_num(np.load(path + '.npy').astype(np.float32))
         self.psnr, self.frames = about['psnr_db'], seen.shape[1]
         self.white = 20 * np.log10(about['white'])
         self.features = torch.from_numpy(seen[:-1].reshape(len(seen) - 1, -1).T.copy())

@@ -1,8 +1,8 @@
 //! How near frames come to the truth, told without it.
 //!
 //! A lab has no truth. What can be seen are the frames themselves: how much changes in them from pixel to pixel
-//! and from frame to frame, how far the priors have moved them since total variation, how well the masks
-//! can tell frames apart, and the [`super::signs`] of pixels that were held out. Block by block the expected error
+//! and from frame to frame, how far the priors have moved them since total variation, how well the denoiser finds
+//! them again when noise is added, how well the masks can tell frames apart, and the [`super::signs`] of pixels that were held out. Block by block the expected error
 //! follows from these by a small network that was fitted to simulated snapshots of many scenes; `docs/benchmarks.md` says
 //! how well it does on others.
 
@@ -11,9 +11,15 @@ use std::ops::Range;
 use std::sync::LazyLock;
 
 use ndarray::{Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis, s};
+use rand::SeedableRng;
+use rand::distr::Distribution;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
 use serde::Deserialize;
 
+use super::error::Result;
 use super::motion::Steps;
+use super::prior::Denoiser;
 use super::schedule::{Method, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
@@ -23,8 +29,9 @@ pub const BLOCK: usize = 16;
 
 /// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames of the
 /// result, and of those that total variation alone had left, where other priors followed. Nothing betrays frames that are
-/// wrong as much as motion that does not explain how they change.
-pub const FEATURES: [&str; 26] = [
+/// wrong as much as motion that does not explain how they change. The errors of the denoiser are those with which it finds
+/// the result again under [`NOISE`].
+pub const FEATURES: [&str; 28] = [
     "gradient",
     "curvature",
     "change in time",
@@ -51,13 +58,19 @@ pub const FEATURES: [&str; 26] = [
     "change that is no motion after total variation",
     "gradient beside other frames after total variation",
     "change in time beside other frames after total variation",
+    "error of the denoiser under little noise",
+    "error of the denoiser under much noise",
 ];
+
+/// Little and much noise: standard deviations on the scale on which the scene is on \[0,1\].
+const NOISE: [f32; 2] = [15.0 / 255.0, 40.0 / 255.0];
 
 /// How many are seen of the frames of a clip by themselves, and the first ones of the other kinds.
 const OF_CLIP: usize = 9;
 const OF_RESULT: usize = 9;
 const OF_WHOLE: usize = 14;
 const OF_EARLY: usize = 17;
+const OF_DENOISER: usize = 26;
 
 /// Below this, energies are rounding.
 const FLOOR: f32 = 1e-7;
@@ -69,20 +82,24 @@ pub fn blocks(height: usize, width: usize) -> (usize, usize) {
 
 /// What is seen of each block of each frame \[features, S B, rows, columns\], of the frames \[S B,H,W\] of a
 /// reconstruction and those that total variation alone had left, if other priors followed; all on the scale on which the
-/// scene is on \[0,1\].
+/// scene is on \[0,1\]. What a denoiser makes of them is NaN where none is given: it is not known.
+/// Errors: those of the denoiser.
 pub fn features(
     op: &SensingOperator,
     early: Option<ArrayView3<'_, f32>>,
     frames: ArrayView3<'_, f32>,
-) -> Array4<f32> {
+    denoiser: Option<&mut dyn Denoiser>,
+) -> Result<Array4<f32>> {
     let (count, height, width) = frames.dim();
     let (rows, columns) = blocks(height, width);
     let ratio = op.masks().len_of(Axis(0));
     let mut all = Array4::zeros((FEATURES.len(), count, rows, columns));
     of_clip(frames, ratio, all.slice_mut(s![..OF_CLIP, .., .., ..]));
     if let Some(early) = early {
-        of_clip(early, ratio, all.slice_mut(s![OF_EARLY.., .., .., ..]));
+        of_clip(early, ratio, all.slice_mut(s![OF_EARLY..OF_EARLY + OF_CLIP, .., .., ..]));
     }
+    let of_denoiser = all.slice_mut(s![OF_DENOISER.., .., .., ..]);
+    of_denoiser_errors(frames, denoiser, of_denoiser)?;
     let (contrast, roughness) = of_masks(op);
     let ratio = (ratio as f32).log10();
     for (k, frame) in frames.outer_iter().enumerate() {
@@ -109,7 +126,34 @@ pub fn features(
             all.slice_mut(s![OF_WHOLE + index, k, .., ..]).fill(value);
         }
     }
-    all
+    Ok(all)
+}
+
+/// How far a denoiser comes from frames to which noise was added, by [`NOISE`], into \[levels, S B, rows, columns\]. The
+/// noise is always the same.
+fn of_denoiser_errors(
+    frames: ArrayView3<'_, f32>,
+    denoiser: Option<&mut dyn Denoiser>,
+    mut all: ArrayViewMut4<'_, f32>,
+) -> Result<()> {
+    let Some(denoiser) = denoiser else {
+        all.fill(f32::NAN);
+        return Ok(());
+    };
+    let (_, height, width) = frames.dim();
+    for (sigma, mut of_level) in NOISE.into_iter().zip(all.outer_iter_mut()) {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut noise = || -> f32 { StandardNormal.sample(&mut random) };
+        let mut found = Array3::from_shape_fn(frames.dim(), |at| frames[at] + sigma * noise());
+        denoiser.denoise(&mut found, sigma)?;
+        for ((found, frame), mut errors) in
+            found.outer_iter().zip(frames.outer_iter()).zip(of_level.outer_iter_mut())
+        {
+            let square = |i, j| (found[[i, j]] - frame[[i, j]]).powi(2);
+            errors.assign(&over_blocks((height, width), square).mapv(logarithm));
+        }
+    }
+    Ok(())
 }
 
 /// What is seen of the frames of snapshots of `ratio` frames by themselves, into \[features, S B, rows, columns\].
@@ -298,7 +342,7 @@ pub struct Model {
     pub interval: [f64; 2],
 }
 
-/// Inputs are shifted, scaled and bounded first.
+/// Inputs are shifted, scaled and bounded first. What is not known counts as in the mean.
 #[derive(Debug, Deserialize)]
 struct Scaling {
     mean: Vec<f32>,
@@ -376,7 +420,8 @@ impl Model {
 impl Scaling {
     fn of(&self, values: Vec<f32>) -> Vec<f32> {
         let scaled = values.iter().zip(self.mean.iter().zip(&self.scale));
-        scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST)).collect()
+        let bounded = scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST));
+        bounded.map(|x| if x.is_nan() { 0.0 } else { x }).collect()
     }
 }
 
@@ -402,8 +447,10 @@ impl Layer {
 
 #[cfg(test)]
 mod tests {
-    use super::{FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, features};
+    use super::{FEATURES, MODELS, Model, NOISE, OF_CLIP, OF_DENOISER, OF_EARLY, features};
     use crate::optics::iid_masks;
+    use crate::recon::error::ReconError;
+    use crate::recon::prior::Denoiser;
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
     use crate::recon::signs::{SIGNS, Signs};
@@ -419,7 +466,7 @@ mod tests {
         let masks = Array3::from_shape_fn((4, 40, 36), |(k, _, _)| if k == 0 { 1.0 } else { 0.0 });
         let op = SensingOperator::new(masks).unwrap();
         let early = ramp() - 0.1;
-        let seen = features(&op, Some(early.view()), ramp().view());
+        let seen = features(&op, Some(early.view()), ramp().view(), None).unwrap();
         assert_eq!(seen.dim(), (FEATURES.len(), 4, 3, 3));
         let near = |feature: usize, at: (usize, usize, usize), energy: f32| {
             let found = seen[[feature, at.0, at.1, at.2]];
@@ -450,6 +497,38 @@ mod tests {
             let difference = &early - &seen.slice(s![feature, .., .., ..]);
             assert!(difference.iter().all(|d| d.abs() < 1e-3), "{name}");
         }
+    }
+
+    /// A denoiser that leaves all noise where it is.
+    struct Idle;
+
+    impl Denoiser for Idle {
+        fn denoise(&mut self, _: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn the_denoiser_is_seen_by_the_noise_that_it_leaves_and_counts_as_in_the_mean_without() {
+        let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
+        let see = |denoiser: Option<&mut dyn Denoiser>| {
+            features(&op, Some(ramp().view()), ramp().view(), denoiser).unwrap()
+        };
+        let (seen, mut unknown) = (see(Some(&mut Idle)), see(None));
+        for (level, sigma) in NOISE.into_iter().enumerate() {
+            let errors = seen.slice(s![OF_DENOISER + level, .., .., ..]);
+            let whole = errors.slice(s![.., ..2, ..2]).mapv(|error| 10f32.powf(error));
+            assert!((whole.mean().unwrap() / sigma.powi(2) - 1.0).abs() < 0.1, "{errors}");
+            let unknown = unknown.slice(s![OF_DENOISER + level, .., .., ..]);
+            assert!(unknown.iter().all(|error| error.is_nan()));
+        }
+        let model = Model::of(&Schedule::pnp_tv_fastdvdnet()).unwrap();
+        let without = model.log_errors(&unknown, None, 1.0);
+        for level in OF_DENOISER..FEATURES.len() {
+            unknown.slice_mut(s![level, .., .., ..]).fill(model.features.mean[level]);
+        }
+        assert_eq!(without, model.log_errors(&unknown, None, 1.0));
+        assert_ne!(without, model.log_errors(&seen, None, 1.0));
     }
 
     #[test]
@@ -492,7 +571,7 @@ mod tests {
             };
             let frames = Array3::from_shape_fn((4, 48, 48), frame);
             let early = frames.mapv(|x| 0.5 + 0.8 * (x - 0.5));
-            let seen = features(&op, Some(early.view()), frames.view());
+            let seen = features(&op, Some(early.view()), frames.view(), None).unwrap();
             let model = Model::of(&Schedule::pnp_tv_fastdvdnet()).unwrap();
             model.log_errors(&seen, None, 1.0)[[1, 1, 1]]
         };
@@ -504,7 +583,7 @@ mod tests {
     #[test]
     fn a_larger_held_out_error_lets_expect_more_error() {
         let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
-        let seen = features(&op, Some(ramp().view()), ramp().view());
+        let seen = features(&op, Some(ramp().view()), ramp().view(), None).unwrap();
         for model in MODELS.values() {
             let error = |decibels: f32| {
                 let signs = Signs([decibels; SIGNS.len()]);

@@ -115,7 +115,7 @@ pub fn reconstruct(
     stages((op, y), schedule, networks, observer, |_, _| ())
 }
 
-/// As [`reconstruct`], with what an [`assessment`] sees of the frames.
+/// As [`reconstruct`], with what an [`assessment`] sees of the frames; the first network of the schedule is its denoiser.
 pub fn reconstruct_assessed(
     op: &SensingOperator,
     y: ArrayView3<'_, f32>,
@@ -130,7 +130,9 @@ pub fn reconstruct_assessed(
         }
     })?;
     let early = early.as_ref().map(|early| early.view());
-    outcome.features = Some(assessment::features(op, early, outcome.frames.view()));
+    let network = schedule.stages.iter().find_map(|stage| stage.prior.network());
+    let denoiser = network.map(|which| networks.network(which)).transpose()?;
+    outcome.features = Some(assessment::features(op, early, outcome.frames.view(), denoiser)?);
     Ok(outcome)
 }
 
