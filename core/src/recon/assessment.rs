@@ -30,7 +30,7 @@ pub const BLOCK: usize = 16;
 /// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames of the
 /// result, and of those that total variation alone had left, where other priors followed. Nothing betrays frames that are
 /// wrong as much as motion that does not explain how they change. The errors of the denoiser are those with which it finds
-/// the result again under [`NOISE`].
+/// the result again when noise was added.
 pub const FEATURES: [&str; 28] = [
     "gradient",
     "curvature",
