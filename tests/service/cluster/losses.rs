@@ -24,12 +24,14 @@ async fn what_the_message_server_loses_is_handed_out_again() {
     let id = app.submit(&long(&measurement)).await;
     // Until the end there are more tiles than the workers hold, however late the sweep comes.
     let behind = app.submit(&with_iterations(&measurement, 9000)).await;
-    busy(&app).await;
+    // Two for each worker: one that it holds, and one that waits for it.
+    let wait = async || until("tiles wait", || async { nats.messages().await[0].1 >= 4 }).await;
+    wait().await;
     // Tiles that wait, and the windows of all.
     nats.purge("SCI_TASKS").await;
     nats.purge("SCI_IN").await;
     until("the sweep finds what is missing", || async { repaired(&app).await >= 1.0 }).await;
-    until("tiles are out again", || async { nats.messages().await[0].1 > 0 }).await;
+    wait().await;
     let before = repaired(&app).await;
     // All that there is, with the streams themselves.
     nats.end(0);
