@@ -163,14 +163,15 @@ impl MeasurementStudy {
         let deep = self.negative.iter().filter(|below| f64::from(**below) < -DEEP * mean.abs());
         let negative = (deep.count() * BLOCK * BLOCK) as f64 / self.pixels;
         let offset = mean - brightness.dot(&means);
-        let sure = self.offset_uncertainty(&brightness, offset, &inverse.dot(&means));
+        let offset_uncertainty =
+            self.offset_uncertainty((&brightness, offset), &inverse.dot(&means));
         let place = |index: usize| REACH as i32 - index as i32;
         let mosaic = mosaic(&self.strips, &brightness, mean);
         Some(MeasurementFigures {
             mean,
             negative,
             offset,
-            offset_uncertainty: sure,
+            offset_uncertainty,
             brightness: brightness.to_vec(),
             uncertainty: errors,
             mosaic,
@@ -181,13 +182,12 @@ impl MeasurementStudy {
         })
     }
 
-    /// The standard error of the offset, given the brightness of the frames and what of their fine structure the
-    /// masks' means weigh. What masks do not explain of a pixel is much like that of its neighbours, so it is taken from
-    /// how the strips differ, each as a whole (Liang and Zeger, Biometrika 1986).
+    /// The standard error of the offset. What masks do not explain of a pixel is much like that of its neighbours, so it is
+    /// taken from how the strips differ, each as a whole (Liang and Zeger, Biometrika 1986). `weights` is
+    /// `P^-1 m`, with the products `P` of all strips and the masks' means `m`: what an error of the matches changes.
     fn offset_uncertainty(
         &self,
-        brightness: &Array1<f64>,
-        offset: f64,
+        (brightness, offset): (&Array1<f64>, f64),
         weights: &Array1<f64>,
     ) -> f64 {
         let count = self.strips.len() as f64;
@@ -534,6 +534,23 @@ mod tests {
         assert_eq!(codes(&masks, &lifted), ["wrong_dark"]);
         assert_eq!(codes(&masks, &(&y - 0.07 * mean)), ["wrong_dark"]);
         assert_eq!(undarkened(&masks, &(&y - 0.07 * mean)), ["negative_offset"]);
+    }
+
+    /// Texture of a few pixels is not explained in patches, not in single pixels: the offset is as far off as it is told to
+    /// be.
+    #[test]
+    fn the_standard_error_of_an_offset_holds_where_the_rest_is_texture() {
+        let off = |seed: u64| {
+            let (masks, _) = random_squares(10, 140, 140, seed).unwrap();
+            let scene = scene(10, 140);
+            let y = measure(masks.view(), scene.view()).unwrap();
+            let mut study = MeasurementStudy::new(10);
+            study.add(masks.view(), y.view());
+            let figures = study.finish().unwrap();
+            (figures.offset / figures.offset_uncertainty).powi(2)
+        };
+        let square = (0..12).map(off).sum::<f64>() / 12.0;
+        assert!((0.2..3.0).contains(&square), "{square}");
     }
 
     #[test]
