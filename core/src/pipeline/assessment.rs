@@ -78,8 +78,9 @@ pub struct Expected {
 /// Better is not told apart, in dB: nobody sees it.
 const BEST: f64 = 40.0;
 
-/// From here on frames are good, from the second on usable, in dB.
-const GRADES: [(f64, Grade); 2] = [(28.0, Grade::Good), (22.0, Grade::Usable)];
+/// From here on frames are good, and below that bad, in dB.
+const GOOD: f64 = 28.0;
+const BAD: f64 = 22.0;
 
 /// What the tiles of a snapshot tell together: of each run that has a share in it those of its tiles, in the
 /// plan's order. None if one of them tells nothing.
@@ -134,7 +135,7 @@ pub fn expected(
     let mut reasons = reasons(&error, (psnr_db, white), warnings);
     reasons.extend(too_fast(motion));
     let assessment = Assessment {
-        grade: grade(psnr_db, &reasons),
+        grade: grade((psnr_db, high), &reasons),
         psnr_db: Assessment::round(psnr_db),
         psnr_low_db: Assessment::round(low),
         psnr_high_db: Assessment::round(high),
@@ -143,10 +144,14 @@ pub fn expected(
     Some(Expected { assessment, error })
 }
 
-/// What is expected, but never better than the findings allow.
-fn grade(psnr_db: f64, reasons: &[Finding]) -> Grade {
-    let expected = GRADES.into_iter().find(|(least, _)| psnr_db >= *least);
-    let expected = expected.map_or(Grade::Bad, |(_, grade)| grade);
+/// What is expected, but never better than the findings allow. Bad are frames only where the whole interval says so: nobody
+/// shall throw away a picture that is usable.
+fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
+    let expected = match psnr_db {
+        GOOD.. => Grade::Good,
+        _ if high >= BAD => Grade::Usable,
+        _ => Grade::Bad,
+    };
     let worst = reasons.iter().filter(|reason| reason.code != UNEVEN).map(|reason| reason.severity);
     match worst.max() {
         Some(Severity::Error) => Grade::Bad,
@@ -263,11 +268,12 @@ mod tests {
 
     #[test]
     fn what_the_checks_found_bounds_the_grade() {
-        let of = |psnr, found: &[Finding]| grade(psnr, found);
+        let of = |psnr, found: &[Finding]| grade((psnr, psnr + 1.5), found);
         assert_eq!(
-            (of(30.0, &[]), of(25.0, &[]), of(20.0, &[])),
-            (Grade::Good, Grade::Usable, Grade::Bad)
+            [30.0, 25.0, 21.0].map(|psnr| of(psnr, &[])),
+            [Grade::Good, Grade::Usable, Grade::Usable]
         );
+        assert_eq!(of(20.0, &[]), Grade::Bad);
         assert_eq!(of(30.0, &[finding(Severity::Warning)]), Grade::Usable);
         assert_eq!(of(20.0, &[finding(Severity::Warning)]), Grade::Bad);
         assert_eq!(of(30.0, &[finding(Severity::Error)]), Grade::Bad);

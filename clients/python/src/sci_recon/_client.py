@@ -24,6 +24,8 @@ from ._transfer import Source
 Record = dict[str, Any]
 Snapshots = Literal["all"] | int | tuple[int, int]
 ENDED = {"succeeded", "failed", "cancelled"}
+# Side of the blocks of error.npy in pixels.
+BLOCK = 16
 
 
 class Client:
@@ -379,6 +381,19 @@ class Result:
         """The frames of one snapshot, [B, H, W], as a memory map of the downloaded file."""
         frames: npt.NDArray[np.float32] = np.load(self.download("frames.npy", index), mmap_mode="r")
         return frames
+
+    @property
+    def assessment(self) -> Record | None:
+        """How good the frames are expected to be: `grade`, `psnr_db` between `psnr_low_db` and `psnr_high_db`, and `reasons`;
+        None where nothing can be told."""
+        return self.job.record.get("assessment")
+
+    def expected_error(self, index: int) -> npt.NDArray[np.float32]:
+        """The error expected in the frames of one snapshot, [B, H, W]: the root of the mean square of blocks of 16x16 pixels,
+        on the scale of the frames. `KeyError` where nothing can be told (`assessment` is None)."""
+        blocks: npt.NDArray[np.float32] = np.load(self.download("error.npy", index))
+        height, width = self.snapshot(index).shape[1:3]
+        return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]
 
     def download(self, name: str, snapshot: int | None = None) -> Path:
         """Fetches a file such as `stack.exr`, `frames.npy` or `frames/frame_0001.exr`, unless it is here already."""
