@@ -1,6 +1,6 @@
 """Fit what the program predicts of its own results without a truth: the expected error of blocks and the PSNR of a snapshot.
 
-    python assessment.py make --binary sci-recon-experiments --data DATA --scenes SCENES --out FOLDER
+    python assessment.py make --binary sci-recon-experiments --data DATA --scenes SCENES [--more FOLDER] --out FOLDER
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
 `make` simulates snapshots of 128x128 pixels (photographs that a camera moves over, half of them with a part that moves by itself, and
@@ -20,7 +20,7 @@ import scipy.io
 import torch
 from torch import nn
 
-SIDE, LONGEST = 128, 24
+SIDE, BLOCK, LONGEST = 128, 16, 24      # the second as the program has it
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
 RATIOS = 6, 8, 10, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
@@ -79,6 +79,9 @@ def cases(a):
     """Name, scene, frames [B,H,W] (uint8), kind of masks, noise and seed of each case, in an order that mixes all of them."""
     photos = sorted(glob.glob(f'{a.data}/photos/train/*.jpg')) + sorted(glob.glob(f'{a.data}/photos/val/*.jpg'))
     clips = {os.path.basename(folder): pictures(folder) for folder in sorted(glob.glob(f'{a.data}/clips/*/*'))}
+    if a.more:
+        photos += sorted(glob.glob(f'{a.more}/*.jpg') + glob.glob(f'{a.more}/*.png'))
+        clips |= {os.path.basename(file)[:-4]: np.load(file) for file in sorted(glob.glob(f'{a.more}/*.npy'))}
     clips['traffic'] = scipy.io.loadmat(f'{a.scenes}/traffic48_cacti.mat')['orig'].transpose(2, 0, 1).round().astype(np.uint8)
     clips['city'] = pictures(os.path.join(os.path.dirname(os.path.abspath(__file__)), '../demo/clip'))
     with np.load(f'{a.scenes}/street_1024x1024x20.npz') as archive:
@@ -150,9 +153,15 @@ class Model:
         self.networks = [self.network(cases, a, seed) for seed in range(a.networks)]
 
     def inputs(self, case):
+        """Of each block what is seen of it, of the blocks around it, of these in all frames, and of the whole."""
         features = scaled(case.features, self.features)
+        side = SIDE // BLOCK
+        frames = features.reshape(case.frames, side, side, -1).permute(0, 3, 1, 2)
+        around = nn.functional.avg_pool2d(frames, 3, 1, 1, count_include_pad=False)
+        always = around.mean(0, keepdim=True).expand_as(around)
+        around, always = (values.permute(0, 2, 3, 1).reshape(features.shape) for values in (around, always))
         rest = torch.cat([features.mean(0), scaled(case.signs, self.signs)])
-        return torch.cat([features, rest.expand(len(features), -1)], 1)
+        return torch.cat([features, around, always, rest.expand(len(features), -1)], 1)
 
     def network(self, cases, a, seed):
         torch.manual_seed(seed)
@@ -242,6 +251,7 @@ def main():
     p.add_argument('--binary', default='sci-recon-experiments')
     p.add_argument('--data', default='../../shared/training')
     p.add_argument('--scenes', default='../../shared/scenes')
+    p.add_argument('--more', help='a folder of further photographs (.jpg, .png) and clips (.npy, [frame, row, column] of uint8)')
     p.add_argument('--out', default='assessment-output')
     p.add_argument('--write', help='the file of the models')
     p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')

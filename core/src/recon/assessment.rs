@@ -2,15 +2,17 @@
 //!
 //! A lab has no truth. What can be seen are the frames themselves: how much changes in them from pixel to pixel
 //! and from frame to frame, how far the priors have moved them since total variation, how well the denoiser finds
-//! them again when noise is added, how well the masks can tell frames apart, and the [`super::signs`] of pixels that were held out. Block by block the expected error
-//! follows from these by a small network that was fitted to simulated snapshots of many scenes; `docs/benchmarks.md` says
-//! how well it does on others.
+//! them again when noise is added, how well the masks can tell frames apart, and the [`super::signs`] of pixels
+//! that were held out. Block by block the expected error follows from these by a small network that was fitted to
+//! simulated snapshots of many scenes; `docs/benchmarks.md` says how well it does on others.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::LazyLock;
 
-use ndarray::{Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis, s};
+use ndarray::{
+    Array1, Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis, s,
+};
 use rand::SeedableRng;
 use rand::distr::Distribution;
 use rand_chacha::ChaCha8Rng;
@@ -332,7 +334,8 @@ fn over_blocks(
 }
 
 /// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some networks of a
-/// few neurons, of what is seen of a block, of the mean of that over all blocks, of the white level, and of the signs.
+/// few neurons, of what is seen of a block, of its means over the blocks around, over these in all frames, and over all
+/// blocks, of the white level, and of the signs.
 #[derive(Debug, Deserialize)]
 pub struct Model {
     features: Scaling,
@@ -392,29 +395,41 @@ impl Model {
         signs: Option<&Signs>,
         white: f32,
     ) -> Array3<f32> {
-        let (count, frames, rows, columns) = features.dim();
-        let blocks = frames * rows * columns;
-        let seen = |block: usize| {
-            let (k, place) = (block / (rows * columns), block % (rows * columns));
-            let of_block = features.slice(s![.., k, place / columns, place % columns]);
-            self.features.of(of_block.iter().copied().collect())
-        };
-        let mut mean = vec![0.0; count];
-        for block in 0..blocks {
-            let values = seen(block);
-            mean.iter_mut().zip(values).for_each(|(mean, value)| *mean += value / blocks as f32);
+        let (_, frames, rows, columns) = features.dim();
+        let mut seen = features.clone();
+        for mut of_block in seen.lanes_mut(Axis(0)) {
+            let scaled = self.features.of(of_block.to_vec());
+            of_block.assign(&Array1::from(scaled));
         }
+        let around = around(&seen);
+        let always: Vec<Array2<f32>> = around
+            .outer_iter()
+            .map(|of_feature| of_feature.sum_axis(Axis(0)) / frames as f32)
+            .collect();
+        let blocks = (frames * rows * columns) as f32;
+        let mean = seen.outer_iter().map(|of_feature| of_feature.sum() / blocks);
         let mut known = vec![20.0 * white.log10()];
         known.extend(signs.map_or(self.signs.mean[1..].to_vec(), |signs| signs.0.to_vec()));
-        let rest = [mean, self.signs.of(known)].concat();
-        let errors = (0..blocks).map(|block| {
-            let inputs = [seen(block), rest.clone()].concat();
+        let rest: Vec<f32> = mean.chain(self.signs.of(known)).collect();
+        Array3::from_shape_fn((frames, rows, columns), |(k, row, column)| {
+            let mut inputs = seen.slice(s![.., k, row, column]).to_vec();
+            inputs.extend(around.slice(s![.., k, row, column]));
+            inputs.extend(always.iter().map(|of_feature| of_feature[[row, column]]));
+            inputs.extend(&rest);
             let told = self.networks.iter().map(|layers| output(layers, inputs.clone()));
             told.sum::<f32>() / self.networks.len() as f32
-        });
-        let errors = Array3::from_shape_vec((frames, rows, columns), errors.collect());
-        errors.unwrap_or_else(|_| unreachable!("as many errors as blocks"))
+        })
     }
+}
+
+/// The means over each block and those that touch it, of the same frame.
+fn around(seen: &Array4<f32>) -> Array4<f32> {
+    let (_, _, rows, columns) = seen.dim();
+    let beside = |at: usize, length: usize| at.saturating_sub(1)..length.min(at + 2);
+    Array4::from_shape_fn(seen.dim(), |(feature, k, row, column)| {
+        let place = s![feature, k, beside(row, rows), beside(column, columns)];
+        seen.slice(place).mean().unwrap_or(0.0)
+    })
 }
 
 impl Scaling {
@@ -447,14 +462,14 @@ impl Layer {
 
 #[cfg(test)]
 mod tests {
-    use super::{FEATURES, MODELS, Model, NOISE, OF_CLIP, OF_DENOISER, OF_EARLY, features};
+    use super::{FEATURES, MODELS, Model, NOISE, OF_CLIP, OF_DENOISER, OF_EARLY, around, features};
     use crate::optics::iid_masks;
     use crate::recon::error::ReconError;
     use crate::recon::prior::Denoiser;
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
     use crate::recon::signs::{SIGNS, Signs};
-    use ndarray::{Array3, s};
+    use ndarray::{Array3, Array4, Axis, s};
 
     /// A ramp of 0.01 a column that brightens by 0.02 a frame.
     fn ramp() -> Array3<f32> {
@@ -538,7 +553,7 @@ mod tests {
         assert!(has(Schedule::gap_tv()) && has(Schedule::pnp_tv_fastdvdnet()));
         assert!(!has(Schedule::admm_tv()) && !has(Schedule::pnp_ffdnet()));
         for model in MODELS.values() {
-            let inputs = 2 * FEATURES.len() + 1 + SIGNS.len();
+            let inputs = 4 * FEATURES.len() + 1 + SIGNS.len();
             assert_eq!(
                 (model.features.mean.len(), model.features.scale.len()),
                 (FEATURES.len(), FEATURES.len())
@@ -560,23 +575,47 @@ mod tests {
         }
     }
 
-    /// Moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
+    #[test]
+    fn blocks_at_the_edge_have_fewer_around_them() {
+        let seen =
+            Array4::from_shape_fn((1, 2, 3, 4), |(_, k, i, j)| (100 * k + 10 * i + j) as f32);
+        let around = around(&seen);
+        assert_eq!((around[[0, 0, 0, 0]], around[[0, 1, 1, 2]]), (5.5, 112.0));
+        assert_eq!((around[[0, 0, 2, 1]], around[[0, 1, 2, 3]]), (16.0, 117.5));
+    }
+
+    /// A denoiser that takes the mean of a pixel and those that touch it.
+    struct Blur;
+
+    impl Denoiser for Blur {
+        fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
+            let blurred = around(&frames.clone().insert_axis(Axis(0)));
+            frames.assign(&blurred.index_axis(Axis(0), 0));
+            Ok(())
+        }
+    }
+
+    /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
     #[test]
     fn more_texture_lets_expect_more_error() {
         let op = SensingOperator::new(iid_masks(4, 48, 48, 1).unwrap()).unwrap();
-        let error = |texture: f32| {
+        let error = |schedule: &Schedule, texture: f32| {
             let frame = |(k, i, j): (usize, usize, usize)| {
-                let phase = i as f32 * 0.4 + (j as f32 - k as f32) * 0.3;
+                let phase = i as f32 * 1.1 + (j as f32 - k as f32) * 0.9;
                 0.5 + texture * phase.sin()
             };
             let frames = Array3::from_shape_fn((4, 48, 48), frame);
             let early = frames.mapv(|x| 0.5 + 0.8 * (x - 0.5));
-            let seen = features(&op, Some(early.view()), frames.view(), None).unwrap();
-            let model = Model::of(&Schedule::pnp_tv_fastdvdnet()).unwrap();
-            model.log_errors(&seen, None, 1.0)[[1, 1, 1]]
+            let deep = schedule.stages.len() > 1;
+            let denoiser = if deep { Some(&mut Blur as &mut dyn Denoiser) } else { None };
+            let early = deep.then(|| early.view());
+            let seen = features(&op, early, frames.view(), denoiser).unwrap();
+            Model::of(schedule).unwrap().log_errors(&seen, None, 1.0)[[1, 1, 1]]
         };
-        let (much, little) = (error(0.1), error(0.01));
-        assert!(much > little + 0.3 && much < -1.0 && little > -6.0, "{much}, {little}");
+        for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
+            let (much, little) = (error(&schedule, 0.1), error(&schedule, 0.01));
+            assert!(much > little + 0.3 && much < -1.0 && little > -6.0, "{much}, {little}");
+        }
     }
 
     /// What held-out pixels say of the error moves the prediction.
