@@ -78,7 +78,7 @@ pub struct Expected {
 /// Better is not told apart, in dB: nobody sees it.
 const BEST: f64 = 40.0;
 
-/// From here on frames are good, and below that bad, in dB.
+/// From here on frames are good, and bad if even the upper end of the interval is below that, in dB.
 const GOOD: f64 = 28.0;
 const BAD: f64 = 22.0;
 
@@ -144,8 +144,8 @@ pub fn expected(
     Some(Expected { assessment, error })
 }
 
-/// What is expected, but never better than the findings allow. Bad are frames only where the whole interval says so: nobody
-/// shall throw away a picture that is usable.
+/// What is expected, but never better than the findings allow. Frames are called bad only where the whole interval says so,
+/// lest somebody throws away a usable picture.
 fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
     let expected = match psnr_db {
         GOOD.. => Grade::Good,

@@ -402,10 +402,7 @@ impl Model {
             of_block.assign(&Array1::from(scaled));
         }
         let around = around(&seen);
-        let always: Vec<Array2<f32>> = around
-            .outer_iter()
-            .map(|of_feature| of_feature.sum_axis(Axis(0)) / frames as f32)
-            .collect();
+        let always = around.sum_axis(Axis(1)) / frames as f32;
         let blocks = (frames * rows * columns) as f32;
         let mean = seen.outer_iter().map(|of_feature| of_feature.sum() / blocks);
         let mut known = vec![20.0 * white.log10()];
@@ -414,7 +411,7 @@ impl Model {
         Array3::from_shape_fn((frames, rows, columns), |(k, row, column)| {
             let mut inputs = seen.slice(s![.., k, row, column]).to_vec();
             inputs.extend(around.slice(s![.., k, row, column]));
-            inputs.extend(always.iter().map(|of_feature| of_feature[[row, column]]));
+            inputs.extend(always.slice(s![.., row, column]));
             inputs.extend(&rest);
             let told = self.networks.iter().map(|layers| output(layers, inputs.clone()));
             told.sum::<f32>() / self.networks.len() as f32
