@@ -3,8 +3,8 @@
     python assessment.py make --binary sci-recon-experiments --data DATA --scenes SCENES [--more FOLDER] --out FOLDER
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
-`make` simulates snapshots of 128x128 pixels (photographs that a camera moves over, half of them with a part that moves by itself, and
-clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is
+`make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
+them with a part that moves by itself, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is
 a mixture of all. `fit` fits small
 networks to all cases, and tells how they do on scenes that were left out (ten folds, no scene in two of them).
 """
@@ -20,7 +20,7 @@ import scipy.io
 import torch
 from torch import nn
 
-SIDE, BLOCK, LONGEST = 128, 16, 24      # the second as the program has it
+SIDES, LONGEST = (128, 256, 256), 24
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
 RATIOS = 6, 8, 10, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
@@ -37,42 +37,43 @@ def pictures(folder):
     return np.stack([cv2.imread(f, cv2.IMREAD_GRAYSCALE) for f in files])
 
 
-def panned(rng, file, others):
+def panned(rng, file, others, wide):
     """A camera that moves over a photograph, perhaps with a part of another one that moves by itself."""
     photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE).astype(np.float32)
-    scale = max(rng.choice([.2, .3, .45, .7]), (SIDE + 40) / min(photo.shape))
+    scale = max(rng.choice([.2, .3, .45, .7]), (wide + 40) / min(photo.shape))
     photo = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     angle, speed, turn, light = rng.uniform(0, 2 * np.pi), rng.choice([0, .3, 1, 2, 4, 7]), rng.choice([0, 0, .5]), rng.choice([1, 1, .6, .3])
     centre = [extent * (.5 + rng.uniform(-.2, .2)) for extent in photo.shape[::-1]]
     part = None
     if rng.random() < .5:
         other = cv2.imread(others[rng.integers(len(others))], cv2.IMREAD_GRAYSCALE).astype(np.float32)
-        other = cv2.resize(other, None, fx=.25, fy=.25, interpolation=cv2.INTER_AREA)
-        side = int(rng.integers(24, 56))
+        side = int(rng.integers(wide // 5, wide * 9 // 20))
+        smaller = max(.25, (side + 1) / min(other.shape))
+        other = cv2.resize(other, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA)
         row, column = (int(rng.integers(0, extent - side)) for extent in other.shape)
-        part, place, step = other[row:row + side, column:column + side], rng.uniform(20, SIDE - 20 - side / 2, 2), rng.uniform(-4, 4, 2)
+        part, place, step = other[row:row + side, column:column + side], rng.uniform(20, wide - 20 - side / 2, 2), rng.uniform(-4, 4, 2)
     frames = []
     for time in np.arange(LONGEST) - (LONGEST - 1) / 2:
         x, y = centre[0] + time * speed * np.cos(angle), centre[1] + time * speed * np.sin(angle)
         matrix = cv2.getRotationMatrix2D((x, y), turn * time, 1)
-        matrix[:, 2] += SIDE / 2 - np.array((x, y))
-        frame = cv2.warpAffine(photo, matrix, (SIDE, SIDE), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        matrix[:, 2] += wide / 2 - np.array((x, y))
+        frame = cv2.warpAffine(photo, matrix, (wide, wide), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         if part is not None:
             shift = np.float32([[1, 0, place[0] + time * step[0]], [0, 1, place[1] + time * step[1]]])
-            cover = cv2.warpAffine(np.ones_like(part), shift, (SIDE, SIDE), flags=cv2.INTER_LINEAR)
-            frame = frame * (1 - cover) + cv2.warpAffine(part, shift, (SIDE, SIDE), flags=cv2.INTER_LINEAR)
+            cover = cv2.warpAffine(np.ones_like(part), shift, (wide, wide), flags=cv2.INTER_LINEAR)
+            frame = frame * (1 - cover) + cv2.warpAffine(part, shift, (wide, wide), flags=cv2.INTER_LINEAR)
         frames.append(frame)
     return (np.stack(frames) * light).clip(0, 255).round().astype(np.uint8)
 
 
-def cropped(rng, clip):
+def cropped(rng, clip, wide):
     """A part of a clip, at its own or at half its size."""
     height, width = clip.shape[1:]
-    side = int(SIDE * (rng.choice([1, 2]) if min(height, width) >= 2 * SIDE else 1))
+    side = int(wide * (rng.choice([1, 2]) if min(height, width) >= 2 * wide else 1))
     row, column = int(rng.integers(0, height - side + 1)), int(rng.integers(0, width - side + 1))
     first = int(rng.integers(0, max(1, len(clip) - LONGEST)))
     part = clip[first:first + LONGEST, row:row + side, column:column + side]
-    return np.stack([cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for frame in part])
+    return np.stack([cv2.resize(frame, (wide, wide), interpolation=cv2.INTER_AREA) for frame in part])
 
 
 def cases(a):
@@ -90,7 +91,8 @@ def cases(a):
     all_of = [(photo, None) for photo in photos for _ in range(4)] + [(name, clip) for name, clip in clips.items() for _ in range(8)]
     for number, index in enumerate(np.random.default_rng(11).permutation(len(all_of))):
         (scene, clip), rng = all_of[index], np.random.default_rng([5, int(index)])
-        frames = panned(rng, scene, photos) if clip is None else cropped(rng, clip)
+        wide = int(rng.choice([side for side in SIDES if clip is None or side <= min(clip.shape[1:])]))
+        frames = panned(rng, scene, photos, wide) if clip is None else cropped(rng, clip, wide)
         ratio = int(rng.choice([ratio for ratio in RATIOS if ratio <= len(frames)]))
         pattern, sigma = PATTERNS[rng.integers(len(PATTERNS))], int(rng.choice(SIGMAS))
         seeds = {algorithm: int(rng.integers(1e6)) for algorithm in ALGORITHMS}
@@ -107,7 +109,7 @@ def make(a):
         np.save(f'{folder}/clip/{name}.npy', frames)
         for algorithm, seed in seeds.items():
             subprocess.run([a.binary, 'assess', '--clips', f'{folder}/clip', '--pattern', pattern, '--cr', str(len(frames)), '--noise-sigma', str(sigma),
-                            '--algorithm', algorithm, '--scale', str(SIDE), '--seed', str(seed), '--out', f'{folder}/{algorithm}'], check=True)
+                            '--algorithm', algorithm, '--scale', str(frames.shape[1]), '--seed', str(seed), '--out', f'{folder}/{algorithm}'], check=True)
         with open(f'{folder}/scene.json', 'w') as f:
             json.dump(scene, f)
 
@@ -124,11 +126,13 @@ class Case:
             self.scene = json.load(f)
         # [features and the true error, frame, block]; what is not known counts as in the mean, as the program has it.
         seen = np.nan_to_num(np.load(path + '.npy').astype(np.float32))
-        self.psnr, self.frames = about['psnr_db'], seen.shape[1]
+        self.psnr, self.frames, self.side = about['psnr_db'], seen.shape[1], round(seen.shape[2] ** .5)
         self.white = 20 * np.log10(about['white'])
         self.features = torch.from_numpy(seen[:-1].reshape(len(seen) - 1, -1).T.copy())
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
-        self.signs = torch.tensor([self.white, *about['signs']], dtype=torch.float32)
+        evidence = about['evidence']
+        self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
+        self.piece = torch.tensor([float('nan') if value is None else value for value in evidence['features']], dtype=torch.float32)
         self.pattern = about['setting']['pattern']
 
     def psnr_of(self, errors):
@@ -153,14 +157,13 @@ class Model:
         self.networks = [self.network(cases, a, seed) for seed in range(a.networks)]
 
     def inputs(self, case):
-        """Of each block what is seen of it, of the blocks around it, of these in all frames, and of the whole."""
+        """Of each block what is seen of it, of the blocks around it, of these in all frames, and what the piece tells."""
         features = scaled(case.features, self.features)
-        side = SIDE // BLOCK
-        frames = features.reshape(case.frames, side, side, -1).permute(0, 3, 1, 2)
+        frames = features.reshape(case.frames, case.side, case.side, -1).permute(0, 3, 1, 2)
         around = nn.functional.avg_pool2d(frames, 3, 1, 1, count_include_pad=False)
         always = around.mean(0, keepdim=True).expand_as(around)
         around, always = (values.permute(0, 2, 3, 1).reshape(features.shape) for values in (around, always))
-        rest = torch.cat([features.mean(0), scaled(case.signs, self.signs)])
+        rest = torch.cat([scaled(case.piece, self.features).nan_to_num(), scaled(case.signs, self.signs)])
         return torch.cat([features, around, always, rest.expand(len(features), -1)], 1)
 
     def network(self, cases, a, seed):

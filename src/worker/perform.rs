@@ -57,7 +57,7 @@ pub(super) fn perform(
         }
         TaskInput::Pilot { arrays, snapshots, white, schedule, runs, mosaic } => {
             let y = arrays.snapshot(snapshots.first).map_err(PipelineError::from)?;
-            let place = pilot::place(y.view(), mosaic);
+            let place = pilot::place(arrays.light(monitor)?.view(), y.view(), mosaic);
             let first = snapshots.first as usize;
             let task = Pilot { first, place: &place, schedule: &schedule, runs: &runs };
             engines.models.only(None, monitor)?;
@@ -241,7 +241,7 @@ fn tile(
     let solved = task.pieces.iter().flat_map(Clone::clone).collect();
     let assessment = match task.model {
         Some(_) => None,
-        None => TileAssessment::of(&outcome, (&task.schedule, task.signs, task.white)),
+        None => TileAssessment::of(&outcome, (&task.schedule, task.evidence, task.white)),
     };
     let tile = TileRecord::from(&outcome);
     Ok((TileTaskRecord { tile, solved, assessment, cost }, outcome.frames))

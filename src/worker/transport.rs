@@ -23,8 +23,8 @@ use crate::pipeline::manifest::{JobTasks, Recipe};
 use crate::pipeline::movie::MovieTask;
 use crate::pipeline::networks::ModelFile;
 use crate::pipeline::tile::TileInput;
+use crate::recon::assessment::Evidence;
 use crate::recon::sequence::SequencePlan;
-use crate::recon::signs::Signs;
 use crate::recon::tile::Tile;
 use crate::store::{
     BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath, StoreError,
@@ -172,7 +172,7 @@ pub struct TileTask {
     pub model: Option<Sha256>,
     /// What the pilot tells of the error of the frames.
     #[serde(default)]
-    pub signs: Option<Signs>,
+    pub evidence: Option<Evidence>,
 }
 
 #[derive(Debug)]

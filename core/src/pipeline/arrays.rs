@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, Array3, Axis};
 
 use super::error::{PipelineError, Result};
+use super::progress::Monitor;
 use super::tile::TileInput;
 use crate::formats::planar::Reader;
 use crate::formats::{FormatError, Limits};
@@ -36,6 +37,17 @@ impl Arrays {
 
     pub(super) fn masks(&self) -> Result<Reader, FormatError> {
         Reader::open(&self.masks.0, &Limits::default())
+    }
+
+    /// The sum \[H,W\] of all masks; memory holds two planes.
+    pub fn light(&self, monitor: &Monitor) -> Result<Array2<f32>> {
+        let masks = self.masks()?;
+        let mut light = Array2::zeros((masks.info().height, masks.info().width));
+        for frame in 0..masks.info().frames {
+            monitor.check()?;
+            light += &plane(&masks, frame)?;
+        }
+        Ok(light)
     }
 
     /// One snapshot \[H,W\].

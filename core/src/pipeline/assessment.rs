@@ -5,12 +5,11 @@ use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
 use crate::job::{Assessment, Finding, Grade, Severity};
-use crate::recon::assessment::Model;
 pub use crate::recon::assessment::{BLOCK, blocks};
+use crate::recon::assessment::{Evidence, Model};
 use crate::recon::motion::fastest;
 use crate::recon::schedule::Schedule;
 use crate::recon::sequence::RunShare;
-use crate::recon::signs::Signs;
 use crate::recon::solver::Outcome;
 use crate::recon::tile::TilePlan;
 
@@ -39,7 +38,7 @@ impl TileAssessment {
     /// expected.
     pub fn of(
         outcome: &Outcome,
-        (schedule, signs, white): (&Schedule, Option<Signs>, f32),
+        (schedule, evidence, white): (&Schedule, Option<Evidence>, f32),
     ) -> Option<Self> {
         let model = Model::of(schedule)?;
         let Some(features) = &outcome.features else {
@@ -48,7 +47,7 @@ impl TileAssessment {
             let levels = vec![DARK; frames * size.0 * size.1];
             return Some(Self { size, levels, motion: 0.0 });
         };
-        let errors = model.log_errors(features, outcome.signs.or(signs).as_ref(), white);
+        let errors = model.log_errors(features, outcome.evidence.or(evidence).as_ref(), white);
         let level = |error: &f32| (-10.0 * error * STEPS).round().clamp(0.0, 254.0) as u8;
         let (_, rows, columns) = errors.dim();
         let motion = fastest(outcome.frames.view(), white);

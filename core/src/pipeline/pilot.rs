@@ -27,13 +27,15 @@ pub struct Pilot<'a> {
 }
 
 /// Where in a snapshot \[H,W\] the pilot is run: in the picture, or in the first green sub-image of a mosaic.
-pub fn place(y: ArrayView2<'_, f32>, mosaic: Option<Mosaic>) -> Window {
+/// `light` is the sum \[H,W\] of all masks.
+pub fn place(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, mosaic: Option<Mosaic>) -> Window {
     let Some(mosaic) = mosaic else {
-        let (rows, columns) = pilot::piece(y);
+        let (rows, columns) = pilot::piece(light, y);
         return Window { rows, columns, step: 1 };
     };
     let first = mosaic.green();
-    let (rows, columns) = pilot::piece(y.slice(s![first.0..;2, first.1..;2]));
+    let plane = s![first.0..;2, first.1..;2];
+    let (rows, columns) = pilot::piece(light.slice(plane), y.slice(plane));
     Window::of_plane(rows, columns, first)
 }
 
@@ -63,12 +65,12 @@ pub fn decide(
         width,
         stages: vec![],
         joints: vec![],
-        signs: None,
+        evidence: None,
     };
     if schedule.adaptive {
         let y = y.slice(s![..1, .., ..]);
-        let (findings, signs) = pilot::run(op.clone(), y, schedule, networks, observer)?;
-        record.signs = signs;
+        let (findings, evidence) = pilot::run(&op, y, schedule, networks, observer)?;
+        record.evidence = evidence;
         record.stages = schedule.stages.iter().zip(findings).map(stage).collect();
     }
     let decided = record.decide(schedule);

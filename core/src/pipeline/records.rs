@@ -4,10 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::TileAssessment;
 use crate::job::{Assessment, ResultFile, Timestamp};
+use crate::recon::assessment::Evidence;
 use crate::recon::pilot::Decision;
 use crate::recon::prior::Prior;
 use crate::recon::schedule::Schedule;
-use crate::recon::signs::Signs;
 use crate::recon::solver::Outcome;
 
 /// The record of the task that prepares a job.
@@ -32,7 +32,7 @@ pub struct PilotRecord {
     pub joints: Vec<JointRecord>,
     /// What its held-out pixels tell of the error of an adaptive schedule's frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub signs: Option<Signs>,
+    pub evidence: Option<Evidence>,
 }
 
 impl PilotRecord {

@@ -1,8 +1,8 @@
 //! The white level that all tiles of a job share.
 
-use ndarray::ArrayView3;
+use ndarray::{ArrayView3, Axis};
 
-use super::arrays::{Arrays, plane};
+use super::arrays::Arrays;
 use super::error::{PipelineError, Result};
 use super::progress::Monitor;
 use crate::job::SnapshotRange;
@@ -11,9 +11,7 @@ use crate::recon::scale::ScaleEstimator;
 
 /// The typical white level of snapshots in memory: masks \[B,H,W\] and snapshots \[S,H,W\].
 pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
-    let (_, height, width) = masks.dim();
-    let mut estimator = ScaleEstimator::new(height, width);
-    masks.outer_iter().try_for_each(|mask| estimator.add_mask(mask))?;
+    let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
     let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
     let none = || ReconError::Shape {
         what: "the measurement",
@@ -26,12 +24,7 @@ pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, 
 /// The typical white level of the snapshots of a job; memory holds a few planes, whatever the number
 /// of frames.
 pub fn white_of_job(arrays: &Arrays, snapshots: SnapshotRange, monitor: &Monitor) -> Result<f32> {
-    let masks = arrays.masks()?;
-    let mut estimator = ScaleEstimator::new(masks.info().height, masks.info().width);
-    for frame in 0..masks.info().frames {
-        monitor.check()?;
-        estimator.add_mask(plane(&masks, frame)?.view())?;
-    }
+    let estimator = ScaleEstimator::new(arrays.light(monitor)?);
     let mut whites = Vec::with_capacity(snapshots.count as usize);
     for snapshot in snapshots.indices() {
         monitor.check()?;

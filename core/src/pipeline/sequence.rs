@@ -100,8 +100,8 @@ impl Solved {
         schedule: &Schedule,
     ) -> Vec<(RunShare, Vec<Option<TileAssessment>>)> {
         let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
-        let signs = self.pilot.as_ref().and_then(|pilot| pilot.signs);
-        let by = (schedule, signs, input.white);
+        let evidence = self.pilot.as_ref().and_then(|pilot| pilot.evidence);
+        let by = (schedule, evidence, input.white);
         let of = |share: RunShare| {
             let tiles = self.runs[share.run].iter();
             let found = tiles.map(|tile| TileAssessment::of(tile, by)).collect();
@@ -131,7 +131,9 @@ pub fn solve(
 ) -> Result<Solved> {
     let mut pilot = None;
     if let Solver::Schedule(schedule) = input.solver {
-        let place = pilot::place(input.measurement.index_axis(Axis(0), 0), input.mosaic);
+        let light = input.masks.sum_axis(Axis(0));
+        let first = input.measurement.index_axis(Axis(0), 0);
+        let place = pilot::place(light.view(), first, input.mosaic);
         let mut networks = WarmNetworks::new(network.clone());
         let window = input.window(input.snapshots(), place.clone(), Vec::new());
         let task = pilot::Pilot { first: input.first, place: &place, schedule, runs: input.runs };

@@ -73,7 +73,7 @@ impl TileInput {
             residual: 0.0,
             stop_reason: StopReason::Converged,
             features: None,
-            signs: None,
+            evidence: None,
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(whole) };
         let all: usize = pieces.iter().map(Range::len).sum();
@@ -109,7 +109,7 @@ impl TileInput {
 }
 
 /// Iterations of total variation after which its error hardly changes. More would hold up those who cancel the job.
-const MOST_FOR_SIGNS: usize = 200;
+const MOST_FOR_EVIDENCE: usize = 200;
 
 /// Reconstructs one tile by the iterations of a schedule. The frames \[S B,h,w\] are on the scale of
 /// the measurement.
@@ -123,22 +123,22 @@ pub fn reconstruct_tile(
     let assessed = Model::of(schedule).is_some();
     // Of more than total variation the pilot tells.
     let quick = schedule.stages.len() == 1;
-    let mut signs = None;
+    let mut evidence = None;
     let mut outcome = input.solved(|op, y, part| {
         observer.part(part);
         if !assessed {
             return solver::reconstruct(op, y, schedule, networks, observer);
         }
-        if quick && signs.is_none() {
+        if quick && evidence.is_none() {
             let bounded = match schedule.planned_iterations() {
-                ..=MOST_FOR_SIGNS => schedule.clone(),
-                _ => schedule.clone().with_iterations(MOST_FOR_SIGNS),
+                ..=MOST_FOR_EVIDENCE => schedule.clone(),
+                _ => schedule.clone().with_iterations(MOST_FOR_EVIDENCE),
             };
-            signs = pilot::signs(op, y, &bounded, networks)?;
+            evidence = pilot::evidence(op, y, &bounded, networks)?;
         }
         solver::reconstruct_assessed(op, y, schedule, networks, observer)
     })?;
-    outcome.signs = signs;
+    outcome.evidence = evidence;
     Ok(outcome)
 }
 
@@ -154,7 +154,7 @@ pub fn run_network(
         let norm = squares(y).max(f64::MIN_POSITIVE);
         Ok(Outcome {
             features: None,
-            signs: None,
+            evidence: None,
             frames,
             tv_iterations: 0,
             denoiser_passes: 1,

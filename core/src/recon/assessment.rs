@@ -17,7 +17,7 @@ use rand::SeedableRng;
 use rand::distr::Distribution;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::error::Result;
 use super::motion::Steps;
@@ -333,9 +333,28 @@ fn over_blocks(
     })
 }
 
+/// What a piece of a measurement tells of the error of all of it: by pixels that were held out there, and by what is seen of
+/// its frames, each in the mean over its blocks; none of what is not known. Signs tell of frames like these.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Evidence {
+    /// What the held-out pixels tell.
+    pub signs: Signs,
+    /// Values of [`FEATURES`].
+    pub features: [Option<f32>; FEATURES.len()],
+}
+
+impl Evidence {
+    /// Of signs and features \[features, B, rows, columns\] of the same piece.
+    pub(super) fn new(signs: Signs, seen: &Array4<f32>) -> Self {
+        let mean = |feature| seen.index_axis(Axis(0), feature).mean();
+        let features = std::array::from_fn(|k| mean(k).filter(|mean| mean.is_finite()));
+        Self { signs, features }
+    }
+}
+
 /// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some networks of a
-/// few neurons, of what is seen of a block, of its means over the blocks around, over these in all frames, and over all
-/// blocks, of the white level, and of the signs.
+/// few neurons, of what is seen of a block, of its means over the blocks around and over these in all frames, of the white
+/// level, and of the evidence.
 #[derive(Debug, Deserialize)]
 pub struct Model {
     features: Scaling,
@@ -388,11 +407,12 @@ impl Model {
     }
 
     /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is seen of
-    /// them. Signs that are not known count as in the mean of the fit. `white` is the scene's white level.
+    /// them. Signs that are not known count as in the mean of the fit, and are then those of the whole. `white` is the
+    /// scene's white level.
     pub fn log_errors(
         &self,
         features: &Array4<f32>,
-        signs: Option<&Signs>,
+        evidence: Option<&Evidence>,
         white: f32,
     ) -> Array3<f32> {
         let (_, frames, rows, columns) = features.dim();
@@ -404,10 +424,18 @@ impl Model {
         let around = around(&seen);
         let always = around.sum_axis(Axis(1)) / frames as f32;
         let blocks = (frames * rows * columns) as f32;
-        let mean = seen.outer_iter().map(|of_feature| of_feature.sum() / blocks);
         let mut known = vec![20.0 * white.log10()];
-        known.extend(signs.map_or(self.signs.mean[1..].to_vec(), |signs| signs.0.to_vec()));
-        let rest: Vec<f32> = mean.chain(self.signs.of(known)).collect();
+        let mut rest: Vec<f32> = match evidence {
+            Some(evidence) => {
+                known.extend(evidence.signs.0);
+                self.features.of(evidence.features.map(|value| value.unwrap_or(f32::NAN)).to_vec())
+            }
+            None => {
+                known.extend(&self.signs.mean[1..]);
+                seen.outer_iter().map(|of_feature| of_feature.sum() / blocks).collect()
+            }
+        };
+        rest.extend(self.signs.of(known));
         Array3::from_shape_fn((frames, rows, columns), |(k, row, column)| {
             let mut inputs = seen.slice(s![.., k, row, column]).to_vec();
             inputs.extend(around.slice(s![.., k, row, column]));
@@ -459,7 +487,9 @@ impl Layer {
 
 #[cfg(test)]
 mod tests {
-    use super::{FEATURES, MODELS, Model, NOISE, OF_CLIP, OF_DENOISER, OF_EARLY, around, features};
+    use super::{
+        Evidence, FEATURES, MODELS, Model, NOISE, OF_CLIP, OF_DENOISER, OF_EARLY, around, features,
+    };
     use crate::optics::iid_masks;
     use crate::recon::error::ReconError;
     use crate::recon::prior::Denoiser;
@@ -622,8 +652,8 @@ mod tests {
         let seen = features(&op, Some(ramp().view()), ramp().view(), None).unwrap();
         for model in MODELS.values() {
             let error = |decibels: f32| {
-                let signs = Signs([decibels; SIGNS.len()]);
-                model.log_errors(&seen, Some(&signs), 1.0).mean().unwrap()
+                let evidence = Evidence::new(Signs([decibels; SIGNS.len()]), &seen);
+                model.log_errors(&seen, Some(&evidence), 1.0).mean().unwrap()
             };
             assert!(error(-20.0) > error(-35.0), "{}, {}", error(-20.0), error(-35.0));
         }

@@ -11,6 +11,7 @@ use std::ops::Range;
 
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 
+use super::assessment::Evidence;
 use super::error::{ReconError, Result};
 use super::held_out::HeldOut;
 use super::prior::Networks;
@@ -27,9 +28,14 @@ pub const SIDE: usize = 96;
 /// more, the frames often still get better: in doubt the schedule goes on.
 const SLACK: f64 = 0.005;
 
-/// The rows and columns of the piece: of all that lie side by side in a measurement \[H,W\], the one
-/// with the greatest variance. Flat sky would tell nothing.
-pub fn piece(y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
+/// Side in pixels of the squares over which a scene without texture and motion is even.
+const EVEN: usize = 8;
+
+/// The rows and columns of the piece: of all that lie side by side in a measurement `y` \[H,W\], the one with
+/// most texture and motion. An even part would tell nothing, and where it is bright its measurement varies as
+/// much as any: by the sum of the masks, `light` \[H,W\], alone. So that counts which `y = light x`, with one `x` for each
+/// square of the piece, leaves of the measurement's energy.
+pub fn piece(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
     let (height, width) = y.dim();
     let starts = |length: usize| {
         let last = length.saturating_sub(SIDE);
@@ -37,13 +43,29 @@ pub fn piece(y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
     };
     let window =
         |row: usize, column: usize| (row..height.min(row + SIDE), column..width.min(column + SIDE));
-    let variance = |(rows, columns): &(Range<usize>, Range<usize>)| {
-        y.slice(s![rows.clone(), columns.clone()]).var(0.0)
+    let uneven = |(rows, columns): &(Range<usize>, Range<usize>)| {
+        let window = s![rows.clone(), columns.clone()];
+        let (light, y) = (light.slice(window), y.slice(window));
+        let squares =
+            light.exact_chunks((EVEN, EVEN)).into_iter().zip(y.exact_chunks((EVEN, EVEN)));
+        squares.map(|(light, y)| left(light, y)).sum::<f64>()
     };
     starts(height)
         .flat_map(|row| starts(width).map(move |column| window(row, column)))
-        .max_by(|a, b| variance(a).total_cmp(&variance(b)))
+        .max_by(|a, b| uneven(a).total_cmp(&uneven(b)))
         .unwrap_or((0..height, 0..width))
+}
+
+/// `min_x ||y - light x||^2`.
+fn left(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> f64 {
+    let (mut yy, mut ly, mut ll) = (0.0, 0.0, 0.0);
+    for (&light, &y) in light.iter().zip(y) {
+        let (light, y) = (f64::from(light), f64::from(y));
+        yy += y * y;
+        ly += light * y;
+        ll += light * light;
+    }
+    if ll > 0.0 { yy - ly * ly / ll } else { yy }
 }
 
 /// What was found out about a stage.
@@ -83,19 +105,19 @@ pub enum StageEnd {
 /// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],
 /// and tells where it should end. Stages of total variation alone, which cost next to nothing, are taken
 /// as they are, but for their part along time: it is left out if the stage's error is less without.
-/// With what its held-out pixels tell of the error of the frames.
+/// With what it tells of the error of the frames.
 /// Errors: as [`super::solver::reconstruct`].
 pub fn run(
-    op: SensingOperator,
+    whole: &SensingOperator,
     y: ArrayView3<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-) -> Result<(Vec<StageFinding>, Option<Signs>)> {
+) -> Result<(Vec<StageFinding>, Option<Evidence>)> {
     schedule.validate()?;
-    let held_out = HeldOut::of(&op, 0);
-    let op = op.without(&held_out.pixels);
-    let mut run = Run::new(&op, y, schedule, networks);
+    let held_out = HeldOut::of(whole, 0);
+    let op = whole.clone().without(&held_out.pixels);
+    let mut run = Run::new(&op, y, schedule, &mut *networks);
     let mut courses: Vec<Course> = Vec::with_capacity(schedule.stages.len());
     let mut early = None;
     for (index, stage) in schedule.stages.iter().enumerate() {
@@ -121,31 +143,32 @@ pub fn run(
         }
     }
     let last = courses.iter().rev().find_map(|course| course.best.as_ref());
-    let signs = early
-        .as_ref()
-        .zip(last)
-        .and_then(|(early, last)| Signs::of((&op, y), &held_out, early.view(), last.view()));
-    Ok((judge(schedule, &courses), signs))
+    let evidence = early.as_ref().zip(last).map(|(early, last)| {
+        let frames = (early.view(), last.view());
+        tell((whole, &op, y), &held_out, schedule, frames, networks)
+    });
+    Ok((judge(schedule, &courses), evidence.transpose()?.flatten()))
 }
 
-/// What held-out pixels of the first snapshot tell of the error of a fixed schedule's frames, on the piece of it that
+/// What the first snapshot tells of the error of a fixed schedule's frames, on the piece of it that
 /// [`piece`] gives, and both on the scale on which the scene is on \[0,1\]; none if no light reaches it, or the iteration diverges. Costs
 /// a run of the schedule on that piece.
 /// Errors: as [`super::solver::reconstruct`].
-pub fn signs(
+pub fn evidence(
     op: &SensingOperator,
     y: ArrayView3<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
-) -> Result<Option<Signs>> {
-    let (rows, columns) = piece(y.index_axis(Axis(0), 0));
+) -> Result<Option<Evidence>> {
+    let light = op.masks().sum_axis(Axis(0));
+    let (rows, columns) = piece(light.view(), y.index_axis(Axis(0), 0));
     let masks = op.masks().slice(s![.., rows.clone(), columns.clone()]).to_owned();
-    let op = match SensingOperator::new(masks) {
+    let whole = match SensingOperator::new(masks) {
         Err(ReconError::DarkMasks { .. }) => return Ok(None),
         other => other?,
     };
-    let held_out = HeldOut::of(&op, 0);
-    let op = op.without(&held_out.pixels);
+    let held_out = HeldOut::of(&whole, 0);
+    let op = whole.clone().without(&held_out.pixels);
     let y = y.slice(s![..1, rows, columns]);
     let mut early: Option<Array3<f32>> = None;
     let solved = solver::stages((&op, y), schedule, networks, &mut (), |_, frames| {
@@ -156,8 +179,23 @@ pub fn signs(
         Err(ReconError::Diverged { .. }) => return Ok(None),
         other => other?,
     };
-    let early = early.unwrap_or_else(|| outcome.frames.clone());
-    Ok(Signs::of((&op, y), &held_out, early.view(), outcome.frames.view()))
+    let early = early.as_ref().unwrap_or(&outcome.frames).view();
+    tell((&whole, &op, y), &held_out, schedule, (early, outcome.frames.view()), networks)
+}
+
+/// What the frames of a piece, after the first stage and at the end, tell: by `y` at the held-out pixels, which the operator
+/// `op` lacks, and by themselves.
+fn tell(
+    (whole, op, y): (&SensingOperator, &SensingOperator, ArrayView3<'_, f32>),
+    held_out: &HeldOut,
+    schedule: &Schedule,
+    (early, last): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
+    networks: &mut dyn Networks,
+) -> Result<Option<Evidence>> {
+    let Some(signs) = Signs::of((op, y), held_out, early, last) else { return Ok(None) };
+    let early = (schedule.stages.len() > 1).then_some(early);
+    let seen = solver::seen((whole, schedule), early, last, networks)?;
+    Ok(Some(Evidence::new(signs, &seen)))
 }
 
 /// What a stage, as planned, may be instead of what was taken last.
@@ -427,7 +465,7 @@ mod tests {
         // So that each pass helps.
         schedule.stages[1].memory = 0.0;
         let mut network = Moody { truth, good, passes: 0, harm };
-        let (found, _) = run(op, y.view(), &schedule, &mut network, &mut ()).unwrap();
+        let (found, _) = run(&op, y.view(), &schedule, &mut network, &mut ()).unwrap();
         (schedule, found)
     }
 
@@ -474,7 +512,8 @@ mod tests {
             });
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
             let op = SensingOperator::new(masks.clone()).unwrap();
-            run(op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().0[0].temporal_weight
+            run(&op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().0[0]
+                .temporal_weight
         };
         let asked = Schedule::gap_tv3d().stages[0].temporal_weight;
         assert_eq!((Some(weight(false)), weight(true)), (asked, 0.0));
@@ -493,7 +532,7 @@ mod tests {
             });
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
             schedule.stages[1].static_variance = Some(planned);
-            run(op.clone(), y.view(), &schedule, &mut (), &mut ()).unwrap().0[1].static_variance
+            run(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().0[1].static_variance
         };
         assert_eq!(found(2.0, 0.5), Some(0.5));
         assert_ne!(found(0.0, 0.05), Some(0.05));
@@ -511,7 +550,7 @@ mod tests {
         let op = SensingOperator::new(masks).unwrap();
         let found = |schedule: &Schedule, sigma: f32| {
             let y = &y + &(sigma * &noise);
-            run(op.clone(), y.view(), schedule, &mut (), &mut ()).unwrap().0[1].gamma
+            run(&op, y.view(), schedule, &mut (), &mut ()).unwrap().0[1].gamma
         };
         let mut schedule = Schedule::pnp_nonlocal();
         assert_eq!(found(&schedule, 0.0), None);
@@ -542,7 +581,13 @@ mod tests {
     fn the_piece_has_the_greatest_contrast_and_lies_inside() {
         let mut y = Array2::zeros((200, 300));
         y.slice_mut(s![150.., 250..]).assign(&Array2::from_shape_fn((50, 50), |(i, _)| i as f32));
-        assert_eq!(piece(y.view()), (104..200, 204..300));
-        assert_eq!(piece(Array2::zeros((40, 60)).view()), (0..40, 0..60));
+        let light = Array2::ones((200, 300));
+        assert_eq!(piece(light.view(), y.view()), (104..200, 204..300));
+        // Where it is bright and even the measurement varies more, by the masks alone.
+        let light = Array2::from_shape_fn((200, 300), |(i, j)| ((7 * i + 11 * j) % 5) as f32);
+        y.slice_mut(s![..96, ..96]).assign(&(100.0 * &light.slice(s![..96, ..96])));
+        assert_eq!(piece(light.view(), y.view()), (104..200, 204..300));
+        let nothing = Array2::zeros((40, 60));
+        assert_eq!(piece(nothing.view(), nothing.view()), (0..40, 0..60));
     }
 }

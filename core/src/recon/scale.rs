@@ -11,31 +11,29 @@ const WHITE_QUANTILE: f64 = 0.995;
 ///
 /// `y / sum_k C_k` is a mean of the frames at each pixel, weighted by the masks. Its upper
 /// quantile over the pixels is the scene's white: robust against hot pixels, and taken once
-/// from the whole picture, before tiling, so that all tiles share it. Masks come frame by
-/// frame, so that memory holds one.
+/// from the whole picture, before tiling, so that all tiles share it.
 #[derive(Debug)]
 pub struct ScaleEstimator {
     light: Array2<f32>,
 }
 
 impl ScaleEstimator {
-    /// For pictures of `height` x `width` pixels.
-    pub fn new(height: usize, width: usize) -> Self {
-        Self { light: Array2::zeros((height, width)) }
-    }
-
-    /// Adds one mask \[H,W\].
-    pub fn add_mask(&mut self, mask: ArrayView2<'_, f32>) -> Result<()> {
-        self.check("a mask", mask.shape())?;
-        self.light += &mask;
-        Ok(())
+    /// For masks of this sum \[H,W\].
+    pub fn new(light: Array2<f32>) -> Self {
+        Self { light }
     }
 
     /// The white level of the scene behind measurement `y` \[H,W\]: divide measurement (and
     /// so frames) by it before reconstruction, multiply frames by it after.
     /// Errors: sizes that differ, or a measurement without light.
     pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
-        self.check("the measurement", y.shape())?;
+        if y.dim() != self.light.dim() {
+            return Err(ReconError::Shape {
+                what: "the measurement",
+                found: shape_text(y.shape()),
+                expected: shape_text(self.light.shape()),
+            });
+        }
         // Pixels with little light have a ratio of noise by almost nothing.
         let floor = 0.25 * self.light.mean().unwrap_or(0.0);
         let lit = y.iter().zip(&self.light).filter(|&(_, &light)| light > floor);
@@ -54,20 +52,12 @@ impl ScaleEstimator {
             range: "above 0: the measurement holds no light (is the dark frame too bright?)",
         })
     }
-
-    fn check(&self, what: &'static str, found: &[usize]) -> Result<()> {
-        let expected = self.light.shape();
-        if found == expected {
-            return Ok(());
-        }
-        Err(ReconError::Shape { what, found: shape_text(found), expected: shape_text(expected) })
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::ScaleEstimator;
-    use ndarray::{Array2, Array3};
+    use ndarray::{Array2, Array3, Axis};
     use rand::{Rng, SeedableRng};
 
     fn scene(factor: f32) -> (Array3<f32>, Array2<f32>) {
@@ -84,9 +74,7 @@ mod tests {
     }
 
     fn white(masks: &Array3<f32>, y: &Array2<f32>) -> f32 {
-        let mut estimator = ScaleEstimator::new(64, 64);
-        masks.outer_iter().for_each(|mask| estimator.add_mask(mask).unwrap());
-        estimator.white(y.view()).unwrap()
+        ScaleEstimator::new(masks.sum_axis(Axis(0))).white(y.view()).unwrap()
     }
 
     #[test]
@@ -111,8 +99,7 @@ mod tests {
     #[test]
     fn darkness_is_refused() {
         let (masks, y) = scene(1.0);
-        let mut estimator = ScaleEstimator::new(64, 64);
-        masks.outer_iter().for_each(|mask| estimator.add_mask(mask).unwrap());
+        let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
         let error = estimator.white((y * -1.0).view()).unwrap_err();
         assert!(error.to_string().contains("holds no light"), "{error}");
         assert!(estimator.white(Array2::zeros((3, 3)).view()).is_err());

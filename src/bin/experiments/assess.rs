@@ -90,10 +90,11 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
             writer.write_frame(plane)?;
         }
         writer.finish()?;
+        let pilot = tile.pilot.as_ref().and_then(|pilot| pilot.evidence);
+        let evidence = tile.outcome.evidence.or(pilot);
         let about = json!({"clip": clip.name, "setting": setting, "cr": frames, "features": FEATURES,
             "algorithm": arguments.algorithm, "psnr_db": psnr, "white": tile.white,
-            "signs": tile.outcome.signs.or(tile.pilot.as_ref().and_then(|pilot| pilot.signs)),
-            "pilot": tile.pilot});
+            "evidence": evidence, "pilot": tile.pilot});
         let path = out.join(format!("{}.json", clip.name));
         fs::write(&path, about.to_string())
             .map_err(|error| CliError::file("write", &path, &error))?;

@@ -8,12 +8,11 @@ use std::ops::Range;
 
 use ndarray::{Array3, Array4, ArrayView3};
 
-use super::assessment;
+use super::assessment::{self, Evidence};
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
 use super::schedule::{Schedule, Stage};
 use super::sensing::{SensingOperator, Statistics};
-use super::signs::Signs;
 use state::{Change, State};
 use strum::Display;
 
@@ -93,8 +92,8 @@ pub struct Outcome {
     pub stop_reason: StopReason,
     /// What an [`assessment`] sees of the frames \[features, S B, rows, columns\], where it was asked for.
     pub features: Option<Array4<f32>>,
-    /// What pixels held out of a piece tell of the frames' error, where that was asked for.
-    pub signs: Option<Signs>,
+    /// What a piece with held-out pixels tells of the frames' error, where that was asked for.
+    pub evidence: Option<Evidence>,
 }
 
 /// Reconstructs the `S B` frames of a run of snapshots `y` \[S,H,W\], both on the scale on which the
@@ -130,10 +129,20 @@ pub fn reconstruct_assessed(
         }
     })?;
     let early = early.as_ref().map(|early| early.view());
+    outcome.features = Some(seen((op, schedule), early, outcome.frames.view(), networks)?);
+    Ok(outcome)
+}
+
+/// What an [`assessment`] sees of the frames of a schedule, whose first stage had left `early`, if others followed.
+pub(super) fn seen(
+    (op, schedule): (&SensingOperator, &Schedule),
+    early: Option<ArrayView3<'_, f32>>,
+    frames: ArrayView3<'_, f32>,
+    networks: &mut dyn Networks,
+) -> Result<Array4<f32>> {
     let network = schedule.stages.iter().find_map(|stage| stage.prior.network());
     let denoiser = network.map(|which| networks.network(which)).transpose()?;
-    outcome.features = Some(assessment::features(op, early, outcome.frames.view(), denoiser)?);
-    Ok(outcome)
+    assessment::features(op, early, frames, denoiser)
 }
 
 /// Runs the stages, and tells after each of them its index and the frames.
@@ -169,7 +178,7 @@ pub(super) fn stages(
         residual,
         stop_reason,
         features: None,
-        signs: None,
+        evidence: None,
     })
 }
 
