@@ -30,7 +30,7 @@ pub struct PilotRecord {
     /// Whether snapshots that follow one another belong together, joint by joint.
     #[serde(default)]
     pub joints: Vec<JointRecord>,
-    /// What its held-out pixels tell of the error of an adaptive schedule's frames.
+    /// What it tells of the error of an adaptive schedule's frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
 }
