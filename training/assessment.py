@@ -5,8 +5,7 @@
 
 `make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
 them with a part that moves by itself, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is
-a mixture of all. `fit` fits small
-networks to all cases, and tells how they do on scenes that were left out (ten folds, no scene in two of them).
+a mixture of all. `fit` fits small networks to all cases, and tells how they do on scenes that were left out (no scene is in two folds).
 """
 import argparse
 import glob
@@ -20,15 +19,17 @@ import scipy.io
 import torch
 from torch import nn
 
-SIDES, LONGEST = (128, 256, 256), 24
+SIDES, LONGEST, BLOCK = (128, 256, 256), 24, 16      # the last as the program has it
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
 RATIOS = 6, 8, 10, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
 ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
+FEATURES = 26       # as the program has them; what follows is what its encoder sees
 FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
 SPARE = 10.0        # dB above it up to which the fit follows
-FOLDS = 10
+COMPONENTS = 64     # of what the encoder sees
+AT_ONCE = 128       # blocks of a case that a step sees, in all its frames
 
 
 # ---------------------------------------------------------------- scenes
@@ -125,18 +126,19 @@ class Case:
         with open(f'{folder}/scene.json') as f:
             self.scene = json.load(f)
         # [features and the true error, frame, block]; what is not known counts as in the mean, as the program has it.
-        seen = np.nan_to_num(np.load(path + '.npy').astype(np.float32))
+        seen = np.load(path + '.npy').astype(np.float32)
         self.psnr, self.frames, self.side = about['psnr_db'], seen.shape[1], round(seen.shape[2] ** .5)
         self.white = 20 * np.log10(about['white'])
-        self.features = torch.from_numpy(seen[:-1].reshape(len(seen) - 1, -1).T.copy())
+        values = lambda rows: torch.from_numpy(rows.reshape(len(rows), seen[0].size).T.copy())
+        self.features, self.encoded = values(seen[:FEATURES]), values(seen[FEATURES:-1]).half()
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
         evidence = about['evidence']
         self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
-        self.piece = torch.tensor([float('nan') if value is None else value for value in evidence['features']], dtype=torch.float32)
+        self.piece = torch.tensor([float('nan') if value is None else value for value in evidence['features'][:FEATURES]], dtype=torch.float32)
         self.pattern = about['setting']['pattern']
 
     def psnr_of(self, errors):
-        """Of the decimal logarithms of all blocks' errors."""
+        """Of the decimal logarithms of the errors of blocks, as many of each frame."""
         return (-10 * torch.log10((10 ** errors).reshape(self.frames, -1).mean(1))).mean() - self.white
 
 
@@ -154,23 +156,36 @@ class Model:
     def __init__(self, cases, a):
         self.features = scaling(torch.cat([case.features for case in cases]), .05)
         self.signs = scaling(torch.stack([case.signs for case in cases]), 1e-3)
+        self.encoding = self.principal(torch.cat([case.encoded[::37].float() for case in cases])) if cases[0].encoded.shape[1] else None
         self.networks = [self.network(cases, a, seed) for seed in range(a.networks)]
 
+    @staticmethod
+    def principal(seen):
+        """The mean, and the weights of the principal components, each of which then varies by 1."""
+        mean, scale = scaling(seen, 1e-3)
+        values, axes = torch.linalg.eigh(torch.cov(((seen - mean) / scale).T))
+        values, axes = values.flip(0)[:COMPONENTS], axes.flip(1)[:, :COMPONENTS]
+        return mean, (axes / values.sqrt()).T / scale
+
     def inputs(self, case):
-        """Of each block what is seen of it, of the blocks around it, of these in all frames, and what the piece tells."""
+        """Of each block what is seen of it, of the blocks around it, of these in all frames, what the piece tells, and what the encoder sees."""
         features = scaled(case.features, self.features)
         frames = features.reshape(case.frames, case.side, case.side, -1).permute(0, 3, 1, 2)
         around = nn.functional.avg_pool2d(frames, 3, 1, 1, count_include_pad=False)
         always = around.mean(0, keepdim=True).expand_as(around)
         around, always = (values.permute(0, 2, 3, 1).reshape(features.shape) for values in (around, always))
         rest = torch.cat([scaled(case.piece, self.features).nan_to_num(), scaled(case.signs, self.signs)])
-        return torch.cat([features, around, always, rest.expand(len(features), -1)], 1)
+        all_of = [features, around, always, rest.expand(len(features), -1)]
+        if self.encoding:
+            mean, components = self.encoding
+            all_of.append(((case.encoded.float() - mean) @ components.T).clamp(-FARTHEST, FARTHEST))
+        return torch.cat(all_of, 1)
 
     def network(self, cases, a, seed):
         torch.manual_seed(seed)
-        inputs = [self.inputs(case) for case in cases]
+        inputs = [self.inputs(case).half() for case in cases]
         count = inputs[0].shape[1]
-        network = nn.Sequential(nn.Linear(count, 32), nn.SiLU(), nn.Dropout(.15), nn.Linear(32, 16), nn.SiLU(), nn.Linear(16, 1))
+        network = nn.Sequential(nn.Linear(count, 64), nn.SiLU(), nn.Dropout(.15), nn.Linear(64, 16), nn.SiLU(), nn.Linear(16, 1))
         with torch.no_grad():
             network[-1].bias.fill_(float(torch.cat([case.error for case in cases]).mean()))
         optimiser = torch.optim.AdamW(network.parameters(), 3e-3, weight_decay=.05)
@@ -179,14 +194,19 @@ class Model:
         for _ in range(a.epochs):
             order = torch.randperm(len(cases))
             for batch in batches:
-                loss = 0
-                for index in order[batch].tolist():
-                    case = cases[index]
+                drawn, seen, errors = [cases[index] for index in order[batch].tolist()], [], []
+                for index, case in zip(order[batch].tolist(), drawn):
+                    blocks = torch.randperm(case.side ** 2)[:AT_ONCE]
+                    of = lambda values: values.reshape(case.frames, case.side ** 2, -1)[:, blocks].flatten(0, 1).float()
                     # All cases of a fit are a little alike, and those to come are not.
-                    shaken = inputs[index] + .15 * torch.randn(1, count) + .05 * torch.randn_like(inputs[index])
-                    told = network(shaken)[:, 0]
-                    wanted = torch.tensor(min(case.psnr, BEST + SPARE), dtype=torch.float32)
-                    loss = loss + ((told - case.error) ** 2).mean() + .15 * nn.functional.smooth_l1_loss(case.psnr_of(told), wanted, beta=1.5)
+                    seen.append(of(inputs[index]) + .1 * torch.randn(1, count))
+                    errors.append(of(case.error)[:, 0])
+                seen = torch.cat(seen)
+                told = network(seen + .05 * torch.randn_like(seen))[:, 0].split([len(of_case) for of_case in errors])
+                loss = 0
+                for case, told, error in zip(drawn, told, errors):
+                    wanted = case.psnr_of(error).clamp(max=BEST + SPARE)
+                    loss = loss + ((told - error) ** 2).mean() + .15 * nn.functional.smooth_l1_loss(case.psnr_of(told), wanted, beta=1.5)
                 optimiser.zero_grad()
                 (loss / len(batch)).backward()
                 optimiser.step()
@@ -204,7 +224,8 @@ class Model:
         numbers = lambda tensor: [float(f'{value:.6g}') for value in tensor.tolist()]
         layers = lambda network: [{'weights': [numbers(row) for row in layer.weight], 'bias': numbers(layer.bias)} for layer in network if isinstance(layer, nn.Linear)]
         by = lambda scaling: {'mean': numbers(scaling[0]), 'scale': numbers(scaling[1])}
-        return {'features': by(self.features), 'signs': by(self.signs), 'networks': [layers(network) for network in self.networks]}
+        encoding = self.encoding and {'mean': numbers(self.encoding[0]), 'components': [numbers(row) for row in self.encoding[1]]}
+        return {'features': by(self.features), 'signs': by(self.signs), 'encoding': encoding, 'networks': [layers(network) for network in self.networks]}
 
 
 def fit(a):
@@ -215,9 +236,9 @@ def fit(a):
     for algorithm in [a.algorithm] if a.algorithm else ALGORITHMS:
         cases = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))]
         names = sorted({case.scene for case in cases})
-        fold = {name: index % FOLDS for index, name in enumerate(np.random.default_rng(1).permutation(names))}
+        fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
-        for k in range(FOLDS):
+        for k in range(a.folds):
             model = Model([case for case in cases if fold[case.scene] != k], a)
             for index, case in enumerate(cases):
                 if fold[case.scene] == k:
@@ -236,10 +257,12 @@ def fit(a):
         print(f'{algorithm}: {len(cases)} cases of {len(names)} scenes; error {np.abs(wrong).mean():.2f} dB in the mean, 80 % within {np.quantile(np.abs(wrong), .8):.2f}, '
               f'{100 * np.mean(np.abs(wrong) < 1.5):.0f} % within 1.5; interval {ends(slice(None)).round(2)}, held by {100 * inside.mean():.0f} % left out; '
               f'correlation of the map {np.nanmedian(spread):.2f}')
-        for pattern in PATTERNS:
-            of = np.array([case.pattern == pattern for case in cases])
+        kinds = {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
+        kinds |= {f'{side}x{side}': [case.side * BLOCK == side for case in cases] for side in sorted(set(SIDES))}
+        for kind, of in kinds.items():
+            of = np.array(of)
             if of.any():
-                print(f'  {pattern}: {of.sum()} cases, {np.abs(wrong[of]).mean():.2f} dB, {100 * np.mean(np.abs(wrong[of]) < 1.5):.0f} % within 1.5, '
+                print(f'  {kind}: {of.sum()} cases, {np.abs(wrong[of]).mean():.2f} dB, {100 * np.mean(np.abs(wrong[of]) < 1.5):.0f} % within 1.5, '
                       f'{100 * inside[of].mean():.0f} % in the interval')
         models[algorithm] = Model(cases, a).record() | {'interval': [round(float(end), 2) for end in ends(slice(None))]}
     if a.write:
@@ -260,6 +283,7 @@ def main():
     p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')
     p.add_argument('--epochs', type=int, default=24)
     p.add_argument('--algorithm', choices=ALGORITHMS, help='fit this one alone')
+    p.add_argument('--folds', type=int, default=10, help='as many parts are left out, one after the other')
     p.add_argument('--networks', type=int, default=3, help='whose mean is taken')
     a = p.parse_args()
     {'make': make, 'fit': fit}[a.what](a)

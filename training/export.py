@@ -64,14 +64,15 @@ class Graph:
     def ints(self, values):
         return self.constant(np.array(values, np.int64))
 
-    def save(self, path, result, axes, notes):
-        self.nodes.append(helper.make_node('Identity', [result], ['denoised']))
+    def save(self, path, result, axes, notes, output=('denoised', 1, 'height', 'width')):
+        name, *sides = output
+        self.nodes.append(helper.make_node('Identity', [result], [name]))
         frames, denoised = axes
         graph = helper.make_graph(
             self.nodes, 'denoiser',
             [helper.make_tensor_value_info('frames', TensorProto.FLOAT, [frames, 1, 'height', 'width']),
              helper.make_tensor_value_info('sigma', TensorProto.FLOAT, [])],
-            [helper.make_tensor_value_info('denoised', TensorProto.FLOAT, [denoised, 1, 'height', 'width'])],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, [denoised, *sides])],
             self.constants)
         m = helper.make_model(graph, opset_imports=[helper.make_opsetid('', OPSET)], ir_version=8, producer_name='sci-recon training')
         m.doc_string = notes
@@ -99,9 +100,8 @@ def padded_to_16(weight, bias, following):
             np.pad(following, ((0, 0), (0, extra), (0, 0), (0, 0))))
 
 
-def block_graph(block):
-    """One block over a clip: frames [n+2,1,H,W] and sigma -> the middle frames of all triplets, [n,1,H,W]."""
-    g = Graph()
+def encoding_half(g, block):
+    """The middle frames of all triplets of frames [n+2,1,H,W] and sigma, and what a block makes of them at each of its three scales."""
     last = np.iinfo(np.int64).max
     f = [g.add('Slice', 'frames', g.ints([start]), g.ints([end]), g.ints([0])) for start, end in ((0, -2), (1, -1), (2, last))]
     x = g.add('Concat', *f, g.noise_map(f[1], 'sigma'), axis=1)
@@ -109,11 +109,18 @@ def block_graph(block):
     w, b, w2 = padded_to_16(dense_input_weight(first.weight.numpy()), first.bias.numpy(), second.weight.numpy())
     x0 = g.conv(g.conv(x, w, b), w2, second.bias.numpy())
     x1 = g.sequence(x0, block.d0)
-    x1 = g.add('Add', g.sequence(g.sequence(x1, block.d1), block.u2), x1)
+    return f[1], x0, x1, g.sequence(x1, block.d1)
+
+
+def block_graph(block):
+    """One block over a clip: frames [n+2,1,H,W] and sigma -> the middle frames of all triplets, [n,1,H,W]."""
+    g = Graph()
+    middle, x0, x1, x2 = encoding_half(g, block)
+    x1 = g.add('Add', g.sequence(x2, block.u2), x1)
     x0 = g.add('Add', g.sequence(x1, block.u1), x0)
     # The network predicts the noise; with the sign in the last weights the residual is an addition, which runtimes fuse.
     y = g.layer(g.layer(x0, block.out[0]), block.out[2], relu=False, sign=-1.)
-    return g, g.add('Add', y, f[1])
+    return g, g.add('Add', y, middle)
 
 
 def ffdnet_graph(net):

@@ -108,6 +108,14 @@ def test_pipeline():
         assert 0 < change < .05, change
         size = lambda name: os.path.getsize(os.path.join(out(name), 'stage1.onnx'))
         assert size('int8') < .3 * size('loop')
+        run('encoder.py', out('loop'), out('encoder'))
+        block, clip = model.load(out('loop.pt')).t1, torch.rand(5, 1, 32, 32)
+        noise = torch.full((3, 1, 32, 32), .1)
+        with torch.no_grad():
+            seen = block.d1(block.d0(block.inc(torch.cat([clip[:3], noise, clip[1:4], noise, clip[2:], noise], 1))))
+        expected = torch.log(torch.nn.functional.avg_pool2d(seen, 4) + .02).numpy()
+        encoded, = export.session(os.path.join(out('encoder'), 'model.onnx')).run(None, {'frames': clip.numpy(), 'sigma': np.array(.1, np.float32)})
+        assert encoded.shape == (3, 128, 2, 2) and np.abs(encoded - expected).max() < 1e-4
         rows = [json.loads(line) for line in run('evaluate.py', '--data', data, out('loop'), out('ffdnet'), '--passes', 2, '--size', 32).splitlines()]
         assert [os.path.basename(r['model']) for r in rows] == ['tv', 'loop', 'ffdnet']
         assert all(np.isfinite(list(r['loop'].values())).all() for r in rows)

@@ -307,7 +307,7 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
         tile,
         white: white(task.prepared.as_ref())?,
         schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),
-        evidence: pilot.as_ref().and_then(|pilot| pilot.evidence),
+        evidence: pilot.as_ref().and_then(|pilot| pilot.evidence.clone()),
         model: task.spec.model.as_ref().map(|model| model.sha256),
     })
 }

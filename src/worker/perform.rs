@@ -241,7 +241,7 @@ fn tile(
     let solved = task.pieces.iter().flat_map(Clone::clone).collect();
     let assessment = match task.model {
         Some(_) => None,
-        None => TileAssessment::of(&outcome, (&task.schedule, task.evidence, task.white)),
+        None => TileAssessment::of(&outcome, (&task.schedule, task.evidence.as_ref(), task.white)),
     };
     let tile = TileRecord::from(&outcome);
     Ok((TileTaskRecord { tile, solved, assessment, cost }, outcome.frames))

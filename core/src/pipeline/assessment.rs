@@ -38,7 +38,7 @@ impl TileAssessment {
     /// expected.
     pub fn of(
         outcome: &Outcome,
-        (schedule, evidence, white): (&Schedule, Option<Evidence>, f32),
+        (schedule, evidence, white): (&Schedule, Option<&Evidence>, f32),
     ) -> Option<Self> {
         let model = Model::of(schedule)?;
         let Some(features) = &outcome.features else {
@@ -47,7 +47,7 @@ impl TileAssessment {
             let levels = vec![DARK; frames * size.0 * size.1];
             return Some(Self { size, levels, motion: 0.0 });
         };
-        let errors = model.log_errors(features, outcome.evidence.or(evidence).as_ref(), white);
+        let errors = model.log_errors(features, outcome.evidence.as_ref().or(evidence), white);
         let level = |error: &f32| (-10.0 * error * STEPS).round().clamp(0.0, 254.0) as u8;
         let (_, rows, columns) = errors.dim();
         let motion = fastest(outcome.frames.view(), white);

@@ -13,9 +13,9 @@ use sha2::Digest;
 
 use crate::job::{JobSpec, Label, Schedule, Sha256};
 use crate::recon::ReconError;
-use crate::recon::prior::network::ClipDenoiser;
+use crate::recon::prior::network::{ClipDenoiser, ClipEncoder};
 use crate::recon::prior::onnx::{Device, EndToEndNetwork, Runtime};
-use crate::recon::prior::{Denoiser, Network, Networks};
+use crate::recon::prior::{Denoiser, Encoder, Network, Networks};
 
 /// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
 #[derive(Debug, Clone, Copy)]
@@ -49,6 +49,10 @@ const FASTDVDNET_GRAY_INT8: Model = Model {
         ("stage2.onnx", include_bytes!("../../../models/fastdvdnet-gray-int8/stage2.onnx")),
     ],
 };
+
+/// What results are assessed by. It is always the one that the program carries: predictions are fitted to what it sees.
+const FASTDVDNET_GRAY_ENCODER: &[u8] =
+    include_bytes!("../../../models/fastdvdnet-gray-encoder/model.onnx");
 
 const FFDNET_GRAY: Model = Model {
     name: "ffdnet-gray",
@@ -222,6 +226,11 @@ impl NetworkSource {
         Ok(ClipDenoiser::load(&self.runtime()?, which, &self.contents(which)?)?)
     }
 
+    /// The encoder with a session of its own, for one thread.
+    fn encoder(&self) -> Result<ClipEncoder, NetworkError> {
+        Ok(ClipEncoder::load(&self.runtime()?, FASTDVDNET_GRAY_ENCODER)?)
+    }
+
     /// An end-to-end network with a session of its own, for one thread.
     /// Errors: no library; these bytes of an ONNX file hold no network that can be run.
     pub fn end_to_end(&self, content: &[u8]) -> Result<EndToEndNetwork, NetworkError> {
@@ -268,6 +277,7 @@ fn near(executable: &Path) -> Option<PathBuf> {
 pub struct WarmNetworks {
     source: NetworkSource,
     loaded: Vec<(Network, ClipDenoiser)>,
+    encoder: Option<ClipEncoder>,
     /// The last end-to-end network.
     end_to_end: Option<(Sha256, EndToEndNetwork)>,
 }
@@ -275,7 +285,7 @@ pub struct WarmNetworks {
 impl WarmNetworks {
     /// Networks from `source`, none of them loaded yet.
     pub fn new(source: NetworkSource) -> Self {
-        Self { source, loaded: Vec::new(), end_to_end: None }
+        Self { source, loaded: Vec::new(), encoder: None, end_to_end: None }
     }
 
     /// The end-to-end network in this file, which is kept until another one is asked for.
@@ -307,6 +317,17 @@ impl Networks for WarmNetworks {
         };
         Ok(&mut self.loaded[index].1)
     }
+
+    fn encoder(&mut self) -> Result<Option<&mut dyn Encoder>, ReconError> {
+        let encoder = match self.encoder.take() {
+            Some(encoder) => encoder,
+            None => {
+                let loaded = self.source.encoder();
+                loaded.map_err(|error| ReconError::Runtime(error.to_string()))?
+            }
+        };
+        Ok(Some(self.encoder.insert(encoder)))
+    }
 }
 
 fn existing(path: &Path) -> Option<PathBuf> {
@@ -328,7 +349,10 @@ fn version_in(library: &[u8]) -> Option<String> {
 mod tests {
     use std::fs;
 
-    use super::{LIBRARY, ModelFile, NetworkSource, PLACES, carried, near, version_in};
+    use super::{
+        FASTDVDNET_GRAY_ENCODER, LIBRARY, ModelFile, NetworkSource, PLACES, carried, near,
+        version_in,
+    };
     use crate::job::{Algorithm, Sha256};
     use crate::recon::prior::Network;
     use crate::recon::prior::onnx::Device;
@@ -403,6 +427,15 @@ mod tests {
             let found = quick.windows(source.len()).any(|window| window == source.as_bytes());
             assert!(found, "{name}: make the twin anew with training/quantize.py");
         }
+    }
+
+    #[test]
+    fn the_encoder_was_made_from_these_weights() {
+        let (_, first) = carried(Network::FastDvdNet).files[0];
+        let source = Sha256::of(first).to_string();
+        let found =
+            FASTDVDNET_GRAY_ENCODER.windows(source.len()).any(|window| window == source.as_bytes());
+        assert!(found, "make it anew with training/encoder.py");
     }
 
     #[test]

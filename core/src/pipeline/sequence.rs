@@ -100,7 +100,7 @@ impl Solved {
         schedule: &Schedule,
     ) -> Vec<(RunShare, Vec<Option<TileAssessment>>)> {
         let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
-        let evidence = self.pilot.as_ref().and_then(|pilot| pilot.evidence);
+        let evidence = self.pilot.as_ref().and_then(|pilot| pilot.evidence.as_ref());
         let by = (schedule, evidence, input.white);
         let of = |share: RunShare| {
             let tiles = self.runs[share.run].iter();

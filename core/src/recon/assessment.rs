@@ -1,8 +1,8 @@
 //! How near frames come to the truth, told without it.
 //!
 //! A lab has no truth. What can be seen are the frames themselves: how much changes in them from pixel to pixel
-//! and from frame to frame, how far the priors have moved them since total variation, how well the denoiser finds
-//! them again when noise is added, how well the masks can tell frames apart, and the [`super::signs`] of pixels
+//! and from frame to frame, how far the priors have moved them since total variation, what the denoiser's own first
+//! layers see in them, how well the masks can tell frames apart, and the [`super::signs`] of pixels
 //! that were held out. Block by block the expected error follows from these by a small network that was fitted to
 //! simulated snapshots of many scenes; `docs/benchmarks.md` says how well it does on others.
 
@@ -11,17 +11,14 @@ use std::ops::Range;
 use std::sync::LazyLock;
 
 use ndarray::{
-    Array1, Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis, s,
+    Array1, Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis,
+    concatenate, s,
 };
-use rand::SeedableRng;
-use rand::distr::Distribution;
-use rand_chacha::ChaCha8Rng;
-use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 
-use super::error::Result;
+use super::error::{ReconError, Result, shape_text};
 use super::motion::Steps;
-use super::prior::Denoiser;
+use super::prior::{CHANNELS, Encoder};
 use super::schedule::{Method, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
@@ -31,9 +28,8 @@ pub const BLOCK: usize = 16;
 
 /// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames of the
 /// result, and of those that total variation alone had left, where other priors followed. Nothing betrays frames that are
-/// wrong as much as motion that does not explain how they change. The errors of the denoiser are those with which it finds
-/// the result again when noise was added.
-pub const FEATURES: [&str; 28] = [
+/// wrong as much as motion that does not explain how they change.
+pub const FEATURES: [&str; 26] = [
     "gradient",
     "curvature",
     "change in time",
@@ -60,19 +56,13 @@ pub const FEATURES: [&str; 28] = [
     "change that is no motion after total variation",
     "gradient beside other frames after total variation",
     "change in time beside other frames after total variation",
-    "error of the denoiser under little noise",
-    "error of the denoiser under much noise",
 ];
-
-/// Little and much noise: standard deviations on the scale on which the scene is on \[0,1\].
-const NOISE: [f32; 2] = [15.0 / 255.0, 40.0 / 255.0];
 
 /// How many are seen of the frames of a clip by themselves, and the first ones of the other kinds.
 const OF_CLIP: usize = 9;
 const OF_RESULT: usize = 9;
 const OF_WHOLE: usize = 14;
 const OF_EARLY: usize = 17;
-const OF_DENOISER: usize = 26;
 
 /// Below this, energies are rounding.
 const FLOOR: f32 = 1e-7;
@@ -84,14 +74,12 @@ pub fn blocks(height: usize, width: usize) -> (usize, usize) {
 
 /// What is seen of each block of each frame \[features, S B, rows, columns\], of the frames \[S B,H,W\] of a
 /// reconstruction and those that total variation alone had left, if other priors followed; all on the scale on which the
-/// scene is on \[0,1\]. What a denoiser makes of them is NaN where none is given: it is not known.
-/// Errors: those of the denoiser.
+/// scene is on \[0,1\].
 pub fn features(
     op: &SensingOperator,
     early: Option<ArrayView3<'_, f32>>,
     frames: ArrayView3<'_, f32>,
-    denoiser: Option<&mut dyn Denoiser>,
-) -> Result<Array4<f32>> {
+) -> Array4<f32> {
     let (count, height, width) = frames.dim();
     let (rows, columns) = blocks(height, width);
     let ratio = op.masks().len_of(Axis(0));
@@ -100,8 +88,6 @@ pub fn features(
     if let Some(early) = early {
         of_clip(early, ratio, all.slice_mut(s![OF_EARLY..OF_EARLY + OF_CLIP, .., .., ..]));
     }
-    let of_denoiser = all.slice_mut(s![OF_DENOISER.., .., .., ..]);
-    of_denoiser_errors(frames, denoiser, of_denoiser)?;
     let (contrast, roughness) = of_masks(op);
     let ratio = (ratio as f32).log10();
     for (k, frame) in frames.outer_iter().enumerate() {
@@ -128,34 +114,26 @@ pub fn features(
             all.slice_mut(s![OF_WHOLE + index, k, .., ..]).fill(value);
         }
     }
-    Ok(all)
+    all
 }
 
-/// How far a denoiser comes from frames to which noise was added, by [`NOISE`], into \[levels, S B, rows, columns\]. The
-/// noise is always the same.
-fn of_denoiser_errors(
+/// The same, followed by what the encoder sees of the blocks of the result, if there is one
+/// \[features and [`CHANNELS`], S B, rows, columns\].
+/// Errors: those of the encoder.
+pub fn encoded_features(
+    op: &SensingOperator,
+    early: Option<ArrayView3<'_, f32>>,
     frames: ArrayView3<'_, f32>,
-    denoiser: Option<&mut dyn Denoiser>,
-    mut all: ArrayViewMut4<'_, f32>,
-) -> Result<()> {
-    let Some(denoiser) = denoiser else {
-        all.fill(f32::NAN);
-        return Ok(());
-    };
-    let (_, height, width) = frames.dim();
-    for (sigma, mut of_level) in NOISE.into_iter().zip(all.outer_iter_mut()) {
-        let mut random = ChaCha8Rng::seed_from_u64(1);
-        let mut noise = || -> f32 { StandardNormal.sample(&mut random) };
-        let mut found = Array3::from_shape_fn(frames.dim(), |at| frames[at] + sigma * noise());
-        denoiser.denoise(&mut found, sigma)?;
-        for ((found, frame), mut errors) in
-            found.outer_iter().zip(frames.outer_iter()).zip(of_level.outer_iter_mut())
-        {
-            let square = |i, j| (found[[i, j]] - frame[[i, j]]).powi(2);
-            errors.assign(&over_blocks((height, width), square).mapv(logarithm));
-        }
-    }
-    Ok(())
+    encoder: Option<&mut dyn Encoder>,
+) -> Result<Array4<f32>> {
+    let seen = features(op, early, frames);
+    let Some(encoder) = encoder else { return Ok(seen) };
+    let encoded = encoder.encode(frames)?;
+    concatenate(Axis(0), &[seen.view(), encoded.view()]).map_err(|_| ReconError::Shape {
+        what: "what the encoder gave",
+        found: shape_text(encoded.shape()),
+        expected: shape_text(&[&[CHANNELS], &seen.shape()[1..]].concat()),
+    })
 }
 
 /// What is seen of the frames of snapshots of `ratio` frames by themselves, into \[features, S B, rows, columns\].
@@ -335,30 +313,32 @@ fn over_blocks(
 
 /// What a piece of a measurement tells of the error of all of it: by pixels that were held out there, and by what is seen of
 /// its frames, each in the mean over its blocks; none of what is not known. Signs tell of frames like these.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evidence {
     /// What the held-out pixels tell.
     pub signs: Signs,
     /// Values of [`FEATURES`].
-    pub features: [Option<f32>; FEATURES.len()],
+    pub features: Vec<Option<f32>>,
 }
 
 impl Evidence {
     /// Of signs and features \[features, B, rows, columns\] of the same piece.
     pub(super) fn new(signs: Signs, seen: &Array4<f32>) -> Self {
         let mean = |feature| seen.index_axis(Axis(0), feature).mean();
-        let features = std::array::from_fn(|k| mean(k).filter(|mean| mean.is_finite()));
-        Self { signs, features }
+        let features = (0..FEATURES.len()).map(|k| mean(k).filter(|mean| mean.is_finite()));
+        Self { signs, features: features.collect() }
     }
 }
 
 /// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some networks of a
 /// few neurons, of what is seen of a block, of its means over the blocks around and over these in all frames, of the white
-/// level, and of the evidence.
+/// level, of the evidence, and of what the encoder sees of the block.
 #[derive(Debug, Deserialize)]
 pub struct Model {
     features: Scaling,
     signs: Scaling,
+    /// Of results that a network has had a part in.
+    encoding: Option<Encoding>,
     networks: Vec<Vec<Layer>>,
     /// What is added to the predicted PSNR for the ends of its interval, in dB.
     pub interval: [f64; 2],
@@ -369,6 +349,13 @@ pub struct Model {
 struct Scaling {
     mean: Vec<f32>,
     scale: Vec<f32>,
+}
+
+/// Principal components of what the encoder sees, each with a weight for each channel. What they give is bounded.
+#[derive(Debug, Deserialize)]
+struct Encoding {
+    mean: Vec<f32>,
+    components: Vec<Vec<f32>>,
 }
 
 /// Neurons, each with as many weights as there are inputs.
@@ -407,8 +394,8 @@ impl Model {
     }
 
     /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is seen of
-    /// them. Signs that are not known count as in the mean of the fit, and are then those of the whole. `white` is the
-    /// scene's white level.
+    /// them ([`encoded_features`]). Without evidence signs count as in the mean of the fit, and the features of the whole stand
+    /// for those of the piece; without an encoder its components count as in the mean. `white` is the scene's white level.
     pub fn log_errors(
         &self,
         features: &Array4<f32>,
@@ -416,7 +403,8 @@ impl Model {
         white: f32,
     ) -> Array3<f32> {
         let (_, frames, rows, columns) = features.dim();
-        let mut seen = features.clone();
+        let encoded = features.slice(s![FEATURES.len().., .., .., ..]);
+        let mut seen = features.slice(s![..FEATURES.len(), .., .., ..]).to_owned();
         for mut of_block in seen.lanes_mut(Axis(0)) {
             let scaled = self.features.of(of_block.to_vec());
             of_block.assign(&Array1::from(scaled));
@@ -428,7 +416,8 @@ impl Model {
         let mut rest: Vec<f32> = match evidence {
             Some(evidence) => {
                 known.extend(evidence.signs.0);
-                self.features.of(evidence.features.map(|value| value.unwrap_or(f32::NAN)).to_vec())
+                let known = evidence.features.iter().map(|value| value.unwrap_or(f32::NAN));
+                self.features.of(known.collect())
             }
             None => {
                 known.extend(&self.signs.mean[1..]);
@@ -441,6 +430,9 @@ impl Model {
             inputs.extend(around.slice(s![.., k, row, column]));
             inputs.extend(always.slice(s![.., row, column]));
             inputs.extend(&rest);
+            if let Some(encoding) = &self.encoding {
+                inputs.extend(encoding.of(encoded.slice(s![.., k, row, column])));
+            }
             let told = self.networks.iter().map(|layers| output(layers, inputs.clone()));
             told.sum::<f32>() / self.networks.len() as f32
         })
@@ -462,6 +454,16 @@ impl Scaling {
         let scaled = values.iter().zip(self.mean.iter().zip(&self.scale));
         let bounded = scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST));
         bounded.map(|x| if x.is_nan() { 0.0 } else { x }).collect()
+    }
+}
+
+impl Encoding {
+    fn of(&self, encoded: ArrayView1<'_, f32>) -> impl Iterator<Item = f32> {
+        let moved: Vec<f32> = encoded.iter().zip(&self.mean).map(|(x, mean)| x - mean).collect();
+        self.components.iter().map(move |weights| {
+            let value = weights.iter().zip(&moved).map(|(w, x)| w * x).sum::<f32>();
+            value.clamp(-FARTHEST, FARTHEST)
+        })
     }
 }
 
@@ -488,15 +490,15 @@ impl Layer {
 #[cfg(test)]
 mod tests {
     use super::{
-        Evidence, FEATURES, MODELS, Model, NOISE, OF_CLIP, OF_DENOISER, OF_EARLY, around, features,
+        Evidence, FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, around, encoded_features, features,
     };
     use crate::optics::iid_masks;
     use crate::recon::error::ReconError;
-    use crate::recon::prior::Denoiser;
+    use crate::recon::prior::{CHANNELS, Encoder};
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
     use crate::recon::signs::{SIGNS, Signs};
-    use ndarray::{Array3, Array4, Axis, s};
+    use ndarray::{Array3, Array4, ArrayView3, s};
 
     /// A ramp of 0.01 a column that brightens by 0.02 a frame.
     fn ramp() -> Array3<f32> {
@@ -508,7 +510,7 @@ mod tests {
         let masks = Array3::from_shape_fn((4, 40, 36), |(k, _, _)| if k == 0 { 1.0 } else { 0.0 });
         let op = SensingOperator::new(masks).unwrap();
         let early = ramp() - 0.1;
-        let seen = features(&op, Some(early.view()), ramp().view(), None).unwrap();
+        let seen = features(&op, Some(early.view()), ramp().view());
         assert_eq!(seen.dim(), (FEATURES.len(), 4, 3, 3));
         let near = |feature: usize, at: (usize, usize, usize), energy: f32| {
             let found = seen[[feature, at.0, at.1, at.2]];
@@ -541,36 +543,31 @@ mod tests {
         }
     }
 
-    /// A denoiser that leaves all noise where it is.
-    struct Idle;
+    /// An encoder to which all blocks look the same.
+    struct Alike(Vec<f32>);
 
-    impl Denoiser for Idle {
-        fn denoise(&mut self, _: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
-            Ok(())
+    impl Encoder for Alike {
+        fn encode(&mut self, frames: ArrayView3<'_, f32>) -> Result<Array4<f32>, ReconError> {
+            let (count, height, width) = frames.dim();
+            let size = (self.0.len(), count, height.div_ceil(16), width.div_ceil(16));
+            Ok(Array4::from_shape_fn(size, |(channel, ..)| self.0[channel]))
         }
     }
 
     #[test]
-    fn the_denoiser_is_seen_by_the_noise_that_it_leaves_and_counts_as_in_the_mean_without() {
+    fn what_the_encoder_sees_moves_the_prediction_and_without_it_counts_as_in_the_mean() {
         let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
-        let see = |denoiser: Option<&mut dyn Denoiser>| {
-            features(&op, Some(ramp().view()), ramp().view(), denoiser).unwrap()
-        };
-        let (seen, mut unknown) = (see(Some(&mut Idle)), see(None));
-        for (level, sigma) in NOISE.into_iter().enumerate() {
-            let errors = seen.slice(s![OF_DENOISER + level, .., .., ..]);
-            let whole = errors.slice(s![.., ..2, ..2]).mapv(|error| 10f32.powf(error));
-            assert!((whole.mean().unwrap() / sigma.powi(2) - 1.0).abs() < 0.1, "{errors}");
-            let unknown = unknown.slice(s![OF_DENOISER + level, .., .., ..]);
-            assert!(unknown.iter().all(|error| error.is_nan()));
-        }
         let model = Model::of(&Schedule::pnp_tv_fastdvdnet()).unwrap();
-        let without = model.log_errors(&unknown, None, 1.0);
-        for level in OF_DENOISER..FEATURES.len() {
-            unknown.slice_mut(s![level, .., .., ..]).fill(model.features.mean[level]);
-        }
-        assert_eq!(without, model.log_errors(&unknown, None, 1.0));
-        assert_ne!(without, model.log_errors(&seen, None, 1.0));
+        let see = |values: Option<Vec<f32>>| {
+            let mut encoder = values.map(Alike);
+            let encoder = encoder.as_mut().map(|encoder| encoder as &mut dyn Encoder);
+            encoded_features(&op, Some(ramp().view()), ramp().view(), encoder)
+        };
+        let told = |values| model.log_errors(&see(values).unwrap(), None, 1.0);
+        let mean = model.encoding.as_ref().unwrap().mean.clone();
+        assert_eq!(told(None), told(Some(mean.clone())));
+        assert_ne!(told(None), told(Some(mean.iter().map(|value| value + 1.0).collect())));
+        assert_eq!(see(Some(mean)).unwrap().len_of(ndarray::Axis(0)), FEATURES.len() + CHANNELS);
     }
 
     #[test]
@@ -580,7 +577,9 @@ mod tests {
         assert!(has(Schedule::gap_tv()) && has(Schedule::pnp_tv_fastdvdnet()));
         assert!(!has(Schedule::admm_tv()) && !has(Schedule::pnp_ffdnet()));
         for model in MODELS.values() {
-            let inputs = 4 * FEATURES.len() + 1 + SIGNS.len();
+            let encoding = model.encoding.as_ref();
+            let components = encoding.map_or(0, |encoding| encoding.components.len());
+            let inputs = 4 * FEATURES.len() + 1 + SIGNS.len() + components;
             assert_eq!(
                 (model.features.mean.len(), model.features.scale.len()),
                 (FEATURES.len(), FEATURES.len())
@@ -598,6 +597,10 @@ mod tests {
                 }
                 assert_eq!(before, 1, "the last layer has one neuron");
             }
+            if let Some(encoding) = &model.encoding {
+                assert_eq!(encoding.mean.len(), CHANNELS);
+                assert!(encoding.components.iter().all(|weights| weights.len() == CHANNELS));
+            }
             assert!(model.interval[0] < 0.0 && model.interval[1] > 0.0);
         }
     }
@@ -609,17 +612,6 @@ mod tests {
         let around = around(&seen);
         assert_eq!((around[[0, 0, 0, 0]], around[[0, 1, 1, 2]]), (5.5, 112.0));
         assert_eq!((around[[0, 0, 2, 1]], around[[0, 1, 2, 3]]), (16.0, 117.5));
-    }
-
-    /// A denoiser that takes the mean of a pixel and those that touch it.
-    struct Blur;
-
-    impl Denoiser for Blur {
-        fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
-            let blurred = around(&frames.clone().insert_axis(Axis(0)));
-            frames.assign(&blurred.index_axis(Axis(0), 0));
-            Ok(())
-        }
     }
 
     /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
@@ -634,9 +626,8 @@ mod tests {
             let frames = Array3::from_shape_fn((4, 48, 48), frame);
             let early = frames.mapv(|x| 0.5 + 0.8 * (x - 0.5));
             let deep = schedule.stages.len() > 1;
-            let denoiser = if deep { Some(&mut Blur as &mut dyn Denoiser) } else { None };
             let early = deep.then(|| early.view());
-            let seen = features(&op, early, frames.view(), denoiser).unwrap();
+            let seen = features(&op, early, frames.view());
             Model::of(schedule).unwrap().log_errors(&seen, None, 1.0)[[1, 1, 1]]
         };
         for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
@@ -649,7 +640,7 @@ mod tests {
     #[test]
     fn a_larger_held_out_error_lets_expect_more_error() {
         let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
-        let seen = features(&op, Some(ramp().view()), ramp().view(), None).unwrap();
+        let seen = features(&op, Some(ramp().view()), ramp().view());
         for model in MODELS.values() {
             let error = |decibels: f32| {
                 let evidence = Evidence::new(Signs([decibels; SIGNS.len()]), &seen);

@@ -11,7 +11,7 @@ use std::ops::Range;
 
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 
-use super::assessment::Evidence;
+use super::assessment::{Evidence, features};
 use super::error::{ReconError, Result};
 use super::held_out::HeldOut;
 use super::prior::Networks;
@@ -145,9 +145,9 @@ pub fn run(
     let last = courses.iter().rev().find_map(|course| course.best.as_ref());
     let evidence = early.as_ref().zip(last).map(|(early, last)| {
         let frames = (early.view(), last.view());
-        tell((whole, &op, y), &held_out, schedule, frames, networks)
+        tell((whole, &op, y), &held_out, schedule, frames)
     });
-    Ok((judge(schedule, &courses), evidence.transpose()?.flatten()))
+    Ok((judge(schedule, &courses), evidence.flatten()))
 }
 
 /// What the first snapshot tells of the error of a fixed schedule's frames, on the piece of it that
@@ -180,7 +180,7 @@ pub fn evidence(
         other => other?,
     };
     let early = early.as_ref().unwrap_or(&outcome.frames).view();
-    tell((&whole, &op, y), &held_out, schedule, (early, outcome.frames.view()), networks)
+    Ok(tell((&whole, &op, y), &held_out, schedule, (early, outcome.frames.view())))
 }
 
 /// What the frames of a piece, after the first stage and at the end, tell: by `y` at the held-out pixels, which the operator
@@ -190,12 +190,10 @@ fn tell(
     held_out: &HeldOut,
     schedule: &Schedule,
     (early, last): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
-    networks: &mut dyn Networks,
-) -> Result<Option<Evidence>> {
-    let Some(signs) = Signs::of((op, y), held_out, early, last) else { return Ok(None) };
+) -> Option<Evidence> {
+    let signs = Signs::of((op, y), held_out, early, last)?;
     let early = (schedule.stages.len() > 1).then_some(early);
-    let seen = solver::seen((whole, schedule), early, last, networks)?;
-    Ok(Some(Evidence::new(signs, &seen)))
+    Some(Evidence::new(signs, &features(whole, early, last)))
 }
 
 /// What a stage, as planned, may be instead of what was taken last.

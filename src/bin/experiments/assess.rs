@@ -44,7 +44,8 @@ pub struct Arguments {
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for NAME.npy [features and the true error, frame, block] and NAME.json.
+    /// Folder for NAME.npy [features, the encoder's channels (if a network had a part), and the true error; frame, block] and
+    /// NAME.json.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
 }
@@ -67,19 +68,20 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         let tile = bench.first_tile(&measured, &key)?;
         let (found, truth) = (&tile.outcome.frames, measured.truth());
         let (rows, columns) = blocks(side, side);
-        let mut seen = Array3::zeros((FEATURES.len() + 1, frames, rows * columns));
         let Some(features) = &tile.outcome.features else {
             let name = arguments.algorithm.into_str();
             return Err(CliError::Input(format!("{name}: its results are not assessed")));
         };
-        let features = features.to_shape((FEATURES.len(), frames, rows * columns));
+        let count = features.len_of(Axis(0));
+        let features = features.to_shape((count, frames, rows * columns));
         let features = features.map_err(|error| CliError::Failure(error.to_string()))?;
-        seen.slice_mut(s![..FEATURES.len(), .., ..]).assign(&features);
+        let mut seen = Array3::zeros((count + 1, frames, rows * columns));
+        seen.slice_mut(s![..count, .., ..]).assign(&features);
         let psnr = metrics::psnr(found.view(), truth.view()).map_err(PipelineError::from)?;
         for (k, (found, truth)) in found.outer_iter().zip(truth.outer_iter()).enumerate() {
             let squares = (&found - &truth).mapv(|error| (error / tile.white).powi(2));
             for (at, block) in squares.exact_chunks((BLOCK, BLOCK)).into_iter().enumerate() {
-                seen[[FEATURES.len(), k, at]] = block.mean().unwrap_or(0.0);
+                seen[[count, k, at]] = block.mean().unwrap_or(0.0);
             }
         }
         let array = out.join(format!("{}.npy", clip.name));
@@ -90,8 +92,8 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
             writer.write_frame(plane)?;
         }
         writer.finish()?;
-        let pilot = tile.pilot.as_ref().and_then(|pilot| pilot.evidence);
-        let evidence = tile.outcome.evidence.or(pilot);
+        let pilot = tile.pilot.as_ref().and_then(|pilot| pilot.evidence.as_ref());
+        let evidence = tile.outcome.evidence.as_ref().or(pilot);
         let about = json!({"clip": clip.name, "setting": setting, "cr": frames, "features": FEATURES,
             "algorithm": arguments.algorithm, "psnr_db": psnr, "white": tile.white,
             "evidence": evidence, "pilot": tile.pilot});

@@ -12,7 +12,7 @@ pub mod tv;
 
 use std::ops::{Bound, Range, RangeBounds};
 
-use ndarray::Array3;
+use ndarray::{Array3, Array4, ArrayView3};
 use schemars::Schema;
 
 use super::error::{ReconError, Result};
@@ -218,10 +218,25 @@ pub trait Denoiser {
     fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()>;
 }
 
+/// A loaded network that tells what blocks of frames look like.
+pub trait Encoder {
+    /// What it sees of each block of 16x16 pixels \[[`CHANNELS`], B, rows, columns\] of frames \[B,H,W\] on the \[0,1\] scale.
+    /// Blocks at the far edges are filled up with mirrored pixels.
+    fn encode(&mut self, frames: ArrayView3<'_, f32>) -> Result<Array4<f32>>;
+}
+
+/// How many values an encoder has for a block.
+pub const CHANNELS: usize = 128;
+
 /// Where the solver gets its networks from.
 pub trait Networks {
     /// The network, loaded at its first use.
     fn network(&mut self, which: Network) -> Result<&mut dyn Denoiser>;
+
+    /// The encoder, loaded at its first use; none where there is none.
+    fn encoder(&mut self) -> Result<Option<&mut dyn Encoder>> {
+        Ok(None)
+    }
 }
 
 /// No networks at all.

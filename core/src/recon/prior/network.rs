@@ -3,10 +3,13 @@
 
 use std::ops::Range;
 
-use ndarray::{Array3, ArrayView2, ArrayView4, ArrayViewMut2, Axis};
+use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, ArrayViewMut2, Axis};
 
 use super::onnx::{ClipNetwork, Runtime};
-use super::{Denoiser, Memory, Network, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
+use super::{
+    CHANNELS, Denoiser, Encoder, Memory, Network, Networks, Parameter, Pass, Prior, Ready, SIGMA,
+    Settings,
+};
 use crate::recon::error::{ReconError, Result};
 
 /// FFDNet, frame by frame.
@@ -23,7 +26,7 @@ pub const FASTDVDNET: NetworkPrior = NetworkPrior {
     summary: "FastDVDNet over the clip",
     network: Network::FastDvdNet,
     pass_ns: 4_900.0,
-    memory: FLOAT_MEMORY,
+    memory: Memory { per_network_pixel: FLOAT_MEMORY.per_network_pixel + ENCODER, ..FLOAT_MEMORY },
 };
 /// The same with weights and activations of 8 bits.
 pub const FASTDVDNET_INT8: NetworkPrior = NetworkPrior {
@@ -33,11 +36,16 @@ pub const FASTDVDNET_INT8: NetworkPrior = NetworkPrior {
     // 0.36 of it, with AVX-512 VNNI.
     pass_ns: 1_800.0,
     // It stays loaded beside its twin.
-    memory: Memory { per_network_pixel: FLOAT_MEMORY.per_network_pixel + 2000, ..FLOAT_MEMORY },
+    memory: Memory {
+        per_network_pixel: FLOAT_MEMORY.per_network_pixel + 2000 + ENCODER,
+        ..FLOAT_MEMORY
+    },
 };
 
 /// Padded input, middle and output for each voxel, and the activations.
 const FLOAT_MEMORY: Memory = Memory { per_voxel: 24, per_network_pixel: 2600 };
+/// Bytes for each pixel of a frame of the encoder by which results are assessed.
+const ENCODER: u64 = 1100;
 
 /// A network alone.
 pub struct NetworkPrior {
@@ -134,25 +142,75 @@ impl ClipDenoiser {
 impl Denoiser for ClipDenoiser {
     fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
         let Self { blocks, reach, multiple, input, output } = self;
-        let (count, height, width) = frames.dim();
+        let (_, height, width) = frames.dim();
         let (rows, columns) =
             (height.next_multiple_of(*multiple), width.next_multiple_of(*multiple));
         let plane = rows * columns;
-        let margin = *reach * blocks.len();
-        input.resize((count + 2 * margin) * plane, 0.0);
-        for (k, padded) in input.chunks_exact_mut(plane).enumerate() {
-            let frame = reflect(k as isize - margin as isize, count);
-            pad_frame(frames.index_axis(Axis(0), frame), padded, columns);
-        }
+        pad(frames.view(), input, (rows, columns), *reach * blocks.len());
+        let chunk = (PIXELS_AT_ONCE / plane).max(1);
         for block in blocks {
             output.resize(input.len() - 2 * *reach * plane, 0.0);
-            run_chunked(block, input, output, (rows, columns), sigma)?;
+            run_chunked(block, (input, output), (rows, columns), (chunk, plane), sigma)?;
             std::mem::swap(input, output);
         }
         for (frame, output) in frames.outer_iter_mut().zip(input.chunks_exact(plane)) {
             unpad_frame(output, columns, frame);
         }
         Ok(())
+    }
+}
+
+/// The first half of FastDVDNet's first stage, loaded: what the denoiser sees of a block and its two
+/// neighbours in time before it begins to draw it.
+pub struct ClipEncoder {
+    network: ClipNetwork,
+    input: Vec<f32>,
+    output: Vec<f32>,
+}
+
+/// Side of the blocks of which it tells.
+const BLOCK: usize = 16;
+/// The noise that it is told of: as little as there is in frames of a reconstruction.
+const LITTLE_NOISE: f32 = 10.0 / 255.0;
+
+impl ClipEncoder {
+    /// Loads it from its ONNX file (see [`ClipNetwork::load`] for its face).
+    pub fn load(runtime: &Runtime, file: &[u8]) -> Result<Self> {
+        let network = ClipNetwork::load(runtime, "FastDVDNet encoder", file)?;
+        Ok(Self { network, input: Vec::new(), output: Vec::new() })
+    }
+}
+
+impl Encoder for ClipEncoder {
+    fn encode(&mut self, frames: ArrayView3<'_, f32>) -> Result<Array4<f32>> {
+        let Self { network, input, output } = self;
+        let (count, height, width) = frames.dim();
+        let (rows, columns) = (height.div_ceil(BLOCK), width.div_ceil(BLOCK));
+        let padded = (rows * BLOCK, columns * BLOCK);
+        pad(frames, input, padded, 1);
+        output.resize(count * CHANNELS * rows * columns, 0.0);
+        // It is no faster with several frames at once.
+        let each = (1, CHANNELS * rows * columns);
+        run_chunked(network, (input, output), padded, each, LITTLE_NOISE)?;
+        let seen = ArrayView4::from_shape((count, CHANNELS, rows, columns), output)
+            .map_err(|error| ReconError::Runtime(error.to_string()))?;
+        Ok(seen.permuted_axes([1, 0, 2, 3]).as_standard_layout().into_owned())
+    }
+}
+
+/// Copies a clip into one of frames of `rows` x `columns` pixels with so many more at both ends, mirrored in space
+/// and time.
+fn pad(
+    frames: ArrayView3<'_, f32>,
+    padded: &mut Vec<f32>,
+    (rows, columns): (usize, usize),
+    margin: usize,
+) {
+    let count = frames.len_of(Axis(0));
+    padded.resize((count + 2 * margin) * rows * columns, 0.0);
+    for (k, padded) in padded.chunks_exact_mut(rows * columns).enumerate() {
+        let frame = reflect(k as isize - margin as isize, count);
+        pad_frame(frames.index_axis(Axis(0), frame), padded, columns);
     }
 }
 
@@ -175,19 +233,18 @@ fn unpad_frame(padded: &[f32], columns: usize, mut frame: ArrayViewMut2<'_, f32>
     }
 }
 
-/// One block over a clip, some frames at a time.
+/// One block over a clip of `rows` x `columns` pixels, so many frames at a time, with so many values of output for each.
 fn run_chunked(
     block: &mut ClipNetwork,
-    input: &[f32],
-    output: &mut [f32],
+    (input, output): (&[f32], &mut [f32]),
     (rows, columns): (usize, usize),
+    (chunk, values): (usize, usize),
     sigma: f32,
 ) -> Result<()> {
     let plane = rows * columns;
-    let beside = (input.len() - output.len()) / plane;
-    let chunk = (PIXELS_AT_ONCE / plane).max(1);
-    for (index, output) in output.chunks_mut(chunk * plane).enumerate() {
-        let count = output.len() / plane + beside;
+    let beside = input.len() / plane - output.len() / values;
+    for (index, output) in output.chunks_mut(chunk * values).enumerate() {
+        let count = output.len() / values + beside;
         let frames = &input[index * chunk * plane..][..count * plane];
         let frames = ArrayView4::from_shape((count, 1, rows, columns), frames)
             .map_err(|error| ReconError::Runtime(error.to_string()))?;
@@ -209,21 +266,24 @@ fn reflect(index: isize, length: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::{ClipDenoiser, reflect};
-    use crate::pipeline::networks;
+    use crate::pipeline::networks::{self, NetworkSource, WarmNetworks};
     use crate::recon::prior::onnx::{Device, Runtime};
-    use crate::recon::prior::{Denoiser, Network};
-    use ndarray::{Array3, s};
+    use crate::recon::prior::{CHANNELS, Denoiser, Network, Networks};
+    use ndarray::{Array3, ArrayView3, s};
     use rand::{Rng, SeedableRng};
     use std::path::PathBuf;
 
-    /// The network, or none (said aloud) where libonnxruntime has not been fetched.
-    fn network(which: Network) -> Option<ClipDenoiser> {
+    /// The library, or none (said aloud) where it has not been fetched.
+    fn library() -> Option<PathBuf> {
         let library = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from).filter(|p| p.exists());
-        let Some(library) = library else {
+        if library.is_none() {
             eprintln!("skipped: no libonnxruntime (run scripts/fetch-onnxruntime.sh)");
-            return None;
-        };
-        let runtime = Runtime::open(&library, Device::Cpu).unwrap();
+        }
+        library
+    }
+
+    fn network(which: Network) -> Option<ClipDenoiser> {
+        let runtime = Runtime::open(&library()?, Device::Cpu).unwrap();
         let files: Vec<_> = networks::carried(which).files.iter().map(|(_, file)| *file).collect();
         Some(ClipDenoiser::load(&runtime, which, &files).unwrap())
     }
@@ -263,6 +323,28 @@ mod tests {
         let mut short = video.slice(s![2..7, .., ..]).to_owned();
         network.denoise(&mut short, 0.1).unwrap();
         assert_eq!(long.slice(s![4, .., ..]), short.slice(s![2, .., ..]));
+    }
+
+    #[test]
+    fn the_encoder_tells_of_each_block_and_of_no_other_frames_than_those_beside() {
+        let Some(library) = library() else { return };
+        let source = NetworkSource::new(Some(library), Device::Cpu);
+        let mut networks = WarmNetworks::new(source);
+        let mut encode = |frames: ArrayView3<'_, f32>| {
+            networks.encoder().unwrap().unwrap().encode(frames).unwrap()
+        };
+        let (clean, noisy) = noisy(9, 300, 290);
+        let seen = encode(noisy.view());
+        assert_eq!(seen.dim(), (CHANNELS, 9, 19, 19));
+        let alone = encode(noisy.slice(s![3..6, .., ..]));
+        let difference = &seen.slice(s![.., 4, .., ..]) - &alone.slice(s![.., 1, .., ..]);
+        assert!(difference.iter().all(|d| d.abs() < 1e-5));
+        // What reaches a block lies within 40 pixels of it.
+        let mut half = clean.clone();
+        half.slice_mut(s![.., .., ..128]).assign(&noisy.slice(s![.., .., ..128]));
+        let change = (&encode(half.view()) - &encode(clean.view())).mapv(f32::abs);
+        assert!(change.slice(s![.., .., .., ..8]).mean().unwrap() > 0.1);
+        assert!(change.slice(s![.., .., .., 11..]).iter().all(|d| *d == 0.0));
     }
 
     #[test]

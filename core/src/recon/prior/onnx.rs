@@ -134,7 +134,7 @@ pub struct ClipNetwork {
 
 impl ClipNetwork {
     /// Loads a network with inputs `frames` \[n+2,1,H,W\] and `sigma` (a number) and one
-    /// output \[n,1,H,W\].
+    /// output \[n,..\].
     pub fn load(runtime: &Runtime, name: &str, model: &[u8]) -> Result<Self> {
         let session = runtime.session(name, model)?;
         let inputs: Vec<&str> = session.inputs().iter().map(|input| input.name()).collect();
@@ -148,7 +148,7 @@ impl ClipNetwork {
         Ok(Self { name: name.to_string(), session })
     }
 
-    /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes the n middle frames.
+    /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes what it gives for the n middle ones.
     pub fn run(
         &mut self,
         frames: ArrayView4<'_, f32>,

@@ -114,7 +114,8 @@ pub fn reconstruct(
     stages((op, y), schedule, networks, observer, |_, _| ())
 }
 
-/// As [`reconstruct`], with what an [`assessment`] sees of the frames; the first network of the schedule is its denoiser.
+/// As [`reconstruct`], with what an [`assessment`] sees of the frames; with that of the encoder where a network has had a
+/// part in them.
 pub fn reconstruct_assessed(
     op: &SensingOperator,
     y: ArrayView3<'_, f32>,
@@ -129,20 +130,11 @@ pub fn reconstruct_assessed(
         }
     })?;
     let early = early.as_ref().map(|early| early.view());
-    outcome.features = Some(seen((op, schedule), early, outcome.frames.view(), networks)?);
+    let deep = !schedule.networks().is_empty();
+    let encoder = if deep { networks.encoder()? } else { None };
+    let seen = assessment::encoded_features(op, early, outcome.frames.view(), encoder)?;
+    outcome.features = Some(seen);
     Ok(outcome)
-}
-
-/// What an [`assessment`] sees of the frames of a schedule, whose first stage had left `early`, if others followed.
-pub(super) fn seen(
-    (op, schedule): (&SensingOperator, &Schedule),
-    early: Option<ArrayView3<'_, f32>>,
-    frames: ArrayView3<'_, f32>,
-    networks: &mut dyn Networks,
-) -> Result<Array4<f32>> {
-    let network = schedule.stages.iter().find_map(|stage| stage.prior.network());
-    let denoiser = network.map(|which| networks.network(which)).transpose()?;
-    assessment::features(op, early, frames, denoiser)
 }
 
 /// Runs the stages, and tells after each of them its index and the frames.
