@@ -4,8 +4,9 @@
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
 `make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
-them with a part that moves by itself, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is
-a mixture of all. `fit` fits small networks to all cases, and tells how they do on scenes that were left out (no scene is in two folds).
+them with a part that moves by itself, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them
+reconstructed. It goes on where it was stopped, and what it has made so far is a mixture of all. `fit` fits small networks to
+all cases, and tells how they do on scenes that were left out (no scene is in two folds).
 """
 import argparse
 import glob
@@ -134,7 +135,7 @@ class Case:
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
         evidence = about['evidence']
         self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
-        self.piece = torch.tensor([float('nan') if value is None else value for value in evidence['features'][:FEATURES]], dtype=torch.float32)
+        self.piece = torch.tensor(evidence['features'], dtype=torch.float32)
         self.pattern = about['setting']['pattern']
 
     def psnr_of(self, errors):
@@ -174,7 +175,7 @@ class Model:
         around = nn.functional.avg_pool2d(frames, 3, 1, 1, count_include_pad=False)
         always = around.mean(0, keepdim=True).expand_as(around)
         around, always = (values.permute(0, 2, 3, 1).reshape(features.shape) for values in (around, always))
-        rest = torch.cat([scaled(case.piece, self.features).nan_to_num(), scaled(case.signs, self.signs)])
+        rest = torch.cat([scaled(case.piece, self.features), scaled(case.signs, self.signs)])
         all_of = [features, around, always, rest.expand(len(features), -1)]
         if self.encoding:
             mean, components = self.encoding
@@ -222,9 +223,9 @@ class Model:
 
     def record(self):
         numbers = lambda tensor: [float(f'{value:.6g}') for value in tensor.tolist()]
-        layers = lambda network: [{'weights': [numbers(row) for row in layer.weight], 'bias': numbers(layer.bias)} for layer in network if isinstance(layer, nn.Linear)]
+        layers = lambda network: [{'weights': [numbers(of_input) for of_input in layer.weight.T], 'bias': numbers(layer.bias)} for layer in network if isinstance(layer, nn.Linear)]
         by = lambda scaling: {'mean': numbers(scaling[0]), 'scale': numbers(scaling[1])}
-        encoding = self.encoding and {'mean': numbers(self.encoding[0]), 'components': [numbers(row) for row in self.encoding[1]]}
+        encoding = self.encoding and {'mean': numbers(self.encoding[0]), 'components': [numbers(of_channel) for of_channel in self.encoding[1].T]}
         return {'features': by(self.features), 'signs': by(self.signs), 'encoding': encoding, 'networks': [layers(network) for network in self.networks]}
 
 
@@ -283,7 +284,7 @@ def main():
     p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')
     p.add_argument('--epochs', type=int, default=24)
     p.add_argument('--algorithm', choices=ALGORITHMS, help='fit this one alone')
-    p.add_argument('--folds', type=int, default=10, help='as many parts are left out, one after the other')
+    p.add_argument('--folds', type=int, default=5, help='as many parts are left out, one after the other')
     p.add_argument('--networks', type=int, default=3, help='whose mean is taken')
     a = p.parse_args()
     {'make': make, 'fit': fit}[a.what](a)

@@ -18,13 +18,11 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result, shape_text};
 use super::motion::Steps;
+pub use super::prior::BLOCK;
 use super::prior::{CHANNELS, Encoder};
 use super::schedule::{Method, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
-
-/// Side of the blocks in pixels.
-pub const BLOCK: usize = 16;
 
 /// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames of the
 /// result, and of those that total variation alone had left, where other priors followed. Nothing betrays frames that are
@@ -312,21 +310,20 @@ fn over_blocks(
 }
 
 /// What a piece of a measurement tells of the error of all of it: by pixels that were held out there, and by what is seen of
-/// its frames, each in the mean over its blocks; none of what is not known. Signs tell of frames like these.
+/// its frames, each in the mean over its blocks. Signs tell of frames like these.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evidence {
     /// What the held-out pixels tell.
     pub signs: Signs,
     /// Values of [`FEATURES`].
-    pub features: Vec<Option<f32>>,
+    pub features: Vec<f32>,
 }
 
 impl Evidence {
     /// Of signs and features \[features, B, rows, columns\] of the same piece.
     pub(super) fn new(signs: Signs, seen: &Array4<f32>) -> Self {
-        let mean = |feature| seen.index_axis(Axis(0), feature).mean();
-        let features = (0..FEATURES.len()).map(|k| mean(k).filter(|mean| mean.is_finite()));
-        Self { signs, features: features.collect() }
+        let mean = |of_feature: ArrayView3<'_, f32>| of_feature.mean().unwrap_or(0.0);
+        Self { signs, features: seen.outer_iter().map(mean).collect() }
     }
 }
 
@@ -344,21 +341,21 @@ pub struct Model {
     pub interval: [f64; 2],
 }
 
-/// Inputs are shifted, scaled and bounded first. What is not known counts as in the mean.
+/// Inputs are shifted, scaled and bounded first.
 #[derive(Debug, Deserialize)]
 struct Scaling {
     mean: Vec<f32>,
     scale: Vec<f32>,
 }
 
-/// Principal components of what the encoder sees, each with a weight for each channel. What they give is bounded.
+/// Principal components of what the encoder sees: of each channel a weight for each of them. What they give is bounded.
 #[derive(Debug, Deserialize)]
 struct Encoding {
     mean: Vec<f32>,
     components: Vec<Vec<f32>>,
 }
 
-/// Neurons, each with as many weights as there are inputs.
+/// Neurons: of each input a weight for each of them.
 #[derive(Debug, Deserialize)]
 struct Layer {
     weights: Vec<Vec<f32>>,
@@ -416,8 +413,7 @@ impl Model {
         let mut rest: Vec<f32> = match evidence {
             Some(evidence) => {
                 known.extend(evidence.signs.0);
-                let known = evidence.features.iter().map(|value| value.unwrap_or(f32::NAN));
-                self.features.of(known.collect())
+                self.features.of(evidence.features.clone())
             }
             None => {
                 known.extend(&self.signs.mean[1..]);
@@ -433,7 +429,7 @@ impl Model {
             if let Some(encoding) = &self.encoding {
                 inputs.extend(encoding.of(encoded.slice(s![.., k, row, column])));
             }
-            let told = self.networks.iter().map(|layers| output(layers, inputs.clone()));
+            let told = self.networks.iter().map(|layers| output(layers, &inputs));
             told.sum::<f32>() / self.networks.len() as f32
         })
     }
@@ -452,38 +448,44 @@ fn around(seen: &Array4<f32>) -> Array4<f32> {
 impl Scaling {
     fn of(&self, values: Vec<f32>) -> Vec<f32> {
         let scaled = values.iter().zip(self.mean.iter().zip(&self.scale));
-        let bounded = scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST));
-        bounded.map(|x| if x.is_nan() { 0.0 } else { x }).collect()
+        scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST)).collect()
     }
 }
 
 impl Encoding {
-    fn of(&self, encoded: ArrayView1<'_, f32>) -> impl Iterator<Item = f32> {
-        let moved: Vec<f32> = encoded.iter().zip(&self.mean).map(|(x, mean)| x - mean).collect();
-        self.components.iter().map(move |weights| {
-            let value = weights.iter().zip(&moved).map(|(w, x)| w * x).sum::<f32>();
-            value.clamp(-FARTHEST, FARTHEST)
-        })
+    /// The components; all 0, as in the mean, where the encoder has seen nothing.
+    fn of(&self, encoded: ArrayView1<'_, f32>) -> Vec<f32> {
+        let mut values = vec![0.0; self.components.first().map_or(0, Vec::len)];
+        let moved = encoded.iter().zip(&self.mean).map(|(x, mean)| x - mean);
+        add_weighted(&mut values, moved, &self.components);
+        values.iter().map(|value| value.clamp(-FARTHEST, FARTHEST)).collect()
+    }
+}
+
+/// Adds to each sum all inputs by their weights for it, sum beside sum: that vectorises, and is the same on every machine.
+fn add_weighted(sums: &mut [f32], inputs: impl Iterator<Item = f32>, weights: &[Vec<f32>]) {
+    for (input, weights) in inputs.zip(weights) {
+        sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight * input);
     }
 }
 
 /// What the last of some layers gives.
-fn output(layers: &[Layer], inputs: Vec<f32>) -> f32 {
-    let outputs = layers
-        .iter()
-        .enumerate()
-        .fold(inputs, |inputs, (index, layer)| layer.outputs(&inputs, index + 1 < layers.len()));
+fn output(layers: &[Layer], inputs: &[f32]) -> f32 {
+    let outputs = layers.iter().enumerate().fold(inputs.to_vec(), |inputs, (index, layer)| {
+        layer.outputs(&inputs, index + 1 < layers.len())
+    });
     outputs.first().copied().unwrap_or_default()
 }
 
 impl Layer {
     /// `W x + b`, and of all layers but the last its product with its sigmoid.
     fn outputs(&self, inputs: &[f32], inner: bool) -> Vec<f32> {
-        let neuron = |(weights, bias): (&Vec<f32>, &f32)| {
-            let sum = bias + weights.iter().zip(inputs).map(|(w, x)| w * x).sum::<f32>();
-            if inner { sum / (1.0 + (-sum).exp()) } else { sum }
-        };
-        self.weights.iter().zip(&self.bias).map(neuron).collect()
+        let mut sums = self.bias.clone();
+        add_weighted(&mut sums, inputs.iter().copied(), &self.weights);
+        if inner {
+            sums.iter_mut().for_each(|sum| *sum /= 1.0 + (-*sum).exp());
+        }
+        sums
     }
 }
 
@@ -578,7 +580,7 @@ mod tests {
         assert!(!has(Schedule::admm_tv()) && !has(Schedule::pnp_ffdnet()));
         for model in MODELS.values() {
             let encoding = model.encoding.as_ref();
-            let components = encoding.map_or(0, |encoding| encoding.components.len());
+            let components = encoding.map_or(0, |encoding| encoding.components[0].len());
             let inputs = 4 * FEATURES.len() + 1 + SIGNS.len() + components;
             assert_eq!(
                 (model.features.mean.len(), model.features.scale.len()),
@@ -591,15 +593,17 @@ mod tests {
             for layers in &model.networks {
                 let mut before = inputs;
                 for layer in layers {
-                    assert!(layer.weights.iter().all(|weights| weights.len() == before));
-                    assert_eq!(layer.weights.len(), layer.bias.len());
+                    assert_eq!(layer.weights.len(), before);
+                    let neurons = layer.bias.len();
+                    assert!(layer.weights.iter().all(|weights| weights.len() == neurons));
                     before = layer.bias.len();
                 }
                 assert_eq!(before, 1, "the last layer has one neuron");
             }
             if let Some(encoding) = &model.encoding {
                 assert_eq!(encoding.mean.len(), CHANNELS);
-                assert!(encoding.components.iter().all(|weights| weights.len() == CHANNELS));
+                assert_eq!(encoding.components.len(), CHANNELS);
+                assert!(encoding.components.iter().all(|weights| weights.len() == components));
             }
             assert!(model.interval[0] < 0.0 && model.interval[1] > 0.0);
         }

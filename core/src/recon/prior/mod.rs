@@ -220,11 +220,13 @@ pub trait Denoiser {
 
 /// A loaded network that tells what blocks of frames look like.
 pub trait Encoder {
-    /// What it sees of each block of 16x16 pixels \[[`CHANNELS`], B, rows, columns\] of frames \[B,H,W\] on the \[0,1\] scale.
+    /// What it sees of each block of [`BLOCK`] x [`BLOCK`] pixels \[[`CHANNELS`], B, rows, columns\] of frames \[B,H,W\] on the \[0,1\] scale.
     /// Blocks at the far edges are filled up with mirrored pixels.
     fn encode(&mut self, frames: ArrayView3<'_, f32>) -> Result<Array4<f32>>;
 }
 
+/// Side of the blocks of which an encoder tells, in pixels.
+pub const BLOCK: usize = 16;
 /// How many values an encoder has for a block.
 pub const CHANNELS: usize = 128;
 

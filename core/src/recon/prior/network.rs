@@ -7,8 +7,8 @@ use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, ArrayViewMut2,
 
 use super::onnx::{ClipNetwork, Runtime};
 use super::{
-    CHANNELS, Denoiser, Encoder, Memory, Network, Networks, Parameter, Pass, Prior, Ready, SIGMA,
-    Settings,
+    BLOCK, CHANNELS, Denoiser, Encoder, Memory, Network, Networks, Parameter, Pass, Prior, Ready,
+    SIGMA, Settings,
 };
 use crate::recon::error::{ReconError, Result};
 
@@ -168,8 +168,6 @@ pub struct ClipEncoder {
     output: Vec<f32>,
 }
 
-/// Side of the blocks of which it tells.
-const BLOCK: usize = 16;
 /// The noise that it is told of: as little as there is in frames of a reconstruction.
 const LITTLE_NOISE: f32 = 10.0 / 255.0;
 
@@ -189,7 +187,7 @@ impl Encoder for ClipEncoder {
         let padded = (rows * BLOCK, columns * BLOCK);
         pad(frames, input, padded, 1);
         output.resize(count * CHANNELS * rows * columns, 0.0);
-        // It is no faster with several frames at once.
+        // Several frames at once would take as much memory each.
         let each = (1, CHANNELS * rows * columns);
         run_chunked(network, (input, output), padded, each, LITTLE_NOISE)?;
         let seen = ArrayView4::from_shape((count, CHANNELS, rows, columns), output)
