@@ -434,7 +434,7 @@ mod reference {
             x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
         }
 
-        /// `P(w)` along the masks, or along `R C` (an orthogonal cosine at a time), with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
+        /// `P(w)` along the masks, or along `R C` (an orthogonal cosine at a time; bounded), with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
         pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
             let plane = self.masks.dim().1 * self.masks.dim().2;
             let stage = &self.schedule.stages[0];
@@ -473,15 +473,19 @@ mod reference {
                 let (first, pixel) = (p / plane * mask.len(), p % plane);
                 let voxels = || (pixel..mask.len()).step_by(plane);
                 let seen: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
-                let gram: f64 = voxels().map(|voxel| mask[voxel] * direction[voxel]).sum();
+                let of_all = |part: &dyn Fn(usize) -> f64| -> f64 {
+                    voxels().map(|voxel| mask[voxel] * part(voxel)).sum::<f64>() + f64::from(gamma)
+                };
+                let least = -0.02 * of_all(&|voxel| direction[voxel]);
+                let bounded = |voxel: usize| direction[voxel].max(least / mask[voxel]);
+                let total = of_all(&bounded);
                 let mut target = f64::from(y);
                 if self.schedule.accelerated {
                     y1[p] = target + f64::from(memory) * (y1[p] - seen);
                     target = y1[p];
                 }
                 for voxel in voxels() {
-                    x[first + voxel] +=
-                        direction[voxel] * (target - seen) / (gram + f64::from(gamma));
+                    x[first + voxel] += bounded(voxel) * (target - seen) / total;
                 }
             }
             x

@@ -13,7 +13,7 @@ mod search;
 
 use std::ops::Range;
 
-use ndarray::Array3;
+use ndarray::{Array3, ArrayView2};
 use pulp::{Arch, Simd, WithSimd};
 
 use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
@@ -73,6 +73,11 @@ impl Pass for Nonlocal {
 const REFRESH: usize = 4;
 /// `tau` in units of `PATCHES sigma^2`, the eigenvalue that noise alone would have.
 const STRENGTH: f32 = 4.0;
+/// How far a pixel may lie outside the range of the eight around it, in units of `sigma`. A group takes a single
+/// pixel far from all others for a direction of its own, which it keeps whole; so nothing would ever take it out again, and behind
+/// masks that are much alike, where a projection does not hold a single frame, such specks grow.
+const OUTSIDE: f32 = 4.0;
+
 /// The prior with its groups and working memory, for clips of one size.
 #[derive(Debug)]
 pub struct Nonlocal {
@@ -125,9 +130,9 @@ impl Nonlocal {
             return;
         }
         let row_length = row_length(self.width);
-        let rows = self.noisy.chunks_exact_mut(row_length);
-        for (row, source) in rows.zip(frames.rows()) {
-            row.iter_mut().zip(source).for_each(|(value, &x)| *value = x);
+        let planes = self.noisy.chunks_exact_mut(self.height * row_length);
+        for (plane, frame) in planes.zip(frames.outer_iter()) {
+            without_specks(frame, OUTSIDE * sigma, plane.chunks_exact_mut(row_length));
         }
         if self.passes == 0 {
             self.guide.copy_from_slice(&self.noisy);
@@ -150,6 +155,36 @@ impl Nonlocal {
     /// Does these parts of a pass on the clip as it stands.
     pub fn work(&mut self, parts: &[Part], sigma: f32) {
         self.arch.dispatch(Work { prior: self, parts, sigma });
+    }
+}
+
+/// Copies a frame \[H,W\], at least 2x2, into rows of its width or more; a pixel that lies further than `margin` outside the
+/// range of the eight around it, as far as that. At its edges the frame is reflected.
+fn without_specks<'a>(
+    frame: ArrayView2<'_, f32>,
+    margin: f32,
+    rows: impl Iterator<Item = &'a mut [f32]>,
+) {
+    let (height, width) = frame.dim();
+    // Least and greatest of the pixels above and below, and of these and the pixel between them.
+    let (mut pairs, mut triples) = (vec![[0.0f32; 2]; width], vec![[0.0f32; 2]; width + 2]);
+    for (i, row) in rows.take(height).enumerate() {
+        let above = frame.row(if i == 0 { 1 } else { i - 1 });
+        let below = frame.row(if i + 1 == height { i - 1 } else { i + 1 });
+        let here = frame.row(i);
+        let columns = above.iter().zip(&below).zip(&here);
+        let found = pairs.iter_mut().zip(&mut triples[1..]);
+        for (((&a, &b), &x), (pair, triple)) in columns.zip(found) {
+            *pair = [a.min(b), a.max(b)];
+            *triple = [pair[0].min(x), pair[1].max(x)];
+        }
+        (triples[0], triples[width + 1]) = (triples[2], triples[width - 1]);
+        let around = triples.windows(3).zip(&pairs);
+        for ((value, &x), (sides, pair)) in row.iter_mut().zip(&here).zip(around) {
+            let least = pair[0].min(sides[0][0]).min(sides[2][0]);
+            let greatest = pair[1].max(sides[0][1]).max(sides[2][1]);
+            *value = x.max(least - margin).min(greatest + margin);
+        }
     }
 }
 
@@ -258,8 +293,8 @@ fn span<S: Simd>() -> usize {
 mod tests {
     use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions, shift};
     use super::search::window;
-    use super::{Nonlocal, REFRESH, STRENGTH};
-    use ndarray::Array3;
+    use super::{Nonlocal, OUTSIDE, REFRESH, STRENGTH, without_specks};
+    use ndarray::{Array2, Array3};
     use pulp::Arch;
     use rand::{Rng, SeedableRng};
 
@@ -276,6 +311,27 @@ mod tests {
 
     fn mean_square(a: &Array3<f32>, b: &Array3<f32>) -> f32 {
         (a - b).mapv(|d| d * d).mean().unwrap()
+    }
+
+    #[test]
+    fn a_pixel_far_from_all_around_it_is_taken_out() {
+        let ramp = Array2::from_shape_fn((8, 9), |(i, j)| 0.01 * (3 * i + j) as f32);
+        for (at, greatest) in [((4, 4), 0.2), ((0, 0), 0.04), ((7, 8), 0.28), ((3, 8), 0.2)] {
+            let mut frame = ramp.clone();
+            frame[at] = 5.0;
+            let mut rows = vec![7.0; 8 * 16];
+            without_specks(frame.view(), 0.1, rows.chunks_exact_mut(16));
+            let limited = Array2::from_shape_fn((8, 9), |(i, j)| rows[16 * i + j]);
+            assert!((limited[at] - greatest - 0.1).abs() < 1e-6, "{at:?}: {}", limited[at]);
+            frame[at] = limited[at];
+            assert_eq!(limited, frame);
+            assert!(rows[9..16].iter().all(|&beyond| beyond == 7.0));
+        }
+        let size = (3, 24, 24);
+        let (clean, mut video) = noisy(size, 0.02);
+        video[[1, 12, 12]] = 4.0;
+        Nonlocal::new(size).denoise(&mut video, 0.02);
+        assert!((video[[1, 12, 12]] - clean[[1, 12, 12]]).abs() < 0.15, "{}", video[[1, 12, 12]]);
     }
 
     #[test]
@@ -300,8 +356,28 @@ mod tests {
         passes: usize,
     }
 
+    /// Pixels no further than `margin` outside the range of those around them, in a clip reflected at its edges.
+    fn limited(clip: &Array3<f32>, margin: f32) -> Array3<f32> {
+        let (_, height, width) = clip.dim();
+        let reflected = |at: usize, step: usize, length: usize| match at + step {
+            0 => 1,
+            beside if beside > length => length - 2,
+            beside => beside - 1,
+        };
+        let steps = (0..9).map(|step| (step / 3, step % 3)).filter(|&step| step != (1, 1));
+        Array3::from_shape_fn(clip.dim(), |(k, i, j)| {
+            let beside = steps.clone().map(|(down, right)| {
+                clip[[k, reflected(i, down, height), reflected(j, right, width)]]
+            });
+            let least = beside.clone().fold(f32::INFINITY, f32::min);
+            let greatest = beside.fold(f32::NEG_INFINITY, f32::max);
+            clip[[k, i, j]].clamp(least - margin, greatest + margin)
+        })
+    }
+
     impl Reference {
         fn denoise(&mut self, clip: &mut Array3<f32>, sigma: f32) {
+            *clip = limited(clip, OUTSIDE * sigma);
             if self.passes == 0 {
                 self.guide = clip.clone();
             }
