@@ -30,7 +30,7 @@ FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
 SPARE = 10.0        # dB above it up to which the fit follows
 COMPONENTS = 64     # of what the encoder sees
-AT_ONCE = 64       # blocks of a case that a step sees, in all its frames
+AT_ONCE = 64        # blocks of a case that a step sees, in all its frames
 
 
 # ---------------------------------------------------------------- scenes

@@ -154,11 +154,8 @@ async fn a_task_whose_workers_the_kernel_kills_for_their_memory_is_given_up_with
     let done = app.ended(&job).await;
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
-    assert!(error.contains("no memory left"), "{error}");
-    // A slow machine may have called some of them hung first.
-    let attempts = error.rsplit('(').next().and_then(|text| text.split(' ').next());
-    let attempts: usize = attempts.and_then(|count| count.parse().ok()).unwrap_or_default();
-    assert!(attempts >= 5, "{error}");
+    // The metrics below count those five; a busy machine may lose the task in other ways, too.
+    assert!(error.contains("no memory left") && error.contains(" attempts)"), "{error}");
     let peak = error.split("seen at ").nth(1).and_then(|text| text.split(' ').next());
     let peak: u64 = peak.and_then(|peak| peak.parse().ok()).unwrap_or_default();
     // Pages of the program's own file are counted too, and stand on the account of another group.

@@ -301,7 +301,7 @@ struct Stack {
     frames: usize,
 }
 
-/// Of a correction of a measured pixel the most that a frame may take against it. A covariance lets a residual raise
+/// The most that a frame may take against the correction of a measured pixel, as a share of it. A covariance lets a residual raise
 /// frames whose masks are more open than others, and lower the rest. Where a prior takes the error of some frames out
 /// and leaves that of others as it is, the error `e` left is multiplied by `1 - sum c d / (C R C^T)` over the frames that
 /// keep it, each time: if `c d < 0` there, it grows. Behind masks that are much alike single pixels of still fine texture came to
