@@ -80,7 +80,7 @@ fn nonlocal(criterion: &mut Criterion) {
     let mut prior = Nonlocal::new(DIM);
     let mut frames = random(7);
     group.bench_function("four passes", |bencher| {
-        bencher.iter(|| (0..4).for_each(|_| prior.denoise(black_box(&mut frames), 0.05)));
+        bencher.iter(|| (0..4).for_each(|_| prior.denoise(black_box(&mut frames), 0.05, 0.35)));
     });
     for part in Part::ALL {
         let name = format!("{part:?}").to_lowercase();

@@ -86,6 +86,8 @@ fn stage((stage, finding): (&Stage, StageFinding)) -> StageRecord {
         iterations: finding.iterations,
         planned_temporal_weight: stage.temporal_weight.unwrap_or(0.0),
         temporal_weight: finding.temporal_weight,
+        planned_temporal_shrinkage: stage.temporal_shrinkage.unwrap_or(0.0),
+        temporal_shrinkage: finding.temporal_shrinkage,
         planned_static_variance: stage.static_variance,
         static_variance: finding.static_variance,
         gamma: finding.gamma,

@@ -43,6 +43,7 @@ impl PilotRecord {
         let decision = |stage: &StageRecord| Decision {
             iterations: stage.iterations,
             temporal_weight: stage.temporal_weight,
+            temporal_shrinkage: stage.temporal_shrinkage,
             static_variance: stage.static_variance,
             gamma: stage.gamma,
         };
@@ -84,6 +85,12 @@ pub struct StageRecord {
     /// The same if it pays; else 0.
     #[serde(default)]
     pub temporal_weight: f32,
+    /// Shrinkage of changes along time that was asked for; 0 for none.
+    #[serde(default)]
+    pub planned_temporal_shrinkage: f32,
+    /// The one that pays; 0 if none does.
+    #[serde(default)]
+    pub temporal_shrinkage: f32,
     /// Static variance of the projection that was asked for; none if it was not.
     #[serde(default)]
     pub planned_static_variance: Option<f32>,
@@ -102,17 +109,22 @@ pub struct StageRecord {
 }
 
 impl StageRecord {
-    /// What became of the total variation along time, of the static variance and of the noise term, as far as there are any.
+    /// What became of the total variation along time, of the shrinkage of changes, of the static variance and of the noise term, as far as there are any.
     pub fn fates(&self) -> Vec<String> {
         let kept = if self.temporal_weight > 0.0 { "kept" } else { "left out" };
         let along_time = (self.planned_temporal_weight > 0.0)
             .then(|| format!("total variation along time {kept}"));
+        let changes =
+            (self.planned_temporal_shrinkage > 0.0).then(|| match self.temporal_shrinkage {
+                0.0 => "shrinkage along time left out".into(),
+                shrinkage => format!("shrinkage along time {shrinkage}"),
+            });
         let variance = self.planned_static_variance.map(|_| match self.static_variance {
             Some(variance) => format!("static variance {variance}"),
             None => "static variance left out".into(),
         });
         let noise = self.gamma.map(|gamma| format!("noise term {gamma}"));
-        along_time.into_iter().chain(variance).chain(noise).collect()
+        along_time.into_iter().chain(changes).chain(variance).chain(noise).collect()
     }
 }
 

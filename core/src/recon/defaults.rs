@@ -75,6 +75,9 @@ const TEMPORAL_WEIGHT: f32 = 0.004;
 /// The best behind independent pixels, at Cr 6 to 24; for masks that are alike the projection takes less.
 const STATIC_VARIANCE: f32 = 0.55;
 
+/// The most that loses nothing where textures move slowly.
+const TEMPORAL_SHRINKAGE: f32 = 0.35;
+
 /// What comes before the plugged-in priors.
 fn first_stage() -> Stage {
     Stage { temporal_weight: Some(TEMPORAL_WEIGHT), ..tv_stage(60, 0.0) }
@@ -88,6 +91,7 @@ fn tv_stage(iterations: usize, tolerance: f32) -> Stage {
         tv_weight: Some(0.15),
         tv_updates: Some(4),
         temporal_weight: None,
+        temporal_shrinkage: None,
         memory: 1.0,
         momentum: 0.0,
         static_variance: None,
@@ -105,6 +109,7 @@ fn level_stage(prior: &'static dyn Prior, iterations: usize, first: f32, last: f
         tv_weight: None,
         tv_updates: None,
         temporal_weight: None,
+        temporal_shrinkage: None,
         memory: 0.85,
         momentum: 0.5,
         static_variance: None,
@@ -130,6 +135,7 @@ fn fastdvdnet_stages(quick: usize, exact: usize, first: f32, last: f32) -> [Stag
 fn nonlocal_stage(iterations: usize, first: f32, last: f32) -> Stage {
     let variance = Some(STATIC_VARIANCE);
     Stage {
+        temporal_shrinkage: Some(TEMPORAL_SHRINKAGE),
         memory: 0.6,
         momentum: 0.8,
         static_variance: variance,

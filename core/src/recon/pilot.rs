@@ -75,6 +75,8 @@ pub struct StageFinding {
     pub iterations: usize,
     /// Weight of the total variation along time, if it pays; else 0.
     pub temporal_weight: f32,
+    /// Shrinkage of changes along time, if any pays; else 0.
+    pub temporal_shrinkage: f32,
     /// Static variance of the projection, if one pays.
     pub static_variance: Option<f32>,
     /// Noise term of the projection, where it is not the schedule's.
@@ -200,12 +202,42 @@ fn tell(
 type Variant = fn(&SensingOperator, &Stage, &Course) -> Option<Stage>;
 
 /// One after the other is run, and taken if it is better.
-const VARIANTS: [Variant; 5] =
-    [without_time, with_more_variance, without_variance, with_noise, with_other_noise];
+const VARIANTS: [Variant; 8] = [
+    without_time,
+    with_most_shrinkage,
+    with_other_shrinkage,
+    without_shrinkage,
+    with_more_variance,
+    without_variance,
+    with_noise,
+    with_other_noise,
+];
 
 fn without_time(_: &SensingOperator, planned: &Stage, _: &Course) -> Option<Stage> {
     let weighs = planned.temporal_weight.is_some_and(|weight| weight > 0.0);
     weighs.then(|| Stage { temporal_weight: None, ..planned.clone() })
+}
+
+fn shrunk(planned: &Stage) -> Option<f32> {
+    planned.temporal_shrinkage.filter(|shrinkage| *shrinkage > 0.0)
+}
+
+/// For scenes at rest, or with a background that is.
+fn with_most_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
+    let fourfold = Some(4.0 * shrunk(planned)?);
+    Some(Stage { temporal_shrinkage: fourfold, ..taken.stage.clone() })
+}
+
+/// Still more, if that was taken; else less.
+fn with_other_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
+    let as_planned = taken.stage.temporal_shrinkage == planned.temporal_shrinkage;
+    let times = if as_planned { 2.0 } else { 8.0 };
+    Some(Stage { temporal_shrinkage: Some(times * shrunk(planned)?), ..taken.stage.clone() })
+}
+
+fn without_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
+    let as_planned = taken.stage.temporal_shrinkage == Some(shrunk(planned)?);
+    as_planned.then(|| Stage { temporal_shrinkage: None, ..taken.stage.clone() })
 }
 
 /// Where masks differ much it is at its bound.
@@ -246,6 +278,7 @@ impl Schedule {
         // As many as `VARIANTS` may ask for.
         let runs = |stage: &Stage| {
             1 + usize::from(stage.temporal_weight.is_some())
+                + 3 * usize::from(shrunk(stage).is_some())
                 + stage.static_variance.map_or(0, |_| 2 + usize::from(stage.gamma.is_none()) * 2)
         };
         self.stages.iter().map(|stage| stage.planned_ns() * runs(stage) as f64).sum()
@@ -288,7 +321,8 @@ impl Course {
     /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more than
-    /// it counts in the frames: so for another one the difference must be twice as clear.
+    /// it counts in the frames: so for another one the difference must be twice as clear. What more shrinkage of changes spares a scene at rest
+    /// hardly shows in a measurement, and what it costs a moving one does: there half as clear will do.
     fn surpasses(&self, other: &Self) -> bool {
         if self.squares.is_empty() || other.squares.is_empty() {
             return self.least() < other.least();
@@ -297,8 +331,14 @@ impl Course {
         let count = self.squares.len() as f64;
         let mean = gains().sum::<f64>() / count;
         let variance = gains().map(|gain| (gain - mean).powi(2)).sum::<f64>() / count;
-        let exchanges = self.stage.static_variance != other.stage.static_variance;
-        mean > if exchanges { 2.0 } else { 1.0 } * (variance / count).sqrt()
+        let errors = if self.stage.static_variance != other.stage.static_variance {
+            2.0
+        } else if self.stage.temporal_shrinkage > other.stage.temporal_shrinkage {
+            0.5
+        } else {
+            1.0
+        };
+        mean > errors * (variance / count).sqrt()
     }
 }
 
@@ -324,10 +364,21 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
         };
         let after = errors[..done].last().copied().unwrap_or(before);
         let temporal_weight = course.and_then(|course| course.stage.temporal_weight).unwrap_or(0.0);
+        let temporal_shrinkage =
+            course.and_then(|course| course.stage.temporal_shrinkage).unwrap_or(0.0);
         let static_variance = course.and_then(|course| course.stage.static_variance);
         let gamma = course.and_then(|course| course.stage.gamma);
         let before = std::mem::replace(&mut before, after);
-        StageFinding { iterations, temporal_weight, static_variance, gamma, before, after, end }
+        StageFinding {
+            iterations,
+            temporal_weight,
+            temporal_shrinkage,
+            static_variance,
+            gamma,
+            before,
+            after,
+            end,
+        }
     };
     schedule.stages.iter().enumerate().map(finding).collect()
 }
@@ -339,6 +390,8 @@ pub struct Decision {
     pub iterations: usize,
     /// The weight of its total variation along time; 0 for none.
     pub temporal_weight: f32,
+    /// Its shrinkage of changes along time; 0 for none.
+    pub temporal_shrinkage: f32,
     /// The static variance of its projection.
     pub static_variance: Option<f32>,
     /// The noise term of its projection.
@@ -350,15 +403,16 @@ impl Schedule {
     /// earlier. A stage of no iterations is left out, unless no other is left.
     pub fn decided(&self, decisions: &[Decision]) -> Self {
         let stage = |(stage, decision): (&Stage, &Decision)| {
-            let &Decision { iterations, temporal_weight, static_variance, gamma } = decision;
+            let &Decision { iterations, temporal_weight, temporal_shrinkage, .. } = decision;
             let last = stage.sigma_at(iterations.checked_sub(1)?);
             let sigma = stage.sigma.zip(last).map(|([first, _], last)| [first, last]);
-            let temporal_weight = (temporal_weight > 0.0).then_some(temporal_weight);
+            let positive = |value: f32| (value > 0.0).then_some(value);
             Some(Stage {
                 iterations,
-                temporal_weight,
-                static_variance,
-                gamma,
+                temporal_weight: positive(temporal_weight),
+                temporal_shrinkage: positive(temporal_shrinkage),
+                static_variance: decision.static_variance,
+                gamma: decision.gamma,
                 sigma,
                 ..stage.clone()
             })
@@ -468,7 +522,13 @@ mod tests {
     }
 
     fn iterations(iterations: usize) -> Decision {
-        Decision { iterations, temporal_weight: 0.0, static_variance: None, gamma: None }
+        Decision {
+            iterations,
+            temporal_weight: 0.0,
+            temporal_shrinkage: 0.0,
+            static_variance: None,
+            gamma: None,
+        }
     }
 
     #[test]
@@ -534,6 +594,26 @@ mod tests {
         };
         assert_eq!(found(2.0, 0.5), Some(0.5));
         assert_ne!(found(0.0, 0.05), Some(0.05));
+    }
+
+    #[test]
+    fn changes_are_shrunk_more_where_nothing_moves() {
+        let masks = iid_masks(6, 64, 64, 3).unwrap();
+        let op = SensingOperator::new(masks.clone()).unwrap();
+        let mut schedule = Schedule::pnp_nonlocal();
+        schedule.stages[1].iterations = 20;
+        let planned = schedule.stages[1].temporal_shrinkage.unwrap();
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        // Too fine for the filter of groups.
+        let texture = Array2::from_shape_simple_fn((64, 64), || random.random::<f32>());
+        let wave = |i: usize, j: usize| 0.5 + 0.4 * (i as f32 * 0.3).sin() * (j as f32 * 0.2).cos();
+        let found = |truth: Array3<f32>| {
+            let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+            run(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().0[1].temporal_shrinkage
+        };
+        let still = found(Array3::from_shape_fn((6, 64, 64), |(_, i, j)| texture[[i, j]]));
+        let moving = found(Array3::from_shape_fn((6, 64, 64), |(k, i, j)| wave(i + 2 * k, j)));
+        assert!(still >= 4.0 * planned && moving <= planned, "{still} {moving}");
     }
 
     #[test]

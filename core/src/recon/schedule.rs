@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 use super::error::{ReconError, Result};
 use super::prior::registry::PRIORS;
 use super::prior::{
-    Network, Parameter, Prior, SIGMA, Settings, TEMPORAL_WEIGHT, TV_UPDATES, TV_WEIGHT,
+    Network, Parameter, Prior, SIGMA, Settings, TEMPORAL_SHRINKAGE, TEMPORAL_WEIGHT, TV_UPDATES,
+    TV_WEIGHT,
 };
 
 /// The stages of the solver, one after the other (Algorithm 1 of the paper is two).
@@ -78,6 +79,12 @@ pub struct Stage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = TEMPORAL_WEIGHT.bounds())]
     pub temporal_weight: Option<f32>,
+    /// Shrinkage of changes along time in the nonlocal prior: cosines along time of a pixel (DCT-II) whose mean square e over 5x5 pixels
+    /// is small lose the share l^4 / (l^4 + e^2), where l is this times sigma; none where it is left out. An adaptive schedule takes two, four or
+    /// eight times as much, or leaves it out, where that pays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = TEMPORAL_SHRINKAGE.bounds())]
+    pub temporal_shrinkage: Option<f32>,
     /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the next: 1 is
     /// accelerated GAP, 0 plain GAP. A learned denoiser never explains the measurement fully, so with 1 the
     /// residual winds up in its stages.
@@ -166,11 +173,12 @@ impl Stage {
             tv_weight: self.tv_weight.unwrap_or(0.0),
             tv_updates: self.tv_updates.unwrap_or(DEFAULT_TV_UPDATES),
             temporal_weight: self.temporal_weight.unwrap_or(0.0),
+            temporal_shrinkage: self.temporal_shrinkage.unwrap_or(0.0),
         }
     }
 
     /// The parameters that belong to a prior, as far as they are given.
-    fn given(&self) -> [(&'static Parameter, Option<Vec<f32>>); 4] {
+    fn given(&self) -> [(&'static Parameter, Option<Vec<f32>>); 5] {
         let one = |value: Option<f32>| value.map(|value| vec![value]);
         // Without total variation it does no harm.
         let updates = self.tv_updates.filter(|_| self.prior.takes(&TV_UPDATES));
@@ -178,6 +186,7 @@ impl Stage {
             (&SIGMA, self.sigma.map(Vec::from)),
             (&TV_WEIGHT, one(self.tv_weight)),
             (&TEMPORAL_WEIGHT, one(self.temporal_weight)),
+            (&TEMPORAL_SHRINKAGE, one(self.temporal_shrinkage)),
             (&TV_UPDATES, one(updates.map(|updates| updates as f32))),
         ]
     }
@@ -289,6 +298,7 @@ impl Schedule {
             let updates = stage.settings(0).tv_updates;
             stage.tv_updates = stage.prior.takes(&TV_UPDATES).then_some(updates);
             stage.temporal_weight = stage.temporal_weight.filter(|weight| *weight > 0.0);
+            stage.temporal_shrinkage = stage.temporal_shrinkage.filter(|level| *level > 0.0);
         }
         self
     }

@@ -92,6 +92,8 @@ pub struct Settings {
     pub tv_updates: usize,
     /// Weight of the total variation along time; 0 for none.
     pub temporal_weight: f32,
+    /// Changes along time below this times `sigma` are shrunk; 0 shrinks none.
+    pub temporal_shrinkage: f32,
 }
 
 /// Bytes that a prior needs, measured.
@@ -144,6 +146,8 @@ pub const TV_UPDATES: Parameter = Parameter {
 };
 /// Weight of the total variation along time.
 pub const TEMPORAL_WEIGHT: Parameter = Parameter::not_negative("temporal_weight");
+/// Level below which changes along time are shrunk, in units of the noise level.
+pub const TEMPORAL_SHRINKAGE: Parameter = Parameter::not_negative("temporal_shrinkage");
 
 impl Parameter {
     /// One that may be any number from 0.

@@ -7,6 +7,7 @@
 //! `G^2 (G^2 + tau^2)^-1` with `G = Y Y^T`: nearly as sharp (of second order in the eigenvalues),
 //! and one Cholesky factorisation instead of an eigenvalue problem.
 
+mod changes;
 mod layout;
 mod low_rank;
 mod search;
@@ -16,8 +17,9 @@ use std::ops::Range;
 use ndarray::{Array3, ArrayView2};
 use pulp::{Arch, Simd, WithSimd};
 
-use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings};
+use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings, TEMPORAL_SHRINKAGE};
 use crate::recon::error::ReconError;
+use changes::Changes;
 use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
 use low_rank::Filter;
 
@@ -37,7 +39,7 @@ impl Prior for NonlocalPrior {
     }
 
     fn parameters(&self) -> Vec<&'static Parameter> {
-        vec![&SIGMA]
+        vec![&SIGMA, &TEMPORAL_SHRINKAGE]
     }
 
     fn cost(&self, _: &Settings) -> f64 {
@@ -63,7 +65,7 @@ impl Pass for Nonlocal {
         _: &mut dyn Networks,
         ready: &mut Ready<'_>,
     ) -> Result<(), ReconError> {
-        self.denoise(x, settings.sigma);
+        self.denoise(x, settings.sigma, settings.temporal_shrinkage);
         (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
         Ok(())
     }
@@ -91,6 +93,7 @@ pub struct Nonlocal {
     /// The result of the pass before: patches are compared in it.
     guide: Vec<f32>,
     sum: Vec<f32>,
+    changes: Changes,
     /// How many patches cover a pixel.
     cover: Vec<f32>,
     /// Top left pixels of all patches, `PATCHES` for a group.
@@ -112,6 +115,7 @@ impl Nonlocal {
             noisy: vec![0.0; size],
             guide: vec![0.0; size],
             sum: vec![0.0; size],
+            changes: Changes::new((frames, height, width)),
             cover: vec![0.0; size],
             groups: Vec::new(),
             filter: Filter::default(),
@@ -119,12 +123,12 @@ impl Nonlocal {
         }
     }
 
-    /// Removes noise of level `sigma` from frames \[B,H,W\] on \[0,1\], in place. Frames smaller
-    /// than a patch (6x6) are left as they are.
+    /// Removes noise of level `sigma` from frames \[B,H,W\] on \[0,1\], in place, after changes along time have been
+    /// shrunk at the level of `shrinkage` times `sigma`, where that is not 0. Frames smaller than a patch (6x6) are left as they are.
     ///
     /// Passes of one object belong to one clip: patches are compared in the result of the pass
     /// before, and the groups are kept for a few passes.
-    pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) {
+    pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32, shrinkage: f32) {
         debug_assert_eq!(frames.dim(), (self.frames, self.height, self.width));
         if self.height < SIDE || self.width < SIDE {
             return;
@@ -133,6 +137,9 @@ impl Nonlocal {
         let planes = self.noisy.chunks_exact_mut(self.height * row_length);
         for (plane, frame) in planes.zip(frames.outer_iter()) {
             without_specks(frame, OUTSIDE * sigma, plane.chunks_exact_mut(row_length));
+        }
+        if shrinkage > 0.0 {
+            self.changes.shrink(&mut self.noisy, row_length, shrinkage * sigma);
         }
         if self.passes == 0 {
             self.guide.copy_from_slice(&self.noisy);
@@ -293,7 +300,7 @@ fn span<S: Simd>() -> usize {
 mod tests {
     use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions, shift};
     use super::search::window;
-    use super::{Nonlocal, OUTSIDE, REFRESH, STRENGTH, without_specks};
+    use super::{Nonlocal, OUTSIDE, REFRESH, STRENGTH, changes, without_specks};
     use ndarray::{Array2, Array3};
     use pulp::Arch;
     use rand::{Rng, SeedableRng};
@@ -330,7 +337,7 @@ mod tests {
         let size = (3, 24, 24);
         let (clean, mut video) = noisy(size, 0.02);
         video[[1, 12, 12]] = 4.0;
-        Nonlocal::new(size).denoise(&mut video, 0.02);
+        Nonlocal::new(size).denoise(&mut video, 0.02, 0.0);
         assert!((video[[1, 12, 12]] - clean[[1, 12, 12]]).abs() < 0.15, "{}", video[[1, 12, 12]]);
     }
 
@@ -340,7 +347,7 @@ mod tests {
             let (clean, mut video) = noisy(size, 0.1);
             let before = mean_square(&video, &clean);
             let mut prior = Nonlocal::new(size);
-            prior.denoise(&mut video, 0.1);
+            prior.denoise(&mut video, 0.1, 0.0);
             let after = mean_square(&video, &clean);
             // A handful of patches tells little.
             let least = if size.1 < 10 { 1.0 } else { 0.25 };
@@ -376,8 +383,11 @@ mod tests {
     }
 
     impl Reference {
-        fn denoise(&mut self, clip: &mut Array3<f32>, sigma: f32) {
+        fn denoise(&mut self, clip: &mut Array3<f32>, sigma: f32, shrinkage: f32) {
             *clip = limited(clip, OUTSIDE * sigma);
+            if shrinkage > 0.0 {
+                *clip = changes::tests::shrunk(clip, f64::from(shrinkage * sigma));
+            }
             if self.passes == 0 {
                 self.guide = clip.clone();
             }
@@ -492,9 +502,9 @@ mod tests {
             let mut found = expected.clone();
             let mut prior = Nonlocal::new(size);
             let mut reference = Reference { guide: found.clone(), groups: Vec::new(), passes: 0 };
-            for pass in 0..2 {
-                prior.denoise(&mut found, 0.08);
-                reference.denoise(&mut expected, 0.08);
+            for (pass, shrinkage) in [0.0, 1.5].into_iter().enumerate() {
+                prior.denoise(&mut found, 0.08, shrinkage);
+                reference.denoise(&mut expected, 0.08, shrinkage);
                 let worst = (&found - &expected).mapv(f32::abs).fold(0.0, |a: f32, &b| a.max(b));
                 assert!(worst < 2e-5, "{size:?} pass {pass}: {worst}");
             }
@@ -508,7 +518,7 @@ mod tests {
         let passes = |arch: Arch| {
             let mut clip = noisy(size, 0.1).1;
             let mut prior = Nonlocal { arch, ..Nonlocal::new(size) };
-            (0..REFRESH + 2).for_each(|_| prior.denoise(&mut clip, 0.05));
+            (0..REFRESH + 2).for_each(|_| prior.denoise(&mut clip, 0.05, 0.4));
             clip
         };
         let own = passes(Arch::new());
@@ -528,7 +538,7 @@ mod tests {
         let mut video = clean.clone();
         let mut prior = Nonlocal::new(size);
         for _ in 0..6 {
-            prior.denoise(&mut video, 0.01);
+            prior.denoise(&mut video, 0.01, 0.4);
         }
         assert!(mean_square(&video, &clean) < 1e-4, "{}", mean_square(&video, &clean));
     }
@@ -537,7 +547,7 @@ mod tests {
     fn frames_smaller_than_a_patch_and_frames_without_contrast_stay() {
         for size in [(2, 5, 30), (3, 30, 30)] {
             let mut video = Array3::from_elem(size, 0.25f32);
-            Nonlocal::new(size).denoise(&mut video, 0.05);
+            Nonlocal::new(size).denoise(&mut video, 0.05, 0.4);
             assert!(video.iter().all(|&x| (x - 0.25).abs() < 1e-5), "{size:?}");
         }
     }
