@@ -91,13 +91,15 @@ def cases(a):
         street = next(archive[k] for k in archive.files if archive[k].ndim == 3)
     clips['street'] = street if street.dtype == np.uint8 else (street * 255).round().astype(np.uint8)
     all_of = [(photo, None) for photo in photos for _ in range(4)] + [(name, clip) for name, clip in clips.items() for _ in range(8)]
+    sides = (a.side,) if a.side else SIDES
     for number, index in enumerate(np.random.default_rng(11).permutation(len(all_of))):
         (scene, clip), rng = all_of[index], np.random.default_rng([5, int(index)])
-        wide = int(rng.choice([side for side in SIDES if clip is None or side <= min(clip.shape[1:])]))
+        wide = int(rng.choice([side for side in sides if clip is None or side <= min(clip.shape[1:])]))
         frames = panned(rng, scene, photos, wide) if clip is None else cropped(rng, clip, wide)
         ratio = int(rng.choice([ratio for ratio in RATIOS if ratio <= len(frames)]))
         pattern, sigma = PATTERNS[rng.integers(len(PATTERNS))], int(rng.choice(SIGMAS))
         seeds = {algorithm: int(rng.integers(1e6)) for algorithm in ALGORITHMS}
+        seeds = {algorithm: seed for algorithm, seed in seeds.items() if a.algorithm in (None, algorithm)}
         yield f'c{number:04d}', os.path.basename(scene), frames[:ratio], pattern, sigma, seeds
 
 
@@ -154,11 +156,20 @@ def scaled(values, by):
 class Model:
     """The mean of some networks of two inner layers, all fitted to the same cases, each from weights of its own."""
 
-    def __init__(self, cases, a):
+    def __init__(self, cases, a, start=None):
+        self.start = start
+        if start:
+            by = lambda name: tuple(torch.tensor(start[name][part]) for part in ('mean', 'scale'))
+            encoding = start['encoding'] and (torch.tensor(start['encoding']['mean']), torch.tensor(start['encoding']['components']).T)
+            self.features, self.signs, self.encoding = by('features'), by('signs'), encoding
+        else:
+            self.scale(cases)
+        self.networks = [self.network(cases, a, seed) for seed in range(a.networks)]
+
+    def scale(self, cases):
         self.features = scaling(torch.cat([case.features for case in cases]), .05)
         self.signs = scaling(torch.stack([case.signs for case in cases]), 1e-3)
         self.encoding = self.principal(torch.cat([case.encoded[::37].float() for case in cases])) if cases[0].encoded.shape[1] else None
-        self.networks = [self.network(cases, a, seed) for seed in range(a.networks)]
 
     @staticmethod
     def principal(seen):
@@ -189,9 +200,13 @@ class Model:
         network = nn.Sequential(nn.Linear(count, 64), nn.SiLU(), nn.Dropout(.15), nn.Linear(64, 16), nn.SiLU(), nn.Linear(16, 1))
         with torch.no_grad():
             network[-1].bias.fill_(float(torch.cat([case.error for case in cases]).mean()))
-        optimiser = torch.optim.AdamW(network.parameters(), 3e-3, weight_decay=.05)
+            if self.start:
+                for layer, known in zip([layer for layer in network if isinstance(layer, nn.Linear)], self.start['networks'][seed]):
+                    layer.weight.copy_(torch.tensor(known['weights']).T)
+                    layer.bias.copy_(torch.tensor(known['bias']))
+        optimiser = torch.optim.AdamW(network.parameters(), a.rate, weight_decay=.05)
         batches = torch.arange(len(cases)).split(8)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 5e-3, total_steps=a.epochs * len(batches))
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, a.rate, total_steps=a.epochs * len(batches))
         for _ in range(a.epochs):
             order = torch.randperm(len(cases))
             for batch in batches:
@@ -230,7 +245,10 @@ class Model:
 
 
 def fit(a):
-    models = {}
+    models, start = {}, None
+    if a.start:
+        with open(a.start) as f:
+            start = json.load(f)
     if a.write and os.path.exists(a.write):
         with open(a.write) as f:
             models = json.load(f)
@@ -240,7 +258,7 @@ def fit(a):
         fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
         for k in range(a.folds):
-            model = Model([case for case in cases if fold[case.scene] != k], a)
+            model = Model([case for case in cases if fold[case.scene] != k], a, start and start[algorithm])
             for index, case in enumerate(cases):
                 if fold[case.scene] == k:
                     errors, psnr = model(case)
@@ -265,7 +283,7 @@ def fit(a):
             if of.any():
                 print(f'  {kind}: {of.sum()} cases, {np.abs(wrong[of]).mean():.2f} dB, {100 * np.mean(np.abs(wrong[of]) < 1.5):.0f} % within 1.5, '
                       f'{100 * inside[of].mean():.0f} % in the interval')
-        models[algorithm] = Model(cases, a).record() | {'interval': [round(float(end), 2) for end in ends(slice(None))]}
+        models[algorithm] = Model(cases, a, start and start[algorithm]).record() | {'interval': [round(float(end), 2) for end in ends(slice(None))]}
     if a.write:
         with open(a.write, 'w') as f:
             json.dump(models, f)
@@ -282,8 +300,11 @@ def main():
     p.add_argument('--out', default='assessment-output')
     p.add_argument('--write', help='the file of the models')
     p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')
+    p.add_argument('--side', type=int, help='of the pictures; a mixture where it is left out')
     p.add_argument('--epochs', type=int, default=24)
-    p.add_argument('--algorithm', choices=ALGORITHMS, help='fit this one alone')
+    p.add_argument('--start', help='a file of models to go on from, where the cases are few')
+    p.add_argument('--rate', type=float, default=5e-3, help='the highest rate of learning; less to go on from a model')
+    p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this one alone, or fit it alone')
     p.add_argument('--folds', type=int, default=5, help='as many parts are left out, one after the other')
     p.add_argument('--networks', type=int, default=3, help='whose mean is taken')
     a = p.parse_args()

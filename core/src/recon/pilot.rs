@@ -7,6 +7,7 @@
 //! a prior takes over at a level far above the error that is left, and falls again with the level: so
 //! the whole stage is run, and judged by its end.
 
+use std::cmp::Ordering;
 use std::ops::Range;
 
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
@@ -295,6 +296,8 @@ struct Course {
     squares: Vec<f64>,
     /// The frames then.
     best: Option<Array3<f32>>,
+    /// `(y - Hv)^2` of each held-out pixel after the last iteration.
+    last: Vec<f64>,
     /// Whether the next iteration left the finite numbers.
     diverged: bool,
 }
@@ -311,8 +314,12 @@ impl Course {
         self.errors.iter().position(|error| *error == least).map_or(0, |index| index + 1)
     }
 
-    /// Iterations up to where the error is about least.
+    /// Iterations up to where the error is about least; all, if after the last one it is not greater by more than chance.
     fn paid(&self) -> usize {
+        let all_done = !self.diverged && self.errors.len() == self.stage.iterations;
+        if all_done && excess(&self.last, &self.squares) <= 1.0 {
+            return self.errors.len();
+        }
         let near = self.least() * (1.0 + SLACK);
         self.errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1)
     }
@@ -322,24 +329,30 @@ impl Course {
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more than
     /// it counts in the frames: so for another one the difference must be twice as clear. What more shrinkage of changes spares a scene at rest
-    /// hardly shows in a measurement, and what it costs a moving one does: there half as clear will do.
+    /// hardly shows in a measurement, and what it costs a moving one does: there half as clear will do. For less it takes more: pixels that are
+    /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.squares.is_empty() || other.squares.is_empty() {
             return self.least() < other.least();
         }
-        let gains = || other.squares.iter().zip(&self.squares).map(|(other, own)| other - own);
-        let count = self.squares.len() as f64;
-        let mean = gains().sum::<f64>() / count;
-        let variance = gains().map(|gain| (gain - mean).powi(2)).sum::<f64>() / count;
-        let errors = if self.stage.static_variance != other.stage.static_variance {
-            2.0
-        } else if self.stage.temporal_shrinkage > other.stage.temporal_shrinkage {
-            0.5
-        } else {
-            1.0
+        let shrinkage = |course: &Self| course.stage.temporal_shrinkage;
+        let errors = match shrinkage(self).partial_cmp(&shrinkage(other)) {
+            _ if self.stage.static_variance != other.stage.static_variance => 2.0,
+            Some(Ordering::Greater) => 0.5,
+            Some(Ordering::Less) => 2.5,
+            _ => 1.0,
         };
-        mean > errors * (variance / count).sqrt()
+        excess(&other.squares, &self.squares) > errors
     }
+}
+
+/// By how many standard errors of the mean difference one thing's squared errors at the held-out pixels are greater than another's.
+fn excess(one: &[f64], other: &[f64]) -> f64 {
+    let differences = || one.iter().zip(other).map(|(one, other)| one - other);
+    let count = one.len() as f64;
+    let mean = differences().sum::<f64>() / count;
+    let variance = differences().map(|difference| (difference - mean).powi(2)).sum::<f64>() / count;
+    if variance > 0.0 { mean / (variance / count).sqrt() } else { 0.0 }
 }
 
 /// Ends the last stage with a level where its own error is about least. Those before it run as planned: what
@@ -437,7 +450,7 @@ impl Watch<'_, '_> {
     fn stage(&mut self, stage: &Stage, run: &mut Run<'_>) -> Result<Course> {
         let fixed = stage.sigma.is_none();
         let (mut errors, mut squares, mut diverged) = (vec![], vec![], false);
-        let mut best = None;
+        let (mut best, mut at_last) = (None, vec![]);
         let (mut least, norm) = (f64::INFINITY, self.held_out.norm(self.y));
         run.enter(stage);
         for done in 1..=stage.iterations {
@@ -454,6 +467,7 @@ impl Watch<'_, '_> {
                 let residuals = self.held_out.residuals(self.op, self.y, run.frames());
                 let error = (residuals.iter().sum::<f64>() / norm).sqrt();
                 errors.push(error);
+                at_last.clone_from(&residuals);
                 if error < least {
                     (least, squares) = (error, residuals);
                     best = Some(run.frames().to_owned());
@@ -463,7 +477,7 @@ impl Watch<'_, '_> {
                 break;
             }
         }
-        Ok(Course { stage: stage.clone(), errors, squares, best, diverged })
+        Ok(Course { stage: stage.clone(), errors, squares, best, last: at_last, diverged })
     }
 }
 
