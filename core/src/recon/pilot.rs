@@ -29,6 +29,10 @@ pub const SIDE: usize = 96;
 /// more, the frames often still get better: in doubt the schedule goes on.
 const SLACK: f64 = 0.005;
 
+/// How much greater than the least the error after the last iteration may be, in standard errors of the difference, for the whole plan to be
+/// run: one that has really turned loses far more by going on than this can tell.
+const CHANCE: f64 = 1.5;
+
 /// Side in pixels of the squares over which a scene without texture and motion is even.
 const EVEN: usize = 8;
 
@@ -317,7 +321,7 @@ impl Course {
     /// Iterations up to where the error is about least; all, if after the last one it is not greater by more than chance.
     fn paid(&self) -> usize {
         let all_done = !self.diverged && self.errors.len() == self.stage.iterations;
-        if all_done && excess(&self.last, &self.squares) <= 1.0 {
+        if all_done && excess(&self.last, &self.squares) <= CHANCE {
             return self.errors.len();
         }
         let near = self.least() * (1.0 + SLACK);
