@@ -7,7 +7,6 @@
 //! a prior takes over at a level far above the error that is left, and falls again with the level: so
 //! the whole stage is run, and judged by its end.
 
-use std::cmp::Ordering;
 use std::ops::Range;
 
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
@@ -332,19 +331,23 @@ impl Course {
     /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more than
-    /// it counts in the frames: so for another one the difference must be twice as clear. What more shrinkage of changes spares a scene at rest
+    /// it counts in the frames: so for another one the difference must be twice as clear. What far more shrinkage of changes spares a scene at rest
     /// hardly shows in a measurement, and what it costs a moving one does: there half as clear will do. For less it takes more: pixels that are
     /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.squares.is_empty() || other.squares.is_empty() {
             return self.least() < other.least();
         }
-        let shrinkage = |course: &Self| course.stage.temporal_shrinkage;
-        let errors = match shrinkage(self).partial_cmp(&shrinkage(other)) {
-            _ if self.stage.static_variance != other.stage.static_variance => 2.0,
-            Some(Ordering::Greater) => 0.5,
-            Some(Ordering::Less) => 2.5,
-            _ => 1.0,
+        let shrinkage = |course: &Self| course.stage.temporal_shrinkage.unwrap_or(0.0);
+        let (own, others) = (shrinkage(self), shrinkage(other));
+        let errors = if self.stage.static_variance != other.stage.static_variance {
+            2.0
+        } else if own < others {
+            2.5
+        } else if own > 3.0 * others && others > 0.0 {
+            0.5
+        } else {
+            1.0
         };
         excess(&other.squares, &self.squares) > errors
     }
