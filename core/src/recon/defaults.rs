@@ -75,7 +75,7 @@ const TEMPORAL_WEIGHT: f32 = 0.004;
 /// The best behind independent pixels, at Cr 6 to 24; for masks that are alike the projection takes less.
 const STATIC_VARIANCE: f32 = 0.55;
 
-/// The most that loses nothing where textures move slowly.
+/// Less gains less, at rest and in motion; more blurs what moves. Fine texture that moves by a fraction of a pixel loses 0.1 to 0.2 dB.
 const TEMPORAL_SHRINKAGE: f32 = 0.35;
 
 /// What comes before the plugged-in priors.

@@ -208,7 +208,7 @@ type Variant = fn(&SensingOperator, &Stage, &Course) -> Option<Stage>;
 /// One after the other is run, and taken if it is better.
 const VARIANTS: [Variant; 8] = [
     without_time,
-    with_most_shrinkage,
+    with_fourfold_shrinkage,
     with_other_shrinkage,
     without_shrinkage,
     with_more_variance,
@@ -227,7 +227,7 @@ fn shrunk(planned: &Stage) -> Option<f32> {
 }
 
 /// For scenes at rest, or with a background that is.
-fn with_most_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
+fn with_fourfold_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
     let fourfold = Some(4.0 * shrunk(planned)?);
     Some(Stage { temporal_shrinkage: fourfold, ..taken.stage.clone() })
 }
@@ -331,8 +331,8 @@ impl Course {
     /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more than
-    /// it counts in the frames: so for another one the difference must be twice as clear. What far more shrinkage of changes spares a scene at rest
-    /// hardly shows in a measurement, and what it costs a moving one does: there half as clear will do. For less it takes more: pixels that are
+    /// it counts in the frames: so for another one the difference must be twice as clear. What fourfold shrinkage of changes spares a scene at rest
+    /// hardly shows in a measurement, but what it costs a moving one does: there half as clear will do. For less it takes more: pixels that are
     /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.squares.is_empty() || other.squares.is_empty() {
@@ -344,7 +344,7 @@ impl Course {
             2.0
         } else if own < others {
             2.5
-        } else if own > 3.0 * others && others > 0.0 {
+        } else if others > 0.0 && own >= 4.0 * others {
             0.5
         } else {
             1.0
