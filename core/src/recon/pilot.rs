@@ -32,6 +32,10 @@ const SLACK: f64 = 0.005;
 /// run: one that has really turned loses far more by going on than this can tell.
 const CHANCE: f64 = 1.5;
 
+/// What is behind by so many standard errors is clearly behind: a variant of a stage, from half of its iterations on, is
+/// given up then.
+const CLEAR: f64 = 2.0;
+
 /// Side in pixels of the squares over which a scene without texture and motion is even.
 const EVEN: usize = 8;
 
@@ -129,15 +133,16 @@ pub fn run(
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = run.state();
-        let mut course = watch.stage(stage, &mut run)?;
+        let mut course = watch.stage(stage, None, &mut run)?;
         for variant in VARIANTS {
             let Some(variant) = variant(&op, stage, &course) else { continue };
             let end = run.state();
             run.restore(start.clone());
-            let found = watch.stage(&variant, &mut run)?;
+            let found = watch.stage(&variant, Some(&course), &mut run)?;
             if found.surpasses(&course) {
                 course = found;
             } else {
+                course.last_given_up = found.given_up;
                 run.restore(end);
             }
         }
@@ -232,9 +237,12 @@ fn with_fourfold_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course)
     Some(Stage { temporal_shrinkage: fourfold, ..taken.stage.clone() })
 }
 
-/// Still more, if that was taken; else less.
+/// Still more, if that was taken; else less, unless that was clearly worse.
 fn with_other_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
     let as_planned = taken.stage.temporal_shrinkage == planned.temporal_shrinkage;
+    if as_planned && taken.last_given_up {
+        return None;
+    }
     let times = if as_planned { 2.0 } else { 8.0 };
     Some(Stage { temporal_shrinkage: Some(times * shrunk(planned)?), ..taken.stage.clone() })
 }
@@ -295,14 +303,16 @@ struct Course {
     stage: Stage,
     /// After each iteration; of a stage without a level after the last one alone.
     errors: Vec<f64>,
-    /// `(y - Hv)^2` of each held-out pixel where their sum was least.
-    squares: Vec<f64>,
-    /// The frames then.
+    /// `(y - Hv)^2` of each held-out pixel, likewise.
+    squares: Vec<Vec<f64>>,
+    /// The frames where the error was least.
     best: Option<Array3<f32>>,
-    /// `(y - Hv)^2` of each held-out pixel after the last iteration.
-    last: Vec<f64>,
     /// Whether the next iteration left the finite numbers.
     diverged: bool,
+    /// Whether it was clearly behind what it was to surpass, and not run to its end.
+    given_up: bool,
+    /// Whether the last variant was given up for it.
+    last_given_up: bool,
 }
 
 impl Course {
@@ -317,10 +327,16 @@ impl Course {
         self.errors.iter().position(|error| *error == least).map_or(0, |index| index + 1)
     }
 
+    /// `(y - Hv)^2` of each held-out pixel there.
+    fn least_squares(&self) -> &[f64] {
+        self.turn().checked_sub(1).map_or(&[], |index| &self.squares[index])
+    }
+
     /// Iterations up to where the error is about least; all, if after the last one it is not greater by more than chance.
     fn paid(&self) -> usize {
         let all_done = !self.diverged && self.errors.len() == self.stage.iterations;
-        if all_done && excess(&self.last, &self.squares) <= CHANCE {
+        let last = self.squares.last().map_or(&[][..], Vec::as_slice);
+        if all_done && excess(last, self.least_squares()) <= CHANCE {
             return self.errors.len();
         }
         let near = self.least() * (1.0 + SLACK);
@@ -335,7 +351,11 @@ impl Course {
     /// hardly shows in a measurement, but what it costs a moving one does: there half as clear will do. For less it takes more: pixels that are
     /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
-        if self.squares.is_empty() || other.squares.is_empty() {
+        if self.given_up {
+            return false;
+        }
+        let (own_squares, others_squares) = (self.least_squares(), other.least_squares());
+        if own_squares.is_empty() || others_squares.is_empty() {
             return self.least() < other.least();
         }
         let shrinkage = |course: &Self| course.stage.temporal_shrinkage.unwrap_or(0.0);
@@ -349,7 +369,7 @@ impl Course {
         } else {
             1.0
         };
-        excess(&other.squares, &self.squares) > errors
+        excess(others_squares, own_squares) > errors
     }
 }
 
@@ -454,16 +474,29 @@ struct Watch<'a, 'b> {
 }
 
 impl Watch<'_, '_> {
-    fn stage(&mut self, stage: &Stage, run: &mut Run<'_>) -> Result<Course> {
+    /// Runs a stage to its end, unless it is clearly behind `rival`, the best of it so far.
+    fn stage(
+        &mut self,
+        stage: &Stage,
+        rival: Option<&Course>,
+        run: &mut Run<'_>,
+    ) -> Result<Course> {
         let fixed = stage.sigma.is_none();
-        let (mut errors, mut squares, mut diverged) = (vec![], vec![], false);
-        let (mut best, mut at_last) = (None, vec![]);
+        let mut course = Course {
+            stage: stage.clone(),
+            errors: vec![],
+            squares: vec![],
+            best: None,
+            diverged: false,
+            given_up: false,
+            last_given_up: false,
+        };
         let (mut least, norm) = (f64::INFINITY, self.held_out.norm(self.y));
         run.enter(stage);
         for done in 1..=stage.iterations {
             let step = match run.iterate(stage, done - 1) {
                 Err(ReconError::Diverged { .. }) if !fixed => {
-                    diverged = true;
+                    course.diverged = true;
                     break;
                 }
                 other => other?,
@@ -471,20 +504,26 @@ impl Watch<'_, '_> {
             run.tell((self.index, stage), done - 1, &step, &mut *self.observer)?;
             let last = done == stage.iterations || step.change < stage.tolerance;
             if !fixed || last {
-                let residuals = self.held_out.residuals(self.op, self.y, run.frames());
-                let error = (residuals.iter().sum::<f64>() / norm).sqrt();
-                errors.push(error);
-                at_last.clone_from(&residuals);
+                let squares = self.held_out.residuals(self.op, self.y, run.frames());
+                let error = (squares.iter().sum::<f64>() / norm).sqrt();
+                let rivals = rival.filter(|_| !fixed).and_then(|rival| rival.squares.get(done - 1));
+                let behind = rivals.is_some_and(|rivals| excess(&squares, rivals) > CLEAR);
+                course.errors.push(error);
+                course.squares.push(squares);
                 if error < least {
-                    (least, squares) = (error, residuals);
-                    best = Some(run.frames().to_owned());
+                    least = error;
+                    course.best = Some(run.frames().to_owned());
+                }
+                if behind && 2 * done >= stage.iterations {
+                    course.given_up = true;
+                    break;
                 }
             }
             if fixed && last {
                 break;
             }
         }
-        Ok(Course { stage: stage.clone(), errors, squares, best, last: at_last, diverged })
+        Ok(course)
     }
 }
 
