@@ -94,7 +94,10 @@ def cases(a):
     sides = (a.side,) if a.side else SIDES
     for number, index in enumerate(np.random.default_rng(11).permutation(len(all_of))):
         (scene, clip), rng = all_of[index], np.random.default_rng([5, int(index)])
-        wide = int(rng.choice([side for side in sides if clip is None or side <= min(clip.shape[1:])]))
+        fitting = [side for side in sides if clip is None or side <= min(clip.shape[1:])]
+        if not fitting:     # a clip smaller than the pictures that are wanted
+            continue
+        wide = int(rng.choice(fitting))
         frames = panned(rng, scene, photos, wide) if clip is None else cropped(rng, clip, wide)
         ratio = int(rng.choice([ratio for ratio in RATIOS if ratio <= len(frames)]))
         pattern, sigma = PATTERNS[rng.integers(len(PATTERNS))], int(rng.choice(SIGMAS))
@@ -164,7 +167,8 @@ class Model:
             self.features, self.signs, self.encoding = by('features'), by('signs'), encoding
         else:
             self.scale(cases)
-        self.networks = [self.network(cases, a, seed) for seed in range(a.networks)]
+        count = len(start['networks']) if start else a.networks
+        self.networks = [self.network(cases, a, seed) for seed in range(count)]
 
     def scale(self, cases):
         self.features = scaling(torch.cat([case.features for case in cases]), .05)
@@ -306,7 +310,7 @@ def main():
     p.add_argument('--rate', type=float, default=5e-3, help='the highest rate of learning; less to go on from a model')
     p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this one alone, or fit it alone')
     p.add_argument('--folds', type=int, default=5, help='as many parts are left out, one after the other')
-    p.add_argument('--networks', type=int, default=3, help='whose mean is taken')
+    p.add_argument('--networks', type=int, default=3, help='whose mean is taken; with --start as many as the file has')
     a = p.parse_args()
     {'make': make, 'fit': fit}[a.what](a)
 
