@@ -95,17 +95,17 @@ pub struct Arguments {
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels (with --mosaic those of a sub-image) [default: 320, 384 for those of TV alone, 240 where that makes
-    /// room for longer runs of snapshots; for learned 256, or the whole picture for a network that takes
-    /// no other].
+    /// Largest side of a tile, in pixels (with --mosaic those of a sub-image) [default: 320, 384 for those of
+    /// TV alone, 240 where that makes room for longer runs of snapshots; for learned 256, or the whole
+    /// picture for a network that takes no other].
     #[arg(long, value_name = "PIXELS")]
     tile: Option<usize>,
     /// Least overlap of neighbouring tiles, in pixels [default: 32, 16 for those of TV alone, or 0
     /// for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
-    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json; of several snapshots each has its
-    /// own folder there, snapshot_0000 and so on.
+    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json; of several
+    /// snapshots each has its own folder there, snapshot_0000 and so on.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object.

@@ -55,7 +55,8 @@ pub struct Services {
 
 impl App {
     /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine, none if
-    /// none should; `confinement` why networks of users can read files of labs, if they can. Answers that have no end of their own end with `closing`. Needs a runtime of tokio.
+    /// none should; `confinement` why networks of users can read files of labs, if they can. Answers that
+    /// have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
         settings: &ServeArguments,

@@ -70,8 +70,9 @@ pub(super) enum Wanted {
     Outside,
 }
 
-/// Reads `Range` and `If-Range` for a file of `size` bytes. Ranges are defined for GET alone. Several ranges at once, other units and
-/// what can't be read are ignored, as the RFC allows: the whole file is the answer then.
+/// Reads `Range` and `If-Range` for a file of `size` bytes. Ranges are defined for GET alone. Several ranges
+/// at once, other units and what can't be read are ignored, as the RFC allows: the whole file is the answer
+/// then.
 pub(super) fn wanted(method: &Method, headers: &HeaderMap, etag: &str, size: u64) -> Wanted {
     if method != Method::GET {
         return Wanted::Whole;

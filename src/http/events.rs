@@ -1,4 +1,5 @@
-//! `/v1/events`: says which jobs, calibrations and checks of measurements have changed, for those who would poll otherwise.
+//! `/v1/events`: says which jobs, calibrations and checks of measurements have changed, for those who would
+//! poll otherwise.
 //!
 //! Workers are other processes, so the server looks at the database once a second, as long as
 //! somebody listens, and compares what it sees with what it saw before.

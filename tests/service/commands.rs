@@ -84,8 +84,8 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     let line =
         ["fetch", &job, "--out", "out", "--json", "--file", everything[0], "--file", everything[1]];
     let fetched = lab.json(&line).await;
-    // The array, the stacks, the movie, the manifest, EXR and PNG of each frame of each snapshot; the manifest, the array and
-    // the movie of all.
+    // The array, the stacks, the movie, the manifest, EXR and PNG of each frame of each snapshot; the
+    // manifest, the array and the movie of all.
     assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (6 + 2 * 8) + 3, "{fetched:#}");
     for file in [
         "snapshot_0001/frames.npy",

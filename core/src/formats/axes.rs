@@ -85,7 +85,8 @@ impl Axes {
 
 impl Writer {
     /// The orders that people use, the usual one first. In MATLAB a matrix is \[row, column\].
-    /// [`Axes::FrameColumnRow`] is not among them: turned pictures of a size that nobody knows are no worse than others.
+    /// [`Axes::FrameColumnRow`] is not among them: turned pictures of a size that nobody knows are no worse
+    /// than others.
     fn orders(self) -> &'static [Axes] {
         use Axes::{ColumnRowFrame, FrameRowColumn, RowColumnFrame};
         match self {

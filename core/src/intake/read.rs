@@ -103,7 +103,8 @@ pub fn read_truth(
     Ok(Some((truth.slice(s![first..first + wanted, .., ..]).to_owned(), channels)))
 }
 
-/// Frames \[T,H,W\] of a file, or of a folder of pictures in the order of their names, divided by the full scale; all finite.
+/// Frames \[T,H,W\] of a file, or of a folder of pictures in the order of their names, divided by the full
+/// scale; all finite.
 /// Errors: files that can't be read; pictures of different sizes.
 pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
     clip(path, full_scale, read_frames)

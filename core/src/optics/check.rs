@@ -19,7 +19,8 @@ const MOSAIC: f64 = 0.02;
 const SURE_OF_MOSAIC: f64 = 8.0;
 /// The share of a measurement's light that its masks need not explain.
 const OFFSET: f64 = 0.03;
-/// The share of the mean by which a block is below 0 whatever the noise: that of a block's mean is an eighth of a pixel's.
+/// The share of the mean by which a block is below 0 whatever the noise: that of a block's mean is an eighth
+/// of a pixel's.
 const DEEP: f64 = 0.05;
 /// Where the mean brightness of a scene lies.
 const LEVELS: std::ops::RangeInclusive<f64> = 0.05..=1.05;
@@ -182,9 +183,10 @@ impl MeasurementStudy {
         })
     }
 
-    /// The standard error of the offset. What masks do not explain of a pixel is much like that of its neighbours, so it is
-    /// taken from how the strips differ, each as a whole (Liang and Zeger, Biometrika 1986). `weights` is
-    /// `P^-1 m`, with the products `P` of all strips and the masks' means `m`: what an error of the matches changes.
+    /// The standard error of the offset. What masks do not explain of a pixel is much like that of its
+    /// neighbours, so it is taken from how the strips differ, each as a whole (Liang and Zeger, Biometrika
+    /// 1986). `weights` is `P^-1 m`, with the products `P` of all strips and the masks' means `m`: what an
+    /// error of the matches changes.
     fn offset_uncertainty(
         &self,
         (brightness, offset): (&Array1<f64>, f64),
@@ -536,8 +538,8 @@ mod tests {
         assert_eq!(undarkened(&masks, &(&y - 0.07 * mean)), ["negative_offset"]);
     }
 
-    /// Texture of a few pixels is not explained in patches, not in single pixels: the offset is as far off as it is told to
-    /// be.
+    /// Texture of a few pixels is not explained in patches, not in single pixels: the offset is as far off as
+    /// it is told to be.
     #[test]
     fn the_standard_error_of_an_offset_holds_where_the_rest_is_texture() {
         let off = |seed: u64| {

@@ -143,8 +143,8 @@ pub fn expected(
     Some(Expected { assessment, error })
 }
 
-/// What is expected, but never better than the findings allow. Frames are called bad only where the whole interval says so,
-/// lest somebody throws away a usable picture.
+/// What is expected, but never better than the findings allow. Frames are called bad only where the whole
+/// interval says so, lest somebody throws away a usable picture.
 fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
     let expected = match psnr_db {
         GOOD.. => Grade::Good,
@@ -222,8 +222,8 @@ fn reasons(
     reasons
 }
 
-/// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up to 5.3, motion
-/// by 10 as 7 to 14 (`docs/benchmarks.md`).
+/// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up
+/// to 5.3, motion by 10 as 7 to 14 (`docs/benchmarks.md`).
 const FAST: f32 = 6.0;
 
 fn too_fast(motion: f32) -> Option<Finding> {

@@ -109,7 +109,8 @@ pub struct StageRecord {
 }
 
 impl StageRecord {
-    /// What became of the total variation along time, of the shrinkage of changes, of the static variance and of the noise term, as far as there are any.
+    /// What became of the total variation along time, of the shrinkage of changes, of the static variance and
+    /// of the noise term, as far as there are any.
     pub fn fates(&self) -> Vec<String> {
         let kept = if self.temporal_weight > 0.0 { "kept" } else { "left out" };
         let along_time = (self.planned_temporal_weight > 0.0)

@@ -24,9 +24,9 @@ use super::schedule::{Method, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
 
-/// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames of the
-/// result, and of those that total variation alone had left, where other priors followed. Nothing betrays frames that are
-/// wrong as much as motion that does not explain how they change.
+/// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames
+/// of the result, and of those that total variation alone had left, where other priors followed. Nothing
+/// betrays frames that are wrong as much as motion that does not explain how they change.
 pub const FEATURES: [&str; 26] = [
     "gradient",
     "curvature",
@@ -71,8 +71,8 @@ pub fn blocks(height: usize, width: usize) -> (usize, usize) {
 }
 
 /// What is seen of each block of each frame \[features, S B, rows, columns\], of the frames \[S B,H,W\] of a
-/// reconstruction and those that total variation alone had left, if other priors followed; all on the scale on which the
-/// scene is on \[0,1\].
+/// reconstruction and those that total variation alone had left, if other priors followed; all on the scale
+/// on which the scene is on \[0,1\].
 pub fn features(
     op: &SensingOperator,
     early: Option<ArrayView3<'_, f32>>,
@@ -245,8 +245,8 @@ impl Energies {
     }
 }
 
-/// The part of the gram diagonal that changes from mask to mask, and the energy of the masks' gradient, both relative to
-/// the masks' energy, of each block.
+/// The part of the gram diagonal that changes from mask to mask, and the energy of the masks' gradient, both
+/// relative to the masks' energy, of each block.
 fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
     let masks = op.masks();
     let (_, height, width) = masks.dim();
@@ -309,8 +309,8 @@ fn over_blocks(
     })
 }
 
-/// What a piece of a measurement tells of the error of all of it: by pixels that were held out there, and by what is seen of
-/// its frames, each in the mean over its blocks. Signs tell of frames like these.
+/// What a piece of a measurement tells of the error of all of it: by pixels that were held out there, and by
+/// what is seen of its frames, each in the mean over its blocks. Signs tell of frames like these.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evidence {
     /// What the held-out pixels tell.
@@ -327,9 +327,9 @@ impl Evidence {
     }
 }
 
-/// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some networks of a
-/// few neurons, of what is seen of a block, of its means over the blocks around and over these in all frames, of the white
-/// level, of the evidence, and of what the encoder sees of the block.
+/// What errors are predicted by: `assessment.json`, which `training/assessment.py` fits. The mean of some
+/// networks of a few neurons, of what is seen of a block, of its means over the blocks around and over these
+/// in all frames, of the white level, of the evidence, and of what the encoder sees of the block.
 #[derive(Debug, Deserialize)]
 pub struct Model {
     features: Scaling,
@@ -390,9 +390,10 @@ impl Model {
         }
     }
 
-    /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is seen of
-    /// them ([`encoded_features`]). Without evidence signs count as in the mean of the fit, and the features of the whole stand
-    /// for those of the piece; without an encoder its components count as in the mean. `white` is the scene's white level.
+    /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is
+    /// seen of them ([`encoded_features`]). Without evidence signs count as in the mean of the fit, and the
+    /// features of the whole stand for those of the piece; without an encoder its components count as in the
+    /// mean. `white` is the scene's white level.
     pub fn log_errors(
         &self,
         features: &Array4<f32>,
@@ -462,7 +463,8 @@ impl Encoding {
     }
 }
 
-/// Adds to each sum all inputs by their weights for it, sum beside sum: that vectorises, and is the same on every machine.
+/// Adds to each sum all inputs by their weights for it, sum beside sum: that vectorises, and is the same on
+/// every machine.
 fn add_weighted(sums: &mut [f32], inputs: impl Iterator<Item = f32>, weights: &[Vec<f32>]) {
     for (input, weights) in inputs.zip(weights) {
         sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight * input);
@@ -526,8 +528,8 @@ mod tests {
         // 0.02 times -1.5, -0.5, 0.5 and 1.5 from the mean over time, whose gradient is that of each frame.
         near(3, (0, 0, 0), 9e-4);
         near(4, (1, 0, 0), 0.5 * 1e-4);
-        // A ramp of 0.01 a column that brightens by 0.02 a frame moves by two columns a frame, but where the last column
-        // has no next one.
+        // A ramp of 0.01 a column that brightens by 0.02 a frame moves by two columns a frame, but where the
+        // last column has no next one.
         assert!((seen[[5, 2, 0, 0]] - 4f32.log10()).abs() < 0.02, "{}", seen[[5, 2, 0, 0]]);
         assert!(seen[[6, 2, 0, 0]] < -1.8 && seen[[6, 2, 0, 2]] > -1.0, "{seen:?}");
         near(7, (2, 1, 0), 1.0);

@@ -55,8 +55,9 @@ impl Schedule {
     /// schedule) gained only while the memory was 1.
     ///
     /// Passes of the nonlocal prior cost a tenth of the network's, so there are many. Their first level is a
-    /// compromise: 12 is better by up to 0.5 dB behind correlated masks, where the network has come further than the
-    /// prior can from 20; behind independent pixels 20 is better by up to 0.3 dB. The pilot ends them where they no longer pay.
+    /// compromise: 12 is better by up to 0.5 dB behind correlated masks, where the network has come further
+    /// than the prior can from 20; behind independent pixels 20 is better by up to 0.3 dB. The pilot ends
+    /// them where they no longer pay.
     pub fn pnp_tv_fastdvdnet() -> Self {
         let deep = level_stage(&FASTDVDNET_INT8, 12, 25.0, 5.3);
         Self::gap(vec![first_stage(), deep, nonlocal_stage(65, 15.0, 1.7)])
@@ -75,7 +76,8 @@ const TEMPORAL_WEIGHT: f32 = 0.004;
 /// The best behind independent pixels, at Cr 6 to 24; for masks that are alike the projection takes less.
 const STATIC_VARIANCE: f32 = 0.55;
 
-/// Less gains less, at rest and in motion; more blurs what moves. Fine texture that moves by a fraction of a pixel loses 0.1 to 0.2 dB.
+/// Less gains less, at rest and in motion; more blurs what moves. Fine texture that moves by a fraction of a
+/// pixel loses 0.1 to 0.2 dB.
 const TEMPORAL_SHRINKAGE: f32 = 0.35;
 
 /// What comes before the plugged-in priors.

@@ -1,10 +1,9 @@
 //! The reconstruction core: arrays in, arrays out.
 //!
 //! A snapshot `y = sum_k C_k x_k` of `B` frames, or a run of them (see [`sequence`]), goes through a
-//! [`sensing::SensingOperator`];
-//! [`solver::reconstruct`] alternates its projection with the priors that a
-//! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes (frame, row, column); frames
-//! and masks live on \[0,1\].
+//! [`sensing::SensingOperator`]; [`solver::reconstruct`] alternates its projection with the priors that a
+//! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes
+//! (frame, row, column); frames and masks live on \[0,1\].
 
 #![warn(missing_docs)]
 

@@ -28,12 +28,13 @@ pub const SIDE: usize = 96;
 /// more, the frames often still get better: in doubt the schedule goes on.
 const SLACK: f64 = 0.005;
 
-/// How much greater than the least the error after the last iteration may be, in standard errors of the difference, for the whole plan to be
-/// run: one that has really turned loses far more by going on than this can tell.
+/// How much greater than the least the error after the last iteration may be, in standard errors of the
+/// difference, for the whole plan to be run: one that has really turned loses far more by going on than this
+/// can tell.
 const CHANCE: f64 = 1.5;
 
-/// What is behind by so many standard errors is clearly behind: a variant of a stage, from half of its iterations on, is
-/// given up then.
+/// What is behind by so many standard errors is clearly behind: a variant of a stage, from half of its
+/// iterations on, is given up then.
 const CLEAR: f64 = 2.0;
 
 /// Side in pixels of the squares over which a scene without texture and motion is even.
@@ -41,8 +42,8 @@ const EVEN: usize = 8;
 
 /// The rows and columns of the piece: of all that lie side by side in a measurement `y` \[H,W\], the one with
 /// most texture and motion. An even part would tell nothing, and where it is bright its measurement varies as
-/// much as any: by the sum of the masks, `light` \[H,W\], alone. So that counts which `y = light x`, with one `x` for each
-/// square of the piece, leaves of the measurement's energy.
+/// much as any: by the sum of the masks, `light` \[H,W\], alone. So that counts which `y = light x`, with one
+/// `x` for each square of the piece, leaves of the measurement's energy.
 pub fn piece(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
     let (height, width) = y.dim();
     let starts = |length: usize| {
@@ -161,9 +162,9 @@ pub fn run(
     Ok((judge(schedule, &courses), evidence.flatten()))
 }
 
-/// What the first snapshot tells of the error of a fixed schedule's frames, on the piece of it that
-/// [`piece`] gives, and both on the scale on which the scene is on \[0,1\]; none if no light reaches it, or the iteration diverges. Costs
-/// a run of the schedule on that piece.
+/// What the first snapshot tells of the error of a fixed schedule's frames, on the piece of it that [`piece`]
+/// gives, and both on the scale on which the scene is on \[0,1\]; none if no light reaches it, or the
+/// iteration diverges. Costs a run of the schedule on that piece.
 /// Errors: as [`super::solver::reconstruct`].
 pub fn evidence(
     op: &SensingOperator,
@@ -194,8 +195,8 @@ pub fn evidence(
     Ok(tell((&whole, &op, y), &held_out, schedule, (early, outcome.frames.view())))
 }
 
-/// What the frames of a piece, after the first stage and at the end, tell: by `y` at the held-out pixels, which the operator
-/// `op` lacks, and by themselves.
+/// What the frames of a piece, after the first stage and at the end, tell: by `y` at the held-out pixels,
+/// which the operator `op` lacks, and by themselves.
 fn tell(
     (whole, op, y): (&SensingOperator, &SensingOperator, ArrayView3<'_, f32>),
     held_out: &HeldOut,
@@ -332,7 +333,8 @@ impl Course {
         self.turn().checked_sub(1).map_or(&[], |index| &self.squares[index])
     }
 
-    /// Iterations up to where the error is about least; all, if after the last one it is not greater by more than chance.
+    /// Iterations up to where the error is about least; all, if after the last one it is not greater by more
+    /// than chance.
     fn paid(&self) -> usize {
         let all_done = !self.diverged && self.errors.len() == self.stage.iterations;
         let last = self.squares.last().map_or(&[][..], Vec::as_slice);
@@ -346,10 +348,11 @@ impl Course {
     /// Whether its least error is below that of another by more than chance: by more than the standard error of
     /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
     ///
-    /// A static variance gives up changes for what frames have in common, of which a measurement tells more than
-    /// it counts in the frames: so for another one the difference must be twice as clear. What fourfold shrinkage of changes spares a scene at rest
-    /// hardly shows in a measurement, but what it costs a moving one does: there half as clear will do. For less it takes more: pixels that are
-    /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
+    /// A static variance gives up changes for what frames have in common, of which a measurement tells more
+    /// than it counts in the frames: so for another one the difference must be twice as clear. What fourfold
+    /// shrinkage of changes spares a scene at rest hardly shows in a measurement, but what it costs a moving
+    /// one does: there half as clear will do. For less it takes more: pixels that are held out have what
+    /// changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.given_up {
             return false;
@@ -373,7 +376,8 @@ impl Course {
     }
 }
 
-/// By how many standard errors of the mean difference one thing's squared errors at the held-out pixels are greater than another's.
+/// By how many standard errors of the mean difference one thing's squared errors at the held-out pixels are
+/// greater than another's.
 fn excess(one: &[f64], other: &[f64]) -> f64 {
     let differences = || one.iter().zip(other).map(|(one, other)| one - other);
     let count = one.len() as f64;

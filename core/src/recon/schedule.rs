@@ -79,9 +79,10 @@ pub struct Stage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = TEMPORAL_WEIGHT.bounds())]
     pub temporal_weight: Option<f32>,
-    /// Shrinkage of changes along time in the nonlocal prior: cosines along time of a pixel (DCT-II) whose mean square e over 5x5 pixels
-    /// is small lose the share l^4 / (l^4 + e^2), where l is this times sigma; none where it is left out. An adaptive schedule takes two, four or
-    /// eight times as much, or leaves it out, where that pays.
+    /// Shrinkage of changes along time in the nonlocal prior: cosines along time of a pixel (DCT-II) whose
+    /// mean square e over 5x5 pixels is small lose the share l^4 / (l^4 + e^2), where l is this times sigma;
+    /// none where it is left out. An adaptive schedule takes two, four or eight times as much, or leaves it
+    /// out, where that pays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = TEMPORAL_SHRINKAGE.bounds())]
     pub temporal_shrinkage: Option<f32>,
@@ -97,11 +98,12 @@ pub struct Stage {
     #[schemars(transform = MOMENTUM.bounds())]
     pub momentum: f32,
     /// Variance of the part of the frames' error that all frames of a snapshot share, in units of that of its
-    /// slowest change. The projection supposes then that errors change slowly from frame to frame, with
-    /// the covariance R, the variance of whose cosine m is this for m = 0 and m^-0.4 from m = 1 on; without it R = 1. More
-    /// frames have more to change, and masks that are alike tell little of the changes: so this is for Cr 10, and at others, and where
-    /// only a share c of the masks' energy changes from frame to frame, it is multiplied by the lesser of (10 / Cr)^0.5 and (c / 0.125)^1.5. An
-    /// adaptive schedule doubles it, or leaves it out, where that pays.
+    /// slowest change. The projection supposes then that errors change slowly from frame to frame, with the
+    /// covariance R, the variance of whose cosine m is this for m = 0 and m^-0.4 from m = 1 on; without it R
+    /// = 1. More frames have more to change, and masks that are alike tell little of the changes: so this is
+    /// for Cr 10, and at others, and where only a share c of the masks' energy changes from frame to frame,
+    /// it is multiplied by the lesser of (10 / Cr)^0.5 and (c / 0.125)^1.5. An adaptive schedule doubles it,
+    /// or leaves it out, where that pays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = STATIC_VARIANCE.bounds())]
     pub static_variance: Option<f32>,

@@ -119,9 +119,9 @@ impl SensingOperator {
         mean.mapv(|mean| frames * mean.powi(2))
     }
 
-    /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a snapshot's frames
-    /// at a pixel, with the cosines `Psi` of the DCT-II, and `s = static_variance min((10 / B)^0.5, (c / 0.125)^1.5)` of the masks'
-    /// contrast `c`.
+    /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a
+    /// snapshot's frames at a pixel, with the cosines `Psi` of the DCT-II, and `s = static_variance min((10 /
+    /// B)^0.5, (c / 0.125)^1.5)` of the masks' contrast `c`.
     ///
     /// Where masks are alike a measurement says well what all frames have in common, and hardly what changes from
     /// one to the next: so this is where the error is, slow changes first. The projection along the masks
@@ -301,15 +301,16 @@ struct Stack {
     frames: usize,
 }
 
-/// The most that a frame may take against the correction of a measured pixel, as a share of it. A covariance lets a residual raise
-/// frames whose masks are more open than others, and lower the rest. Where a prior takes the error of some frames out
-/// and leaves that of others as it is, the error `e` left is multiplied by `1 - sum c d / (C R C^T)` over the frames that
-/// keep it, each time: if `c d < 0` there, it grows. Behind masks that are much alike single pixels of still fine texture came to
-/// values of -6 and 9 that way, for a loss of up to 11 dB.
+/// The most that a frame may take against the correction of a measured pixel, as a share of it. A covariance
+/// lets a residual raise frames whose masks are more open than others, and lower the rest. Where a prior
+/// takes the error of some frames out and leaves that of others as it is, the error `e` left is multiplied by
+/// `1 - sum c d / (C R C^T)` over the frames that keep it, each time: if `c d < 0` there, it grows. Behind
+/// masks that are much alike single pixels of still fine texture came to values of -6 and 9 that way, for a
+/// loss of up to 11 dB.
 const AGAINST: f32 = 0.02;
 
-/// `R C` \[B,W\] of a row, no product with `C` below [`AGAINST`] of their sum, and its `(H R H^T + gamma)^-1` \[W\] from
-/// `(H H^T)^-1`, with the bound of [`invert`] in it; 0 where that is 0.
+/// `R C` \[B,W\] of a row, no product with `C` below [`AGAINST`] of their sum, and its `(H R H^T + gamma)^-1`
+/// \[W\] from `(H H^T)^-1`, with the bound of [`invert`] in it; 0 where that is 0.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn directions_of_row(
     (masks, stack): (&[f32], Stack),

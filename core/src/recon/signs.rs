@@ -1,11 +1,12 @@
 //! What pixels that the solver did not see tell of the error of its frames.
 //!
-//! At a held-out pixel `y - Hv = sum_k C_k e_k + n` of the frames' errors `e` and the noise `n`. The pixel's masks had no
-//! part in `v`, so that `E (y - Hv)^2 = a S + b D + sigma^2`, with the variances `a` of what the errors have in common
-//! and `b` of their changes (cosines along time), and the gram's two parts, `S` of what the masks have in common and
-//! `D`. These parts differ from pixel to pixel: a fit tells `a`, `b` and `sigma^2` apart, and `(a + (B - 1) b) / B` is the
-//! mean squared error of the frames. Errors are larger in some places than in others, so `a` and `b` are multiples of
-//! what is seen nearby: of the residuals of other held-out pixels, and of the frames' texture and motion.
+//! At a held-out pixel `y - Hv = sum_k C_k e_k + n` of the frames' errors `e` and the noise `n`. The pixel's
+//! masks had no part in `v`, so that `E (y - Hv)^2 = a S + b D + sigma^2`, with the variances `a` of what the
+//! errors have in common and `b` of their changes (cosines along time), and the gram's two parts, `S` of what
+//! the masks have in common and `D`. These parts differ from pixel to pixel: a fit tells `a`, `b` and
+//! `sigma^2` apart, and `(a + (B - 1) b) / B` is the mean squared error of the frames. Errors are larger in
+//! some places than in others, so `a` and `b` are multiples of what is seen nearby: of the residuals of other
+//! held-out pixels, and of the frames' texture and motion.
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
@@ -44,9 +45,9 @@ const QUIET: f64 = 0.2;
 const STEPS: usize = 150;
 
 impl Signs {
-    /// Of one snapshot `y` \[1,H,W\] at the pixels that were held out of its reconstruction: `early` are the frames
-    /// \[B,H,W\] after the first stage, `last` those at its end, all on the scale on which the scene is on \[0,1\]. None if
-    /// no pixel was held out.
+    /// Of one snapshot `y` \[1,H,W\] at the pixels that were held out of its reconstruction: `early` are the
+    /// frames \[B,H,W\] after the first stage, `last` those at its end, all on the scale on which the scene
+    /// is on \[0,1\]. None if no pixel was held out.
     pub(super) fn of(
         (op, y): (&SensingOperator, ArrayView3<'_, f32>),
         held_out: &HeldOut,
@@ -126,8 +127,8 @@ fn nearby(held_out: &HeldOut, residuals: &[f64]) -> Vec<f64> {
     scaled(held_out.pixels.iter().enumerate().map(around))
 }
 
-/// Squared steps from pixel to pixel and from frame to frame, in the mean over the frames and a square around each pixel
-/// \[H,W\].
+/// Squared steps from pixel to pixel and from frame to frame, in the mean over the frames and a square around
+/// each pixel \[H,W\].
 fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
     let (count, height, width) = frames.dim();
     let mut steps = Array2::<f64>::zeros((height, width));
@@ -158,8 +159,9 @@ fn extremes(texture: &[f64], squares: &[f64]) -> [f64; 2] {
     [mean(&order[..count]), mean(&order[order.len() - count..])]
 }
 
-/// The factors, none below 0, of parts whose sum is the expectation of each square: the most likely ones where these are
-/// squares of Gaussian numbers, by multiplicative steps (Févotte, Bertin and Durrieu, Neural Computation 2009).
+/// The factors, none below 0, of parts whose sum is the expectation of each square: the most likely ones
+/// where these are squares of Gaussian numbers, by multiplicative steps (Févotte, Bertin and Durrieu, Neural
+/// Computation 2009).
 fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
     let mean = squares.iter().sum::<f64>() / squares.len() as f64;
     let all = parts.iter().flatten().sum::<f64>() / squares.len() as f64;

@@ -110,7 +110,8 @@ struct Span {
 
 impl TilePlan {
     /// Cuts `height` x `width` pixels into as few tiles of at most `size` x `size` as share at least
-    /// `overlap` pixels with each neighbour, and makes these tiles as small as that allows. A side that fits into one tile is not cut.
+    /// `overlap` pixels with each neighbour, and makes these tiles as small as that allows. A side that fits
+    /// into one tile is not cut.
     /// Errors: `size` below 16 or above 8192, or `overlap` of more than half of `size`.
     pub fn new(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
         if height == 0 || width == 0 {

@@ -44,8 +44,8 @@ pub struct Arguments {
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for NAME.npy [features, the encoder's channels (if a network had a part), and the true error; frame, block] and
-    /// NAME.json.
+    /// Folder for NAME.npy [features, the encoder's channels (if a network had a part), and the true error;
+    /// frame, block] and NAME.json.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
 }

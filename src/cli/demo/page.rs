@@ -29,8 +29,8 @@ pub(super) struct Made {
     pub(super) movie: String,
 }
 
-/// Writes `report.html` and its pictures: the measurement, the movies, and of the middle frame the truth, what came of it, and
-/// the difference.
+/// Writes `report.html` and its pictures: the measurement, the movies, and of the middle frame the truth,
+/// what came of it, and the difference.
 pub(super) fn write(out: &Path, truth: &Array3<f32>, made: &[Made], report: &Report) -> Result<()> {
     let folder = out.join(PICTURES);
     let unwritable = |path: &Path, error| CliError::file("write", path, &error);

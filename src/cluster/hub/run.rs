@@ -25,8 +25,8 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// Starts to hand tiles out to workers that are `program`, as soon as the message server answers. A message is delivered again when
-    /// its worker was silent for `ack_wait`.
+    /// Starts to hand tiles out to workers that are `program`, as soon as the message server answers. A
+    /// message is delivered again when its worker was silent for `ack_wait`.
     #[must_use]
     pub fn start(store: Store, access: Access, program: Program, ack_wait: Duration) -> Self {
         let mut running = JoinSet::new();

@@ -1,4 +1,5 @@
-//! Results in the forms of other programs, made as they are read, so that nothing of them lies on the disk; but for movies, which take too long.
+//! Results in the forms of other programs, made as they are read, so that nothing of them lies on the disk;
+//! but for movies, which take too long.
 
 mod archive;
 mod clip;

@@ -224,8 +224,8 @@ pub trait Denoiser {
 
 /// A loaded network that tells what blocks of frames look like.
 pub trait Encoder {
-    /// What it sees of each block of [`BLOCK`] x [`BLOCK`] pixels \[[`CHANNELS`], B, rows, columns\] of frames \[B,H,W\] on the \[0,1\] scale.
-    /// Blocks at the far edges are filled up with mirrored pixels.
+    /// What it sees of each block of [`BLOCK`] x [`BLOCK`] pixels \[[`CHANNELS`], B, rows, columns\] of
+    /// frames \[B,H,W\] on the \[0,1\] scale. Blocks at the far edges are filled up with mirrored pixels.
     fn encode(&mut self, frames: ArrayView3<'_, f32>) -> Result<Array4<f32>>;
 }
 

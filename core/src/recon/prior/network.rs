@@ -231,7 +231,8 @@ fn unpad_frame(padded: &[f32], columns: usize, mut frame: ArrayViewMut2<'_, f32>
     }
 }
 
-/// One block over a clip of `rows` x `columns` pixels, so many frames at a time, with so many values of output for each.
+/// One block over a clip of `rows` x `columns` pixels, so many frames at a time, with so many values of
+/// output for each.
 fn run_chunked(
     block: &mut ClipNetwork,
     (input, output): (&[f32], &mut [f32]),

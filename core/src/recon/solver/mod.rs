@@ -100,8 +100,8 @@ pub struct Outcome {
 /// scene is on \[0,1\]. The priors see the frames of all snapshots as one clip; each measured pixel
 /// stays tied to its own `B`.
 ///
-/// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total
-/// variation and the learned denoiser costs what the acceleration gained. Networks are asked for when a stage needs them.
+/// Starts from `v = 0`, `y1 = 0`. `y1` is kept through all stages: resetting it between total variation and
+/// the learned denoiser costs what the acceleration gained. Networks are asked for when a stage needs them.
 /// Errors: sizes that disagree, an invalid schedule, a missing or failing network, divergence, or
 /// [`ReconError::Cancelled`] when the observer says so.
 pub fn reconstruct(
@@ -114,8 +114,8 @@ pub fn reconstruct(
     stages((op, y), schedule, networks, observer, |_, _| ())
 }
 
-/// As [`reconstruct`], with what an [`assessment`] sees of the frames; with that of the encoder where a network has had a
-/// part in them.
+/// As [`reconstruct`], with what an [`assessment`] sees of the frames; with that of the encoder where a
+/// network has had a part in them.
 pub fn reconstruct_assessed(
     op: &SensingOperator,
     y: ArrayView3<'_, f32>,
@@ -434,7 +434,8 @@ mod reference {
             x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
         }
 
-        /// `P(w)` along the masks, or along `R C` (an orthogonal cosine at a time; bounded), with the target `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
+        /// `P(w)` along the masks, or along `R C` (an orthogonal cosine at a time; bounded), with the target
+        /// `y`, or, accelerated, `y1 = y + memory (y1 - H w)`.
         pub(super) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
             let plane = self.masks.dim().1 * self.masks.dim().2;
             let stage = &self.schedule.stages[0];

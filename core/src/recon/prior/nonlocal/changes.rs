@@ -1,7 +1,8 @@
 //! Shrinkage of what changes along time.
 //!
-//! A group of patches in fine texture spans all directions, so that its filter passes everything, also what differs from frame to
-//! frame where nothing moves. Along time alone such differences are told from motion: they are weak in each frequency.
+//! A group of patches in fine texture spans all directions, so that its filter passes everything, also what
+//! differs from frame to frame where nothing moves. Along time alone such differences are told from motion:
+//! they are weak in each frequency.
 
 use std::f32::consts::PI;
 
@@ -38,9 +39,9 @@ impl Changes {
         Self { frames, height, width, cosines, rows: ring, squares, excess }
     }
 
-    /// Each coefficient becomes `g` times itself with `g = e^2 / (e^2 + level^4)`, where `e` is the mean of its square over
-    /// 5x5 pixels, cut at the edges. `level` is above 0. Frames lie one after the other in `clip`, row by row, each row of `row_length` or, with its
-    /// margin, more.
+    /// Each coefficient becomes `g` times itself with `g = e^2 / (e^2 + level^4)`, where `e` is the mean of
+    /// its square over 5x5 pixels, cut at the edges. `level` is above 0. Frames lie one after the other in
+    /// `clip`, row by row, each row of `row_length` or, with its margin, more.
     pub(super) fn shrink(&mut self, clip: &mut [f32], row_length: usize, level: f32) {
         let Self { frames, height, width, .. } = *self;
         let (plane, changes) = (height * row_length, frames.saturating_sub(1));

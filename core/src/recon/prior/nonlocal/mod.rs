@@ -75,9 +75,10 @@ impl Pass for Nonlocal {
 const REFRESH: usize = 4;
 /// `tau` in units of `PATCHES sigma^2`, the eigenvalue that noise alone would have.
 const STRENGTH: f32 = 4.0;
-/// How far a pixel may lie outside the range of the eight around it, in units of `sigma`. A group takes a single
-/// pixel far from all others for a direction of its own, which it keeps whole; so nothing would ever take it out again, and behind
-/// masks that are much alike, where a projection does not hold a single frame, such specks grow.
+/// How far a pixel may lie outside the range of the eight around it, in units of `sigma`. A group takes a
+/// single pixel far from all others for a direction of its own, which it keeps whole; so nothing would ever
+/// take it out again, and behind masks that are much alike, where a projection does not hold a single frame,
+/// such specks grow.
 const OUTSIDE: f32 = 4.0;
 
 /// The prior with its groups and working memory, for clips of one size.
@@ -123,8 +124,9 @@ impl Nonlocal {
         }
     }
 
-    /// Removes noise of level `sigma` from frames \[B,H,W\] on \[0,1\], in place, after changes along time have been
-    /// shrunk at the level of `shrinkage` times `sigma`, where that is not 0. Frames smaller than a patch (6x6) are left as they are.
+    /// Removes noise of level `sigma` from frames \[B,H,W\] on \[0,1\], in place, after changes along time
+    /// have been shrunk at the level of `shrinkage` times `sigma`, where that is not 0. Frames smaller than a
+    /// patch (6x6) are left as they are.
     ///
     /// Passes of one object belong to one clip: patches are compared in the result of the pass
     /// before, and the groups are kept for a few passes.
@@ -165,8 +167,8 @@ impl Nonlocal {
     }
 }
 
-/// Copies a frame \[H,W\], at least 2x2, into rows of its width or more; a pixel that lies further than `margin` outside the
-/// range of the eight around it, as far as that. At its edges the frame is reflected.
+/// Copies a frame \[H,W\], at least 2x2, into rows of its width or more; a pixel that lies further than
+/// `margin` outside the range of the eight around it, as far as that. At its edges the frame is reflected.
 fn without_specks<'a>(
     frame: ArrayView2<'_, f32>,
     margin: f32,

@@ -15,8 +15,9 @@ pub(super) const ROWS: usize = 8;
 const KEPT: usize = 128;
 
 /// Finds the patches most similar to each reference patch, near it in space and time, and counts how many
-/// cover a pixel; the grid of references depends on the number of searches before. Of patches equally similar those that come first in the clip are taken; of a group they are
-/// in the clip's order, which does not depend on how they were found.
+/// cover a pixel; the grid of references depends on the number of searches before. Of patches equally similar
+/// those that come first in the clip are taken; of a group they are in the clip's order, which does not
+/// depend on how they were found.
 #[inline(always)]
 pub(super) fn search<S: Simd>(
     simd: S,
