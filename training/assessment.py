@@ -27,6 +27,9 @@ SIGMAS = 0, 0, 0, 2, 5, 10
 # Pixels a frame. At rest and fast most: there the pilot shrinks most of what changes, and has to be told right from wrong.
 SPEEDS = 0, 0, 0, .3, 1, 2, 4, 7, 7, 7
 ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
+# The models of results: of which algorithm, and whether changes along time were shrunk by more than SHRUNK, as the program has it.
+MODELS = {'gap-tv': ('gap-tv', False), 'pnp-tv-fastdvdnet': ('pnp-tv-fastdvdnet', False), 'pnp-tv-fastdvdnet, shrunk': ('pnp-tv-fastdvdnet', True)}
+SHRUNK = 1.0
 FEATURES = 26       # as the program has them; what follows is what its encoder sees
 FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
@@ -144,6 +147,9 @@ class Case:
         self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
         self.piece = torch.tensor(evidence['features'], dtype=torch.float32)
         self.pattern = about['setting']['pattern']
+        # The default's pilot shrinks changes along time; gap-tv has none.
+        stages = about['pilot']['stages'] if about.get('pilot') else []
+        self.shrunk = any(stage.get('temporal_shrinkage', 0) > SHRUNK for stage in stages)
 
     def psnr_of(self, errors):
         """Of the decimal logarithms of the errors of blocks, as many of each frame."""
@@ -258,13 +264,19 @@ def fit(a):
     if a.write and os.path.exists(a.write):
         with open(a.write) as f:
             models = json.load(f)
-    for algorithm in [a.algorithm] if a.algorithm else ALGORITHMS:
+    for name in [a.model] if a.model else MODELS:
+        algorithm, shrunk = MODELS[name]
         cases = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))]
+        cases = [case for case in cases if case.shrunk == shrunk]
+        if not cases:
+            raise SystemExit(f'{a.out} has no cases for the model of {name}')
+        # Those that were shrunk are few: their model may go on from that of the others.
+        known = start and start.get(name, start[algorithm])
         names = sorted({case.scene for case in cases})
         fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
         for k in range(a.folds):
-            model = Model([case for case in cases if fold[case.scene] != k], a, start and start[algorithm])
+            model = Model([case for case in cases if fold[case.scene] != k], a, known)
             for index, case in enumerate(cases):
                 if fold[case.scene] == k:
                     errors, psnr = model(case)
@@ -279,7 +291,7 @@ def fit(a):
         for k in (0, 1):
             low, high = ends(half != k)
             inside[half == k] = (wrong[half == k] >= low) & (wrong[half == k] <= high)
-        print(f'{algorithm}: {len(cases)} cases of {len(names)} scenes; error {np.abs(wrong).mean():.2f} dB in the mean, 80 % within {np.quantile(np.abs(wrong), .8):.2f}, '
+        print(f'{name}: {len(cases)} cases of {len(names)} scenes; error {np.abs(wrong).mean():.2f} dB in the mean, 80 % within {np.quantile(np.abs(wrong), .8):.2f}, '
               f'{100 * np.mean(np.abs(wrong) < 1.5):.0f} % within 1.5; interval {ends(slice(None)).round(2)}, held by {100 * inside.mean():.0f} % left out; '
               f'correlation of the map {np.nanmedian(spread):.2f}')
         kinds = {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
@@ -289,7 +301,7 @@ def fit(a):
             if of.any():
                 print(f'  {kind}: {of.sum()} cases, {np.abs(wrong[of]).mean():.2f} dB, {100 * np.mean(np.abs(wrong[of]) < 1.5):.0f} % within 1.5, '
                       f'{100 * inside[of].mean():.0f} % in the interval')
-        models[algorithm] = Model(cases, a, start and start[algorithm]).record() | {'interval': [round(float(end), 2) for end in ends(slice(None))]}
+        models[name] = Model(cases, a, known).record() | {'interval': [round(float(end), 2) for end in ends(slice(None))]}
     if a.write:
         with open(a.write, 'w') as f:
             json.dump(models, f)
@@ -310,7 +322,8 @@ def main():
     p.add_argument('--epochs', type=int, default=24)
     p.add_argument('--start', help='a file of models to go on from, where the cases are few')
     p.add_argument('--rate', type=float, default=5e-3, help='the highest rate of learning; less to go on from a model')
-    p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this one alone, or fit it alone')
+    p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this one alone')
+    p.add_argument('--model', choices=MODELS, help='fit this one alone')
     p.add_argument('--folds', type=int, default=5, help='as many parts are left out, one after the other')
     p.add_argument('--networks', type=int, default=3, help='whose mean is taken; with --start as many as the file has')
     a = p.parse_args()

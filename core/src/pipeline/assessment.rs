@@ -128,7 +128,7 @@ pub fn expected(
     };
     let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
     let end = |further: f64| (psnr_db + further).min(BEST);
-    let (low, high) = (end(model.interval[0]), end(model.interval[1]));
+    let [low, high] = model.interval.map(end);
     let error = squares.mapv(|square| (square.sqrt() * white) as f32);
     let psnr_db = psnr_db.min(BEST);
     let mut reasons = reasons(&error, (psnr_db, white), warnings);

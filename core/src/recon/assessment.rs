@@ -337,7 +337,8 @@ pub struct Model {
     /// Of results that a network has had a part in.
     encoding: Option<Encoding>,
     networks: Vec<Vec<Layer>>,
-    /// What is added to the predicted PSNR for the ends of its interval, in dB.
+    /// What is added to the predicted PSNR for the ends of the interval in which four of five true values lie,
+    /// in dB.
     pub interval: [f64; 2],
 }
 
@@ -362,6 +363,10 @@ struct Layer {
     bias: Vec<f32>,
 }
 
+/// Shrinkage along time, in units of `sigma`, above which frames have a model of their own: where masks are much
+/// alike, motion that was shrunk away may leave nothing behind that looks wrong.
+const SHRUNK: f32 = 1.0;
+
 /// Inputs further from the mean than in any fit, in their scale, count as that far.
 const FARTHEST: f32 = 3.0;
 
@@ -372,8 +377,9 @@ static MODELS: LazyLock<BTreeMap<String, Model>> = LazyLock::new(|| {
 });
 
 impl Model {
-    /// The model that was fitted to results of such schedules, if there is one: of total variation alone, or of
-    /// total variation with what may follow in the default schedule.
+    /// The model that was fitted to results of such schedules, as they were run, if there is one: of total
+    /// variation alone, or of total variation with what may follow in the default schedule, little shrunk along
+    /// time or much.
     pub fn of(schedule: &Schedule) -> Option<&'static Self> {
         if schedule.method != Method::Gap {
             return None;
@@ -382,9 +388,13 @@ impl Model {
         let known = |stage: &Stage| {
             ["fastdvdnet", "fastdvdnet-int8", "nonlocal"].contains(&stage.prior.name())
         };
+        let shrunk = |stage: &Stage| stage.temporal_shrinkage.is_some_and(|level| level > SHRUNK);
         let rest = &schedule.stages[1..];
         match (first, rest.iter().all(known), rest.is_empty()) {
             ("tv", true, true) => MODELS.get("gap-tv"),
+            ("tv", true, false) if rest.iter().any(shrunk) => {
+                MODELS.get("pnp-tv-fastdvdnet, shrunk")
+            }
             ("tv", true, false) => MODELS.get("pnp-tv-fastdvdnet"),
             _ => None,
         }
@@ -576,7 +586,7 @@ mod tests {
 
     #[test]
     fn results_of_known_schedules_have_a_model_and_no_others() {
-        assert_eq!(MODELS.len(), 2);
+        assert_eq!(MODELS.len(), 3);
         let has = |schedule: Schedule| Model::of(&schedule).is_some();
         assert!(has(Schedule::gap_tv()) && has(Schedule::pnp_tv_fastdvdnet()));
         assert!(!has(Schedule::admm_tv()) && !has(Schedule::pnp_ffdnet()));
@@ -609,6 +619,16 @@ mod tests {
             }
             assert!(model.interval[0] < 0.0 && model.interval[1] > 0.0);
         }
+    }
+
+    #[test]
+    fn frames_whose_changes_were_shrunk_far_have_a_model_of_their_own() {
+        let mut schedule = Schedule::pnp_tv_fastdvdnet();
+        let low = |schedule: &Schedule| Model::of(schedule).unwrap().interval[0];
+        let planned = low(&schedule);
+        let stage = schedule.stages.last_mut().unwrap();
+        stage.temporal_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
+        assert!(low(&schedule) < planned, "it knows less");
     }
 
     #[test]
