@@ -539,6 +539,7 @@ mod tests {
     use crate::recon::prior::{Denoiser, Network, Networks};
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::SensingOperator;
+    use crate::recon::solver::{Control, Observer, Progress};
     use ndarray::{Array2, Array3, Axis, s};
     use rand::{Rng, SeedableRng};
     use std::ops::Range;
@@ -678,6 +679,29 @@ mod tests {
         let still = found(Array3::from_shape_fn((6, 64, 64), |(_, i, j)| texture[[i, j]]));
         let moving = found(Array3::from_shape_fn((6, 64, 64), |(k, i, j)| wave(i + 2 * k, j)));
         assert!(still >= 4.0 * planned && moving <= planned, "{still} {moving}");
+    }
+
+    #[test]
+    fn a_variant_that_is_clearly_behind_is_given_up() {
+        struct Steps(usize);
+        impl Observer for Steps {
+            fn iteration(&mut self, progress: &Progress) -> Control {
+                self.0 += usize::from(progress.stage == 1);
+                Control::Continue
+            }
+        }
+        let masks = iid_masks(6, 64, 64, 3).unwrap();
+        let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
+            0.5 + 0.4 * ((i + 2 * k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+        });
+        let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+        let op = SensingOperator::new(masks).unwrap();
+        let mut schedule = Schedule::pnp_nonlocal();
+        schedule.stages[1].iterations = 20;
+        schedule.stages[1].static_variance = None;
+        let mut steps = Steps(0);
+        run(&op, y.view(), &schedule, &mut (), &mut steps).unwrap();
+        assert_eq!(steps.0, 40, "the plan, half of four times the shrinkage, and half of none");
     }
 
     #[test]
