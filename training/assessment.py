@@ -149,7 +149,7 @@ class Case:
         self.pattern = about['setting']['pattern']
         # The default's pilot shrinks changes along time; gap-tv has none.
         stages = about['pilot']['stages'] if about.get('pilot') else []
-        self.shrunk = any(stage.get('temporal_shrinkage', 0) > SHRUNK for stage in stages)
+        self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
 
     def psnr_of(self, errors):
         """Of the decimal logarithms of the errors of blocks, as many of each frame."""

@@ -44,6 +44,7 @@ impl PilotRecord {
             iterations: stage.iterations,
             temporal_weight: stage.temporal_weight,
             temporal_shrinkage: stage.temporal_shrinkage,
+            rest_shrinkage: stage.rest_shrinkage,
             static_variance: stage.static_variance,
             gamma: stage.gamma,
         };
@@ -91,6 +92,9 @@ pub struct StageRecord {
     /// The one that pays; 0 if none does.
     #[serde(default)]
     pub temporal_shrinkage: f32,
+    /// The same where nothing moves, if four times as much or more pays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rest_shrinkage: Option<f32>,
     /// Static variance of the projection that was asked for; none if it was not.
     #[serde(default)]
     pub planned_static_variance: Option<f32>,
@@ -120,12 +124,14 @@ impl StageRecord {
                 0.0 => "shrinkage along time left out".into(),
                 shrinkage => format!("shrinkage along time {shrinkage}"),
             });
+        let rest =
+            self.rest_shrinkage.map(|level| format!("shrinkage where nothing moves {level}"));
         let variance = self.planned_static_variance.map(|_| match self.static_variance {
             Some(variance) => format!("static variance {variance}"),
             None => "static variance left out".into(),
         });
         let noise = self.gamma.map(|gamma| format!("noise term {gamma}"));
-        along_time.into_iter().chain(changes).chain(variance).chain(noise).collect()
+        along_time.into_iter().chain(changes).chain(rest).chain(variance).chain(noise).collect()
     }
 }
 

@@ -388,7 +388,10 @@ impl Model {
         let known = |stage: &Stage| {
             ["fastdvdnet", "fastdvdnet-int8", "nonlocal"].contains(&stage.prior.name())
         };
-        let shrunk = |stage: &Stage| stage.temporal_shrinkage.is_some_and(|level| level > SHRUNK);
+        let shrunk = |stage: &Stage| {
+            let most = stage.rest_shrinkage.or(stage.temporal_shrinkage);
+            most.is_some_and(|level| level > SHRUNK)
+        };
         let rest = &schedule.stages[1..];
         match (first, rest.iter().all(known), rest.is_empty()) {
             ("tv", true, true) => MODELS.get("gap-tv"),
@@ -627,7 +630,7 @@ mod tests {
         let low = |schedule: &Schedule| Model::of(schedule).unwrap().interval[0];
         let planned = low(&schedule);
         let stage = schedule.stages.last_mut().unwrap();
-        stage.temporal_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
+        stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
         assert!(low(&schedule) < planned, "it knows less");
     }
 

@@ -18,6 +18,7 @@ pub mod motion;
 pub mod pilot;
 pub mod preview;
 pub mod prior;
+mod rest;
 pub mod scale;
 pub mod schedule;
 pub mod sensing;

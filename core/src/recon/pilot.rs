@@ -37,6 +37,11 @@ const CHANCE: f64 = 1.5;
 /// iterations on, is given up then.
 const CLEAR: f64 = 2.0;
 
+/// Below this correlation of their changes along time, frames that were shrunk much and those that were not
+/// have no motion in common: what changed was not in the scene. Of 224 simulated scenes
+/// (`docs/benchmarks.md`) 27 of 33 at rest are below it, and 8 of 191 others.
+const MOTION: f64 = 0.45;
+
 /// Side in pixels of the squares over which a scene without texture and motion is even.
 const EVEN: usize = 8;
 
@@ -86,6 +91,8 @@ pub struct StageFinding {
     pub temporal_weight: f32,
     /// Shrinkage of changes along time, if any pays; else 0.
     pub temporal_shrinkage: f32,
+    /// The same where nothing moves, if four times as much or more pays, in a stage that is not ended early.
+    pub rest_shrinkage: Option<f32>,
     /// Static variance of the projection, if one pays.
     pub static_variance: Option<f32>,
     /// Noise term of the projection, where it is not the schedule's.
@@ -134,14 +141,15 @@ pub fn run(
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = run.state();
-        let mut course = watch.stage(stage, None, &mut run)?;
+        let once = Stage { rest_shrinkage: None, ..stage.clone() };
+        let mut course = watch.stage(&once, None, &mut run)?;
         for variant in VARIANTS {
-            let Some(variant) = variant(&op, stage, &course) else { continue };
+            let Some(variant) = variant(&op, &once, &course) else { continue };
             let end = run.state();
             run.restore(start.clone());
             let found = watch.stage(&variant, Some(&course), &mut run)?;
             if found.surpasses(&course) {
-                course = found;
+                course = Course { at_rest: course.at_rest || found.stills(&course), ..found };
             } else {
                 course.last_given_up = found.given_up;
                 run.restore(end);
@@ -314,6 +322,8 @@ struct Course {
     given_up: bool,
     /// Whether the last variant was given up for it.
     last_given_up: bool,
+    /// Whether shrinkage has left little of what changed.
+    at_rest: bool,
 }
 
 impl Course {
@@ -345,14 +355,27 @@ impl Course {
         self.errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1)
     }
 
+    fn shrinkage(&self) -> f32 {
+        self.stage.temporal_shrinkage.unwrap_or(0.0)
+    }
+
+    /// Whether it has four times the shrinkage of another, and little of what changed there.
+    fn stills(&self, other: &Self) -> bool {
+        let (own, others) = (self.shrinkage(), other.shrinkage());
+        let fourfold = others > 0.0 && own >= 4.0 * others;
+        let frames = self.best.as_ref().zip(other.best.as_ref()).filter(|_| fourfold);
+        frames.is_some_and(|(own, others)| correlation_of_changes(own, others) < MOTION)
+    }
+
     /// Whether its least error is below that of another by more than chance: by more than the standard error of
     /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more
     /// than it counts in the frames: so for another one the difference must be twice as clear. What fourfold
     /// shrinkage of changes spares a scene at rest hardly shows in a measurement, but what it costs a moving
-    /// one does: there half as clear will do. For less it takes more: pixels that are held out have what
-    /// changes from their neighbours, and lose by shrinkage what the others keep.
+    /// one does: there half as clear will do; where it has left little of what changed, it is enough not to be
+    /// clearly worse, and then for still more, to be better. For less it takes more: pixels that are held out
+    /// have what changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.given_up {
             return false;
@@ -361,12 +384,15 @@ impl Course {
         if own_squares.is_empty() || others_squares.is_empty() {
             return self.least() < other.least();
         }
-        let shrinkage = |course: &Self| course.stage.temporal_shrinkage.unwrap_or(0.0);
-        let (own, others) = (shrinkage(self), shrinkage(other));
+        let (own, others) = (self.shrinkage(), other.shrinkage());
         let errors = if self.stage.static_variance != other.stage.static_variance {
             2.0
         } else if own < others {
             2.5
+        } else if self.stills(other) {
+            -1.5
+        } else if own > others && other.at_rest {
+            0.0
         } else if others > 0.0 && own >= 4.0 * others {
             0.5
         } else {
@@ -384,6 +410,22 @@ fn excess(one: &[f64], other: &[f64]) -> f64 {
     let mean = differences().sum::<f64>() / count;
     let variance = differences().map(|difference| (difference - mean).powi(2)).sum::<f64>() / count;
     if variance > 0.0 { mean / (variance / count).sqrt() } else { 0.0 }
+}
+
+/// The correlation of what differs from the mean over time in frames \[B,H,W\] and in others; 0 where nothing
+/// does.
+fn correlation_of_changes(one: &Array3<f32>, other: &Array3<f32>) -> f64 {
+    let (mut product, mut squares) = (0.0, (0.0, 0.0));
+    for (one, other) in one.lanes(Axis(0)).into_iter().zip(other.lanes(Axis(0))) {
+        let (means, count) = ((one.sum(), other.sum()), one.len() as f32);
+        for (one, other) in one.iter().zip(other) {
+            let (one, other) = (one - means.0 / count, other - means.1 / count);
+            product += f64::from(one * other);
+            squares.0 += f64::from(one * one);
+            squares.1 += f64::from(other * other);
+        }
+    }
+    if product == 0.0 { 0.0 } else { product / (squares.0 * squares.1).sqrt() }
 }
 
 /// Ends the last stage with a level where its own error is about least. Those before it run as planned: what
@@ -408,8 +450,12 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
         };
         let after = errors[..done].last().copied().unwrap_or(before);
         let temporal_weight = course.and_then(|course| course.stage.temporal_weight).unwrap_or(0.0);
-        let temporal_shrinkage =
-            course.and_then(|course| course.stage.temporal_shrinkage).unwrap_or(0.0);
+        let shrinkage = course.map_or(0.0, Course::shrinkage);
+        // Something may move elsewhere in the picture; what, the first iterations don't tell.
+        let planned = stage.temporal_shrinkage.unwrap_or(0.0);
+        let fourfold = planned > 0.0 && shrinkage >= 4.0 * planned;
+        let rest_shrinkage = (fourfold && 2 * done >= stage.iterations).then_some(shrinkage);
+        let temporal_shrinkage = if rest_shrinkage.is_some() { planned } else { shrinkage };
         let static_variance = course.and_then(|course| course.stage.static_variance);
         let gamma = course.and_then(|course| course.stage.gamma);
         let before = std::mem::replace(&mut before, after);
@@ -417,6 +463,7 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
             iterations,
             temporal_weight,
             temporal_shrinkage,
+            rest_shrinkage,
             static_variance,
             gamma,
             before,
@@ -436,6 +483,8 @@ pub struct Decision {
     pub temporal_weight: f32,
     /// Its shrinkage of changes along time; 0 for none.
     pub temporal_shrinkage: f32,
+    /// The same where nothing moves, if it is another.
+    pub rest_shrinkage: Option<f32>,
     /// The static variance of its projection.
     pub static_variance: Option<f32>,
     /// The noise term of its projection.
@@ -455,6 +504,7 @@ impl Schedule {
                 iterations,
                 temporal_weight: positive(temporal_weight),
                 temporal_shrinkage: positive(temporal_shrinkage),
+                rest_shrinkage: decision.rest_shrinkage,
                 static_variance: decision.static_variance,
                 gamma: decision.gamma,
                 sigma,
@@ -494,6 +544,7 @@ impl Watch<'_, '_> {
             diverged: false,
             given_up: false,
             last_given_up: false,
+            at_rest: false,
         };
         let (mut least, norm) = (f64::INFINITY, self.held_out.norm(self.y));
         run.enter(stage);
@@ -533,11 +584,11 @@ impl Watch<'_, '_> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Decision, StageEnd, StageFinding, piece, run};
+    use super::{Course, Decision, StageEnd, StageFinding, piece, run};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
     use crate::recon::prior::{Denoiser, Network, Networks};
-    use crate::recon::schedule::Schedule;
+    use crate::recon::schedule::{Schedule, Stage};
     use crate::recon::sensing::SensingOperator;
     use crate::recon::solver::{Control, Observer, Progress};
     use ndarray::{Array2, Array3, Axis, s};
@@ -591,6 +642,7 @@ mod tests {
             iterations,
             temporal_weight: 0.0,
             temporal_shrinkage: 0.0,
+            rest_shrinkage: None,
             static_variance: None,
             gamma: None,
         }
@@ -674,11 +726,46 @@ mod tests {
         let wave = |i: usize, j: usize| 0.5 + 0.4 * (i as f32 * 0.3).sin() * (j as f32 * 0.2).cos();
         let found = |truth: Array3<f32>| {
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
-            run(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().0[1].temporal_shrinkage
+            let found = run(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().0[1];
+            found.rest_shrinkage.unwrap_or(found.temporal_shrinkage)
         };
         let still = found(Array3::from_shape_fn((6, 64, 64), |(_, i, j)| texture[[i, j]]));
         let moving = found(Array3::from_shape_fn((6, 64, 64), |(k, i, j)| wave(i + 2 * k, j)));
         assert!(still >= 4.0 * planned && moving <= planned, "{still} {moving}");
+    }
+
+    /// A course whose four frames change by `changes`, and whose error at the held-out pixels is `behind`
+    /// standard errors greater than that of one of another `side`.
+    fn course(shrinkage: f32, changes: [f32; 4], (side, behind): (usize, f64)) -> Course {
+        let planned = Schedule::pnp_nonlocal().stages[1].clone();
+        let square = |pixel: usize| ((pixel + side) % 2) as f64 + behind / 10.0;
+        Course {
+            stage: Stage { temporal_shrinkage: Some(shrinkage), ..planned },
+            errors: vec![1.0],
+            squares: vec![(0..100).map(square).collect()],
+            best: Some(Array3::from_shape_fn((4, 8, 8), |(k, i, _)| i as f32 + changes[k])),
+            diverged: false,
+            given_up: false,
+            last_given_up: false,
+            at_rest: false,
+        }
+    }
+
+    #[test]
+    fn changes_of_which_shrinkage_leaves_nothing_were_no_motion() {
+        let planned = course(0.35, [1.0, -1.0, 1.0, -1.0], (0, 0.0));
+        let fourfold = |changes, behind| course(1.4, changes, (1, behind));
+        let (others, fewer) = ([0.1, 0.1, -0.1, -0.1], [0.1, -0.1, 0.1, -0.1]);
+        assert!(fourfold(others, 1.0).surpasses(&planned), "what changed was not in the scene");
+        assert!(fourfold([0.0; 4], 1.0).surpasses(&planned), "nothing is left");
+        assert!(!fourfold(others, 2.0).surpasses(&planned), "it is clearly worse");
+        assert!(!fourfold(fewer, 1.0).surpasses(&planned), "what is left was there before");
+        // For still more shrinkage it is enough to be better.
+        let taken = Course { at_rest: true, ..fourfold(others, 1.0) };
+        let eightfold = |behind| course(2.8, [0.0; 4], (0, behind));
+        assert!(eightfold(0.5).surpasses(&taken) && !eightfold(1.5).surpasses(&taken));
+        let moving = Course { at_rest: false, ..taken };
+        assert!(!eightfold(0.5).surpasses(&moving), "by more than chance where something moves");
     }
 
     #[test]

@@ -81,11 +81,18 @@ pub struct Stage {
     pub temporal_weight: Option<f32>,
     /// Shrinkage of changes along time in the nonlocal prior: cosines along time of a pixel (DCT-II) whose
     /// mean square e over 5x5 pixels is small lose the share l^4 / (l^4 + e^2), where l is this times sigma;
-    /// none where it is left out. An adaptive schedule takes two, four or eight times as much, or leaves it
-    /// out, where that pays.
+    /// none where it is left out. An adaptive schedule takes twice as much, or leaves it out, where that pays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = TEMPORAL_SHRINKAGE.bounds())]
     pub temporal_shrinkage: Option<f32>,
+    /// The same where nothing moves. The stage is run a second time from its start, with this shrinkage, and its
+    /// frames are those of the second run where the changes before the stage and after its first run, over 17x17
+    /// pixels, have a correlation below 0.65, those of the first from 0.8 on, and a mean between; one run where it
+    /// is left out. Only beside temporal_shrinkage. An adaptive schedule takes four or eight times that where that
+    /// pays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(transform = REST_SHRINKAGE.bounds())]
+    pub rest_shrinkage: Option<f32>,
     /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the next: 1 is
     /// accelerated GAP, 0 plain GAP. A learned denoiser never explains the measurement fully, so with 1 the
     /// residual winds up in its stages.
@@ -158,6 +165,7 @@ const STATIC_VARIANCE: Parameter = Parameter {
     range: (Bound::Included(0.01), Bound::Included(MAX_STATIC_VARIANCE as f64)),
     words: "from 0.01 to 2",
 };
+const REST_SHRINKAGE: Parameter = Parameter::not_negative("rest_shrinkage");
 const TOLERANCE: Parameter = Parameter::share("tolerance");
 
 impl Stage {
@@ -213,6 +221,10 @@ impl Stage {
         MOMENTUM.check(self.momentum)?;
         self.static_variance.map_or(Ok(()), |variance| STATIC_VARIANCE.check(variance))?;
         self.gamma.map_or(Ok(()), |gamma| GAMMA.check(gamma))?;
+        self.rest_shrinkage.map_or(Ok(()), |level| REST_SHRINKAGE.check(level))?;
+        if self.rest_shrinkage.is_some() && self.temporal_shrinkage.is_none() {
+            return Err(REST_SHRINKAGE.refused("given", "left out without temporal_shrinkage"));
+        }
         // Where the prior passes everything (even brightness), an error `e` follows
         // `e_(k+1) = -memory momentum (e_k - e_(k-1))`.
         if self.memory * self.momentum > 0.5 {
@@ -224,9 +236,14 @@ impl Stage {
         Ok(())
     }
 
+    /// The most iterations that are run, of both runs if there are two.
+    pub(super) fn iterations_run(&self) -> usize {
+        self.iterations.saturating_mul(1 + usize::from(self.rest_shrinkage.is_some()))
+    }
+
     /// Planned cost of all its iterations, CPU-nanoseconds per voxel.
     pub(super) fn planned_ns(&self) -> f64 {
-        self.iteration_ns() * self.iterations as f64
+        self.iteration_ns() * self.iterations_run() as f64
     }
 
     /// Cost of one iteration, CPU-nanoseconds per voxel.
@@ -244,7 +261,7 @@ impl Schedule {
 
     /// Most iterations of all stages together.
     pub fn planned_iterations(&self) -> usize {
-        self.stages.iter().fold(0, |sum, stage| sum.saturating_add(stage.iterations))
+        self.stages.iter().fold(0, |sum, stage| sum.saturating_add(stage.iterations_run()))
     }
 
     /// Most passes of networks.
@@ -278,8 +295,8 @@ impl Schedule {
         self.stages.iter().any(|stage| stage.prior.looks_along_time(&stage.settings(0)))
     }
 
-    /// Fixes the total number of iterations and switches the convergence tests off: earlier
-    /// stages keep their length as far as it goes, the last one takes the rest.
+    /// Fixes the total number of iterations, with one run of each stage, and switches the convergence tests off:
+    /// earlier stages keep their length as far as it goes, the last one takes the rest.
     pub fn with_iterations(mut self, total: usize) -> Self {
         self.adaptive = false;
         let mut left = total;
@@ -288,6 +305,7 @@ impl Schedule {
             let wanted = if index + 1 == count { left } else { stage.iterations };
             stage.iterations = wanted.min(left);
             stage.tolerance = 0.0;
+            stage.rest_shrinkage = None;
             left -= stage.iterations;
         }
         self.stages.retain(|stage| stage.iterations > 0);
@@ -301,6 +319,8 @@ impl Schedule {
             stage.tv_updates = stage.prior.takes(&TV_UPDATES).then_some(updates);
             stage.temporal_weight = stage.temporal_weight.filter(|weight| *weight > 0.0);
             stage.temporal_shrinkage = stage.temporal_shrinkage.filter(|level| *level > 0.0);
+            let twice = stage.temporal_shrinkage.is_some();
+            stage.rest_shrinkage = stage.rest_shrinkage.filter(|_| twice);
         }
         self
     }
@@ -349,9 +369,10 @@ impl Schedule {
     /// The share of the planned cost, on \[0,1\], that is behind a run which has done `iteration` iterations of
     /// the stage with index `stage` and has left all stages before it.
     pub fn share_done(&self, stage: usize, iteration: usize) -> f64 {
-        let cost =
-            |stage: &Stage, done: usize| stage.iteration_ns() * done.min(stage.iterations) as f64;
-        let before: f64 = self.stages.iter().take(stage).map(|s| cost(s, s.iterations)).sum();
+        let cost = |stage: &Stage, done: usize| {
+            stage.iteration_ns() * done.min(stage.iterations_run()) as f64
+        };
+        let before: f64 = self.stages.iter().take(stage).map(Stage::planned_ns).sum();
         let here = self.stages.get(stage).map_or(0.0, |stage| cost(stage, iteration));
         let planned = self.planned_ns_per_voxel();
         if planned > 0.0 { ((before + here) / planned).clamp(0.0, 1.0) } else { 0.0 }

@@ -11,6 +11,7 @@ use ndarray::{Array3, Array4, ArrayView3};
 use super::assessment::{self, Evidence};
 use super::error::{ReconError, Result, shape_text};
 use super::prior::{Networks, Pass, Settings};
+use super::rest;
 use super::schedule::{Schedule, Stage};
 use super::sensing::{SensingOperator, Statistics};
 use state::{Change, State};
@@ -227,6 +228,26 @@ impl<'a> Run<'a> {
     }
 
     fn stage(
+        &mut self,
+        index: usize,
+        stage: &Stage,
+        observer: &mut dyn Observer,
+    ) -> Result<StopReason> {
+        let Some(shrinkage) = stage.rest_shrinkage else {
+            return self.once(index, stage, observer);
+        };
+        let start = self.state();
+        self.once(index, stage, observer)?;
+        let motion = rest::motion(&start.v, &self.state.v);
+        let moving = std::mem::replace(&mut self.state, start).v;
+        let still =
+            Stage { temporal_shrinkage: Some(shrinkage), rest_shrinkage: None, ..stage.clone() };
+        let stop_reason = self.once(index, &still, observer)?;
+        rest::keep_motion(&mut self.state.v, &moving, &motion);
+        Ok(stop_reason)
+    }
+
+    fn once(
         &mut self,
         index: usize,
         stage: &Stage,
