@@ -457,6 +457,24 @@ mod tests {
     }
 
     #[test]
+    fn shrinkage_at_rest_belongs_to_that_of_all_changes() {
+        let mut schedule = Schedule::pnp_nonlocal();
+        let planned = (schedule.planned_iterations(), schedule.planned_ns_per_voxel());
+        let once = (schedule.stages[1].iterations, schedule.stages[1].planned_ns());
+        schedule.stages[1].rest_shrinkage = Some(1.4);
+        assert!(schedule.validate().is_ok(), "{:?}", schedule.validate());
+        assert_eq!(schedule.planned_iterations(), planned.0 + once.0, "it is run twice");
+        assert_eq!(schedule.planned_ns_per_voxel(), planned.1 + once.1);
+        assert_eq!(schedule.share_done(2, 0), 1.0);
+        schedule.stages[1].temporal_shrinkage = None;
+        let error = schedule.validate().unwrap_err().to_string();
+        assert!(
+            error.contains("rest_shrinkage") && error.contains("temporal_shrinkage"),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn levels_outside_the_unit_interval_are_refused() {
         for value in [0.0, -0.1, 25.0, f32::NAN] {
             let mut schedule = Schedule::pnp_nonlocal();

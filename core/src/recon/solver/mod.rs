@@ -523,7 +523,7 @@ mod reference {
 
 #[cfg(test)]
 mod tests {
-    use super::{Run, reconstruct};
+    use super::{Control, Observer, Progress, Run, reconstruct, rest};
     use crate::recon::prior::temporal::TemporalVariation;
     use crate::recon::prior::tv::TotalVariation;
     use crate::recon::schedule::Schedule;
@@ -571,6 +571,51 @@ mod tests {
             assert!((change.relative() / difference.sqrt() - 1.0).abs() < 1e-4, "{rows} rows");
         }
     }
+
+    #[test]
+    fn a_stage_run_twice_is_its_two_runs_put_together() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+        let masks = Array3::from_shape_simple_fn((5, 48, 48), || rng.random::<f32>());
+        // Fine texture at rest on the left, that moves on the right.
+        let texture: Vec<f32> = (0..48 * 60).map(|_| rng.random()).collect();
+        let truth = Array3::from_shape_fn((5, 48, 48), |(k, i, j)| {
+            texture[60 * i + j + if j < 24 { 0 } else { 2 * k }]
+        });
+        let op = SensingOperator::new(masks).unwrap();
+        let y = op.forward(truth.view()).unwrap();
+        let solve = |shrinkage: Option<(f32, Option<f32>)>| {
+            let mut schedule = Schedule::pnp_nonlocal();
+            let mut stage = schedule.stages.pop().unwrap();
+            if let Some((temporal, rest)) = shrinkage {
+                (stage.temporal_shrinkage, stage.rest_shrinkage) = (Some(temporal), rest);
+                stage.iterations = 8;
+                schedule.stages.push(stage);
+            }
+            let mut steps = Vec::new();
+            let mut watch = Steps(&mut steps);
+            let frames = reconstruct(&op, y.view(), &schedule, &mut (), &mut watch).unwrap().frames;
+            assert!(steps.windows(2).all(|pair| pair[0].0 < pair[1].0 && pair[0].1 >= pair[1].1));
+            assert_eq!(steps.last().map(|step| step.0 == step.1), Some(true), "all is done");
+            frames
+        };
+        let (before, little) = (solve(None), solve(Some((0.35, None))));
+        let mut expected = solve(Some((1.4, None)));
+        let motion = rest::motion(&before, &little);
+        rest::keep_motion(&mut expected, &little, &motion);
+        assert!(motion.iter().any(|share| *share < 0.1) && motion.iter().any(|share| *share > 0.9));
+        assert_eq!(solve(Some((0.35, Some(1.4)))), expected);
+    }
+
+    /// Iterations done, and planned.
+    struct Steps<'a>(&'a mut Vec<(usize, usize)>);
+
+    impl Observer for Steps<'_> {
+        fn iteration(&mut self, progress: &Progress) -> Control {
+            self.0.push((progress.done, progress.planned));
+            Control::Continue
+        }
+    }
+
     /// Where no prior looks along time, a run of snapshots is what they are alone, bit by bit.
     #[test]
     fn snapshots_together_are_those_alone_where_nothing_looks_along_time() {
