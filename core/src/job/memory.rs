@@ -11,8 +11,9 @@ const BASE_BYTES: u64 = 128 << 20;
 const SOLVER_BYTES_PER_VOXEL: u64 = 24;
 /// The solver's start of a projection, with momentum or ADMM; and ADMM's multiplier.
 const START_BYTES_PER_VOXEL: u64 = 4;
-/// Where a stage may be run twice: what it starts from, or the frames of the first run.
-const TWICE_BYTES_PER_VOXEL: u64 = 12;
+/// Where a stage may be run twice: what it starts from, or the frames of its first run. In schedules with a network
+/// the bound has that already: a network's arrays are gone by then (320x320, Cr 10: 318 MiB, and 316 with one run).
+const TWICE_BYTES_PER_VOXEL: u64 = 8;
 /// Pixels that the network takes at once, or one frame of the tile if that is larger.
 const NETWORK_PIXELS: u64 = 1 << 17;
 
@@ -76,7 +77,8 @@ impl JobSpec {
         if self.schedule.stages.iter().any(|stage| stage.momentum > 0.0) {
             per_voxel += START_BYTES_PER_VOXEL;
         }
-        if self.schedule.stages.iter().any(|stage| stage.temporal_shrinkage.is_some()) {
+        let twice = self.schedule.stages.iter().any(|stage| stage.temporal_shrinkage.is_some());
+        if twice && !self.schedule.needs_network() {
             per_voxel += TWICE_BYTES_PER_VOXEL;
         }
         // A prior's arrays go with its stage, but networks stay loaded.
