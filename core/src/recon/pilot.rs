@@ -15,6 +15,7 @@ use super::assessment::{Evidence, features};
 use super::error::{ReconError, Result};
 use super::held_out::HeldOut;
 use super::prior::Networks;
+use super::rest;
 use super::schedule::{MAX_STATIC_VARIANCE, Schedule, Stage};
 use super::sensing::SensingOperator;
 use super::signs::Signs;
@@ -40,7 +41,7 @@ const CLEAR: f64 = 2.0;
 /// Below this correlation of their changes along time, frames that were shrunk much and those that were not
 /// have no motion in common: what changed was not in the scene. Of 224 simulated scenes
 /// (`docs/benchmarks.md`) 27 of 33 at rest are below it, and 8 of 191 others.
-const MOTION: f64 = 0.45;
+const MOTION: f32 = 0.45;
 
 /// Side in pixels of the squares over which a scene without texture and motion is even.
 const EVEN: usize = 8;
@@ -364,7 +365,7 @@ impl Course {
         let (own, others) = (self.shrinkage(), other.shrinkage());
         let fourfold = others > 0.0 && own >= 4.0 * others;
         let frames = self.best.as_ref().zip(other.best.as_ref()).filter(|_| fourfold);
-        frames.is_some_and(|(own, others)| correlation_of_changes(own, others) < MOTION)
+        frames.is_some_and(|(own, others)| rest::correlation(own, others) < MOTION)
     }
 
     /// Whether its least error is below that of another by more than chance: by more than the standard error of
@@ -410,22 +411,6 @@ fn excess(one: &[f64], other: &[f64]) -> f64 {
     let mean = differences().sum::<f64>() / count;
     let variance = differences().map(|difference| (difference - mean).powi(2)).sum::<f64>() / count;
     if variance > 0.0 { mean / (variance / count).sqrt() } else { 0.0 }
-}
-
-/// The correlation of what differs from the mean over time in frames \[B,H,W\] and in others; 0 where nothing
-/// does.
-fn correlation_of_changes(one: &Array3<f32>, other: &Array3<f32>) -> f64 {
-    let (mut product, mut squares) = (0.0, (0.0, 0.0));
-    for (one, other) in one.lanes(Axis(0)).into_iter().zip(other.lanes(Axis(0))) {
-        let (means, count) = ((one.sum(), other.sum()), one.len() as f32);
-        for (one, other) in one.iter().zip(other) {
-            let (one, other) = (one - means.0 / count, other - means.1 / count);
-            product += f64::from(one * other);
-            squares.0 += f64::from(one * one);
-            squares.1 += f64::from(other * other);
-        }
-    }
-    if product == 0.0 { 0.0 } else { product / (squares.0 * squares.1).sqrt() }
 }
 
 /// Ends the last stage with a level where its own error is about least. Those before it run as planned: what

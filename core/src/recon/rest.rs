@@ -16,7 +16,7 @@ const MOTION: f32 = 0.8;
 /// Where something moves \[H,W\], from 0 for rest to 1, by frames \[B,H,W\] before a stage and after a run of it
 /// that shrinks little.
 pub(super) fn motion(before: &Array3<f32>, after: &Array3<f32>) -> Array2<f32> {
-    correlation(before, after).mapv(|c| ((c - REST) / (MOTION - REST)).clamp(0.0, 1.0))
+    correlation_nearby(before, after).mapv(|c| ((c - REST) / (MOTION - REST)).clamp(0.0, 1.0))
 }
 
 /// Puts frames \[B,H,W\] of a run that shrinks little into those of one that shrinks much, `still`, by the share
@@ -29,25 +29,38 @@ pub(super) fn keep_motion(still: &mut Array3<f32>, moving: &Array3<f32>, motion:
     }
 }
 
-/// The correlation \[H,W\] of what differs from the mean over time in frames \[B,H,W\] and in others, of the
-/// pixels near each; 0 where nothing differs.
-fn correlation(one: &Array3<f32>, other: &Array3<f32>) -> Array2<f32> {
+/// The correlation of what differs from the mean over time in frames \[B,H,W\] and in others; 0 where nothing
+/// differs.
+pub(super) fn correlation(one: &Array3<f32>, other: &Array3<f32>) -> f32 {
+    let [product, one, other] = products(one, other).map(|product| product.sum());
+    normed(product, one, other)
+}
+
+/// The same of the pixels near each \[H,W\].
+fn correlation_nearby(one: &Array3<f32>, other: &Array3<f32>) -> Array2<f32> {
+    let [product, one, other] = products(one, other).map(|product| nearby(product.view()));
+    Zip::from(&product).and(&one).and(&other).map_collect(|&p, &one, &other| normed(p, one, other))
+}
+
+fn normed(product: f32, one: f32, other: f32) -> f32 {
+    let norm = (one * other).sqrt();
+    if norm > 0.0 { product / norm } else { 0.0 }
+}
+
+/// Of each pixel, the products of what differs from the mean over time in frames and in others, and the squares of
+/// both, added up over time \[H,W\].
+fn products(one: &Array3<f32>, other: &Array3<f32>) -> [Array2<f32>; 3] {
     let (_, height, width) = one.dim();
     let frames = one.len_of(Axis(0)) as f32;
-    let mean = |frames_of: &Array3<f32>| frames_of.sum_axis(Axis(0)) / frames;
-    let means = (mean(one), mean(other));
+    let means = [one, other].map(|frames_of| frames_of.sum_axis(Axis(0)) / frames);
     let [mut products, mut squares, mut others] = [(); 3].map(|()| Array2::zeros((height, width)));
     for (one, other) in one.outer_iter().zip(other.outer_iter()) {
-        let (one, other) = (&one - &means.0, &other - &means.1);
+        let (one, other) = (&one - &means[0], &other - &means[1]);
         products += &(&one * &other);
         squares += &(&one * &one);
         others += &(&other * &other);
     }
-    let [products, squares, others] = [products, squares, others].map(|sums| nearby(sums.view()));
-    Zip::from(&products).and(&squares).and(&others).map_collect(|product, one, other| {
-        let norm = (one * other).sqrt();
-        if norm > 0.0 { product / norm } else { 0.0 }
-    })
+    [products, squares, others]
 }
 
 /// The sums over the pixels near each.
@@ -71,7 +84,7 @@ fn sums_along(mut lane: ArrayViewMut1<'_, f32>) {
 
 #[cfg(test)]
 mod tests {
-    use super::{NEAR, correlation, keep_motion, motion, nearby};
+    use super::{NEAR, correlation, correlation_nearby, keep_motion, motion, nearby};
     use ndarray::{Array2, Array3, s};
 
     /// Changes of a pixel, one after the other.
@@ -95,7 +108,8 @@ mod tests {
     fn changes_correlate_whatever_their_size_and_mean() {
         let one = Array3::from_shape_fn((6, 24, 24), |(k, i, j)| wave(k, i, j));
         let near = |other: Array3<f32>, wanted: f32| {
-            let found = correlation(&one, &other);
+            assert!((correlation(&one, &other) - wanted).abs() < 1e-3, "{wanted}");
+            let found = correlation_nearby(&one, &other);
             assert!(found.iter().all(|c| (c - wanted).abs() < 1e-3), "{wanted}: {found}");
         };
         near(one.mapv(|x| 3.0 + 0.1 * x), 1.0);
