@@ -35,7 +35,7 @@ FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
 SPARE = 10.0        # dB above it up to which the fit follows
 COMPONENTS = 64     # of what the encoder sees
-NEAR = 1.5          # dB: a PSNR that is told so far off is told well
+NEAR = 1.5          # dB: misses much larger than this weigh no more than one another in the fit
 AT_ONCE = 64        # blocks of a case that a step sees, in all its frames
 
 
@@ -235,7 +235,7 @@ class Model:
                 loss = 0
                 for case, told, error in zip(drawn, told, errors):
                     wanted = case.psnr_of(error).clamp(max=BEST + SPARE)
-                    # Squares of what can't be told would outweigh what can (Welsch's loss).
+                    # What can't be told would outweigh what can (Welsch's loss).
                     off = case.psnr_of(told) - wanted
                     loss = loss + ((told - error) ** 2).mean() + 1.5 * (1 - torch.exp(-.5 * (off / NEAR) ** 2))
                 optimiser.zero_grad()
@@ -252,7 +252,7 @@ class Model:
             return errors.numpy(), float(case.psnr_of(errors))
 
     def move(self, by):
-        """What is told of the PSNR, by so many dB."""
+        """Moves what is told of the PSNR by so many dB."""
         with torch.no_grad():
             for network in self.networks:
                 network[-1].bias -= by / 10

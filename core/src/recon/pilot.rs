@@ -327,6 +327,11 @@ struct Course {
     at_rest: bool,
 }
 
+/// Whether a shrinkage along time is four times another one or more.
+fn fourfold(own: f32, others: f32) -> bool {
+    others > 0.0 && own >= 4.0 * others
+}
+
 impl Course {
     /// Where the frames predict the held-out pixels best.
     fn least(&self) -> f64 {
@@ -363,8 +368,8 @@ impl Course {
     /// Whether it has four times the shrinkage of another, and little of what changed there.
     fn stills(&self, other: &Self) -> bool {
         let (own, others) = (self.shrinkage(), other.shrinkage());
-        let fourfold = others > 0.0 && own >= 4.0 * others;
-        let frames = self.best.as_ref().zip(other.best.as_ref()).filter(|_| fourfold);
+        let frames = self.best.as_ref().zip(other.best.as_ref());
+        let frames = frames.filter(|_| fourfold(own, others));
         frames.is_some_and(|(own, others)| rest::correlation(own, others) < MOTION)
     }
 
@@ -394,7 +399,7 @@ impl Course {
             -1.5
         } else if own > others && other.at_rest {
             0.0
-        } else if others > 0.0 && own >= 4.0 * others {
+        } else if fourfold(own, others) {
             0.5
         } else {
             1.0
@@ -438,8 +443,8 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
         let shrinkage = course.map_or(0.0, Course::shrinkage);
         // Something may move elsewhere in the picture; what, the first iterations don't tell.
         let planned = stage.temporal_shrinkage.unwrap_or(0.0);
-        let fourfold = planned > 0.0 && shrinkage >= 4.0 * planned;
-        let rest_shrinkage = (fourfold && 2 * done >= stage.iterations).then_some(shrinkage);
+        let twice = fourfold(shrinkage, planned) && 2 * done >= stage.iterations;
+        let rest_shrinkage = twice.then_some(shrinkage);
         let temporal_shrinkage = if rest_shrinkage.is_some() { planned } else { shrinkage };
         let static_variance = course.and_then(|course| course.stage.static_variance);
         let gamma = course.and_then(|course| course.stage.gamma);
