@@ -278,8 +278,11 @@ async fn a_tile_that_kills_its_workers_is_given_up_with_the_reason() {
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
     assert!(error.contains("SIGABRT") && error.contains("(3 attempts)"), "{error}");
-    // A process that is killed from outside is replaced, too, and its tile taken up again at once.
-    let job = app.submit(&job(&measurement)).await;
+    // A process that is killed from outside is replaced, too, and its tile taken up again at once. One long tile: a
+    // process that dies between two tiles, before it has noted the next, leaves that to `--ack-wait`.
+    let mut job = with_iterations(&measurement, 3000);
+    job["tile"] = json!({"size": 64, "overlap": 8});
+    let job = app.submit(&job).await;
     busy(&app).await;
     rustix::process::kill_process(worker.inner().unwrap(), Signal::KILL).unwrap();
     assert_eq!(app.ended(&job).await["state"], "succeeded");
