@@ -9,6 +9,7 @@ reconstructed. It goes on where it was stopped, and what it has made so far is a
 all cases, and tells how they do on scenes that were left out (no scene is in two folds).
 """
 import argparse
+import copy
 import glob
 import json
 import os
@@ -30,7 +31,8 @@ ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
 # The models of results: of which algorithm, and whether changes along time were shrunk by more than SHRUNK, as the program has it.
 MODELS = {'gap-tv': ('gap-tv', False), 'pnp-tv-fastdvdnet': ('pnp-tv-fastdvdnet', False), 'pnp-tv-fastdvdnet, shrunk': ('pnp-tv-fastdvdnet', True)}
 SHRUNK = 1.0
-FEATURES = 26       # as the program has them; what follows is what its encoder sees
+FEATURES, CHANNELS = 26, 128    # as the program has them, those of its encoder after the others
+MOVES, SURE, LEAST = 3.0, .3, .1  # as the program has them: see `apart`
 FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
 SPARE = 10.0        # dB above it up to which the fit follows
@@ -142,15 +144,41 @@ class Case:
         self.psnr, self.frames, self.side = about['psnr_db'], seen.shape[1], round(seen.shape[2] ** .5)
         self.white = 20 * np.log10(about['white'])
         values = lambda rows: torch.from_numpy(rows.reshape(len(rows), seen[0].size).T.copy())
-        self.features, self.encoded = values(seen[:FEATURES]), values(seen[FEATURES:-1]).half()
+        both = lambda rows: (values(rows[:FEATURES]), values(rows[FEATURES:]).half())
+        one = FEATURES + CHANNELS if len(seen) > FEATURES + 1 else FEATURES
+        self.features, self.encoded = both(seen[:one])
+        # Of a stage that was run twice.
+        self.first = self.distance = None
+        if len(seen) > one + 1:
+            self.first, self.distance = both(seen[one:2 * one]), 10 ** values(seen[2 * one:2 * one + 1])[:, 0]
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
-        evidence = about['evidence']
-        self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
-        self.piece = torch.tensor(evidence['features'], dtype=torch.float32)
+        self.told_by(about['evidence'])
+        self.first_evidence = about['evidence'].get('first')
         self.pattern = about['setting']['pattern']
         # The default's pilot shrinks changes along time; gap-tv has none.
         stages = about['pilot']['stages'] if about.get('pilot') else []
         self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
+
+    def told_by(self, evidence):
+        self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
+        self.piece = torch.tensor(evidence['features'], dtype=torch.float32)
+
+    def first_run(self):
+        """The frames of the first run of a stage that was run twice, as a case without a true error."""
+        case = copy.copy(self)
+        case.features, case.encoded = self.first
+        case.told_by(self.first_evidence)
+        return case
+
+    def apart(self, of_first):
+        """Of the decimal logarithms of the errors of the first run's frames: the share of them, and the errors of the result if it is all.
+
+        What was shrunk away in the second run was error where the scene is at rest. Then the frames of both are as far from each other as those of the
+        first from the truth. Where it was motion, those of the first are further from the truth, by what both have wrong."""
+        error = 10 ** of_first
+        left = torch.log10(torch.maximum(error - self.distance, LEAST * error))
+        more = 10 * torch.log10(error.mean() / self.distance.mean())
+        return torch.sigmoid((more - MOVES) / SURE), left
 
     def psnr_of(self, errors):
         """Of the decimal logarithms of the errors of blocks, as many of each frame."""
@@ -168,16 +196,36 @@ def scaled(values, by):
 class Model:
     """The mean of some networks of two inner layers, all fitted to the same cases, each from weights of its own."""
 
-    def __init__(self, cases, a, start=None):
-        self.start = start
+    def __init__(self, cases, a, start=None, first=None):
+        """Fitted to cases, from the record of a model on if there is one; `first` is the model of the first run of stages that are run twice."""
+        self.first = first
         if start:
-            by = lambda name: tuple(torch.tensor(start[name][part]) for part in ('mean', 'scale'))
-            encoding = start['encoding'] and (torch.tensor(start['encoding']['mean']), torch.tensor(start['encoding']['components']).T)
-            self.features, self.signs, self.encoding = by('features'), by('signs'), encoding
+            self.scale_as(start)
         else:
             self.scale(cases)
-        count = len(start['networks']) if start else a.networks
-        self.networks = [self.network(cases, a, seed) for seed in range(count)]
+        count = self.inputs(cases[0]).shape[1]
+        self.networks = []
+        for seed, known in enumerate(start['networks'] if start else [None] * a.networks):
+            torch.manual_seed(seed)
+            network = self.network(count, known)
+            if known is None:
+                nn.init.constant_(network[-1].bias, float(torch.cat([case.error for case in cases]).mean()))
+            self.networks.append(self.fitted(network, cases, a))
+
+    @classmethod
+    def read(cls, record):
+        """That of a record."""
+        model = cls.__new__(cls)
+        model.first = None
+        model.scale_as(record)
+        count = len(record['networks'][0][0]['weights'])
+        model.networks = [cls.network(count, known).eval() for known in record['networks']]
+        return model
+
+    def scale_as(self, record):
+        by = lambda name: tuple(torch.tensor(record[name][part]) for part in ('mean', 'scale'))
+        encoding = record['encoding'] and (torch.tensor(record['encoding']['mean']), torch.tensor(record['encoding']['components']).T)
+        self.features, self.signs, self.encoding = by('features'), by('signs'), encoding
 
     def scale(self, cases):
         self.features = scaling(torch.cat([case.features for case in cases]), .05)
@@ -206,34 +254,44 @@ class Model:
             all_of.append(((case.encoded.float() - mean) @ components.T).clamp(-FARTHEST, FARTHEST))
         return torch.cat(all_of, 1)
 
-    def network(self, cases, a, seed):
-        torch.manual_seed(seed)
-        inputs = [self.inputs(case).half() for case in cases]
-        count = inputs[0].shape[1]
+    @staticmethod
+    def network(count, known):
         network = nn.Sequential(nn.Linear(count, 64), nn.SiLU(), nn.Dropout(.15), nn.Linear(64, 16), nn.SiLU(), nn.Linear(16, 1))
         with torch.no_grad():
-            network[-1].bias.fill_(float(torch.cat([case.error for case in cases]).mean()))
-            if self.start:
-                for layer, known in zip([layer for layer in network if isinstance(layer, nn.Linear)], self.start['networks'][seed]):
-                    layer.weight.copy_(torch.tensor(known['weights']).T)
-                    layer.bias.copy_(torch.tensor(known['bias']))
+            for layer, known in zip([layer for layer in network if isinstance(layer, nn.Linear)], known or []):
+                layer.weight.copy_(torch.tensor(known['weights']).T)
+                layer.bias.copy_(torch.tensor(known['bias']))
+        return network
+
+    def by_first(self, case):
+        """What the first run tells of a case: see `Case.apart`."""
+        if case.first is None or self.first is None:
+            return torch.tensor(0.), torch.zeros_like(case.error)
+        return case.apart(self.first.errors(case.first_run()))
+
+    def fitted(self, network, cases, a):
+        inputs = [self.inputs(case).half() for case in cases]
+        firsts = [self.by_first(case) for case in cases]
+        count = inputs[0].shape[1]
         optimiser = torch.optim.AdamW(network.parameters(), a.rate, weight_decay=.05)
         batches = torch.arange(len(cases)).split(8)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, a.rate, total_steps=a.epochs * len(batches))
         for _ in range(a.epochs):
             order = torch.randperm(len(cases))
             for batch in batches:
-                drawn, seen, errors = [cases[index] for index in order[batch].tolist()], [], []
+                drawn, seen, errors, by_first = [cases[index] for index in order[batch].tolist()], [], [], []
                 for index, case in zip(order[batch].tolist(), drawn):
                     blocks = torch.randperm(case.side ** 2)[:AT_ONCE]
                     of = lambda values: values.reshape(case.frames, case.side ** 2, -1)[:, blocks].flatten(0, 1).float()
                     # All cases of a fit are a little alike, and those to come are not.
                     seen.append(of(inputs[index]) + .1 * torch.randn(1, count))
                     errors.append(of(case.error)[:, 0])
+                    by_first.append((firsts[index][0], of(firsts[index][1])[:, 0]))
                 seen = torch.cat(seen)
                 told = network(seen + .05 * torch.randn_like(seen))[:, 0].split([len(of_case) for of_case in errors])
                 loss = 0
-                for case, told, error in zip(drawn, told, errors):
+                for case, told, error, (share, left) in zip(drawn, told, errors, by_first):
+                    told = share * left + (1 - share) * told
                     wanted = case.psnr_of(error).clamp(max=BEST + SPARE)
                     # What can't be told would outweigh what can (Welsch's loss).
                     off = case.psnr_of(told) - wanted
@@ -244,12 +302,17 @@ class Model:
                 schedule.step()
         return network.eval()
 
-    def __call__(self, case):
-        """Errors of the blocks, and the PSNR."""
+    def errors(self, case):
+        """Decimal logarithms of the errors of the blocks."""
         with torch.no_grad():
             inputs = self.inputs(case)
-            errors = torch.stack([network(inputs)[:, 0] for network in self.networks]).mean(0)
-            return errors.numpy(), float(case.psnr_of(errors))
+            share, left = self.by_first(case)
+            return share * left + (1 - share) * torch.stack([network(inputs)[:, 0] for network in self.networks]).mean(0)
+
+    def __call__(self, case):
+        """Errors of the blocks, and the PSNR."""
+        errors = self.errors(case)
+        return errors.numpy(), float(case.psnr_of(errors))
 
     def move(self, by):
         """Moves what is told of the PSNR by so many dB."""
@@ -281,19 +344,20 @@ def fit(a):
             raise SystemExit(f'{a.out} has no cases for the model of {name}')
         # Those that were shrunk are few: their model may go on from that of the others.
         known = start and start.get(name, start[algorithm])
+        first = Model.read(models.get(algorithm) or start[algorithm]) if shrunk else None
         names = sorted({case.scene for case in cases})
         fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
         for k in range(a.folds):
-            model = Model([case for case in cases if fold[case.scene] != k], a, known)
+            model = Model([case for case in cases if fold[case.scene] != k], a, known, first)
             for index, case in enumerate(cases):
                 if fold[case.scene] == k:
                     errors, told[index] = model(case)
                     spread.append(np.corrcoef(errors, case.error)[0, 1])
         # Errors of blocks are told too even, so their mean is too small: what is told is moved to the median, and of each half by that of the other
-        # half, whose interval it has.
+        # half, whose interval it has. Not where first runs tell of the others: what is left is mostly better than BEST, and its median says nothing.
         true, half = np.array([min(case.psnr, BEST) for case in cases]), np.array([fold[case.scene] % 2 for case in cases])
-        median = lambda chosen: np.median((true - told)[chosen & (told < BEST)])
+        median = lambda chosen: 0 if first else np.median((true - told)[chosen & (told < BEST)])
         middle = np.where(half == 0, median(half == 1), median(half == 0))
         wrong = true - (told + middle).clip(max=BEST)
         # A little wider than four of five cases of the fit: other scenes are worse.
@@ -314,7 +378,7 @@ def fit(a):
             if of.any():
                 print(f'  {kind}: {of.sum()} cases, {np.abs(wrong[of]).mean():.2f} dB, {100 * np.mean(np.abs(wrong[of]) < 1.5):.0f} % within 1.5, '
                       f'{100 * inside[of].mean():.0f} % in the interval')
-        model = Model(cases, a, known)
+        model = Model(cases, a, known, first)
         model.move(by)
         models[name] = model.record() | {'interval': [round(float(end), 2) for end in interval]}
     if a.write:

@@ -89,6 +89,7 @@ fn stage((stage, finding): (&Stage, StageFinding)) -> StageRecord {
         planned_temporal_shrinkage: stage.temporal_shrinkage.unwrap_or(0.0),
         temporal_shrinkage: finding.temporal_shrinkage,
         rest_shrinkage: finding.rest_shrinkage,
+        rest_everywhere: finding.rest_everywhere,
         planned_static_variance: stage.static_variance,
         static_variance: finding.static_variance,
         gamma: finding.gamma,

@@ -45,6 +45,7 @@ impl PilotRecord {
             temporal_weight: stage.temporal_weight,
             temporal_shrinkage: stage.temporal_shrinkage,
             rest_shrinkage: stage.rest_shrinkage,
+            rest_everywhere: stage.rest_everywhere,
             static_variance: stage.static_variance,
             gamma: stage.gamma,
         };
@@ -95,6 +96,9 @@ pub struct StageRecord {
     /// The same where nothing moves, if four times as much or more pays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rest_shrinkage: Option<f32>,
+    /// Whether all is taken to be at rest then.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub rest_everywhere: bool,
     /// Static variance of the projection that was asked for; none if it was not.
     #[serde(default)]
     pub planned_static_variance: Option<f32>,
@@ -124,8 +128,10 @@ impl StageRecord {
                 0.0 => "shrinkage along time left out".into(),
                 shrinkage => format!("shrinkage along time {shrinkage}"),
             });
-        let rest =
-            self.rest_shrinkage.map(|level| format!("shrinkage where nothing moves {level}"));
+        let rest = self.rest_shrinkage.map(|level| match self.rest_everywhere {
+            true => format!("shrinkage {level}, as all is at rest"),
+            false => format!("shrinkage where nothing moves {level}"),
+        });
         let variance = self.planned_static_variance.map(|_| match self.static_variance {
             Some(variance) => format!("static variance {variance}"),
             None => "static variance left out".into(),

@@ -11,8 +11,8 @@ use std::ops::Range;
 use std::sync::LazyLock;
 
 use ndarray::{
-    Array1, Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut4, Axis,
-    concatenate, s,
+    Array1, Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, ArrayView4, ArrayViewMut4,
+    Axis, Zip, concatenate, s,
 };
 use serde::{Deserialize, Serialize};
 
@@ -131,6 +131,29 @@ pub fn encoded_features(
         what: "what the encoder gave",
         found: shape_text(encoded.shape()),
         expected: shape_text(&[&[CHANNELS], &seen.shape()[1..]].concat()),
+    })
+}
+
+/// What is seen of a result, followed by what is seen of the first run of its last stage and by the decimal logarithm of
+/// the mean squared distance between the frames of both \[2 times as many and 1, S B, rows, columns\].
+/// Errors: sizes that disagree.
+pub(super) fn with_first_run(
+    result: &Array4<f32>,
+    first: &Array4<f32>,
+    (frames, first_frames): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
+) -> Result<Array4<f32>> {
+    let (_, height, width) = frames.dim();
+    let (_, count, rows, columns) = result.dim();
+    let mut distance = Array4::zeros((1, count, rows, columns));
+    for (k, (one, other)) in frames.outer_iter().zip(first_frames.outer_iter()).enumerate() {
+        let squares = over_blocks((height, width), |i, j| (one[[i, j]] - other[[i, j]]).powi(2));
+        distance.slice_mut(s![0, k, .., ..]).assign(&squares.mapv(logarithm));
+    }
+    let all = concatenate(Axis(0), &[result.view(), first.view(), distance.view()]);
+    all.map_err(|_| ReconError::Shape {
+        what: "what is seen of a stage's first run",
+        found: shape_text(first.shape()),
+        expected: shape_text(result.shape()),
     })
 }
 
@@ -257,9 +280,7 @@ fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
         masks.outer_iter().map(|mask| gradient(mask, i, j)).sum::<f32>()
     });
     let share = |part: &Array2<f32>| {
-        ndarray::Zip::from(part)
-            .and(&energy)
-            .map_collect(|part, all| logarithm(part / all.max(FLOOR)))
+        Zip::from(part).and(&energy).map_collect(|part, all| logarithm(part / all.max(FLOOR)))
     };
     (share(&(&energy - &steady)), share(&steps))
 }
@@ -317,13 +338,16 @@ pub struct Evidence {
     pub signs: Signs,
     /// Values of [`FEATURES`].
     pub features: Vec<f32>,
+    /// The same of the first run of a stage that is run twice.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub first: Option<Box<Evidence>>,
 }
 
 impl Evidence {
     /// Of signs and features \[features, B, rows, columns\] of the same piece.
     pub(super) fn new(signs: Signs, seen: &Array4<f32>) -> Self {
         let mean = |of_feature: ArrayView3<'_, f32>| of_feature.mean().unwrap_or(0.0);
-        Self { signs, features: seen.outer_iter().map(mean).collect() }
+        Self { signs, features: seen.outer_iter().map(mean).collect(), first: None }
     }
 }
 
@@ -367,6 +391,9 @@ struct Layer {
 /// alike, motion that was shrunk away may leave nothing behind that looks wrong.
 const SHRUNK: f32 = 1.0;
 
+/// The model of frames that were shrunk less.
+const LITTLE_SHRUNK: &str = "pnp-tv-fastdvdnet";
+
 /// Inputs further from the mean than in any fit, in their scale, count as that far.
 const FARTHEST: f32 = 3.0;
 
@@ -398,18 +425,39 @@ impl Model {
             ("tv", true, false) if rest.iter().any(shrunk) => {
                 MODELS.get("pnp-tv-fastdvdnet, shrunk")
             }
-            ("tv", true, false) => MODELS.get("pnp-tv-fastdvdnet"),
+            ("tv", true, false) => MODELS.get(LITTLE_SHRUNK),
             _ => None,
         }
     }
 
     /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is
-    /// seen of them ([`encoded_features`]). Without evidence signs count as in the mean of the fit, and the
+    /// seen of them ([`encoded_features`]), and of the frames of the first run of a stage that was run twice.
+    /// Without evidence signs count as in the mean of the fit, and the
     /// features of the whole stand for those of the piece; without an encoder its components count as in the
     /// mean. `white` is the scene's white level.
     pub fn log_errors(
         &self,
         features: &Array4<f32>,
+        evidence: Option<&Evidence>,
+        white: f32,
+    ) -> Array3<f32> {
+        let all = features.len_of(Axis(0));
+        if [FEATURES.len(), FEATURES.len() + CHANNELS].contains(&all) {
+            return self.log_errors_of_one(features.view(), evidence, white);
+        }
+        let (result, others) = features.view().split_at(Axis(0), all / 2);
+        let (first, distance) = others.split_at(Axis(0), all / 2);
+        let told = self.log_errors_of_one(result, evidence, white);
+        let Some(model) = MODELS.get(LITTLE_SHRUNK) else { return told };
+        let evidence = evidence.and_then(|evidence| evidence.first.as_deref());
+        let of_first = model.log_errors_of_one(first, evidence, white);
+        apart(&told, &of_first, distance.index_axis(Axis(0), 0))
+    }
+
+    /// The same from what is seen of one result.
+    fn log_errors_of_one(
+        &self,
+        features: ArrayView4<'_, f32>,
         evidence: Option<&Evidence>,
         white: f32,
     ) -> Array3<f32> {
@@ -447,6 +495,30 @@ impl Model {
             told.sum::<f32>() / self.networks.len() as f32
         })
     }
+}
+
+/// From so many decibels on that the error of the first run's frames is expected to be above their distance from the
+/// result's, they moved; within so many there is doubt. Found on 75 simulated scenes, as `docs/benchmarks.md` says.
+const MOVES: f32 = 3.0;
+const DOUBT: f32 = 0.3;
+/// The least share of the first run's error that its second run leaves where something moves.
+const LEAST: f32 = 0.1;
+
+/// What the result of a stage that was run twice is expected to be off by, by what it is by itself, `told`, by the errors
+/// of its first run, which shrank little, and by the distance of both results; all logarithms \[S B, rows, columns\].
+///
+/// What the second run has taken away was error where the scene is at rest: then the first run's frames are as far from
+/// the result's as from the truth. Where it was motion, they are further from the truth than that, by what both results
+/// have wrong; and frames from which motion was not shrunk away show that they are.
+fn apart(told: &Array3<f32>, of_first: &Array3<f32>, distance: ArrayView3<'_, f32>) -> Array3<f32> {
+    let energy = |logs: ArrayView3<'_, f32>| logs.iter().map(|log| 10f32.powf(*log)).sum::<f32>();
+    let further = 10.0 * (energy(of_first.view()) / energy(distance)).log10();
+    let share = 1.0 / (1.0 + (-(further - MOVES) / DOUBT).exp());
+    Zip::from(told).and(of_first).and(distance).map_collect(|told, first, distance| {
+        let error = 10f32.powf(*first);
+        let left = (error - 10f32.powf(*distance)).max(LEAST * error).log10();
+        share * left + (1.0 - share) * told
+    })
 }
 
 /// The means over each block and those that touch it, of the same frame.
@@ -507,7 +579,8 @@ impl Layer {
 #[cfg(test)]
 mod tests {
     use super::{
-        Evidence, FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, around, encoded_features, features,
+        Evidence, FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, apart, around, encoded_features,
+        features, with_first_run,
     };
     use crate::optics::iid_masks;
     use crate::recon::error::ReconError;
@@ -632,6 +705,52 @@ mod tests {
         let stage = schedule.stages.last_mut().unwrap();
         stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
         assert!(low(&schedule) < planned, "it knows less");
+    }
+
+    #[test]
+    fn what_a_second_run_has_shrunk_away_was_motion_or_error() {
+        let of = |log: f32| Array3::from_elem((2, 1, 3), log);
+        let told = |first, distance: f32| apart(&of(-4.0), &of(first), of(distance).view());
+        let near = |found: Array3<f32>, log: f32| found.iter().all(|f| (f - log).abs() < 0.01);
+        assert!(near(told(-3.0, -3.0), -4.0), "error: the result is what it looks like");
+        let left = (10f32.powf(-2.0) - 10f32.powf(-3.0)).log10();
+        assert!(near(told(-2.0, -3.0), left), "motion: that, and what both have wrong");
+        let mut distance = of(-4.0);
+        distance[[0, 0, 0]] = -2.0;
+        let found = apart(&of(-4.0), &of(-2.0), distance.view());
+        assert!((found[[0, 0, 0]] + 3.0).abs() < 0.01, "never nothing: {found}");
+    }
+
+    #[test]
+    fn frames_of_a_first_run_are_told_by_the_other_model() {
+        let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
+        let mut ripple = ramp();
+        for ((k, i, j), value) in ripple.indexed_iter_mut() {
+            *value += 0.1 * ((i * j + k) as f32).sin();
+        }
+        let see = |frames: &Array3<f32>| features(&op, Some(ramp().view()), frames.view());
+        let (result, first) = (see(&ramp()), see(&ripple));
+        let mut schedule = Schedule::pnp_tv_fastdvdnet();
+        let little = Model::of(&schedule).unwrap();
+        let stage = schedule.stages.last_mut().unwrap();
+        stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
+        let much = Model::of(&schedule).unwrap();
+        let with = |frames: &Array3<f32>| {
+            let frames = (ramp(), frames.clone());
+            with_first_run(&result, &first, (frames.0.view(), frames.1.view())).unwrap()
+        };
+        let alone = much.log_errors(&result, None, 1.0);
+        let apart_far = with(&(ramp() + 1.0));
+        assert_eq!(much.log_errors(&apart_far, None, 1.0), alone, "far apart: at rest");
+        let told = much.log_errors(&with(&(ramp() + 1e-3)), None, 1.0);
+        let of_first = little.log_errors(&first, None, 1.0);
+        let furthest = (&told - &of_first).iter().fold(0.0, |most: f32, d| most.max(d.abs()));
+        assert!(furthest < 0.02, "near each other, and off: {furthest}");
+        let evidence = Evidence::new(Signs([-10.0; SIGNS.len()]), &result);
+        let first = Some(Box::new(evidence.clone()));
+        let seen = with(&(ramp() + 1e-3));
+        let known = much.log_errors(&seen, Some(&Evidence { first, ..evidence.clone() }), 1.0);
+        assert_ne!(known, much.log_errors(&seen, Some(&evidence), 1.0));
     }
 
     #[test]

@@ -92,8 +92,10 @@ pub struct StageFinding {
     pub temporal_weight: f32,
     /// Shrinkage of changes along time, if any pays; else 0.
     pub temporal_shrinkage: f32,
-    /// The same where nothing moves, if four times as much or more pays, in a stage that is not ended early.
+    /// The same where nothing moves, if four times as much or more pays.
     pub rest_shrinkage: Option<f32>,
+    /// Whether all is taken to be at rest then.
+    pub rest_everywhere: bool,
     /// Static variance of the projection, if one pays.
     pub static_variance: Option<f32>,
     /// Noise term of the projection, where it is not the schedule's.
@@ -139,10 +141,13 @@ pub fn run(
     let mut run = Run::new(&op, y, schedule, &mut *networks);
     let mut courses: Vec<Course> = Vec::with_capacity(schedule.stages.len());
     let mut early = None;
+    // The frames of the last stage before they were shrunk four times as much.
+    let mut first = None;
     for (index, stage) in schedule.stages.iter().enumerate() {
         let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
         let start = run.state();
-        let once = Stage { rest_shrinkage: None, ..stage.clone() };
+        first = None;
+        let once = stage.run_once();
         let mut course = watch.stage(&once, None, &mut run)?;
         for variant in VARIANTS {
             let Some(variant) = variant(&op, &once, &course) else { continue };
@@ -150,7 +155,12 @@ pub fn run(
             run.restore(start.clone());
             let found = watch.stage(&variant, Some(&course), &mut run)?;
             if found.surpasses(&course) {
-                course = Course { at_rest: course.at_rest || found.stills(&course), ..found };
+                let at_rest = course.at_rest || found.stills(&course);
+                let taken = Course { at_rest, ..found };
+                let before = std::mem::replace(&mut course, taken);
+                if fourfold(course.shrinkage(), before.shrinkage()) {
+                    first = before.best;
+                }
             } else {
                 course.last_given_up = found.given_up;
                 run.restore(end);
@@ -164,11 +174,14 @@ pub fn run(
         }
     }
     let last = courses.iter().rev().find_map(|course| course.best.as_ref());
-    let evidence = early.as_ref().zip(last).map(|(early, last)| {
-        let frames = (early.view(), last.view());
-        tell((whole, &op, y), &held_out, schedule, frames)
+    let evidence = early.as_ref().zip(last).and_then(|(early, last)| {
+        let tell = |frames: &Array3<f32>| {
+            tell((whole, &op, y), &held_out, schedule, (early.view(), frames.view()))
+        };
+        let first = first.as_ref().and_then(tell).map(Box::new);
+        Some(Evidence { first, ..tell(last)? })
     });
-    Ok((judge(schedule, &courses), evidence.flatten()))
+    Ok((judge(schedule, &courses), evidence))
 }
 
 /// What the first snapshot tells of the error of a fixed schedule's frames, on the piece of it that [`piece`]
@@ -192,8 +205,8 @@ pub fn evidence(
     let op = whole.clone().without(&held_out.pixels);
     let y = y.slice(s![..1, rows, columns]);
     let mut early: Option<Array3<f32>> = None;
-    let solved = solver::stages((&op, y), schedule, networks, &mut (), |_, frames| {
-        early.get_or_insert_with(|| frames.to_owned());
+    let solved = solver::stages((&op, y), schedule, networks, &mut (), |_, run| {
+        early.get_or_insert_with(|| run.frames().to_owned());
     });
     let outcome = match solved {
         // Nothing is told then; whether the frames themselves diverge is the solver's to say.
@@ -441,11 +454,11 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
         let after = errors[..done].last().copied().unwrap_or(before);
         let temporal_weight = course.and_then(|course| course.stage.temporal_weight).unwrap_or(0.0);
         let shrinkage = course.map_or(0.0, Course::shrinkage);
-        // Something may move elsewhere in the picture; what, the first iterations don't tell.
         let planned = stage.temporal_shrinkage.unwrap_or(0.0);
-        let twice = fourfold(shrinkage, planned) && 2 * done >= stage.iterations;
-        let rest_shrinkage = twice.then_some(shrinkage);
+        let rest_shrinkage = fourfold(shrinkage, planned).then_some(shrinkage);
         let temporal_shrinkage = if rest_shrinkage.is_some() { planned } else { shrinkage };
+        // Something may move elsewhere in the picture; what, the first iterations don't tell.
+        let rest_everywhere = rest_shrinkage.is_some() && 2 * done < stage.iterations;
         let static_variance = course.and_then(|course| course.stage.static_variance);
         let gamma = course.and_then(|course| course.stage.gamma);
         let before = std::mem::replace(&mut before, after);
@@ -454,6 +467,7 @@ fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
             temporal_weight,
             temporal_shrinkage,
             rest_shrinkage,
+            rest_everywhere,
             static_variance,
             gamma,
             before,
@@ -475,6 +489,8 @@ pub struct Decision {
     pub temporal_shrinkage: f32,
     /// The same where nothing moves, if it is another.
     pub rest_shrinkage: Option<f32>,
+    /// Whether all is taken to be at rest then.
+    pub rest_everywhere: bool,
     /// The static variance of its projection.
     pub static_variance: Option<f32>,
     /// The noise term of its projection.
@@ -495,6 +511,7 @@ impl Schedule {
                 temporal_weight: positive(temporal_weight),
                 temporal_shrinkage: positive(temporal_shrinkage),
                 rest_shrinkage: decision.rest_shrinkage,
+                rest_everywhere: decision.rest_everywhere,
                 static_variance: decision.static_variance,
                 gamma: decision.gamma,
                 sigma,
@@ -574,7 +591,7 @@ impl Watch<'_, '_> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Course, Decision, StageEnd, StageFinding, piece, run};
+    use super::{Course, Decision, StageEnd, StageFinding, judge, piece, run};
     use crate::optics::{iid_masks, measure};
     use crate::recon::ReconError;
     use crate::recon::prior::{Denoiser, Network, Networks};
@@ -633,6 +650,7 @@ mod tests {
             temporal_weight: 0.0,
             temporal_shrinkage: 0.0,
             rest_shrinkage: None,
+            rest_everywhere: false,
             static_variance: None,
             gamma: None,
         }
@@ -756,6 +774,25 @@ mod tests {
         assert!(eightfold(0.5).surpasses(&taken) && !eightfold(1.5).surpasses(&taken));
         let moving = Course { at_rest: false, ..taken };
         assert!(!eightfold(0.5).surpasses(&moving), "by more than chance where something moves");
+    }
+
+    #[test]
+    fn a_stage_that_ends_early_does_not_tell_what_moves() {
+        let mut schedule = Schedule::pnp_nonlocal();
+        let planned = schedule.stages[1].temporal_shrinkage.unwrap();
+        let tv = schedule.stages[0].clone();
+        let before = || Course { stage: tv.clone(), ..course(0.0, [0.0; 4], (0, 0.0)) };
+        let mut found = |iterations, shrinkage| {
+            schedule.stages[1].iterations = iterations;
+            let taken = Course { diverged: true, ..course(shrinkage, [0.0; 4], (0, 0.0)) };
+            let found = judge(&schedule, &[before(), taken])[1];
+            assert_eq!(found.iterations, 1);
+            (found.temporal_shrinkage, found.rest_shrinkage, found.rest_everywhere)
+        };
+        let fourfold = 4.0 * planned;
+        assert_eq!(found(2, fourfold), (planned, Some(fourfold), false));
+        assert_eq!(found(3, fourfold), (planned, Some(fourfold), true));
+        assert_eq!(found(3, 2.0 * planned), (2.0 * planned, None, false));
     }
 
     #[test]

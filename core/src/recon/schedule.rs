@@ -93,6 +93,11 @@ pub struct Stage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = REST_SHRINKAGE.bounds())]
     pub rest_shrinkage: Option<f32>,
+    /// Whether all is taken to be at rest: the frames are those of the second run, and the first one only helps to
+    /// tell how near they come to the truth. Only beside rest_shrinkage. An adaptive schedule does so with a stage
+    /// that it ends in its first half, whose changes are mostly noise.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub rest_everywhere: bool,
     /// Share of the accumulated residual that accelerated GAP keeps from one iteration to the next: 1 is
     /// accelerated GAP, 0 plain GAP. A learned denoiser never explains the measurement fully, so with 1 the
     /// residual winds up in its stages.
@@ -225,6 +230,13 @@ impl Stage {
         if self.rest_shrinkage.is_some() && self.temporal_shrinkage.is_none() {
             return Err(REST_SHRINKAGE.refused("given", "left out without temporal_shrinkage"));
         }
+        if self.rest_everywhere && self.rest_shrinkage.is_none() {
+            return Err(ReconError::Parameter {
+                name: "rest_everywhere",
+                value: "true".into(),
+                range: "false without rest_shrinkage",
+            });
+        }
         // Where the prior passes everything (even brightness), an error `e` follows
         // `e_(k+1) = -memory momentum (e_k - e_(k-1))`.
         if self.memory * self.momentum > 0.5 {
@@ -234,6 +246,11 @@ impl Stage {
             ));
         }
         Ok(())
+    }
+
+    /// The first run of a stage alone.
+    pub(super) fn run_once(&self) -> Self {
+        Self { rest_shrinkage: None, rest_everywhere: false, ..self.clone() }
     }
 
     /// The most iterations that are run, of both runs if there are two.
@@ -305,7 +322,7 @@ impl Schedule {
             let wanted = if index + 1 == count { left } else { stage.iterations };
             stage.iterations = wanted.min(left);
             stage.tolerance = 0.0;
-            stage.rest_shrinkage = None;
+            (stage.rest_shrinkage, stage.rest_everywhere) = (None, false);
             left -= stage.iterations;
         }
         self.stages.retain(|stage| stage.iterations > 0);
@@ -321,6 +338,7 @@ impl Schedule {
             stage.temporal_shrinkage = stage.temporal_shrinkage.filter(|level| *level > 0.0);
             let twice = stage.temporal_shrinkage.is_some();
             stage.rest_shrinkage = stage.rest_shrinkage.filter(|_| twice);
+            stage.rest_everywhere &= stage.rest_shrinkage.is_some();
         }
         self
     }
@@ -472,6 +490,9 @@ mod tests {
             error.contains("rest_shrinkage") && error.contains("temporal_shrinkage"),
             "{error}"
         );
+        (schedule.stages[1].rest_shrinkage, schedule.stages[1].rest_everywhere) = (None, true);
+        let error = schedule.validate().unwrap_err().to_string();
+        assert!(error.contains("rest_everywhere") && error.contains("rest_shrinkage"), "{error}");
     }
 
     #[test]

@@ -4,12 +4,12 @@ use std::fs;
 use std::path::PathBuf;
 
 use clap::Args;
-use ndarray::{Array3, Axis, s};
+use ndarray::{Array3, ArrayView2, Axis, s};
 use sci_recon::cli::{CliError, MaskArguments, NetworkArguments, algorithms};
 use sci_recon::formats::{Channels, npy};
 use sci_recon::job::{Algorithm, Sequence};
 use sci_recon::pipeline::PipelineError;
-use sci_recon::recon::assessment::{BLOCK, FEATURES, blocks};
+use sci_recon::recon::assessment::{BLOCK, FEATURES, Model, blocks};
 use sci_recon::recon::metrics;
 use serde_json::json;
 
@@ -44,8 +44,8 @@ pub struct Arguments {
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for NAME.npy [features, the encoder's channels (if a network had a part), and the true error;
-    /// frame, block] and NAME.json.
+    /// Folder for NAME.npy [features, the encoder's channels (if a network had a part), both of the first run and
+    /// the distance of the results (if a stage was run twice), and the true error; frame, block] and NAME.json.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
 }
@@ -68,12 +68,12 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         let tile = bench.first_tile(&measured, &key)?;
         let (found, truth) = (&tile.outcome.frames, measured.truth());
         let (rows, columns) = blocks(side, side);
-        let Some(features) = &tile.outcome.features else {
+        let Some(seen_of_tile) = &tile.outcome.features else {
             let name = arguments.algorithm.into_str();
             return Err(CliError::Input(format!("{name}: its results are not assessed")));
         };
-        let count = features.len_of(Axis(0));
-        let features = features.to_shape((count, frames, rows * columns));
+        let count = seen_of_tile.len_of(Axis(0));
+        let features = seen_of_tile.to_shape((count, frames, rows * columns));
         let features = features.map_err(|error| CliError::Failure(error.to_string()))?;
         let mut seen = Array3::zeros((count + 1, frames, rows * columns));
         seen.slice_mut(s![..count, .., ..]).assign(&features);
@@ -94,13 +94,23 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         writer.finish()?;
         let pilot = tile.pilot.as_ref().and_then(|pilot| pilot.evidence.as_ref());
         let evidence = tile.outcome.evidence.as_ref().or(pilot);
+        let schedule = tile.pilot.as_ref().map(|pilot| pilot.decide(&key.schedule));
+        let expected = Model::of(schedule.as_ref().unwrap_or(&key.schedule)).map(|model| {
+            let errors = model.log_errors(seen_of_tile, evidence, tile.white);
+            let psnr = |frame: ArrayView2<'_, f32>| {
+                -10.0 * frame.mapv(|error| 10f32.powf(error)).mean().unwrap_or(0.0).log10()
+            };
+            let mean = errors.outer_iter().map(psnr).sum::<f32>() / frames as f32;
+            mean - 20.0 * tile.white.log10()
+        });
         let about = json!({"clip": clip.name, "setting": setting, "cr": frames, "features": FEATURES,
-            "algorithm": arguments.algorithm, "psnr_db": psnr, "white": tile.white,
-            "evidence": evidence, "pilot": tile.pilot});
+            "algorithm": arguments.algorithm, "psnr_db": psnr, "expected_psnr_db": expected,
+            "white": tile.white, "evidence": evidence, "pilot": tile.pilot});
         let path = out.join(format!("{}.json", clip.name));
         fs::write(&path, about.to_string())
             .map_err(|error| CliError::file("write", &path, &error))?;
-        eprintln!("{}: {psnr:.2} dB", clip.name);
+        let expected = expected.map_or("-".into(), |psnr| format!("{psnr:.2}"));
+        eprintln!("{}: {psnr:.2} dB, expected {expected}", clip.name);
     }
     Ok(())
 }

@@ -83,7 +83,7 @@ function pilot(content) {
     const decided = [
       why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
       stage.planned_temporal_shrinkage > 0 && `shrinkage along time ${stage.temporal_shrinkage > 0 ? figure(stage.temporal_shrinkage) : "left out"}`,
-      stage.rest_shrinkage != null && `where nothing moves ${figure(stage.rest_shrinkage)}`,
+      stage.rest_shrinkage != null && (stage.rest_everywhere ? `as all is at rest ${figure(stage.rest_shrinkage)}` : `where nothing moves ${figure(stage.rest_shrinkage)}`),
       stage.planned_static_variance && `static variance ${stage.static_variance ?? "left out"}`,
       stage.gamma != null && `noise term ${stage.gamma}`,
       stage.planned_temporal_weight > 0 && `total variation along time ${stage.temporal_weight > 0 ? "kept" : "left out"}`,

@@ -124,27 +124,37 @@ pub fn reconstruct_assessed(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome> {
-    let mut early = None;
-    let mut outcome = stages((op, y), schedule, networks, observer, |stage, frames| {
+    let (mut early, mut first) = (None, None);
+    let mut outcome = stages((op, y), schedule, networks, observer, |stage, run| {
         if stage == 0 && schedule.stages.len() > 1 {
-            early = Some(frames.to_owned());
+            early = Some(run.frames().to_owned());
         }
+        first = run.first.take();
     })?;
     let early = early.as_ref().map(|early| early.view());
     let deep = !schedule.networks().is_empty();
-    let encoder = if deep { networks.encoder()? } else { None };
-    let seen = assessment::encoded_features(op, early, outcome.frames.view(), encoder)?;
-    outcome.features = Some(seen);
+    let mut see = |frames| {
+        let encoder = if deep { networks.encoder()? } else { None };
+        assessment::encoded_features(op, early, frames, encoder)
+    };
+    let seen = see(outcome.frames.view())?;
+    outcome.features = Some(match &first {
+        None => seen,
+        Some(first) => {
+            let frames = (outcome.frames.view(), first.view());
+            assessment::with_first_run(&seen, &see(first.view())?, frames)?
+        }
+    });
     Ok(outcome)
 }
 
-/// Runs the stages, and tells after each of them its index and the frames.
+/// Runs the stages, and shows after each of them its index and where the reconstruction stands.
 pub(super) fn stages(
     (op, y): (&SensingOperator, ArrayView3<'_, f32>),
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-    mut done: impl FnMut(usize, ArrayView3<'_, f32>),
+    mut done: impl FnMut(usize, &mut Run<'_>),
 ) -> Result<Outcome> {
     schedule.validate()?;
     if y.dim() != op.measurement_dim() {
@@ -161,7 +171,7 @@ pub(super) fn stages(
     let mut stop_reason = StopReason::MaxIterations;
     for (index, stage) in schedule.stages.iter().enumerate() {
         stop_reason = run.stage(index, stage, observer)?;
-        done(index, run.frames());
+        done(index, &mut run);
     }
     let residual = run.residual();
     Ok(Outcome {
@@ -188,6 +198,8 @@ pub(super) struct Run<'a> {
     y_norm: f64,
     state: State,
     x: Array3<f32>,
+    /// The frames of the first run of a stage that is run twice, after it.
+    first: Option<Array3<f32>>,
     /// The prior of the stage, at work.
     pass: Option<Box<dyn Pass>>,
     /// What the stage supposes of the error and the noise.
@@ -216,6 +228,7 @@ impl<'a> Run<'a> {
             y,
             state: State::new(op, schedule),
             x: Array3::zeros(op.dim()),
+            first: None,
             pass: None,
             supposed: Statistics::default(),
             gamma: schedule.gamma,
@@ -238,12 +251,15 @@ impl<'a> Run<'a> {
         };
         let start = self.state();
         self.once(index, stage, observer)?;
-        let motion = rest::motion(&start.v, &self.state.v);
-        let moving = std::mem::replace(&mut self.state, start).v;
-        let still =
-            Stage { temporal_shrinkage: Some(shrinkage), rest_shrinkage: None, ..stage.clone() };
+        let moves = !stage.rest_everywhere;
+        let motion = moves.then(|| rest::motion(&start.v, &self.state.v));
+        let first = std::mem::replace(&mut self.state, start).v;
+        let still = Stage { temporal_shrinkage: Some(shrinkage), ..stage.run_once() };
         let stop_reason = self.once(index, &still, observer)?;
-        rest::keep_motion(&mut self.state.v, &moving, &motion);
+        if let Some(motion) = motion {
+            rest::keep_motion(&mut self.state.v, &first, &motion);
+        }
+        self.first = Some(first);
         Ok(stop_reason)
     }
 
@@ -523,12 +539,13 @@ mod reference {
 
 #[cfg(test)]
 mod tests {
-    use super::{Control, Observer, Progress, Run, reconstruct, rest};
+    use super::{Control, Observer, Progress, Run, reconstruct, reconstruct_assessed, rest};
+    use crate::recon::assessment::FEATURES;
     use crate::recon::prior::temporal::TemporalVariation;
     use crate::recon::prior::tv::TotalVariation;
     use crate::recon::schedule::Schedule;
     use crate::recon::sensing::{SensingOperator, Statistics};
-    use ndarray::{Array3, ArrayView3, s};
+    use ndarray::{Array3, ArrayView3, Axis, s};
     use rand::{Rng, SeedableRng};
 
     /// Strip by strip is what projection, total variation along time and that of each frame do one after
@@ -583,27 +600,35 @@ mod tests {
         });
         let op = SensingOperator::new(masks).unwrap();
         let y = op.forward(truth.view()).unwrap();
-        let solve = |shrinkage: Option<(f32, Option<f32>)>| {
+        let solve = |shrinkage: Option<(f32, Option<f32>, bool)>| {
             let mut schedule = Schedule::pnp_nonlocal();
             let mut stage = schedule.stages.pop().unwrap();
-            if let Some((temporal, rest)) = shrinkage {
+            if let Some((temporal, rest, everywhere)) = shrinkage {
                 (stage.temporal_shrinkage, stage.rest_shrinkage) = (Some(temporal), rest);
+                stage.rest_everywhere = everywhere;
                 stage.iterations = 8;
                 schedule.stages.push(stage);
             }
             let mut steps = Vec::new();
             let mut watch = Steps(&mut steps);
-            let frames = reconstruct(&op, y.view(), &schedule, &mut (), &mut watch).unwrap().frames;
+            let outcome =
+                reconstruct_assessed(&op, y.view(), &schedule, &mut (), &mut watch).unwrap();
+            let seen = outcome.features.map(|seen| seen.len_of(Axis(0)));
+            let rest = schedule.stages.iter().any(|stage| stage.rest_shrinkage.is_some());
+            let both = if rest { 2 * FEATURES.len() + 1 } else { FEATURES.len() };
+            assert_eq!(seen, Some(both), "what is seen of the first run, too");
             assert!(steps.windows(2).all(|pair| pair[0].0 < pair[1].0 && pair[0].1 >= pair[1].1));
             assert_eq!(steps.last().map(|step| step.0 == step.1), Some(true), "all is done");
-            frames
+            outcome.frames
         };
-        let (before, little) = (solve(None), solve(Some((0.35, None))));
-        let mut expected = solve(Some((1.4, None)));
+        let (before, little) = (solve(None), solve(Some((0.35, None, false))));
+        let much = solve(Some((1.4, None, false)));
+        assert_eq!(solve(Some((0.35, Some(1.4), true))), much);
+        let mut expected = much;
         let motion = rest::motion(&before, &little);
         rest::keep_motion(&mut expected, &little, &motion);
         assert!(motion.iter().any(|share| *share < 0.1) && motion.iter().any(|share| *share > 0.9));
-        assert_eq!(solve(Some((0.35, Some(1.4)))), expected);
+        assert_eq!(solve(Some((0.35, Some(1.4), false))), expected);
     }
 
     /// Iterations done, and planned.
