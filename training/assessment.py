@@ -32,7 +32,7 @@ ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
 MODELS = {'gap-tv': ('gap-tv', False), 'pnp-tv-fastdvdnet': ('pnp-tv-fastdvdnet', False), 'pnp-tv-fastdvdnet, shrunk': ('pnp-tv-fastdvdnet', True)}
 SHRUNK = 1.0
 FEATURES, CHANNELS = 26, 128    # as the program has them, those of its encoder after the others
-MOVES, SURE, LEAST = 3.0, .3, .1  # as the program has them: see `apart`
+MOVES, DOUBT, LEAST = 3.0, .3, .1  # as the program has them: see `apart`
 FARTHEST = 3.0      # as the program has it
 BEST = 40.0         # dB: better is not told apart, here and in the program
 SPARE = 10.0        # dB above it up to which the fit follows
@@ -178,7 +178,7 @@ class Case:
         error = 10 ** of_first
         left = torch.log10(torch.maximum(error - self.distance, LEAST * error))
         more = 10 * torch.log10(error.mean() / self.distance.mean())
-        return torch.sigmoid((more - MOVES) / SURE), left
+        return torch.sigmoid((more - MOVES) / DOUBT), left
 
     def psnr_of(self, errors):
         """Of the decimal logarithms of the errors of blocks, as many of each frame."""
