@@ -344,7 +344,10 @@ def fit(a):
             raise SystemExit(f'{a.out} has no cases for the model of {name}')
         # Those that were shrunk are few: their model may go on from that of the others.
         known = start and start.get(name, start[algorithm])
-        first = Model.read(models.get(algorithm) or start[algorithm]) if shrunk else None
+        others = models.get(algorithm) or (start and start[algorithm])
+        if shrunk and not others:
+            raise SystemExit(f'{name} needs the model of {algorithm} first: fit that, or give a file that has it (--write, --start)')
+        first = Model.read(others) if shrunk else None
         names = sorted({case.scene for case in cases})
         fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
