@@ -203,14 +203,14 @@ class Model:
             self.scale_as(start)
         else:
             self.scale(cases)
-        count = self.inputs(cases[0]).shape[1]
+        inputs, firsts = [self.inputs(case).half() for case in cases], [self.by_first(case) for case in cases]
         self.networks = []
         for seed, known in enumerate(start['networks'] if start else [None] * a.networks):
             torch.manual_seed(seed)
-            network = self.network(count, known)
+            network = self.network(inputs[0].shape[1], known)
             if known is None:
                 nn.init.constant_(network[-1].bias, float(torch.cat([case.error for case in cases]).mean()))
-            self.networks.append(self.fitted(network, cases, a))
+            self.networks.append(self.fitted(network, cases, inputs, firsts, a))
 
     @classmethod
     def read(cls, record):
@@ -269,9 +269,9 @@ class Model:
             return torch.tensor(0.), torch.zeros_like(case.error)
         return case.apart(self.first.errors(case.first_run()))
 
-    def fitted(self, network, cases, a):
-        inputs = [self.inputs(case).half() for case in cases]
-        firsts = [self.by_first(case) for case in cases]
+    @staticmethod
+    def fitted(network, cases, inputs, firsts, a):
+        """A network, fitted to cases by their inputs and by what first runs tell of them."""
         count = inputs[0].shape[1]
         optimiser = torch.optim.AdamW(network.parameters(), a.rate, weight_decay=.05)
         batches = torch.arange(len(cases)).split(8)

@@ -432,9 +432,8 @@ impl Model {
 
     /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is
     /// seen of them ([`encoded_features`]), and of the frames of the first run of a stage that was run twice.
-    /// Without evidence signs count as in the mean of the fit, and the
-    /// features of the whole stand for those of the piece; without an encoder its components count as in the
-    /// mean. `white` is the scene's white level.
+    /// Without evidence signs count as in the mean of the fit, and the features of the whole stand for those of the
+    /// piece; without an encoder its components count as in the mean. `white` is the scene's white level.
     pub fn log_errors(
         &self,
         features: &Array4<f32>,
