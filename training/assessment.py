@@ -1,12 +1,13 @@
 """Fit what the program predicts of its own results without a truth: the expected error of blocks and the PSNR of a snapshot.
 
-    python assessment.py make --binary sci-recon-experiments --data DATA --scenes SCENES [--more FOLDER] --out FOLDER
+    python assessment.py make --binary sci-recon-experiments --data DATA [--more FOLDER] --out FOLDER
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
 `make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, a third of
 them with a part that moves by itself, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them
 reconstructed. It goes on where it was stopped, and what it has made so far is a mixture of all. `fit` fits small networks to
-all cases, and tells how they do on scenes that were left out (no scene is in two folds).
+all cases, and tells how they do on scenes that were left out (no scene is in two folds). The scenes of `eval_loop.py`, which judges them,
+are in no fit.
 """
 import argparse
 import copy
@@ -17,9 +18,10 @@ import subprocess
 
 import cv2
 import numpy as np
-import scipy.io
 import torch
 from torch import nn
+
+import eval_loop
 
 SIDES, LONGEST, BLOCK = (128, 256, 256), 24, 16      # the last as the program has it
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
@@ -39,14 +41,12 @@ SPARE = 10.0        # dB above it up to which the fit follows
 COMPONENTS = 64     # of what the encoder sees
 NEAR = 1.5          # dB: misses much larger than this weigh no more than one another in the fit
 AT_ONCE = 64        # blocks of a case that a step sees, in all its frames
+WHOLE = slice(14, 17)  # which features are of the whole frame
+JOINED = .6         # share of cases that a step sees with a part of another one
+LIKE = 6.0          # dB: pictures whose white levels are as near may be parts of one
 
 
 # ---------------------------------------------------------------- scenes
-def pictures(folder):
-    files = sorted(glob.glob(f'{folder}/*.jpg') + glob.glob(f'{folder}/*.png'))
-    return np.stack([cv2.imread(f, cv2.IMREAD_GRAYSCALE) for f in files])
-
-
 def panned(rng, file, others, wide):
     """A camera that moves over a photograph, perhaps with a part of another one that moves by itself."""
     photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE).astype(np.float32)
@@ -89,15 +89,12 @@ def cropped(rng, clip, wide):
 def cases(a):
     """Name, scene, frames [B,H,W] (uint8), kind of masks, noise and seed of each case, in an order that mixes all of them."""
     photos = sorted(glob.glob(f'{a.data}/photos/train/*.jpg')) + sorted(glob.glob(f'{a.data}/photos/val/*.jpg'))
-    clips = {os.path.basename(folder): pictures(folder) for folder in sorted(glob.glob(f'{a.data}/clips/*/*'))}
+    clips = {os.path.basename(folder): eval_loop.pictures(folder) for folder in sorted(glob.glob(f'{a.data}/clips/*/*'))}
     if a.more:
         photos += sorted(glob.glob(f'{a.more}/*.jpg') + glob.glob(f'{a.more}/*.png'))
         clips |= {os.path.basename(file)[:-4]: np.load(file) for file in sorted(glob.glob(f'{a.more}/*.npy'))}
-    clips['traffic'] = scipy.io.loadmat(f'{a.scenes}/traffic48_cacti.mat')['orig'].transpose(2, 0, 1).round().astype(np.uint8)
-    clips['city'] = pictures(os.path.join(os.path.dirname(os.path.abspath(__file__)), '../demo/clip'))
-    with np.load(f'{a.scenes}/street_1024x1024x20.npz') as archive:
-        street = next(archive[k] for k in archive.files if archive[k].ndim == 3)
-    clips['street'] = street if street.dtype == np.uint8 else (street * 255).round().astype(np.uint8)
+    judged = eval_loop.judged()
+    photos, clips = [photo for photo in photos if os.path.basename(photo) not in judged], {name: clip for name, clip in clips.items() if name not in judged}
     all_of = [(photo, None) for photo in photos for _ in range(4)] + [(name, clip) for name, clip in clips.items() for _ in range(8)]
     sides = (a.side,) if a.side else SIDES
     for number, index in enumerate(np.random.default_rng(11).permutation(len(all_of))):
@@ -154,7 +151,7 @@ class Case:
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
         self.told_by(about['evidence'])
         self.first_evidence = about['evidence'].get('first')
-        self.pattern = about['setting']['pattern']
+        self.pattern, self.noise = about['setting']['pattern'], about['setting']['noise_sigma']
         # The default's pilot shrinks changes along time; gap-tv has none.
         stages = about['pilot']['stages'] if about.get('pilot') else []
         self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
@@ -269,24 +266,47 @@ class Model:
             return torch.tensor(0.), torch.zeros_like(case.error)
         return case.apart(self.first.errors(case.first_run()))
 
-    @staticmethod
-    def fitted(network, cases, inputs, firsts, a):
+    def joined(self, one, other, share):
+        """Inputs [frame, block, input] of a picture that has such a share of the other's blocks, and its piece among those of the first."""
+        rest = slice(3 * FEATURES, 3 * FEATURES + FEATURES + len(self.signs[0]))
+        other[:, :, rest] = one[:, :1, rest]
+        mean, scale = (values[WHOLE] for values in self.features)
+        energy = lambda of: 10 ** (of[:, 0, WHOLE] * scale + mean)
+        whole = scaled(torch.log10((1 - share) * energy(one) + share * energy(other)), (mean, scale))
+        both = torch.cat([one, other], 1)
+        for kind, values in enumerate((whole, whole, whole.mean(0, keepdim=True))):     # of the block, around it, in all frames
+            both[:, :, kind * FEATURES + WHOLE.start:kind * FEATURES + WHOLE.stop] = values[:, None]
+        return both
+
+    def fitted(self, network, cases, inputs, firsts, a):
         """A network, fitted to cases by their inputs and by what first runs tell of them."""
         count = inputs[0].shape[1]
         optimiser = torch.optim.AdamW(network.parameters(), a.rate, weight_decay=.05)
         batches = torch.arange(len(cases)).split(8)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, a.rate, total_steps=a.epochs * len(batches))
+        like = lambda one, other: (one.pattern, one.frames, one.noise) == (other.pattern, other.frames, other.noise) and abs(one.white - other.white) < LIKE
+        # Not where first runs tell of a case: they tell of all of it.
+        others = [[] if self.first else [other for other in range(len(cases)) if other != index and like(case, cases[other])] for index, case in enumerate(cases)]
         for _ in range(a.epochs):
             order = torch.randperm(len(cases))
             for batch in batches:
                 drawn, seen, errors, by_first = [cases[index] for index in order[batch].tolist()], [], [], []
                 for index, case in zip(order[batch].tolist(), drawn):
                     blocks = torch.randperm(case.side ** 2)[:AT_ONCE]
-                    of = lambda values: values.reshape(case.frames, case.side ** 2, -1)[:, blocks].flatten(0, 1).float()
+                    of = lambda index, values, blocks: values.reshape(cases[index].frames, cases[index].side ** 2, -1)[:, blocks].float()
+                    if others[index] and torch.rand(()) < JOINED:
+                        # In small pictures the piece is half of all; in large ones it is not, and the rest is unlike it.
+                        other, part = others[index][int(torch.randint(len(others[index]), ()))], int(AT_ONCE * torch.empty(()).uniform_(.2, .9))
+                        blocks, there = blocks[part:], torch.randperm(cases[other].side ** 2)[:part]
+                        given = self.joined(of(index, inputs[index], blocks), of(other, inputs[other], there), part / AT_ONCE)
+                        error = torch.cat([of(index, case.error, blocks), of(other, cases[other].error, there)], 1)
+                        left = torch.zeros_like(error)
+                    else:
+                        given, error, left = (of(index, values, blocks) for values in (inputs[index], case.error, firsts[index][1]))
                     # All cases of a fit are a little alike, and those to come are not.
-                    seen.append(of(inputs[index]) + .1 * torch.randn(1, count))
-                    errors.append(of(case.error)[:, 0])
-                    by_first.append((firsts[index][0], of(firsts[index][1])[:, 0]))
+                    seen.append(given.flatten(0, 1) + .1 * torch.randn(1, count))
+                    errors.append(error.flatten())
+                    by_first.append((firsts[index][0], left.flatten()))
                 seen = torch.cat(seen)
                 told = network(seen + .05 * torch.randn_like(seen))[:, 0].split([len(of_case) for of_case in errors])
                 loss = 0
@@ -339,7 +359,7 @@ def fit(a):
     for name in [a.model] if a.model else MODELS:
         algorithm, shrunk = MODELS[name]
         cases = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))]
-        cases = [case for case in cases if case.shrunk == shrunk]
+        cases = [case for case in cases if case.shrunk == shrunk and case.scene not in eval_loop.judged()]
         if not cases:
             raise SystemExit(f'{a.out} has no cases for the model of {name}')
         # Those that were shrunk are few: their model may go on from that of the others.
@@ -395,7 +415,6 @@ def main():
     p.add_argument('what', choices=('make', 'fit'))
     p.add_argument('--binary', default='sci-recon-experiments')
     p.add_argument('--data', default='../../shared/training')
-    p.add_argument('--scenes', default='../../shared/scenes')
     p.add_argument('--more', help='a folder of further photographs (.jpg, .png) and clips (.npy, [frame, row, column] of uint8)')
     p.add_argument('--out', default='assessment-output')
     p.add_argument('--write', help='the file of the models')

@@ -90,8 +90,21 @@ CASES = {
 }
 
 
+# What predictions are judged on besides: the same scenes, larger, each with the masks, the ratio and the noise that follow its own here.
+FOLLOWING = ('iid', 'random-squares', 'rotating-circle'), (6, 8, 10, 12, 16, 20, 24, 30), (0, 5, 10)
+NEAR = 1.5          # dB; a prediction that is further off counts as wrong
+BEST = 40.0         # dB; the program does not tell apart what is better
+
+
 def cases():
     return [Setting(*case, size=CASE_SIZE, half=half) for half, those in CASES.items() for case in those]
+
+
+def following(lengths):
+    """The cases of CASES anew, as FOLLOWING has it; `lengths` are those of the clips."""
+    for case in cases():
+        masks, cr, sigma = (values[(values.index(own) + 1) % len(values)] for values, own in zip(FOLLOWING, (case.masks, case.cr, case.sigma)))
+        yield Setting(case.scene, masks, cr if cr <= lengths[case.scene] else FOLLOWING[1][0], sigma)
 
 
 def all_settings(lengths):
@@ -128,12 +141,12 @@ def panned(file, scale, step, light=1.0, turn=0.0, count=24, size=CASE_SIZE):
 
 
 def drawn(frame, count=24, size=CASE_SIZE):
-    """A clip by its formula `frame(k, i, j)`, in grey values."""
+    """A clip by its formula `frame(k, i, j, size)`, in grey values."""
     i, j = np.mgrid[:size, :size].astype(np.float32)
-    return np.stack([frame(k, i, j) for k in range(count)]).clip(0, 255).round().astype(np.uint8)
+    return np.stack([frame(k, i, j, size) for k in range(count)]).clip(0, 255).round().astype(np.uint8)
 
 
-def shapes(k, i, j, size=CASE_SIZE):
+def shapes(k, i, j, size):
     """Discs of all sizes that cross each other before a slope."""
     grey = 60 + 80 * i / size
     for n in range(6):
@@ -142,7 +155,7 @@ def shapes(k, i, j, size=CASE_SIZE):
     return grey
 
 
-def gratings(k, i, j, size=CASE_SIZE):
+def gratings(k, i, j, size):
     """Fine stripes, two ways."""
     upper, lower = (i + 0.7 * k) / 5.3 + j / 17, (j - 1.3 * k) / 7.1 - i / 23
     return 128 + 50 * np.sin(2 * np.pi * np.where(i < size / 2, upper, lower))
@@ -160,8 +173,13 @@ PANNED = {
 }
 
 
-def clips(a):
-    """Name -> frames [count,H,W], uint8. None of them was trained on."""
+def judged():
+    """What the scenes are called where there is footage of them, as `training/assessment.py` has it: they are in no fit."""
+    return {'traffic', 'street', 'city', 'gh-mdn__flower', 'gh-intel__asl_bird'} | {f'{photo}.jpg' for photo, *_ in PANNED.values()}
+
+
+def clips(a, size=CASE_SIZE):
+    """Name -> frames [count,H,W], uint8; photographs and drawn clips of this size. None of them was trained on."""
     for path in (a.traffic, a.street):
         if not os.path.isfile(path):
             raise SystemExit(f'there is no scene {path}: --scenes (make: SCENES=folder) names the folder of the scenes')
@@ -173,9 +191,9 @@ def clips(a):
         'city': pictures(os.path.join(HERE, '../demo/clip')),
         'flower': pictures(os.path.join(a.data, 'clips/val/gh-mdn__flower')),
         'bird': pictures(os.path.join(a.data, 'clips/val/gh-intel__asl_bird')),
-        'shapes': drawn(shapes),
-        'gratings': drawn(gratings),
-    } | {name: panned(os.path.join(a.data, f'photos/val/{photo}.jpg'), *how) for name, (photo, *how) in PANNED.items()}
+        'shapes': drawn(shapes, size=size),
+        'gratings': drawn(gratings, size=size),
+    } | {name: panned(os.path.join(a.data, f'photos/val/{photo}.jpg'), *how, size=size) for name, (photo, *how) in PANNED.items()}
 
 
 def middle(frames, count, size):
@@ -275,8 +293,9 @@ def ways(program, a, frames, folder):
 
 # ---------------------------------------------------------------- rows
 def source_hash():
-    """Of the code that a row depends on."""
-    files = sorted(f for part in ('recon', 'optics') for f in glob.glob(os.path.join(HERE, '../core/src', part, '**/*.rs'), recursive=True))
+    """Of the code, and of the models of predictions, that a row depends on."""
+    files = sorted(f for part in ('recon/**/*.rs', 'recon/*.json', 'optics/**/*.rs')
+                   for f in glob.glob(os.path.join(HERE, '../core/src', part), recursive=True))
     digest = hashlib.sha256()
     for f in files:
         with open(f, 'rb') as content:
@@ -286,13 +305,17 @@ def source_hash():
 
 class Rows:
     def __init__(self, program, a, footage):
+        """`footage` is of sizes, then of names."""
         self.program, self.a, self.footage, self.source = program, a, footage, source_hash()
         self.folder = os.path.join(a.out, 'rows')
         os.makedirs(self.folder, exist_ok=True)
 
+    def frames(self, setting):
+        size = min(setting.size, max(self.footage))
+        return middle(self.footage[size][setting.scene], setting.cr, setting.size)
+
     def key(self, setting, way):
-        frames = middle(self.footage[setting.scene], setting.cr, setting.size)
-        parts = [dataclasses.asdict(setting), SEED, hashlib.sha256(frames).hexdigest(), way.algorithm, way.schedule, way.models, self.source]
+        parts = [dataclasses.asdict(setting), SEED, hashlib.sha256(self.frames(setting)).hexdigest(), way.algorithm, way.schedule, way.models, self.source]
         del parts[0]['twice'], parts[0]['half']
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -308,11 +331,12 @@ class Rows:
             if setting.masks == 'own':
                 inputs = ['--scene', self.a.traffic, '--snapshot', setting.snapshot]
             else:
-                inputs = self.program.simulate(middle(self.footage[setting.scene], setting.cr, setting.size), setting, folder)
+                inputs = self.program.simulate(self.frames(setting), setting, folder)
             report = json.loads(self.program.run('reconstruct', *inputs, *way.arguments, '--threads', 1, '--json'))
+        told = report['assessment'] or {}
         row = {'scene': str(setting), 'masks': setting.masks, 'cr': setting.cr, 'sigma': setting.sigma, 'half': setting.half, 'algorithm': name,
                'psnr_db': round(report['psnr_db'], 2), 'ssim': round(report['ssim'], 4), 'passes': report['denoiser_passes'],
-               'cpu_seconds': round(report['cpu_seconds'], 1), 'models': {m['name']: m['sha256'] for m in way.models}}
+               'cpu_seconds': round(report['cpu_seconds'], 1), 'predicted': [told.get(end) for end in ('psnr_low_db', 'psnr_db', 'psnr_high_db')], 'models': {m['name']: m['sha256'] for m in way.models}}
         with open(path + '.part', 'w') as f:
             json.dump(row, f)
         os.replace(path + '.part', path)
@@ -365,7 +389,24 @@ def summary(rows):
     ]
 
 
-def table(rows, summed):
+def predictions(rows):
+    """How far what the default tells of its PSNR is from the true one, by size and masks."""
+    rows = [r for r in rows if r['algorithm'] == DEFAULT]
+    size = lambda r: r['scene'].split()[1]
+    groups = {'all': rows}
+    for kind in (size, lambda r: r['masks']):
+        groups |= {str(value): [r for r in rows if kind(r) == value] for value in sorted({kind(r) for r in rows})}
+    for what, of in groups.items():
+        told = np.array([r['predicted'] for r in of if None not in r['predicted']]).reshape(-1, 3)
+        if len(told):
+            true = np.minimum([r['psnr_db'] for r in of if None not in r['predicted']], BEST)
+            off = np.abs(true - told[:, 1])
+            yield {'what': what, 'mean_db': round(off.mean(), 2), 'four_of_five_db': round(np.quantile(off, .8), 2),
+                   'near_percent': round(100 * np.mean(off <= NEAR)), 'inside_percent': round(100 * np.mean((told[:, 0] <= true) & (true <= told[:, 2]))),
+                   'snapshots': len(of), 'untold': len(of) - len(told)}
+
+
+def table(rows, summed, predicted):
     yield '| scene | masks | Cr | noise | algorithm | PSNR dB | SSIM | passes | CPU s |'
     yield '| --- | --- | --- | --- | --- | --- | --- | --- | --- |'
     before = None
@@ -379,6 +420,12 @@ def table(rows, summed):
     yield '| --- | --- | --- | --- | --- | --- |'
     for s in summed:
         yield f"| {s['what']} | {s['mean_db']:+.2f} | {s['worst_db']:+.2f} | {s['lost_percent']} % | {s['snapshots']} | {s['aim']} |"
+    yield ''
+    yield f'| PSNR as {DEFAULT} predicts it | mean error, dB | 80 % within, dB | within {NEAR} dB (aim: 80 %) | in the interval (of 80 %) | snapshots | without |'
+    yield '| --- | --- | --- | --- | --- | --- | --- |'
+    for s in predicted:
+        yield (f"| {s['what']} | {s['mean_db']:.2f} | {s['four_of_five_db']:.2f} | {s['near_percent']} % | {s['inside_percent']} % | "
+               f"{s['snapshots']} | {s['untold']} |")
 
 
 def main():
@@ -391,6 +438,7 @@ def main():
     p.add_argument('--out', default='eval-output', help='folder for the rows')
     p.add_argument('--jobs', type=int, default=2, help='runs at the same time, one thread each')
     p.add_argument('--full', action='store_true', help='every combination, 512x512 too: days on two cores')
+    p.add_argument('--predictions', action='store_true', help=f'only what predictions are judged on: {DEFAULT}')
     p.add_argument('--fresh', action='store_true', help='compute every row again')
     p.add_argument('--cached', action='store_true', help='compute nothing: the rows that are there')
     p.add_argument('--json', action='store_true', help='one JSON object a row, and one with all rows at the end')
@@ -398,16 +446,18 @@ def main():
     a.traffic, a.street = (os.path.join(a.scenes, name) for name in ('traffic48_cacti.mat', 'street_1024x1024x20.npz'))
     if not os.path.isfile(a.white):
         raise SystemExit(f'there is no checkpoint {a.white}: --white (make: WHITE=file) names weights trained on white noise, train.py --stage full')
-    footage, program = clips(a), Program(a.binary)
-    settings = all_settings({name: len(frames) for name, frames in footage.items()}) if a.full else DEFAULT_SETTINGS
+    footage, program = {size: clips(a, size) for size in (CASE_SIZE, Setting.size)}, Program(a.binary)
+    lengths = {name: len(frames) for name, frames in footage[CASE_SIZE].items()}
+    settings = all_settings(lengths) if a.full else DEFAULT_SETTINGS
     with tempfile.TemporaryDirectory() as folder:
-        known = ways(program, a, footage['city'], folder)
-        tasks = [(s, name, known[name]) for s in settings for name in NETWORKS if name != TWICE or s.twice]
-        tasks += [(s, name, known[name]) for s in cases() for name in PLANS]
+        known = ways(program, a, footage[CASE_SIZE]['city'], folder)
+        tasks = [(s, name) for s in settings for name in NETWORKS if name != TWICE or s.twice]
+        tasks += [(s, name) for s in cases() for name in PLANS] + [(s, DEFAULT) for s in following(lengths)]
+        tasks = [(s, name, known[name]) for s, name in tasks if name == DEFAULT or not a.predictions]
         report = lambda row: print(json.dumps(row), file=sys.stdout if a.json else sys.stderr, flush=True)
         rows = Rows(program, a, footage).all(tasks, report)
-    summed = summary(rows)
-    print(json.dumps({'rows': rows, 'summary': summed}) if a.json else '\n'.join(table(rows, summed)))
+    summed, predicted = summary(rows), list(predictions(rows))
+    print(json.dumps({'rows': rows, 'summary': summed, 'predictions': predicted}) if a.json else '\n'.join(table(rows, summed, predicted)))
 
 
 if __name__ == '__main__':
