@@ -142,7 +142,7 @@ eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## our networks bes
 		$(if $(JSON),--json) models/fastdvdnet-gray models/ffdnet-gray
 # A checkpoint of the same network before it was trained in the loop.
 WHITE ?= ../shared/weights/fastdvdnet_gray_first.pt
-eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop, network by network, within an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
+eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop, network by network, in about an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
