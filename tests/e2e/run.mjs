@@ -15,7 +15,7 @@ import { scene } from "./scene.mjs";
 import { access, faults, loading, phone } from "./states.mjs";
 
 const FRAMES = 8;
-const LIMITS = { bytes: 150_000, paint: 300 };
+const MOST_BYTES = 150_000;
 const program = process.argv[2];
 const checks = new Checks(fileURLToPath(new URL("../../e2e-output", import.meta.url)));
 const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium" });
@@ -95,8 +95,7 @@ async function loaded(service, measurement) {
   const found = await visit(browser, checks, service.url);
   const still = await service.call("GET", `/v1/jobs/${jobs[0].id}`);
   checks.that(still.progress.tiles_running === 2, "both workers computed meanwhile");
-  checks.that(found.bytes < LIMITS.bytes, `the dashboard weighs ${found.bytes} bytes`);
-  checks.that(found.paint < LIMITS.paint, `the first paint took ${found.paint} ms`);
+  checks.that(found.bytes < MOST_BYTES, `the dashboard weighs ${found.bytes} bytes`);
   await service.call("POST", `/v1/jobs/${jobs[0].id}/cancel`);
   return { page_bytes: found.bytes, page_files: found.files, first_paint_ms: found.paint };
 }
