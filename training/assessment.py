@@ -24,7 +24,7 @@ from torch import nn
 import eval_loop
 
 SIDES, LONGEST, BLOCK = (128, 256, 256), 24, 16      # the last as the program has it
-PATTERNS = 'iid', 'random-squares', 'rotating-circle'
+PATTERNS = eval_loop.FOLLOWING[0]
 RATIOS = 6, 8, 10, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
 # Pixels a frame. At rest and fast most: there the pilot shrinks most of what changes, and has to be told right from wrong.
@@ -36,10 +36,10 @@ SHRUNK = 1.0
 FEATURES, CHANNELS = 26, 128    # as the program has them, those of its encoder after the others
 MOVES, DOUBT, LEAST = 3.0, .3, .1  # as the program has them: see `apart`
 FARTHEST = 3.0      # as the program has it
-BEST = 40.0         # dB: better is not told apart, here and in the program
+BEST = eval_loop.BEST
 SPARE = 10.0        # dB above it up to which the fit follows
 COMPONENTS = 64     # of what the encoder sees
-NEAR = 1.5          # dB: misses much larger than this weigh no more than one another in the fit
+NEAR = eval_loop.NEAR   # misses much larger than this weigh no more than one another in the fit
 AT_ONCE = 64        # blocks of a case that a step sees, in all its frames
 WHOLE = slice(14, 17)  # which features are of the whole frame
 JOINED = .6         # share of cases that a step sees with a part of another one
@@ -200,14 +200,14 @@ class Model:
             self.scale_as(start)
         else:
             self.scale(cases)
-        inputs, firsts = [self.inputs(case).half() for case in cases], [self.by_first(case) for case in cases]
+        inputs, firsts, others = [self.inputs(case).half() for case in cases], [self.by_first(case) for case in cases], self.alike(cases)
         self.networks = []
         for seed, known in enumerate(start['networks'] if start else [None] * a.networks):
             torch.manual_seed(seed)
             network = self.network(inputs[0].shape[1], known)
             if known is None:
                 nn.init.constant_(network[-1].bias, float(torch.cat([case.error for case in cases]).mean()))
-            self.networks.append(self.fitted(network, cases, inputs, firsts, a))
+            self.networks.append(self.fitted(network, cases, inputs, firsts, others, a))
 
     @classmethod
     def read(cls, record):
@@ -278,15 +278,17 @@ class Model:
             both[:, :, kind * FEATURES + WHOLE.start:kind * FEATURES + WHOLE.stop] = values[:, None]
         return both
 
-    def fitted(self, network, cases, inputs, firsts, a):
-        """A network, fitted to cases by their inputs and by what first runs tell of them."""
+    def alike(self, cases):
+        """Of each case the places of those that may be joined to it; none where first runs tell of a case: they tell of all of it."""
+        like = lambda one, other: (one.pattern, one.frames, one.noise) == (other.pattern, other.frames, other.noise) and abs(one.white - other.white) < LIKE
+        return [[] if self.first else [place for place, other in enumerate(cases) if other is not case and like(case, other)] for case in cases]
+
+    def fitted(self, network, cases, inputs, firsts, others, a):
+        """A network, fitted to cases by their inputs, by what first runs tell of them, and joined to others that are alike."""
         count = inputs[0].shape[1]
         optimiser = torch.optim.AdamW(network.parameters(), a.rate, weight_decay=.05)
         batches = torch.arange(len(cases)).split(8)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, a.rate, total_steps=a.epochs * len(batches))
-        like = lambda one, other: (one.pattern, one.frames, one.noise) == (other.pattern, other.frames, other.noise) and abs(one.white - other.white) < LIKE
-        # Not where first runs tell of a case: they tell of all of it.
-        others = [[] if self.first else [other for other in range(len(cases)) if other != index and like(case, cases[other])] for index, case in enumerate(cases)]
         for _ in range(a.epochs):
             order = torch.randperm(len(cases))
             for batch in batches:
@@ -358,8 +360,8 @@ def fit(a):
             models = json.load(f)
     for name in [a.model] if a.model else MODELS:
         algorithm, shrunk = MODELS[name]
-        cases = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))]
-        cases = [case for case in cases if case.shrunk == shrunk and case.scene not in eval_loop.judged()]
+        cases, judged = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))], eval_loop.judged()
+        cases = [case for case in cases if case.shrunk == shrunk and case.scene not in judged]
         if not cases:
             raise SystemExit(f'{a.out} has no cases for the model of {name}')
         # Those that were shrunk are few: their model may go on from that of the others.

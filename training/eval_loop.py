@@ -173,13 +173,16 @@ PANNED = {
 }
 
 
+FILMED = {'flower': 'gh-mdn__flower', 'bird': 'gh-intel__asl_bird'}
+
+
 def judged():
-    """What the scenes are called where there is footage of them, as `training/assessment.py` has it: they are in no fit."""
-    return {'traffic', 'street', 'city', 'gh-mdn__flower', 'gh-intel__asl_bird'} | {f'{photo}.jpg' for photo, *_ in PANNED.values()}
+    """What scenes are made of, as footage and cases name it: predictions are fitted to none of it."""
+    return {'traffic', 'street', 'city', *FILMED.values()} | {f'{photo}.jpg' for photo, *_ in PANNED.values()}
 
 
-def clips(a, size=CASE_SIZE):
-    """Name -> frames [count,H,W], uint8; photographs and drawn clips of this size. None of them was trained on."""
+def filmed(a):
+    """Name -> frames [count,H,W], uint8, of clips. None of them was trained on."""
     for path in (a.traffic, a.street):
         if not os.path.isfile(path):
             raise SystemExit(f'there is no scene {path}: --scenes (make: SCENES=folder) names the folder of the scenes')
@@ -189,11 +192,13 @@ def clips(a, size=CASE_SIZE):
         'traffic': scipy.io.loadmat(a.traffic)['orig'].transpose(2, 0, 1).round().astype(np.uint8),
         'street': street if street.dtype == np.uint8 else (street * 255).round().astype(np.uint8),
         'city': pictures(os.path.join(HERE, '../demo/clip')),
-        'flower': pictures(os.path.join(a.data, 'clips/val/gh-mdn__flower')),
-        'bird': pictures(os.path.join(a.data, 'clips/val/gh-intel__asl_bird')),
-        'shapes': drawn(shapes, size=size),
-        'gratings': drawn(gratings, size=size),
-    } | {name: panned(os.path.join(a.data, f'photos/val/{photo}.jpg'), *how, size=size) for name, (photo, *how) in PANNED.items()}
+    } | {name: pictures(os.path.join(a.data, 'clips/val', folder)) for name, folder in FILMED.items()}
+
+
+def made(a, size):
+    """The same of photographs that a camera moves over, and of drawn clips, [count,size,size]."""
+    return {'shapes': drawn(shapes, size=size), 'gratings': drawn(gratings, size=size)} | {
+        name: panned(os.path.join(a.data, f'photos/val/{photo}.jpg'), *how, size=size) for name, (photo, *how) in PANNED.items()}
 
 
 def middle(frames, count, size):
@@ -311,7 +316,7 @@ class Rows:
         os.makedirs(self.folder, exist_ok=True)
 
     def frames(self, setting):
-        size = min(setting.size, max(self.footage))
+        size = min(setting.size, max(self.footage))     # larger ones are of clips alone
         return middle(self.footage[size][setting.scene], setting.cr, setting.size)
 
     def key(self, setting, way):
@@ -397,13 +402,13 @@ def predictions(rows):
     for kind in (size, lambda r: r['masks']):
         groups |= {str(value): [r for r in rows if kind(r) == value] for value in sorted({kind(r) for r in rows})}
     for what, of in groups.items():
-        told = np.array([r['predicted'] for r in of if None not in r['predicted']]).reshape(-1, 3)
-        if len(told):
-            true = np.minimum([r['psnr_db'] for r in of if None not in r['predicted']], BEST)
+        known = [r for r in of if None not in r['predicted']]
+        if known:
+            told, true = np.array([r['predicted'] for r in known]), np.minimum([r['psnr_db'] for r in known], BEST)
             off = np.abs(true - told[:, 1])
             yield {'what': what, 'mean_db': round(off.mean(), 2), 'four_of_five_db': round(np.quantile(off, .8), 2),
                    'near_percent': round(100 * np.mean(off <= NEAR)), 'inside_percent': round(100 * np.mean((told[:, 0] <= true) & (true <= told[:, 2]))),
-                   'snapshots': len(of), 'untold': len(of) - len(told)}
+                   'snapshots': len(of), 'untold': len(of) - len(known)}
 
 
 def table(rows, summed, predicted):
@@ -446,7 +451,8 @@ def main():
     a.traffic, a.street = (os.path.join(a.scenes, name) for name in ('traffic48_cacti.mat', 'street_1024x1024x20.npz'))
     if not os.path.isfile(a.white):
         raise SystemExit(f'there is no checkpoint {a.white}: --white (make: WHITE=file) names weights trained on white noise, train.py --stage full')
-    footage, program = {size: clips(a, size) for size in (CASE_SIZE, Setting.size)}, Program(a.binary)
+    films, program = filmed(a), Program(a.binary)
+    footage = {size: films | made(a, size) for size in (CASE_SIZE, Setting.size)}
     lengths = {name: len(frames) for name, frames in footage[CASE_SIZE].items()}
     settings = all_settings(lengths) if a.full else DEFAULT_SETTINGS
     with tempfile.TemporaryDirectory() as folder:

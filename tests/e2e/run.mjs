@@ -95,6 +95,7 @@ async function loaded(service, measurement) {
   const found = await visit(browser, checks, service.url);
   const still = await service.call("GET", `/v1/jobs/${jobs[0].id}`);
   checks.that(still.progress.tiles_running === 2, "both workers computed meanwhile");
+  checks.that(found.paint > 0, "something was painted");
   checks.that(found.bytes < MOST_BYTES, `the dashboard weighs ${found.bytes} bytes`);
   await service.call("POST", `/v1/jobs/${jobs[0].id}/cancel`);
   return { page_bytes: found.bytes, page_files: found.files, first_paint_ms: found.paint };
