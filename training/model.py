@@ -7,8 +7,24 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 
-def conv(inputs, outputs, stride=1, groups=1):
-    return nn.Conv2d(inputs, outputs, 3, stride, 1, groups=groups)
+def conv(inputs, outputs, stride=1):
+    return nn.Conv2d(inputs, outputs, 3, stride, 1)
+
+
+class ConvByFrame(nn.Conv2d):
+    """One convolution for each of three frames with its noise map: weights [3n,2,3,3].
+
+    A GPU computes it as one dense convolution, zero between the groups: 2 % more arithmetic, but its kernels for groups are slow.
+    """
+
+    def __init__(self, outputs):
+        super().__init__(6, outputs, 3, 1, 1, groups=3)
+
+    def forward(self, x):
+        if not x.is_cuda:
+            return super().forward(x)
+        parts = [F.pad(w, (0, 0, 0, 0, 2 * k, 4 - 2 * k)) for k, w in enumerate(self.weight.chunk(3))]
+        return F.conv2d(x, torch.cat(parts), self.bias, padding=1)
 
 
 def start_from_identity(net, last):
@@ -30,7 +46,7 @@ class Block(nn.Module):
         super().__init__()
         a, b, c = widths
         relu = lambda: nn.ReLU(inplace=True)
-        self.inc = nn.Sequential(conv(6, 3 * per_frame, groups=3), relu(), conv(3 * per_frame, a), relu())
+        self.inc = nn.Sequential(ConvByFrame(3 * per_frame), relu(), conv(3 * per_frame, a), relu())
         self.d0 = nn.Sequential(conv(a, b, 2), relu(), conv(b, b), relu(), conv(b, b), relu())
         self.d1 = nn.Sequential(conv(b, c, 2), relu(), conv(c, c), relu(), conv(c, c), relu())
         self.u2 = nn.Sequential(conv(c, c), relu(), conv(c, c), relu(), conv(c, b * 4), nn.PixelShuffle(2))

@@ -1,10 +1,10 @@
 #!/bin/sh
-# Half an hour of one CUDA GPU, from the committed weights to better ones. The same command again continues an interrupted run.
+# A quarter of an hour of one CUDA GPU, from the committed weights to better ones. The same command again continues an interrupted run.
 #   training/run_gpu.sh DATA OUT [TOTAL_MINUTES] [MINUTES_OF_THIS_CALL]
-# Leaves OUT/loop.pt (checkpoint), OUT/fastdvdnet-gray/*.onnx, their 8-bit twin in OUT/fastdvdnet-gray-int8 and OUT/evaluation-loop.json. PYTHON names the interpreter;
-# NETWORK=ffdnet trains the small network instead, for which five minutes are much.
+# Leaves OUT/loop.pt (checkpoint), OUT/loop-weights.pt (a third of it: all that export.py needs) and OUT/fastdvdnet-gray/*.onnx. What comes after
+# needs no GPU: quantize.py, evaluate.py. PYTHON names the interpreter; NETWORK=ffdnet trains the small network instead, for which five minutes are much.
 set -eu
-data=$1 out=$2 total=${3:-28} now=${4:-$total}
+data=$1 out=$2 total=${3:-12} now=${4:-$total}
 here=$(cd "$(dirname "$0")" && pwd)
 python=${PYTHON:-python3}
 workers=$(($(nproc) > 4 ? ($(nproc) - 2) / 2 : 1))
@@ -15,7 +15,9 @@ case ${NETWORK:-fastdvdnet} in
 esac
 mkdir -p "$out"
 "$python" "$here/train.py" --data "$data" --out "$out/$stage.pt" --stage "$stage" --init "$here/../models/$name" \
-    --minutes "$total" --run-minutes "$now" --crop 96 --frames "${FRAMES:-256}" --lr 3e-4 --workers "$workers" --runs 24 --every 8 ${EXTRA:-}
+    --minutes "$total" --run-minutes "$now" --crop 96 --frames "${FRAMES:-128}" --lr "${LR:-8e-4}" --workers "$workers" --runs 24 --every 0 ${EXTRA:-}
 "$python" "$here/export.py" "$out/$stage.pt" "$out/$name"
-[ "$stage" != loop ] || "$python" "$here/quantize.py" --data "$data" "$out/$name" "$out/$name-int8"   # weights and twin go together
-"$python" "$here/evaluate.py" --data "$data" "$here/../models/$name" "$out/$name" | tee "$out/evaluation-$stage.json"
+"$python" - "$out/$stage" <<'P'
+import sys, torch
+torch.save(torch.load(sys.argv[1] + '.pt', weights_only=True, map_location='cpu')['average'], sys.argv[1] + '-weights.pt')
+P

@@ -56,7 +56,7 @@ def draw_masks(r, kind, b, size):
 
 def random_masks(r, b, size):
     """Masks of every kind that the product meets: on a doubling relay, slightly blurred, with dead pixels."""
-    kind = r.choice(['iid', 'squares', 'circle', 'grey'], p=[.4, .35, .15, .1])
+    kind = r.choice(['iid', 'squares', 'circle', 'grey'], p=[.35, .35, .2, .1])
     double = r.random() < .15
     c = draw_masks(r, kind, b, size // 2 if double else size)
     if double:

@@ -31,7 +31,7 @@ STAGES = {'block': ('block', 3), 'full': ('fastdvdnet', 5), 'loop': ('fastdvdnet
 
 # The program's default schedules: first and last level (/255), passes, memory, momentum.
 TV_STAGE = 60, .15, .004   # iterations, weight, weight along time (the program leaves that out where it does not pay)
-DEFAULTS = {'loop': (25, 5.3, 16, .85, .5), 'ffdnet-loop': (15, 3, 30, .95, 0)}
+DEFAULTS = {'loop': (25, 5.3, 12, .85, .5), 'ffdnet-loop': (15, 3, 30, .95, 0)}
 
 
 # ---------------------------------------------------------------- producers
@@ -45,13 +45,13 @@ def produce_snapshots(queue, root, seed, voxels, size):
     """Simulated snapshots: truth and masks [N,B,size,size], measurement [N,1,size,size]."""
     footage, r = Footage(root, 'train', seed), np.random.default_rng(seed)
     while True:
-        b = int(r.choice([6, 8, 8, 10, 10, 12, 16]))
+        b = int(r.choice([6, 8, 8, 10, 10, 12, 16, 20, 30]))
         n = max(1, round(voxels / (b * size * size)))
         x = footage.batch(n, b, size)
         masks = np.stack([solver.random_masks(r, b, size) for _ in range(n)])
         y = solver.measure(x, masks)
-        if r.random() < .35:
-            y = y + r.normal(0, r.uniform(0, 6 / 255), y.shape)
+        if r.random() < .4:
+            y = y + r.normal(0, r.uniform(0, 10 / 255), y.shape)
         queue.put((x, masks, y.astype(np.float32)))
 
 
@@ -101,7 +101,7 @@ class Iterates:
             run['start'] = output + run['momentum'] * (output - run['v'])
             run['v'] = output
         run['gap'].excess, run['start'], run['v'] = (a.detach() for a in (run['gap'].excess, run['start'], run['v']))
-        if not run['levels'] or not torch.isfinite(run['v']).all() or run['v'].abs().max() > 4:
+        if not run['levels'] or not torch.isfinite(run['v']).all() or run['v'].abs().max() > 12:
             self.runs[i] = self.fresh()
         return errors
 
@@ -267,13 +267,14 @@ def main():
     torch.set_num_threads(a.threads)
     os.makedirs(os.path.dirname(os.path.abspath(a.out)), exist_ok=True)
 
-    t = Training(a, device)
     count = a.frames or (384 if device == 'cuda' else 16)
     frames = STAGES[a.stage][1]
+    # Before the GPU's context begins: a process that forks with one may not.
     clips = start_producers(produce_clips, a.workers, a.data, max(1, count // frames), frames, a.crop)
+    snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop) if 'loop' in a.stage else None
+    t = Training(a, device)
     loop, scenes = None, None
-    if 'loop' in a.stage:
-        snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop)
+    if snapshots:
         loop = Iterates(snapshots, device, a.runs, DEFAULTS[a.stage])
     if a.stage != 'block' and a.every:
         scenes = evaluate.LoopScenes(a.data, a.scene, a.evaluation_size, device)
