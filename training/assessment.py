@@ -3,8 +3,8 @@
     python assessment.py make --binary sci-recon-experiments --data DATA [--more FOLDER] --out FOLDER
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
-`make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, a third of
-them with a part that moves by itself, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them
+`make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
+them with parts that move by themselves, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them
 reconstructed. It goes on where it was stopped, and what it has made so far is a mixture of all. `fit` fits small networks to
 all cases, and tells how they do on scenes that were left out (no scene is in two folds). The scenes of `eval_loop.py`, which judges them,
 are in no fit.
@@ -47,31 +47,45 @@ LIKE = 6.0          # dB: pictures whose white levels are as near may be parts o
 
 
 # ---------------------------------------------------------------- scenes
-def panned(rng, file, others, wide):
-    """A camera that moves over a photograph, perhaps with a part of another one that moves by itself."""
+def grey(file, smaller, least):
+    """A photograph, smaller by a factor, but no side of it below `least` pixels."""
     photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE).astype(np.float32)
-    scale = max(rng.choice([.2, .3, .45, .7]), (wide + 40) / min(photo.shape))
-    photo = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    factor = max(smaller, least / min(photo.shape))
+    return cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+
+
+def parts(rng, others, wide):
+    """What moves by itself before the photograph, as (part, its shape, place, step a frame): nothing, a large part of another photograph, or many small
+    ones that cover one another, rectangles and ellipses."""
+    kind = rng.random()
+    sides = [[int(rng.integers(wide // 5, wide * 9 // 20))] * 2] if kind < .25 else \
+        [rng.integers(8, wide // 4, 2).tolist() for _ in range(rng.integers(3, 3 + wide // 14))] if kind < .5 else []
+    for height, width in sides:
+        other = grey(others[rng.integers(len(others))], .25, max(height, width) + 1)
+        row, column = (int(rng.integers(0, extent - side)) for extent, side in zip(other.shape, (height, width)))
+        shape = np.ones((height, width), np.float32)
+        if len(sides) > 1 and rng.random() < .5:
+            i, j = np.mgrid[:height, :width]
+            shape = ((2 * (i + .5) / height - 1) ** 2 + (2 * (j + .5) / width - 1) ** 2 < 1).astype(np.float32)
+        way, speed = rng.uniform(0, 2 * np.pi), rng.uniform(0, 6)
+        yield other[row:row + height, column:column + width], shape, rng.uniform(-width / 2, wide - width / 2, 2), speed * np.array([np.cos(way), np.sin(way)])
+
+
+def panned(rng, file, others, wide):
+    """A camera that moves over a photograph, perhaps with parts of others that move by themselves."""
+    photo = grey(file, rng.choice([.2, .3, .45, .7]), wide + 40)
     angle, speed, turn, light = rng.uniform(0, 2 * np.pi), rng.choice(SPEEDS), rng.choice([0, 0, .5]), rng.choice([1, 1, .6, .3])
     centre = [extent * (.5 + rng.uniform(-.2, .2)) for extent in photo.shape[::-1]]
-    part = None
-    if rng.random() < .35:
-        other = cv2.imread(others[rng.integers(len(others))], cv2.IMREAD_GRAYSCALE).astype(np.float32)
-        side = int(rng.integers(wide // 5, wide * 9 // 20))
-        smaller = max(.25, (side + 1) / min(other.shape))
-        other = cv2.resize(other, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA)
-        row, column = (int(rng.integers(0, extent - side)) for extent in other.shape)
-        part, place, step = other[row:row + side, column:column + side], rng.uniform(20, wide - 20 - side / 2, 2), rng.uniform(-4, 4, 2)
-    frames = []
+    before, frames = list(parts(rng, others, wide)), []
     for time in np.arange(LONGEST) - (LONGEST - 1) / 2:
         x, y = centre[0] + time * speed * np.cos(angle), centre[1] + time * speed * np.sin(angle)
         matrix = cv2.getRotationMatrix2D((x, y), turn * time, 1)
         matrix[:, 2] += wide / 2 - np.array((x, y))
         frame = cv2.warpAffine(photo, matrix, (wide, wide), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        if part is not None:
+        for part, shape, place, step in before:
             shift = np.float32([[1, 0, place[0] + time * step[0]], [0, 1, place[1] + time * step[1]]])
-            cover = cv2.warpAffine(np.ones_like(part), shift, (wide, wide), flags=cv2.INTER_LINEAR)
-            frame = frame * (1 - cover) + cv2.warpAffine(part, shift, (wide, wide), flags=cv2.INTER_LINEAR)
+            cover, moved = (cv2.warpAffine(values, shift, (wide, wide), flags=cv2.INTER_LINEAR) for values in (shape, part * shape))
+            frame = frame * (1 - cover) + moved
         frames.append(frame)
     return (np.stack(frames) * light).clip(0, 255).round().astype(np.uint8)
 
