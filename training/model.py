@@ -14,7 +14,8 @@ def conv(inputs, outputs, stride=1):
 class ConvByFrame(nn.Conv2d):
     """One convolution for each of three frames with its noise map: weights [3n,2,3,3].
 
-    A GPU computes it as one dense convolution, zero between the groups: 2 % more arithmetic, but its kernels for groups are slow.
+    A GPU computes it as one dense convolution, zero between the groups: 2 % more arithmetic, and no kernels
+    for groups, which are said to be slow (not measured).
     """
 
     def __init__(self, outputs):

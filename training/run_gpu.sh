@@ -1,7 +1,7 @@
 #!/bin/sh
 # A quarter of an hour of one CUDA GPU, from the committed weights to better ones. The same command again continues an interrupted run.
 #   training/run_gpu.sh DATA OUT [TOTAL_MINUTES] [MINUTES_OF_THIS_CALL]
-# Leaves OUT/loop.pt (checkpoint), OUT/loop-weights.pt (a third of it: all that export.py needs) and OUT/fastdvdnet-gray/*.onnx. What comes after
+# Leaves OUT/loop.pt (checkpoint) and OUT/fastdvdnet-gray/*.onnx (a third of it, and all that training can go on from elsewhere). What comes after
 # needs no GPU: quantize.py, evaluate.py. PYTHON names the interpreter; NETWORK=ffdnet trains the small network instead, for which five minutes are much.
 set -eu
 data=$1 out=$2 total=${3:-12} now=${4:-$total}
@@ -17,7 +17,3 @@ mkdir -p "$out"
 "$python" "$here/train.py" --data "$data" --out "$out/$stage.pt" --stage "$stage" --init "$here/../models/$name" \
     --minutes "$total" --run-minutes "$now" --crop 96 --frames "${FRAMES:-128}" --lr "${LR:-8e-4}" --workers "$workers" --runs 24 --every 0 ${EXTRA:-}
 "$python" "$here/export.py" "$out/$stage.pt" "$out/$name"
-"$python" - "$out/$stage" <<'P'
-import sys, torch
-torch.save(torch.load(sys.argv[1] + '.pt', weights_only=True, map_location='cpu')['average'], sys.argv[1] + '-weights.pt')
-P
