@@ -78,10 +78,8 @@ def panned(rng, file, others, wide):
     centre = [extent * (.5 + rng.uniform(-.2, .2)) for extent in photo.shape[::-1]]
     before, frames = list(parts(rng, others, wide)), []
     for time in np.arange(LONGEST) - (LONGEST - 1) / 2:
-        x, y = centre[0] + time * speed * np.cos(angle), centre[1] + time * speed * np.sin(angle)
-        matrix = cv2.getRotationMatrix2D((x, y), turn * time, 1)
-        matrix[:, 2] += wide / 2 - np.array((x, y))
-        frame = cv2.warpAffine(photo, matrix, (wide, wide), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        above = centre[0] + time * speed * np.cos(angle), centre[1] + time * speed * np.sin(angle)
+        frame = eval_loop.seen(photo, above, turn * time, wide)
         for part, shape, place, step in before:
             shift = np.float32([[1, 0, place[0] + time * step[0]], [0, 1, place[1] + time * step[1]]])
             cover, moved = (cv2.warpAffine(values, shift, (wide, wide), flags=cv2.INTER_LINEAR) for values in (shape, part * shape))
@@ -407,16 +405,14 @@ def fit(a):
             inside[half == k] = (wrong[half == k] >= low) & (wrong[half == k] <= high)
         everywhere = np.ones(len(cases), bool)
         by, interval = median(everywhere), ends(everywhere)
-        print(f'{name}: {len(cases)} cases of {len(names)} scenes; error {np.abs(wrong).mean():.2f} dB in the mean, 80 % within {np.quantile(np.abs(wrong), .8):.2f}, '
-              f'{100 * np.mean(np.abs(wrong) < 1.5):.0f} % within 1.5; moved by {by:+.2f}; interval {interval.round(2)}, held by {100 * inside.mean():.0f} % left out; '
-              f'correlation of the map {np.nanmedian(spread):.2f}')
-        kinds = {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
+        print(f'{name}: moved by {by:+.2f}; interval {interval.round(2)}; correlation of the map {np.nanmedian(spread):.2f}')
+        kinds = {f'all, of {len(names)} scenes, each left out': everywhere} | {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
         kinds |= {f'{side}x{side}': [case.side * BLOCK == side for case in cases] for side in sorted(set(SIDES))}
         for kind, of in kinds.items():
-            of = np.array(of)
-            if of.any():
-                print(f'  {kind}: {of.sum()} cases, {np.abs(wrong[of]).mean():.2f} dB, {100 * np.mean(np.abs(wrong[of]) < 1.5):.0f} % within 1.5, '
-                      f'{100 * inside[of].mean():.0f} % in the interval')
+            if np.any(of):
+                found = eval_loop.accuracy(wrong[of], inside[of])
+                print(f"  {kind}: {found['snapshots']} cases, {found['mean_db']} dB in the mean, 80 % within {found['four_of_five_db']}, "
+                      f"{found['near_percent']} % within {NEAR}, {found['inside_percent']} % in the interval")
         model = Model(cases, a, known, first)
         model.move(by)
         models[name] = model.record() | {'interval': [round(float(end), 2) for end in interval]}

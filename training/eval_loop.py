@@ -125,19 +125,22 @@ def pictures(folder):
     return np.stack([cv2.imread(f, cv2.IMREAD_GRAYSCALE) for f in files])
 
 
+def seen(photo, centre, turned, size):
+    """What a camera above a photograph sees, at `centre` (x, y) and turned by so many degrees."""
+    matrix = cv2.getRotationMatrix2D(centre, turned, 1)
+    matrix[:, 2] += size / 2 - np.array(centre)
+    return cv2.warpAffine(photo, matrix, (size, size), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
 def panned(file, scale, step, light=1.0, turn=0.0, count=24, size=CASE_SIZE):
     """A camera that moves over a photograph: `step` pixels (x, y) and `turn` degrees from frame to frame."""
     photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE)
     if photo is None:
         raise SystemExit(f'there is no photograph {file}')
     photo = cv2.resize(photo.astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    frames = []
-    for time in np.arange(count) - (count - 1) / 2:
-        x, y = (extent / 2 + time * by for extent, by in zip(photo.shape[::-1], step))
-        matrix = cv2.getRotationMatrix2D((x, y), turn * time, 1)
-        matrix[:, 2] += size / 2 - np.array((x, y))
-        frames.append(cv2.warpAffine(photo, matrix, (size, size), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT))
-    return (np.stack(frames) * light).clip(0, 255).round().astype(np.uint8)
+    times = np.arange(count) - (count - 1) / 2
+    centre = lambda time: tuple(extent / 2 + time * by for extent, by in zip(photo.shape[::-1], step))
+    return (np.stack([seen(photo, centre(time), turn * time, size) for time in times]) * light).clip(0, 255).round().astype(np.uint8)
 
 
 def drawn(frame, count=24, size=CASE_SIZE):
@@ -394,6 +397,13 @@ def summary(rows):
     ]
 
 
+def accuracy(off, inside):
+    """Of how far predictions are from the true PSNR, in dB, and which of their intervals hold it."""
+    off = np.abs(off)
+    return {'mean_db': round(off.mean(), 2), 'four_of_five_db': round(np.quantile(off, .8), 2), 'near_percent': round(100 * np.mean(off <= NEAR)),
+            'inside_percent': round(100 * np.mean(inside)), 'snapshots': len(off)}
+
+
 def predictions(rows):
     """How far what the default tells of its PSNR is from the true one, by size and masks."""
     rows = [r for r in rows if r['algorithm'] == DEFAULT]
@@ -405,10 +415,7 @@ def predictions(rows):
         known = [r for r in of if None not in r['predicted']]
         if known:
             told, true = np.array([r['predicted'] for r in known]), np.minimum([r['psnr_db'] for r in known], BEST)
-            off = np.abs(true - told[:, 1])
-            yield {'what': what, 'mean_db': round(off.mean(), 2), 'four_of_five_db': round(np.quantile(off, .8), 2),
-                   'near_percent': round(100 * np.mean(off <= NEAR)), 'inside_percent': round(100 * np.mean((told[:, 0] <= true) & (true <= told[:, 2]))),
-                   'snapshots': len(of), 'untold': len(of) - len(known)}
+            yield {'what': what, **accuracy(true - told[:, 1], (told[:, 0] <= true) & (true <= told[:, 2])), 'untold': len(of) - len(known)}
 
 
 def table(rows, summed, predicted):

@@ -80,19 +80,6 @@ class Graph:
         onnx.save(m, path)
 
 
-def dense_input_weight(grouped):
-    """The grouped input layer [90,2,3,3] on (f0,n), (f1,n), (f2,n) as a dense one [90,4,3,3] on (f0,f1,f2,n).
-
-    The three groups share one noise map. A dense layer costs 1 % more arithmetic, and runtimes have faster kernels for it.
-    """
-    groups = grouped.reshape(3, 30, 2, 3, 3)
-    dense = np.zeros((3, 30, 4, 3, 3), np.float32)
-    for k in range(3):
-        dense[k, :, k] = groups[k, :, 0]
-    dense[:, :, 3] = groups[:, :, 1]
-    return dense.reshape(90, 4, 3, 3)
-
-
 def padded_to_16(weight, bias, following):
     """Zero channels up to a multiple of 16 between two layers: the runtime's blocked kernels want whole blocks."""
     extra = -len(weight) % 16
@@ -106,7 +93,7 @@ def encoding_half(g, block):
     f = [g.add('Slice', 'frames', g.ints([start]), g.ints([end]), g.ints([0])) for start, end in ((0, -2), (1, -1), (2, last))]
     x = g.add('Concat', *f, g.noise_map(f[1], 'sigma'), axis=1)
     first, second = block.inc[0], block.inc[2]
-    w, b, w2 = padded_to_16(dense_input_weight(first.weight.numpy()), first.bias.numpy(), second.weight.numpy())
+    w, b, w2 = padded_to_16(first.dense().numpy(), first.bias.numpy(), second.weight.numpy())
     x0 = g.conv(g.conv(x, w, b), w2, second.bias.numpy())
     x1 = g.sequence(x0, block.d0)
     return f[1], x0, x1, g.sequence(x1, block.d1)
