@@ -497,7 +497,7 @@ impl Model {
 }
 
 /// From so many decibels on that the error of the first run's frames is expected to be above their distance from the
-/// result's, they moved; within so many there is doubt. Found on 75 simulated scenes, as `docs/benchmarks.md` says.
+/// result's, they moved; within so many there is doubt. Found on 75 simulated scenes.
 const MOVES: f32 = 3.0;
 const DOUBT: f32 = 0.3;
 /// The least share of the first run's error that its second run leaves where something moves.

@@ -40,7 +40,7 @@ const CLEAR: f64 = 2.0;
 
 /// Below this correlation of their changes along time, frames that were shrunk much and those that were not
 /// have no motion in common: what changed was not in the scene. Of 224 simulated scenes
-/// (`docs/benchmarks.md`) 27 of 33 at rest are below it, and 8 of 191 others.
+/// (`docs/experiments.md`) 27 of 33 at rest are below it, and 8 of 191 others.
 const MOTION: f32 = 0.45;
 
 /// Side in pixels of the squares over which a scene without texture and motion is even.
