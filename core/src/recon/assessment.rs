@@ -263,8 +263,8 @@ impl Energies {
     /// Logarithms of the squared speed of the motion that explains the slope along time best, and of the share of the
     /// slope that it leaves.
     fn motion(&self) -> (f32, f32) {
-        let (square, share) = self.steps.motion();
-        ((square + REST).log10(), (share + LEFT).log10())
+        let ((down, right), share) = self.steps.motion();
+        ((down * down + right * right + REST).log10(), (share + LEFT).log10())
     }
 }
 

@@ -1,15 +1,21 @@
-//! How fast a picture moves, told from reconstructed frames.
+//! How a picture moves, told from reconstructed frames.
 //!
 //! What moves fast comes out smooth, and looks as good as a smooth scene. Its coarse structure survives, and how that
-//! moves from frame to frame tells the speed: frames are averaged over cells of some pixels, and of each window the one
+//! moves from frame to frame tells the motion: frames are averaged over cells of some pixels, and of each window the one
 //! motion is found that explains the change best (Lucas and Kanade, 1981).
 
-use ndarray::{Array3, ArrayView3, Axis, s};
+use std::ops::Range;
+
+use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 
 /// Side of the cells in pixels: motion by much more than that from frame to frame is told wrongly.
 const CELL: usize = 8;
 /// Side of the windows in cells.
 const WINDOW: usize = 16;
+/// Side of the squares that tell which of several motions is right: so much may it be off.
+const FINE: usize = 2;
+/// Cells to each side whose motion a cell has.
+const REACH: usize = 4;
 /// The share of the change that a motion explains at the least, else there is none.
 const EXPLAINED: f32 = 0.1;
 /// The share of the gradient's energy that is taken to be along an edge, where nothing is known of a motion.
@@ -49,22 +55,22 @@ impl Steps {
         }
     }
 
-    /// The squared speed, in steps, of the motion that explains the slope best, and the share of the slope that it
+    /// The motion that explains the slope best, in steps down and to the right, and the share of the slope that it
     /// leaves. These are of means over pixels.
-    pub(super) fn motion(&self) -> (f32, f32) {
+    pub(super) fn motion(&self) -> ((f32, f32), f32) {
         let ridge = EDGE * (self.down + self.right) + FLOOR;
         let (down, right) = (self.down + ridge, self.right + ridge);
         let determinant = down * right - self.both * self.both;
         let rows = (self.both * self.slope_right - right * self.slope_down) / determinant;
         let columns = (self.both * self.slope_down - down * self.slope_right) / determinant;
         let rest = (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
-        (rows * rows + columns * columns, rest / self.slope.max(FLOOR))
+        ((rows, columns), rest / self.slope.max(FLOOR))
     }
 }
 
 /// The speed of the fastest window of frames \[K,H,W\], whose white level this is, in pixels a frame.
 pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
-    let coarse = averaged(frames) / white;
+    let coarse = averaged(frames, CELL) / white;
     let (count, rows, columns) = coarse.dim();
     if count < 2 || rows < 3 || columns < 3 {
         return 0.0;
@@ -78,21 +84,104 @@ pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
     for row in 0..parts(rows) {
         for column in 0..parts(columns) {
             let window = coarse.slice(s![.., range(row, rows), range(column, columns)]);
-            let (square, rest) = steps(window).motion();
+            let ((down, right), rest) = steps(window).motion();
             if rest <= 1.0 - EXPLAINED {
-                most = most.max(square.sqrt() * CELL as f32);
+                most = most.max(down.hypot(right) * CELL as f32);
             }
         }
     }
     most
 }
 
-/// Means over cells \[K, H / CELL, W / CELL\], without what is left at the far edges.
-fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
+/// How each part of a clip moves, in pixels from frame to frame.
+#[derive(Debug)]
+pub(super) struct Motion {
+    /// Down and to the right, of each cell; empty where a clip is too small or too short.
+    of_cells: Array2<(f32, f32)>,
+}
+
+impl Motion {
+    /// Of frames \[K,H,W\]. A cell has the motion of the [`REACH`] cells around it, or that of the whole picture, or none:
+    /// the one that leaves the least difference between the frames near the cell. So where Lucas and Kanade's motion is
+    /// wrong (periodic texture, more than a cell from frame to frame) there is none.
+    pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
+        let (coarse, fine) = (averaged(frames, CELL), averaged(frames, FINE));
+        let (count, rows, columns) = coarse.dim();
+        if count < 2 || rows < 3 || columns < 3 {
+            return Self { of_cells: Array2::default((0, 0)) };
+        }
+        let told = |window: ArrayView3<'_, f32>| {
+            let ((down, right), _) = steps(window).motion();
+            let most = down.abs().max(right.abs());
+            (most <= 1.0).then_some((down * CELL as f32, right * CELL as f32))
+        };
+        let whole = told(coarse.view());
+        // At least three cells: fewer have no gradient.
+        let near = |at: usize, reach: usize, length: usize| {
+            let start = at.saturating_sub(reach).min(length - 3);
+            start..(at + reach + 1).clamp(start + 3, length)
+        };
+        let of_cells = Array2::from_shape_fn((rows, columns), |(row, column)| {
+            let around = s![.., near(row, REACH, rows), near(column, REACH, columns)];
+            let pixels = |cells: Range<usize>| cells.start * CELL / FINE..cells.end * CELL / FINE;
+            let area = (pixels(near(row, 1, rows)), pixels(near(column, 1, columns)));
+            let mut best = (0.0, 0.0);
+            let mut least = difference(fine.view(), &area, best);
+            for motion in [told(coarse.slice(around)), whole].into_iter().flatten() {
+                let left = difference(fine.view(), &area, motion);
+                if left < least {
+                    (best, least) = (motion, left);
+                }
+            }
+            best
+        });
+        Self { of_cells }
+    }
+
+    /// At this pixel.
+    pub(super) fn at(&self, row: usize, column: usize) -> (f32, f32) {
+        let (rows, columns) = self.of_cells.dim();
+        let cell = [(row / CELL).min(rows.max(1) - 1), (column / CELL).min(columns.max(1) - 1)];
+        self.of_cells.get(cell).copied().unwrap_or_default()
+    }
+}
+
+/// Mean squared difference of these rows and columns of each frame \[K, H / FINE, W / FINE\] from those of the next one to
+/// which a motion, in pixels, leads; infinite where it leads outside.
+fn difference(
+    frames: ArrayView3<'_, f32>,
+    (rows, columns): &(Range<usize>, Range<usize>),
+    (down, right): (f32, f32),
+) -> f32 {
     let (count, height, width) = frames.dim();
-    Array3::from_shape_fn((count, height / CELL, width / CELL), |(k, row, column)| {
-        let (i, j) = (row * CELL, column * CELL);
-        frames.slice(s![k, i..i + CELL, j..j + CELL]).sum() / (CELL * CELL) as f32
+    // Here and in the next frame, as far as both are inside.
+    let ranges = |range: &Range<usize>, by: f32, length: usize| {
+        let by = (by / FINE as f32).round() as isize;
+        let start = (range.start as isize).max(-by);
+        let end = (range.end as isize).min(length as isize - by).max(start);
+        (start as usize..end as usize, (start + by) as usize..(end + by) as usize)
+    };
+    let (rows, next_rows) = ranges(rows, down, height);
+    let (columns, next_columns) = ranges(columns, right, width);
+    let pixels = (count - 1) * rows.len() * columns.len();
+    if pixels == 0 {
+        return f32::INFINITY;
+    }
+    let mut sum = 0.0;
+    for k in 0..count - 1 {
+        let here = frames.slice(s![k, rows.clone(), columns.clone()]);
+        let next = frames.slice(s![k + 1, next_rows.clone(), next_columns.clone()]);
+        sum += here.iter().zip(next).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+    }
+    sum / pixels as f32
+}
+
+/// Means over cells \[K, H / side, W / side\], without what is left at the far edges.
+fn averaged(frames: ArrayView3<'_, f32>, side: usize) -> Array3<f32> {
+    let (count, height, width) = frames.dim();
+    Array3::from_shape_fn((count, height / side, width / side), |(k, row, column)| {
+        let (i, j) = (row * side, column * side);
+        frames.slice(s![k, i..i + side, j..j + side]).sum() / (side * side) as f32
     })
 }
 
@@ -117,7 +206,7 @@ fn steps(window: ArrayView3<'_, f32>) -> Steps {
 
 #[cfg(test)]
 mod tests {
-    use super::fastest;
+    use super::{Motion, fastest};
     use ndarray::{Array3, s};
 
     /// Coarse and fine texture that moves by so many rows and columns a frame.
@@ -148,5 +237,34 @@ mod tests {
         assert!(fastest(lit.view(), 1.0) < 2.0, "{}", fastest(lit.view(), 1.0));
         // Too small for cells.
         assert_eq!(fastest(moving(0.0, 9.0).slice(s![.., ..20, ..]), 1.0), 0.0);
+    }
+
+    #[test]
+    fn each_part_has_its_motion() {
+        let mut frames = moving(0.0, 0.0);
+        frames.slice_mut(s![.., .., 150..]).assign(&moving(-2.0, 4.0).slice(s![.., .., 150..]));
+        let motion = Motion::of(frames.view());
+        assert_eq!((motion.at(80, 60), motion.at(0, 0)), ((0.0, 0.0), (0.0, 0.0)));
+        for at in [(80, 230), (159, 299)] {
+            let (down, right) = motion.at(at.0, at.1);
+            assert!(
+                (down + 2.0).abs() < 1.0 && (right - 4.0).abs() < 1.0,
+                "{at:?}: {down}, {right}"
+            );
+        }
+        // Of a single frame, and of frames too small for cells, nothing is known.
+        for frames in [frames.slice(s![..1, .., ..]), frames.slice(s![.., ..20, ..])] {
+            assert_eq!(Motion::of(frames).at(10, 200), (0.0, 0.0));
+        }
+    }
+
+    #[test]
+    fn a_shadow_that_moves_over_still_texture_is_no_motion() {
+        let frames = Array3::from_shape_fn((8, 96, 128), |(k, i, j)| {
+            let (fine, coarse) = (i as f32 * 1.3, (j as f32 - 5.0 * k as f32) / 11.0);
+            0.5 + 0.2 * fine.sin() * (j as f32 * 1.1).sin() + 0.05 * coarse.sin()
+        });
+        assert!((fastest(frames.view(), 1.0) - 5.0).abs() < 1.0);
+        assert_eq!(Motion::of(frames.view()).at(48, 64), (0.0, 0.0));
     }
 }

@@ -14,11 +14,12 @@ mod search;
 
 use std::ops::Range;
 
-use ndarray::{Array3, ArrayView2};
+use ndarray::{Array3, ArrayView2, ArrayView3, ShapeBuilder};
 use pulp::{Arch, Simd, WithSimd};
 
 use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings, TEMPORAL_SHRINKAGE};
 use crate::recon::error::ReconError;
+use crate::recon::motion::Motion;
 use changes::Changes;
 use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
 use low_rank::Filter;
@@ -237,7 +238,12 @@ impl WithSimd for Work<'_> {
                 let Nonlocal { guide, groups, cover, frames, height, width, passes, .. } =
                     &mut *self.prior;
                 let (size, searches) = ((*frames, *height, *width), *passes / REFRESH);
-                search::search(simd, guide, size, searches, groups, cover);
+                let row_length = row_length(size.2);
+                let strides = (size.1 * row_length, row_length, 1);
+                let clip = ArrayView3::from_shape(size.strides(strides), guide.as_slice())
+                    .expect("a clip with a margin");
+                let motion = Motion::of(clip);
+                search::search(simd, guide, size, searches, &motion, groups, cover);
             }
         }
         let Nonlocal { noisy, sum, groups, filter, width, .. } = self.prior;
@@ -531,6 +537,37 @@ mod tests {
         if let Some(avx2) = pulp::x86::V3::try_new() {
             assert_eq!(passes(Arch::V3(avx2)), own);
         }
+    }
+
+    /// Texture that moves by more than a window reaches in two frames, and never comes back.
+    #[test]
+    fn patches_are_found_where_they_move_to() {
+        let size = (6, 72, 96);
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(6);
+        let fine = Array2::from_shape_fn((120, 120), |_| rng.random::<f32>());
+        let mut video = Array3::from_shape_fn(size, |(k, i, j)| {
+            let (i, j) = (i + 40 - 6 * k, j + 3 * k);
+            0.3 * fine[[i, j]] + 0.2 * ((i as f32 / 9.0).sin() + (j as f32 / 11.0).cos())
+        });
+        let mut prior = Nonlocal::new(size);
+        prior.denoise(&mut video, 0.01, 0.0);
+        let row_length = super::row_length(size.2);
+        let place = |k: usize, i: usize, j: usize| ((k * size.1 + i) * row_length + j) as u32;
+        let groups: Vec<&[u32]> = prior.groups.chunks_exact(PATCHES).collect();
+        let (down, right) = shift(1, 0);
+        let (rows, columns) = (positions(size.1, down), positions(size.2, right));
+        let first = positions(size.1, shift(0, 0).0).len() * positions(size.2, shift(0, 0).1).len();
+        let mut missed = 0;
+        let mut inner = 0;
+        for (row, &i) in rows.iter().enumerate().filter(|(_, i)| (4..44).contains(*i)) {
+            for (column, &j) in columns.iter().enumerate().filter(|(_, j)| (12..84).contains(*j)) {
+                let group = groups[first + row * columns.len() + column];
+                assert!(group.contains(&place(1, i, j)));
+                inner += 1;
+                missed += usize::from(!group.contains(&place(3, i + 12, j - 6)));
+            }
+        }
+        assert!(inner > 80 && missed == 0, "{missed} of {inner}");
     }
 
     #[test]

@@ -4,6 +4,8 @@ use std::ops::Range;
 
 use pulp::{Simd, bytemuck};
 
+use crate::recon::motion::Motion;
+
 use super::layout::{PATCHES, REACH, SIDE, WINDOW, positions, row_length, shift};
 
 /// Frames, height and width of a clip.
@@ -14,24 +16,25 @@ pub(super) const ROWS: usize = 8;
 /// Candidates of a group that are kept before all but the best are dropped.
 const KEPT: usize = 128;
 
-/// Finds the patches most similar to each reference patch, near it in space and time, and counts how many
-/// cover a pixel; the grid of references depends on the number of searches before. Of patches equally similar
-/// those that come first in the clip are taken; of a group they are in the clip's order, which does not
-/// depend on how they were found.
+/// Finds the patches most similar to each reference patch, near it in time and near where its motion leads in space, and
+/// counts how many cover a pixel; the grid of references depends on the number of searches before. Of patches equally
+/// similar those that come first in the clip are taken; of a group they are in the clip's order, which does not depend on
+/// how they were found.
 #[inline(always)]
 pub(super) fn search<S: Simd>(
     simd: S,
     guide: &[f32],
     size: Size,
     searches: usize,
+    motion: &Motion,
     groups: &mut Vec<u32>,
     cover: &mut [f32],
 ) {
     match S::F32_LANES {
-        16 => search_with::<S, { WINDOW / 16 }>(simd, guide, size, searches, groups),
-        8 => search_with::<S, { WINDOW / 8 }>(simd, guide, size, searches, groups),
-        4 => search_with::<S, { WINDOW / 4 }>(simd, guide, size, searches, groups),
-        _ => search_with::<S, WINDOW>(simd, guide, size, searches, groups),
+        16 => search_with::<S, { WINDOW / 16 }>(simd, guide, size, searches, motion, groups),
+        8 => search_with::<S, { WINDOW / 8 }>(simd, guide, size, searches, motion, groups),
+        4 => search_with::<S, { WINDOW / 4 }>(simd, guide, size, searches, motion, groups),
+        _ => search_with::<S, WINDOW>(simd, guide, size, searches, motion, groups),
     }
     count_cover(groups, cover, row_length(size.2));
 }
@@ -43,6 +46,7 @@ fn search_with<S: Simd, const V: usize>(
     guide: &[f32],
     (frames, height, width): Size,
     searches: usize,
+    motion: &Motion,
     groups: &mut Vec<u32>,
 ) {
     let row_length = row_length(width);
@@ -56,15 +60,18 @@ fn search_with<S: Simd, const V: usize>(
         let (down, right) = shift(frame, searches);
         let (rows, columns) = (positions(height, down), positions(width, right));
         for (&row, &column) in rows.iter().flat_map(|row| columns.iter().map(move |c| (row, c))) {
-            let (top, left) = (window(row, height), window(column, width));
+            let (down, right) = motion.at(row + SIDE / 2, column + SIDE / 2);
+            let rows_in = |k: usize| window(moved(row, down, frame, k), height);
+            let columns_in = |k: usize| window(moved(column, right, frame, k), width);
             let reference = frame * plane + row * row_length + column;
             best.clear();
             for (other, first) in
-                order().flat_map(|k| top.clone().step_by(ROWS).map(move |i| (k, i)))
+                order().flat_map(|k| rows_in(k).step_by(ROWS).map(move |i| (k, i)))
             {
                 if other != frame {
                     best.reduce(KEPT);
                 }
+                let (top, left) = (rows_in(other), columns_in(other));
                 let start = other * plane + first * row_length + left.start;
                 let distances = distances::<S, V>(simd, guide, reference, start, row_length);
                 let starts = (start..).step_by(row_length).take(top.end - first);
@@ -86,6 +93,11 @@ fn search_with<S: Simd, const V: usize>(
             groups[start..].sort_unstable();
         }
     }
+}
+
+/// Where what is at `at` in a frame is in another one, if it moves by so many pixels from frame to frame.
+fn moved(at: usize, by: f32, frame: usize, other: usize) -> usize {
+    (at as f32 + by * (other as f32 - frame as f32)).round().max(0.0) as usize
 }
 
 /// Positions that are searched around `at`.
