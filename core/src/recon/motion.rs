@@ -12,9 +12,9 @@ use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 const CELL: usize = 8;
 /// Side of the windows in cells.
 const WINDOW: usize = 16;
-/// Side of the squares that tell which of several motions is right: so much may it be off.
+/// Side in pixels of the squares over which frames are averaged where motions are compared: so much may one be off.
 const FINE: usize = 2;
-/// Cells to each side whose motion a cell has.
+/// Cells to each side that the motion of a cell is told from.
 const REACH: usize = 4;
 /// The share of the change that a motion explains at the least, else there is none.
 const EXPLAINED: f32 = 0.1;
@@ -96,7 +96,8 @@ pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
 /// How each part of a clip moves, in pixels from frame to frame.
 #[derive(Debug)]
 pub(super) struct Motion {
-    /// Down and to the right, of each cell; empty where a clip is too small or too short.
+    /// Down and to the right, of each cell; what lies beyond the last one has that one's. A clip too small or too short is one
+    /// cell at rest.
     of_cells: Array2<(f32, f32)>,
 }
 
@@ -105,11 +106,12 @@ impl Motion {
     /// the one that leaves the least difference between the frames near the cell. So where Lucas and Kanade's motion is
     /// wrong (periodic texture, more than a cell from frame to frame) there is none.
     pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
-        let (coarse, fine) = (averaged(frames, CELL), averaged(frames, FINE));
+        let coarse = averaged(frames, CELL);
         let (count, rows, columns) = coarse.dim();
         if count < 2 || rows < 3 || columns < 3 {
-            return Self { of_cells: Array2::default((0, 0)) };
+            return Self { of_cells: Array2::default((1, 1)) };
         }
+        let fine = averaged(frames, FINE);
         let told = |window: ArrayView3<'_, f32>| {
             let ((down, right), _) = steps(window).motion();
             let most = down.abs().max(right.abs());
@@ -141,8 +143,7 @@ impl Motion {
     /// At this pixel.
     pub(super) fn at(&self, row: usize, column: usize) -> (f32, f32) {
         let (rows, columns) = self.of_cells.dim();
-        let cell = [(row / CELL).min(rows.max(1) - 1), (column / CELL).min(columns.max(1) - 1)];
-        self.of_cells.get(cell).copied().unwrap_or_default()
+        self.of_cells[[(row / CELL).min(rows - 1), (column / CELL).min(columns - 1)]]
     }
 }
 

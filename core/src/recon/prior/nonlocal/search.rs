@@ -60,9 +60,9 @@ fn search_with<S: Simd, const V: usize>(
         let (down, right) = shift(frame, searches);
         let (rows, columns) = (positions(height, down), positions(width, right));
         for (&row, &column) in rows.iter().flat_map(|row| columns.iter().map(move |c| (row, c))) {
-            let (down, right) = motion.at(row + SIDE / 2, column + SIDE / 2);
-            let rows_in = |k: usize| window(moved(row, down, frame, k), height);
-            let columns_in = |k: usize| window(moved(column, right, frame, k), width);
+            let motion = motion.at(row + SIDE / 2, column + SIDE / 2);
+            let rows_in = |k: usize| window(moved(row, motion.0, frame, k), height);
+            let columns_in = |k: usize| window(moved(column, motion.1, frame, k), width);
             let reference = frame * plane + row * row_length + column;
             best.clear();
             for (other, first) in
