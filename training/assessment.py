@@ -12,6 +12,7 @@ are in no fit.
 import argparse
 import copy
 import glob
+import hashlib
 import json
 import os
 import subprocess
@@ -194,6 +195,12 @@ class Case:
         return (-10 * torch.log10((10 ** errors).reshape(self.frames, -1).mean(1))).mean() - self.white
 
 
+def encoder():
+    """The SHA-256 of the encoder that the program carries: a prediction is fitted to what that one sees, and to no other."""
+    with open(os.path.join(eval_loop.HERE, '../models/fastdvdnet-gray-encoder/model.onnx'), 'rb') as f:
+        return hashlib.sha256(f.read()).hexdigest()
+
+
 def scaling(values, least):
     return values.mean(0), values.std(0).clamp_min(least)
 
@@ -358,7 +365,8 @@ class Model:
         numbers = lambda tensor: [float(f'{value:.6g}') for value in tensor.tolist()]
         layers = lambda network: [{'weights': [numbers(of_input) for of_input in layer.weight.T], 'bias': numbers(layer.bias)} for layer in network if isinstance(layer, nn.Linear)]
         by = lambda scaling: {'mean': numbers(scaling[0]), 'scale': numbers(scaling[1])}
-        encoding = self.encoding and {'mean': numbers(self.encoding[0]), 'components': [numbers(of_channel) for of_channel in self.encoding[1].T]}
+        encoding = self.encoding and {'encoder': encoder(), 'mean': numbers(self.encoding[0]),
+                                      'components': [numbers(of_channel) for of_channel in self.encoding[1].T]}
         return {'features': by(self.features), 'signs': by(self.signs), 'encoding': encoding, 'networks': [layers(network) for network in self.networks]}
 
 

@@ -12,8 +12,6 @@ use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 const CELL: usize = 8;
 /// Side of the windows in cells.
 const WINDOW: usize = 16;
-/// Side in pixels of the squares over which frames are averaged where motions are compared: so much may one be off.
-const FINE: usize = 2;
 /// Cells to each side that the motion of a cell is told from.
 const REACH: usize = 4;
 /// The share of the change that a motion explains at the least, else there is none.
@@ -70,7 +68,7 @@ impl Steps {
 
 /// The speed of the fastest window of frames \[K,H,W\], whose white level this is, in pixels a frame.
 pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
-    let coarse = averaged(frames, CELL) / white;
+    let coarse = averaged(frames) / white;
     let (count, rows, columns) = coarse.dim();
     if count < 2 || rows < 3 || columns < 3 {
         return 0.0;
@@ -106,12 +104,11 @@ impl Motion {
     /// the one that leaves the least difference between the frames near the cell. So where Lucas and Kanade's motion is
     /// wrong (periodic texture, more than a cell from frame to frame) there is none.
     pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
-        let coarse = averaged(frames, CELL);
+        let coarse = averaged(frames);
         let (count, rows, columns) = coarse.dim();
         if count < 2 || rows < 3 || columns < 3 {
             return Self { of_cells: Array2::default((1, 1)) };
         }
-        let fine = averaged(frames, FINE);
         let told = |window: ArrayView3<'_, f32>| {
             let ((down, right), _) = steps(window).motion();
             let most = down.abs().max(right.abs());
@@ -125,12 +122,12 @@ impl Motion {
         };
         let of_cells = Array2::from_shape_fn((rows, columns), |(row, column)| {
             let around = s![.., near(row, REACH, rows), near(column, REACH, columns)];
-            let pixels = |cells: Range<usize>| cells.start * CELL / FINE..cells.end * CELL / FINE;
+            let pixels = |cells: Range<usize>| cells.start * CELL..cells.end * CELL;
             let area = (pixels(near(row, 1, rows)), pixels(near(column, 1, columns)));
             let mut best = (0.0, 0.0);
-            let mut least = difference(fine.view(), &area, best);
+            let mut least = difference(frames, &area, best);
             for motion in [told(coarse.slice(around)), whole].into_iter().flatten() {
-                let left = difference(fine.view(), &area, motion);
+                let left = difference(frames, &area, motion);
                 if left < least {
                     (best, least) = (motion, left);
                 }
@@ -147,8 +144,8 @@ impl Motion {
     }
 }
 
-/// Mean squared difference of these rows and columns of each frame \[K, H / FINE, W / FINE\] from those of the next one to
-/// which a motion, in pixels, leads; infinite where it leads outside.
+/// Mean squared difference of these rows and columns of each frame \[K,H,W\] from those of the next one to which a motion
+/// leads; infinite where it leads outside.
 fn difference(
     frames: ArrayView3<'_, f32>,
     (rows, columns): &(Range<usize>, Range<usize>),
@@ -157,7 +154,7 @@ fn difference(
     let (count, height, width) = frames.dim();
     // Here and in the next frame, as far as both are inside.
     let ranges = |range: &Range<usize>, by: f32, length: usize| {
-        let by = (by / FINE as f32).round() as isize;
+        let by = by.round() as isize;
         let start = (range.start as isize).max(-by);
         let end = (range.end as isize).min(length as isize - by).max(start);
         (start as usize..end as usize, (start + by) as usize..(end + by) as usize)
@@ -177,12 +174,12 @@ fn difference(
     sum / pixels as f32
 }
 
-/// Means over cells \[K, H / side, W / side\], without what is left at the far edges.
-fn averaged(frames: ArrayView3<'_, f32>, side: usize) -> Array3<f32> {
+/// Means over cells \[K, H / CELL, W / CELL\], without what is left at the far edges.
+fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
     let (count, height, width) = frames.dim();
-    Array3::from_shape_fn((count, height / side, width / side), |(k, row, column)| {
-        let (i, j) = (row * side, column * side);
-        frames.slice(s![k, i..i + side, j..j + side]).sum() / (side * side) as f32
+    Array3::from_shape_fn((count, height / CELL, width / CELL), |(k, row, column)| {
+        let (i, j) = (row * CELL, column * CELL);
+        frames.slice(s![k, i..i + CELL, j..j + CELL]).sum() / (CELL * CELL) as f32
     })
 }
 

@@ -392,9 +392,9 @@ impl Course {
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more
     /// than it counts in the frames: so for another one the difference must be twice as clear. What fourfold
     /// shrinkage of changes spares a scene at rest hardly shows in a measurement, but what it costs a moving
-    /// one does: there half as clear will do; where it has left little of what changed, it is enough not to be
-    /// clearly worse, and then for still more, to be better. For less it takes more: pixels that are held out
-    /// have what changes from their neighbours, and lose by shrinkage what the others keep.
+    /// one does: there half as clear will do, and where it has left little of what changed, it is enough not to be
+    /// clearly worse, also for still more. For less it takes more: pixels that are held out have what changes from
+    /// their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.given_up {
             return false;
@@ -408,10 +408,8 @@ impl Course {
             2.0
         } else if own < others {
             2.5
-        } else if self.stills(other) {
+        } else if self.stills(other) || own > others && other.at_rest {
             -1.5
-        } else if own > others && other.at_rest {
-            0.0
         } else if fourfold(own, others) {
             0.5
         } else {
@@ -768,10 +766,10 @@ mod tests {
         assert!(fourfold([0.0; 4], 1.0).surpasses(&planned), "nothing is left");
         assert!(!fourfold(others, 2.0).surpasses(&planned), "it is clearly worse");
         assert!(!fourfold(fewer, 1.0).surpasses(&planned), "what is left was there before");
-        // For still more shrinkage it is enough to be better.
+        // So it is for still more shrinkage.
         let taken = Course { at_rest: true, ..fourfold(others, 1.0) };
         let eightfold = |behind| course(2.8, [0.0; 4], (0, behind));
-        assert!(eightfold(0.5).surpasses(&taken) && !eightfold(1.5).surpasses(&taken));
+        assert!(eightfold(2.0).surpasses(&taken) && !eightfold(3.0).surpasses(&taken));
         let moving = Course { at_rest: false, ..taken };
         assert!(!eightfold(0.5).surpasses(&moving), "by more than chance where something moves");
     }
