@@ -330,6 +330,8 @@ struct Course {
     squares: Vec<Vec<f64>>,
     /// The frames where the error was least.
     best: Option<Array3<f32>>,
+    /// The frames after the last iteration.
+    last: Option<Array3<f32>>,
     /// Whether the next iteration left the finite numbers.
     diverged: bool,
     /// Whether it was clearly behind what it was to surpass, and not run to its end.
@@ -374,6 +376,11 @@ impl Course {
         self.errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1)
     }
 
+    /// The frames there. With noise the error may be least after the first iteration, which shrinks little.
+    fn end(&self) -> Option<&Array3<f32>> {
+        if self.paid() == self.errors.len() { self.last.as_ref() } else { self.best.as_ref() }
+    }
+
     fn shrinkage(&self) -> f32 {
         self.stage.temporal_shrinkage.unwrap_or(0.0)
     }
@@ -381,7 +388,7 @@ impl Course {
     /// Whether it has four times the shrinkage of another, and little of what changed there.
     fn stills(&self, other: &Self) -> bool {
         let (own, others) = (self.shrinkage(), other.shrinkage());
-        let frames = self.best.as_ref().zip(other.best.as_ref());
+        let frames = self.end().zip(other.end());
         let frames = frames.filter(|_| fourfold(own, others));
         frames.is_some_and(|(own, others)| rest::correlation(own, others) < MOTION)
     }
@@ -546,6 +553,7 @@ impl Watch<'_, '_> {
             errors: vec![],
             squares: vec![],
             best: None,
+            last: None,
             diverged: false,
             given_up: false,
             last_given_up: false,
@@ -583,6 +591,7 @@ impl Watch<'_, '_> {
                 break;
             }
         }
+        course.last = (!course.diverged).then(|| run.frames().to_owned());
         Ok(course)
     }
 }
@@ -745,11 +754,13 @@ mod tests {
     fn course(shrinkage: f32, changes: [f32; 4], (side, behind): (usize, f64)) -> Course {
         let planned = Schedule::pnp_nonlocal().stages[1].clone();
         let square = |pixel: usize| ((pixel + side) % 2) as f64 + behind / 10.0;
+        let frames = Array3::from_shape_fn((4, 8, 8), |(k, i, _)| i as f32 + changes[k]);
         Course {
             stage: Stage { temporal_shrinkage: Some(shrinkage), ..planned },
             errors: vec![1.0],
             squares: vec![(0..100).map(square).collect()],
-            best: Some(Array3::from_shape_fn((4, 8, 8), |(k, i, _)| i as f32 + changes[k])),
+            best: Some(frames.clone()),
+            last: Some(frames),
             diverged: false,
             given_up: false,
             last_given_up: false,
@@ -766,6 +777,9 @@ mod tests {
         assert!(fourfold([0.0; 4], 1.0).surpasses(&planned), "nothing is left");
         assert!(!fourfold(others, 2.0).surpasses(&planned), "it is clearly worse");
         assert!(!fourfold(fewer, 1.0).surpasses(&planned), "what is left was there before");
+        // With noise the error may be least before shrinkage has had any effect.
+        let early = Course { best: planned.best.clone(), ..fourfold(others, 1.0) };
+        assert!(early.surpasses(&planned), "the frames at the end tell");
         // So it is for still more shrinkage.
         let taken = Course { at_rest: true, ..fourfold(others, 1.0) };
         let eightfold = |behind| course(2.8, [0.0; 4], (0, behind));
