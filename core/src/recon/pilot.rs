@@ -414,7 +414,7 @@ impl Course {
         let errors = if self.stage.static_variance != other.stage.static_variance {
             2.0
         } else if own < others {
-            2.5
+            3.0
         } else if self.stills(other) || own > others && other.at_rest {
             -1.5
         } else if fourfold(own, others) {
