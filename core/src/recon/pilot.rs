@@ -397,7 +397,7 @@ impl Course {
     /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more
-    /// than it counts in the frames: so for another one the difference must be twice as clear. What fourfold
+    /// than it counts in the frames: so for another one the difference must be thrice as clear. What fourfold
     /// shrinkage of changes spares a scene at rest hardly shows in a measurement, but what it costs a moving
     /// one does: there half as clear will do, and where it has left little of what changed, it is enough not to be
     /// clearly worse, also for still more. For less it takes more: pixels that are held out have what changes from
@@ -411,9 +411,7 @@ impl Course {
             return self.least() < other.least();
         }
         let (own, others) = (self.shrinkage(), other.shrinkage());
-        let errors = if self.stage.static_variance != other.stage.static_variance {
-            2.0
-        } else if own < others {
+        let errors = if self.stage.static_variance != other.stage.static_variance || own < others {
             3.0
         } else if self.stills(other) || own > others && other.at_rest {
             -1.5
