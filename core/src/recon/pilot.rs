@@ -398,10 +398,9 @@ impl Course {
     ///
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more
     /// than it counts in the frames: so for another one the difference must be thrice as clear. What fourfold
-    /// shrinkage of changes spares a scene at rest hardly shows in a measurement, but what it costs a moving
-    /// one does: there half as clear will do, and where it has left little of what changed, it is enough not to be
-    /// clearly worse, also for still more. For less it takes more: pixels that are held out have what changes from
-    /// their neighbours, and lose by shrinkage what the others keep.
+    /// shrinkage of changes spares a scene at rest hardly shows in a measurement: where it has left little of what
+    /// changed, it is enough not to be clearly worse, also for still more. For less it takes more: pixels that are
+    /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
     fn surpasses(&self, other: &Self) -> bool {
         if self.given_up {
             return false;
@@ -415,8 +414,6 @@ impl Course {
             3.0
         } else if self.stills(other) || own > others && other.at_rest {
             -1.5
-        } else if fourfold(own, others) {
-            0.5
         } else {
             1.0
         };
