@@ -114,8 +114,9 @@ pub struct Stage {
     /// covariance R, the variance of whose cosine m is this for m = 0 and m^-0.4 from m = 1 on; without it R
     /// = 1. More frames have more to change, and masks that are alike tell little of the changes: so this is
     /// for Cr 10, and at others, and where only a share c of the masks' energy changes from frame to frame,
-    /// it is multiplied by the lesser of (10 / Cr)^0.5 and (c / 0.125)^1.5. An adaptive schedule doubles it,
-    /// or leaves it out, where that pays.
+    /// it is multiplied by the least of n = (10 / Cr)^0.5, (c / 0.125)^1.5 and the greater of 0.55 and
+    /// n (c / c0)^0.9, where c0 = 0.45 (1 - 1 / Cr). An adaptive schedule doubles it, or leaves it out, where
+    /// that pays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(transform = STATIC_VARIANCE.bounds())]
     pub static_variance: Option<f32>,

@@ -120,8 +120,8 @@ impl SensingOperator {
     }
 
     /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a
-    /// snapshot's frames at a pixel, with the cosines `Psi` of the DCT-II, and `s = static_variance min((10 /
-    /// B)^0.5, (c / 0.125)^1.5)` of the masks' contrast `c`.
+    /// snapshot's frames at a pixel, with the cosines `Psi` of the DCT-II, and `s` = `static_variance` times what
+    /// masks of this contrast and number bear of it ([`static_share`]).
     ///
     /// Where masks are alike a measurement says well what all frames have in common, and hardly what changes from
     /// one to the next: so this is where the error is, slow changes first. The projection along the masks
@@ -129,9 +129,8 @@ impl SensingOperator {
     /// out again.
     pub(super) fn error_covariance(&self, static_variance: f32) -> Array2<f32> {
         let frames = self.masks.dim().0;
-        let alike = (self.contrast() / HIGH_CONTRAST).powf(1.5);
-        let many = (10.0 / frames as f32).sqrt();
-        let common = (static_variance * alike.min(many)).max(LEAST_STATIC_VARIANCE);
+        let share = static_share(self.contrast(), frames);
+        let common = (static_variance * share).max(LEAST_STATIC_VARIANCE);
         let count = frames as f32;
         let cosine = |m: usize, k: usize| {
             let norm = if m == 0 { 1.0 / count } else { 2.0 / count }.sqrt();
@@ -285,10 +284,24 @@ pub(super) struct Statistics {
 /// exponents of 0 to 2.6; as the projection's, more than 0.5 gains less, and 0 loses where there is noise.
 const DECAY: f32 = 0.4;
 
-/// The contrast of masks at which they no longer set bounds to the static variance at Cr 10. Of fixed ones the best is
-/// 0.07 at a contrast of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06, and 0.3 at 0.084; behind independent pixels
-/// (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from Cr 16 on.
+/// The contrast of masks at which they are no longer much alike.
 const HIGH_CONTRAST: f32 = 0.125;
+
+/// What `B` masks of contrast `c` bear of the static variance: `min((c / 0.125)^1.5, n, max(n (c / c0)^0.9, 0.55))`
+/// with `n = (10 / B)^0.5`, and nine tenths of the contrast of independent binary masks as `c0`.
+///
+/// With the default's 0.55 the best static variance is 0.07 at a contrast of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06,
+/// 0.3 at 0.084, 0.25 to 0.3 from there to 0.17, and 0.3 to 0.4 at 0.25, where optics blur binary masks or let light
+/// through closed pixels; behind independent binary ones (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from
+/// Cr 16 on (docs/experiments.md).
+fn static_share(contrast: f32, frames: usize) -> f32 {
+    let count = frames as f32;
+    let many = (10.0 / count).sqrt();
+    let alike = (contrast / HIGH_CONTRAST).powf(1.5);
+    let blurred = many * (contrast / (0.45 * (1.0 - 1.0 / count))).powf(0.9);
+    alike.min(many).min(blurred.max(0.551))
+}
+
 /// Of masks that are all alike nothing else than what frames have in common can be told, so it must not be 0.
 const LEAST_STATIC_VARIANCE: f32 = 0.01;
 
@@ -485,6 +498,12 @@ mod tests {
         let binary = |frames: usize| random(3, (frames, 32, 32)).mapv(f32::round);
         near(common(binary(4)), 0.5 * 2.5f32.sqrt());
         near(common(binary(20)), 0.5 * 0.5f32.sqrt());
+        // Light through closed pixels: half and a third of the contrast of binary masks.
+        let leaking = |frames: usize, light: f32| {
+            common(random(3, (frames, 32, 32)).mapv(|c| light + (1.0 - light) * c.round()))
+        };
+        near(leaking(10, 0.23), 0.5 * 0.65);
+        near(leaking(10, 0.42), 0.5 * 0.551);
     }
 
     /// A prior that takes the error of all frames out but one leaves there what the projection makes of it.

@@ -488,7 +488,10 @@ mod reference {
                 let gram: f64 = (0..plane).map(|pixel| sum(pixel, 2)).sum();
                 let steady: f64 = (0..plane).map(|pixel| sum(pixel, 1).powi(2)).sum();
                 let contrast = 1.0 - steady / (frames as f64 * gram);
-                let part = (contrast / 0.125).powf(1.5).min((10.0 / frames as f64).sqrt());
+                let many = (10.0 / frames as f64).sqrt();
+                let half = 0.5 * (1.0 - 1.0 / frames as f64);
+                let part = (many * (contrast / (0.9 * half)).powf(0.9)).max(0.551);
+                let part = part.min(many).min((contrast / 0.125).powf(1.5));
                 let variance = f64::from(variance) * part;
                 let cosine =
                     |m: usize, k: usize| (PI * m as f64 * (k as f64 + 0.5) / frames as f64).cos();
