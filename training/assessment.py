@@ -4,8 +4,8 @@
     python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
 
 `make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
-them with parts that move by themselves, and clips; all kinds of masks, Cr 6 to 24, noise 0 to 10) and has them
-reconstructed. It goes on where it was stopped, and what it has made so far is a mixture of all. `fit` fits small networks to
+them with parts that move by themselves, and clips; all kinds of masks, half of them blurred or with light through closed
+pixels, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is a mixture of all. `fit` fits small networks to
 all cases, and tells how they do on scenes that were left out (no scene is in two folds). The scenes of `eval_loop.py`, which judges them,
 are in no fit.
 """
@@ -99,8 +99,18 @@ def cropped(rng, clip, wide):
     return np.stack([cv2.resize(frame, (wide, wide), interpolation=cv2.INTER_AREA) for frame in part])
 
 
+def softness(rng, pattern):
+    """What a lens blurs masks by (pixels, standard deviation) and the light that closed pixels let through, of half of the cases. Blurred further, those
+    of the hybrid aperture tell nothing of the changes."""
+    if rng.random() < .5:
+        return 0, 0
+    most = 1.3 if pattern == 'iid' else .7
+    blur, leak = (round(float(rng.uniform(least, greatest)), 2) if rng.random() < share else 0 for share, least, greatest in ((.75, .3, most), (.4, .05, .4)))
+    return blur, leak
+
+
 def cases(a):
-    """Name, scene, frames [B,H,W] (uint8), kind of masks, noise and seed of each case, in an order that mixes all of them."""
+    """Name, scene, frames [B,H,W] (uint8), kind of masks, their blur and leak, noise and seed of each case, in an order that mixes all of them."""
     photos = sorted(glob.glob(f'{a.data}/photos/train/*.jpg')) + sorted(glob.glob(f'{a.data}/photos/val/*.jpg'))
     clips = {os.path.basename(folder): eval_loop.pictures(folder) for folder in sorted(glob.glob(f'{a.data}/clips/*/*'))}
     if a.more:
@@ -121,19 +131,20 @@ def cases(a):
         pattern, sigma = PATTERNS[rng.integers(len(PATTERNS))], int(rng.choice(SIGMAS))
         seeds = {algorithm: int(rng.integers(1e6)) for algorithm in ALGORITHMS}
         seeds = {algorithm: seed for algorithm, seed in seeds.items() if a.algorithm in (None, algorithm)}
-        yield f'c{number:04d}', os.path.basename(scene), frames[:ratio], pattern, sigma, seeds
+        yield f'c{number:04d}', os.path.basename(scene), frames[:ratio], pattern, softness(np.random.default_rng([7, int(index)]), pattern), sigma, seeds
 
 
 def make(a):
     part, parts = (int(number) for number in a.part.split('/'))
-    for number, (name, scene, frames, pattern, sigma, seeds) in enumerate(cases(a)):
+    for number, (name, scene, frames, pattern, (blur, leak), sigma, seeds) in enumerate(cases(a)):
         folder = f'{a.out}/{name}'
         if number % parts != part or os.path.exists(f'{folder}/scene.json'):
             continue
         os.makedirs(f'{folder}/clip', exist_ok=True)
         np.save(f'{folder}/clip/{name}.npy', frames)
         for algorithm, seed in seeds.items():
-            subprocess.run([a.binary, 'assess', '--clips', f'{folder}/clip', '--pattern', pattern, '--cr', str(len(frames)), '--noise-sigma', str(sigma),
+            subprocess.run([a.binary, 'assess', '--clips', f'{folder}/clip', '--pattern', pattern, '--blur', str(blur), '--leak', str(leak),
+                            '--cr', str(len(frames)), '--noise-sigma', str(sigma),
                             '--algorithm', algorithm, '--scale', str(frames.shape[1]), '--seed', str(seed), '--out', f'{folder}/{algorithm}'], check=True)
         with open(f'{folder}/scene.json', 'w') as f:
             json.dump(scene, f)
@@ -164,7 +175,8 @@ class Case:
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
         self.told_by(about['evidence'])
         self.first_evidence = about['evidence'].get('first')
-        self.pattern, self.noise = about['setting']['pattern'], about['setting']['noise_sigma']
+        self.pattern, *softened = about['setting']['pattern'].split(', ')
+        self.softened, self.noise = bool(softened), about['setting']['noise_sigma']
         # The default's pilot shrinks changes along time; gap-tv has none.
         stages = about['pilot']['stages'] if about.get('pilot') else []
         self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
@@ -415,6 +427,7 @@ def fit(a):
         by, interval = median(everywhere), ends(everywhere)
         print(f'{name}: moved by {by:+.2f}; interval {interval.round(2)}; correlation of the map {np.nanmedian(spread):.2f}')
         kinds = {f'all, of {len(names)} scenes, each left out': everywhere} | {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
+        kinds |= {'blurred or with light': [case.softened for case in cases], 'neither': [not case.softened for case in cases]}
         kinds |= {f'{side}x{side}': [case.side * BLOCK == side for case in cases] for side in sorted(set(SIDES))}
         for kind, of in kinds.items():
             if np.any(of):

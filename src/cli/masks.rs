@@ -12,7 +12,7 @@ use crate::cli::optics::OpticsFile;
 use crate::intake::read_clip;
 use crate::optics::{
     HybridAperture, Method, Multiplexing, Normalisation, Placement, check_patterns, generator,
-    iid_masks, pattern_rank, single_apertures,
+    iid_masks, pattern_rank, single_apertures, soften,
 };
 
 /// The masks that are asked for.
@@ -35,6 +35,13 @@ pub struct MaskArguments {
     /// What a mask value of 1 means.
     #[arg(long, value_name = "HOW", default_value = "maximum")]
     normalise: Normalise,
+    /// What a lens blurs the masks by, beside what the optics do: the standard deviation in sensor
+    /// pixels.
+    #[arg(long, value_name = "PIXELS", default_value_t = 0.0)]
+    blur: f64,
+    /// Light that closed pixels let through, as a share of that of open ones.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    leak: f32,
 }
 
 /// Kinds of masks.
@@ -93,12 +100,58 @@ impl MaskArguments {
         }
     }
 
+    /// The pattern and what a lens and closed pixels make of it, as `iid, blur 0.7, leak 0.1`.
+    pub fn described(&self) -> String {
+        let mut text = self.pattern().to_owned();
+        if self.blur != 0.0 {
+            text += &format!(", blur {}", self.blur);
+        }
+        if self.leak != 0.0 {
+            text += &format!(", leak {}", self.leak);
+        }
+        text
+    }
+
+    /// Standard deviation of the lens's blur, sensor pixels.
+    pub fn blur(&self) -> f64 {
+        self.blur
+    }
+
+    /// The share of light that closed pixels let through.
+    pub fn leak(&self) -> f32 {
+        self.leak
+    }
+
     pub fn optics(&self) -> Result<OpticsFile> {
         OpticsFile::read(self.optics.as_deref())
     }
 
     /// Makes the masks of frames x rows x columns.
     pub fn make(
+        &self,
+        optics: &OpticsFile,
+        size: (usize, usize, usize),
+        seed: u64,
+    ) -> Result<SimulatedMasks> {
+        let made = self.sharp(optics, size, seed)?;
+        if self.blur == 0.0 && self.leak == 0.0 {
+            return Ok(made);
+        }
+        let SimulatedMasks { mut masks, mut scale, apertures, .. } = made;
+        soften(&mut masks, self.blur, self.leak)?;
+        if self.normalise == Normalise::Maximum {
+            let largest = masks.iter().copied().fold(0.0, f32::max);
+            if largest > 0.0 {
+                masks.mapv_inplace(|mask| mask / largest);
+                scale *= largest;
+            }
+        }
+        let throughput = f64::from(masks.mean().unwrap_or(0.0)) * f64::from(scale);
+        Ok(SimulatedMasks { masks, throughput, scale, apertures })
+    }
+
+    /// The masks as the patterns and the aperture alone make them.
+    fn sharp(
         &self,
         optics: &OpticsFile,
         (frames, height, width): (usize, usize, usize),

@@ -62,6 +62,9 @@ pub struct Arguments {
 struct Record {
     program_version: &'static str,
     pattern: &'static str,
+    /// Of the masks: standard deviation in sensor pixels, and the share that closed pixels let through.
+    blur: f64,
+    leak: f32,
     seed: u64,
     /// None for a grey sensor.
     mosaic: Option<Mosaic>,
@@ -135,6 +138,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut record = Record {
         program_version: env!("CARGO_PKG_VERSION"),
         pattern: arguments.masks.pattern(),
+        blur: arguments.masks.blur(),
+        leak: arguments.masks.leak(),
         seed: arguments.seed,
         mosaic: arguments.mosaic,
         compression_ratio: ratio,

@@ -148,7 +148,7 @@ fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
     for (pattern, rank, more) in [
         ("rotating-circle", 3, &[][..]),
         ("single-apertures", 3, &["--normalise", "throughput"]),
-        ("images", 2, &["--images", &images]),
+        ("images", 2, &["--images", &images, "--blur", "0.6", "--leak", "0.1"]),
     ] {
         let base = ["--compression-ratio", "3", "--optics", &optics];
         let made = files.simulate(pattern, pattern, &[&base[..], more].concat());

@@ -12,6 +12,7 @@ mod check;
 mod findings;
 mod geometry;
 mod iid;
+mod lens;
 mod masks;
 mod mosaic;
 mod multiplex;
@@ -30,6 +31,7 @@ pub use findings::{
 };
 pub use geometry::Geometry;
 pub use iid::iid_masks;
+pub use lens::soften;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
 pub use mosaic::{MARGIN, Mosaic};
 pub use multiplex::{Draw, Multiplexing};

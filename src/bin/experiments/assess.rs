@@ -54,7 +54,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let (frames, side) = (usize::from(arguments.cr), arguments.scale);
     let clips = read_clips(&arguments.clips, frames, Some(side))?;
     let setting = Setting {
-        pattern: arguments.masks.pattern().to_owned(),
+        pattern: arguments.masks.described(),
         noise_sigma: arguments.noise_sigma,
         seed: arguments.seed,
     };

@@ -87,7 +87,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     };
     let mut records = Records::open(&arguments.out)?;
     let setting = Setting {
-        pattern: arguments.masks.pattern().to_owned(),
+        pattern: arguments.masks.described(),
         noise_sigma: arguments.noise_sigma,
         seed: arguments.seed,
     };
