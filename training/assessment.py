@@ -175,8 +175,9 @@ class Case:
         self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
         self.told_by(about['evidence'])
         self.first_evidence = about['evidence'].get('first')
-        self.pattern, *softened = about['setting']['pattern'].split(', ')
-        self.softened, self.noise = bool(softened), about['setting']['noise_sigma']
+        self.masks, self.noise = about['setting']['pattern'], about['setting']['noise_sigma']
+        self.pattern, *softened = self.masks.split(', ')
+        self.softened = bool(softened)
         # The default's pilot shrinks changes along time; gap-tv has none.
         stages = about['pilot']['stages'] if about.get('pilot') else []
         self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
@@ -311,7 +312,7 @@ class Model:
 
     def alike(self, cases):
         """Of each case the places of those that may be joined to it; none where first runs tell of a case: they tell of all of it."""
-        like = lambda one, other: (one.pattern, one.frames, one.noise) == (other.pattern, other.frames, other.noise) and abs(one.white - other.white) < LIKE
+        like = lambda one, other: (one.masks, one.frames, one.noise) == (other.masks, other.frames, other.noise) and abs(one.white - other.white) < LIKE
         return [[] if self.first else [place for place, other in enumerate(cases) if other is not case and like(case, other)] for case in cases]
 
     def fitted(self, network, cases, inputs, firsts, others, a):

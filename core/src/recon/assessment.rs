@@ -7,7 +7,7 @@
 //! simulated snapshots of many scenes; `docs/benchmarks.md` says how well it does on others.
 
 use std::collections::BTreeMap;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 use std::sync::LazyLock;
 
 use ndarray::{
@@ -283,6 +283,21 @@ fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
         Zip::from(part).and(&energy).map_collect(|part, all| logarithm(part / all.max(FLOOR)))
     };
     (share(&(&energy - &steady)), share(&steps))
+}
+
+/// Contrasts of the masks that predictions were fitted to, as decimal logarithms: of the hybrid coded aperture, and of
+/// independent binary pixels; and how far their gradient is above their contrast, at least.
+const KNOWN_CONTRASTS: [RangeInclusive<f32>; 2] = [-1.6..=-1.0, -0.47..=0.0];
+const KNOWN_SHARPNESS: f32 = 0.28;
+
+/// Whether masks are not like those that predictions were fitted to, by what is seen of them in [`features`]: blurred, or
+/// with light through closed pixels.
+pub fn unfamiliar_masks(features: &Array4<f32>) -> bool {
+    let mean =
+        |feature: usize| features.slice(s![OF_RESULT + feature, 0, .., ..]).mean().unwrap_or(0.0);
+    let (contrast, gradient) = (mean(2), mean(3));
+    gradient - contrast < KNOWN_SHARPNESS
+        || KNOWN_CONTRASTS.iter().all(|known| !known.contains(&contrast))
 }
 
 fn logarithm(energy: f32) -> f32 {
@@ -579,9 +594,9 @@ impl Layer {
 mod tests {
     use super::{
         Evidence, FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, apart, around, encoded_features,
-        features, with_first_run,
+        features, unfamiliar_masks, with_first_run,
     };
-    use crate::optics::iid_masks;
+    use crate::optics::{iid_masks, random_squares, soften};
     use crate::recon::error::ReconError;
     use crate::recon::prior::{CHANNELS, Encoder};
     use crate::recon::schedule::Schedule;
@@ -762,6 +777,24 @@ mod tests {
     }
 
     /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
+    #[test]
+    fn masks_that_predictions_were_not_fitted_to_are_told_apart() {
+        let unfamiliar = |masks: Array3<f32>| {
+            let frames = Array3::zeros(masks.raw_dim());
+            let op = SensingOperator::new(masks).unwrap();
+            unfamiliar_masks(&features(&op, None, frames.view()))
+        };
+        let size = (10, 64, 64);
+        let iid = || iid_masks(size.0, size.1, size.2, 3).unwrap();
+        assert!(!unfamiliar(iid()));
+        assert!(!unfamiliar(random_squares(size.0, size.1, size.2, 3).unwrap().0));
+        for (blur, leak) in [(0.6, 0.0), (0.0, 0.4), (1.2, 0.0)] {
+            let mut masks = iid();
+            soften(&mut masks, blur, leak).unwrap();
+            assert!(unfamiliar(masks), "{blur} {leak}");
+        }
+    }
+
     #[test]
     fn more_texture_lets_expect_more_error() {
         let op = SensingOperator::new(iid_masks(4, 48, 48, 1).unwrap()).unwrap();
