@@ -285,19 +285,22 @@ fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
     (share(&(&energy - &steady)), share(&steps))
 }
 
-/// Decimal logarithms of the contrast of masks: those between independent pixels and the first are told as well as these;
-/// those of the hybrid coded aperture lie between the two, and their gradient is so far above their contrast, at least.
+/// Decimal logarithms: between these lies the contrast of the hybrid coded aperture, whose gradient is so far above it, at
+/// least. Behind masks of more contrast, sharp or not, predictions are as good as behind independent pixels.
 const APERTURE_CONTRAST: Range<f32> = -1.6..-1.0;
 const APERTURE_SHARPNESS: f32 = 0.28;
 
 /// Whether predictions were fitted to sharper masks, by what is seen of them in [`features`]: masks that are blurred, or
 /// let light through closed pixels, until they are as much alike as those of the hybrid coded aperture, or more.
 pub fn unfamiliar_masks(features: &Array4<f32>) -> bool {
-    let mean =
-        |feature: usize| features.slice(s![OF_RESULT + feature, 0, .., ..]).mean().unwrap_or(0.0);
-    let (contrast, gradient) = (mean(2), mean(3));
-    let known = gradient - contrast >= APERTURE_SHARPNESS && contrast >= APERTURE_CONTRAST.start;
-    contrast < APERTURE_CONTRAST.end && !known
+    let of_blocks = |feature: usize| features.slice(s![OF_RESULT + feature, 0, .., ..]);
+    // Of a block that no light reaches there is nothing to tell.
+    let lit = of_blocks(2).mapv(|contrast| f32::from(u8::from(contrast > logarithm(0.0))));
+    let mean = |feature: usize| (&of_blocks(feature) * &lit).sum() / lit.sum();
+    let (contrast, sharpness) = (mean(2), mean(3) - mean(2));
+    let known = contrast >= APERTURE_CONTRAST.end
+        || contrast >= APERTURE_CONTRAST.start && sharpness >= APERTURE_SHARPNESS;
+    !known
 }
 
 fn logarithm(energy: f32) -> f32 {
@@ -795,6 +798,10 @@ mod tests {
         assert!(!softened(iid(), 0.0, 0.3));
         assert!(softened(iid(), 1.2, 0.0));
         assert!(!softened(squares(), 0.0, 0.0));
+        // A corner without light.
+        let mut dark = squares();
+        dark.slice_mut(s![.., ..32, ..32]).fill(0.0);
+        assert!(!softened(dark, 0.0, 0.0));
         assert!(softened(squares(), 0.7, 0.0));
         assert!(softened(squares(), 0.0, 0.4));
     }
