@@ -1,7 +1,7 @@
 """Fit what the program predicts of its own results without a truth: the expected error of blocks and the PSNR of a snapshot.
 
     python assessment.py make --binary sci-recon-experiments --data DATA [--more FOLDER] --out FOLDER
-    python assessment.py fit --out FOLDER [--write ../core/src/recon/assessment.json]
+    python assessment.py fit --out FOLDER... [--write ../core/src/recon/assessment.json]
 
 `make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
 them with parts that move by themselves, and clips; all kinds of masks, half of them blurred or with light through closed
@@ -37,6 +37,8 @@ SHRUNK = 1.0
 FEATURES, CHANNELS = 26, 128    # as the program has them, those of its encoder after the others
 MOVES, DOUBT, LEAST = 3.0, .3, .1  # as the program has them: see `apart`
 FARTHEST = 3.0      # as the program has it
+CONTRAST, GRADIENT = 11, 12     # which features are of the masks
+APERTURE_CONTRAST, APERTURE_SHARPNESS = (-1.6, -1.0), .28   # as the program has them
 BEST = eval_loop.BEST
 SPARE = 10.0        # dB above it up to which the fit follows
 COMPONENTS = 64     # of what the encoder sees
@@ -137,7 +139,7 @@ def cases(a):
 def make(a):
     part, parts = (int(number) for number in a.part.split('/'))
     for number, (name, scene, frames, pattern, (blur, leak), sigma, seeds) in enumerate(cases(a)):
-        folder = f'{a.out}/{name}'
+        folder = f'{a.out[0]}/{name}'
         if number % parts != part or os.path.exists(f'{folder}/scene.json'):
             continue
         os.makedirs(f'{folder}/clip', exist_ok=True)
@@ -159,7 +161,7 @@ class Case:
         with open(path + '.json') as f:
             about = json.load(f)
         with open(f'{folder}/scene.json') as f:
-            self.scene = json.load(f)
+            self.scene, self.source = json.load(f), os.path.dirname(folder)
         # [features and the true error, frame, block]; what is not known counts as in the mean, as the program has it.
         seen = np.load(path + '.npy').astype(np.float32)
         self.psnr, self.frames, self.side = about['psnr_db'], seen.shape[1], round(seen.shape[2] ** .5)
@@ -178,6 +180,10 @@ class Case:
         self.masks, self.noise = about['setting']['pattern'], about['setting']['noise_sigma']
         self.pattern, *softened = self.masks.split(', ')
         self.softened = bool(softened)
+        # As `unfamiliar_masks` of the program has it.
+        contrast, gradient = (float(self.features[:, feature].mean()) for feature in (CONTRAST, GRADIENT))
+        least, greatest = APERTURE_CONTRAST
+        self.unfamiliar = contrast < greatest and (contrast < least or gradient - contrast < APERTURE_SHARPNESS)
         # The default's pilot shrinks changes along time; gap-tv has none.
         stages = about['pilot']['stages'] if about.get('pilot') else []
         self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
@@ -242,10 +248,10 @@ class Model:
             self.networks.append(self.fitted(network, cases, inputs, firsts, others, a))
 
     @classmethod
-    def read(cls, record):
+    def read(cls, record, first=None):
         """That of a record."""
         model = cls.__new__(cls)
-        model.first = None
+        model.first = first
         model.scale_as(record)
         count = len(record['networks'][0][0]['weights'])
         model.networks = [cls.network(count, known).eval() for known in record['networks']]
@@ -383,8 +389,25 @@ class Model:
         return {'features': by(self.features), 'signs': by(self.signs), 'encoding': encoding, 'networks': [layers(network) for network in self.networks]}
 
 
+def settle(true, told, half, as_told, outside):
+    """Of cases in two halves what is added to all that is told of them, and the interval; of each what is then missed, and whether it is in the interval.
+
+    Errors of blocks are told too even, so their mean is too small: what is told is moved to the median, and of each half by that of the other half,
+    whose interval it has. Nothing is moved if they are taken as they are told. Outside that interval is such a share of them at either end."""
+    median = lambda chosen: 0 if as_told else np.median((true - told)[chosen & (told < BEST)])
+    wrong = true - (told + np.where(half == 0, median(half == 1), median(half == 0))).clip(max=BEST)
+    ends = lambda chosen: np.quantile(wrong[chosen], [outside, 1 - outside])
+    inside = np.zeros(len(true), bool)
+    for k in (0, 1):
+        low, high = ends(half != k)
+        inside[half == k] = (wrong[half == k] >= low) & (wrong[half == k] <= high)
+    return median(half >= 0), ends(half >= 0), wrong, inside
+
+
 def fit(a):
     models, start = {}, None
+    if not a.epochs and not a.start:
+        raise SystemExit('--epochs 0 needs the models of a file: --start')
     if a.start:
         with open(a.start) as f:
             start = json.load(f)
@@ -393,10 +416,11 @@ def fit(a):
             models = json.load(f)
     for name in [a.model] if a.model else MODELS:
         algorithm, shrunk = MODELS[name]
-        cases, judged = [Case(os.path.dirname(path), algorithm) for path in sorted(glob.glob(f'{a.out}/*/scene.json'))], eval_loop.judged()
+        paths, judged = [path for folder in a.out for path in sorted(glob.glob(f'{folder}/*/scene.json'))], eval_loop.judged()
+        cases = [Case(os.path.dirname(path), algorithm) for path in paths]
         cases = [case for case in cases if case.shrunk == shrunk and case.scene not in judged]
         if not cases:
-            raise SystemExit(f'{a.out} has no cases for the model of {name}')
+            raise SystemExit(f"{', '.join(a.out)} has no cases for the model of {name}")
         # Those that were shrunk are few: their model may go on from that of the others.
         known = start and start.get(name, start[algorithm])
         others = models.get(algorithm) or (start and start[algorithm])
@@ -406,38 +430,40 @@ def fit(a):
         names = sorted({case.scene for case in cases})
         fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
         told, spread = np.zeros(len(cases)), []
+        # Of what no model was fitted to all may be told by the same.
+        made = lambda of: Model(of, a, known, first) if a.epochs else Model.read(known, first)
         for k in range(a.folds):
-            model = Model([case for case in cases if fold[case.scene] != k], a, known, first)
+            model = made([case for case in cases if fold[case.scene] != k])
             for index, case in enumerate(cases):
                 if fold[case.scene] == k:
                     errors, told[index] = model(case)
                     spread.append(np.corrcoef(errors, case.error)[0, 1])
-        # Errors of blocks are told too even, so their mean is too small: what is told is moved to the median, and of each half by that of the other
-        # half, whose interval it has. Not where first runs tell of the others: what is left is mostly better than BEST, and its median says nothing.
         true, half = np.array([min(case.psnr, BEST) for case in cases]), np.array([fold[case.scene] % 2 for case in cases])
-        median = lambda chosen: 0 if first else np.median((true - told)[chosen & (told < BEST)])
-        middle = np.where(half == 0, median(half == 1), median(half == 0))
-        wrong = true - (told + middle).clip(max=BEST)
+        unfamiliar = np.array([case.unfamiliar for case in cases])
+        wrong, inside, settled = np.zeros(len(cases)), np.zeros(len(cases), bool), []
         # A little wider than four of five cases of the fit: other scenes are worse.
-        ends = lambda chosen: np.quantile(wrong[chosen], [.08, .92])
-        inside = np.zeros(len(cases), bool)
-        for k in (0, 1):
-            low, high = ends(half != k)
-            inside[half == k] = (wrong[half == k] >= low) & (wrong[half == k] <= high)
+        outside = .08 if a.epochs else .1
+        for of, moved in ((~unfamiliar, a.epochs and not first), (unfamiliar, True)):
+            # What first runs leave is mostly better than BEST, and its median says nothing.
+            *by_all, wrong[of], inside[of] = settle(true[of], told[of], half[of], not moved, outside)
+            settled.append(by_all)
+        (by, interval), (by_unfamiliar, of_unfamiliar) = settled
         everywhere = np.ones(len(cases), bool)
-        by, interval = median(everywhere), ends(everywhere)
-        print(f'{name}: moved by {by:+.2f}; interval {interval.round(2)}; correlation of the map {np.nanmedian(spread):.2f}')
+        print(f'{name}: moved by {by:+.2f}; interval {interval.round(2)}; behind unfamiliar masks {by_unfamiliar:+.2f} and {of_unfamiliar.round(2)}; '
+              f'correlation of the map {np.nanmedian(spread):.2f}')
         kinds = {f'all, of {len(names)} scenes, each left out': everywhere} | {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
-        kinds |= {'blurred or with light': [case.softened for case in cases], 'neither': [not case.softened for case in cases]}
+        kinds |= {'blurred or with light': [case.softened for case in cases], 'neither': [not case.softened for case in cases], 'unfamiliar': unfamiliar}
         kinds |= {f'{side}x{side}': [case.side * BLOCK == side for case in cases] for side in sorted(set(SIDES))}
+        kinds |= {folder: [case.source == folder for case in cases] for folder in a.out if len(a.out) > 1}
         for kind, of in kinds.items():
             if np.any(of):
                 found = eval_loop.accuracy(wrong[of], inside[of])
                 print(f"  {kind}: {found['snapshots']} cases, {found['mean_db']} dB in the mean, 80 % within {found['four_of_five_db']}, "
                       f"{found['near_percent']} % within {NEAR}, {found['inside_percent']} % in the interval")
-        model = Model(cases, a, known, first)
+        model = made(cases)
         model.move(by)
-        models[name] = model.record() | {'interval': [round(float(end), 2) for end in interval]}
+        rounded = lambda values: [round(float(value), 2) for value in values]
+        models[name] = model.record() | {'interval': rounded(interval), 'unfamiliar': {'offset': rounded([by_unfamiliar - by])[0], 'interval': rounded(of_unfamiliar)}}
     if a.write:
         with open(a.write, 'w') as f:
             json.dump(models, f)
@@ -450,11 +476,11 @@ def main():
     p.add_argument('--binary', default='sci-recon-experiments')
     p.add_argument('--data', default='../../shared/training')
     p.add_argument('--more', help='a folder of further photographs (.jpg, .png) and clips (.npy, [frame, row, column] of uint8)')
-    p.add_argument('--out', default='assessment-output')
+    p.add_argument('--out', nargs='+', default=['assessment-output'], help='the folder of the cases; `fit` takes several')
     p.add_argument('--write', help='the file of the models')
     p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')
     p.add_argument('--side', type=int, help='of the pictures; a mixture where it is left out')
-    p.add_argument('--epochs', type=int, default=24)
+    p.add_argument('--epochs', type=int, default=24, help='0 leaves the models of --start as they are, and fits their intervals to cases that they have not seen')
     p.add_argument('--start', help='a file of models to go on from, where the cases are few')
     p.add_argument('--rate', type=float, default=5e-3, help='the highest rate of learning; less to go on from a model')
     p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this one alone')

@@ -25,15 +25,10 @@ pub struct TileAssessment {
     /// How fast the frames move at most, in pixels a frame.
     #[serde(default)]
     motion: f32,
-    /// Whether predictions were fitted to other masks.
+    /// Whether predictions are uncertain behind its masks.
     #[serde(default)]
     unfamiliar: bool,
 }
-
-/// By how much predictions are too high behind masks that they were not fitted to, in dB, and what is added to the rest for the
-/// ends of the interval that four of five true values lie in. Of 147 cases (docs/benchmarks.md).
-const UNFAMILIAR_DB: f32 = 4.5;
-const UNFAMILIAR_INTERVAL: [f64; 2] = [-8.2, 4.9];
 
 /// Levels in a decibel.
 const STEPS: f32 = 4.0;
@@ -57,8 +52,9 @@ impl TileAssessment {
         };
         let errors = model.log_errors(features, outcome.evidence.as_ref().or(evidence), white);
         let unfamiliar = unfamiliar_masks(features);
-        let less = if unfamiliar { UNFAMILIAR_DB } else { 0.0 };
-        let level = |error: &f32| ((-10.0 * error - less) * STEPS).round().clamp(0.0, 254.0) as u8;
+        let offset = if unfamiliar { model.unfamiliar.offset } else { 0.0 };
+        let level =
+            |error: &f32| ((-10.0 * error + offset) * STEPS).round().clamp(0.0, 254.0) as u8;
         let (_, rows, columns) = errors.dim();
         let motion = fastest(outcome.frames.view(), white);
         let levels = errors.iter().map(level).collect();
@@ -140,7 +136,7 @@ pub fn expected(
     };
     let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
     let end = |further: f64| (psnr_db + further).min(BEST);
-    let interval = if unfamiliar { UNFAMILIAR_INTERVAL } else { model.interval };
+    let interval = if unfamiliar { model.unfamiliar.interval } else { model.interval };
     let [low, high] = interval.map(end);
     let error = squares.mapv(|square| (square.sqrt() * white) as f32);
     let psnr_db = psnr_db.min(BEST);
@@ -258,11 +254,9 @@ fn other_masks() -> Finding {
     Finding {
         code: "unfamiliar_masks".to_owned(),
         severity: Severity::Warning,
-        detail: format!(
-            "the masks are more blurred than those that this prediction was fitted to, or their closed pixels let light \
-             through: behind such masks it was {UNFAMILIAR_DB} dB too high in the mean, which is taken off, and often \
-             far from the truth"
-        ),
+        detail: "the masks are much alike and not sharp: they are blurred, or their closed pixels let light through. Behind \
+                 such masks the expected PSNR is often far from the truth, and the interval wider"
+            .to_owned(),
         remedy:
             "Don't rely on the expected PSNR here; simulate a scene like yours behind these masks."
                 .to_owned(),

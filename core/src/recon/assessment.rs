@@ -290,7 +290,7 @@ fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
 const APERTURE_CONTRAST: Range<f32> = -1.6..-1.0;
 const APERTURE_SHARPNESS: f32 = 0.28;
 
-/// Whether predictions were fitted to sharper masks, by what is seen of them in [`features`]: masks that are blurred, or
+/// Whether predictions are uncertain behind these masks, by what is seen of them in [`features`]: masks that are blurred, or
 /// let light through closed pixels, until they are as much alike as those of the hybrid coded aperture, or more.
 pub fn unfamiliar_masks(features: &Array4<f32>) -> bool {
     let of_blocks = |feature: usize| features.slice(s![OF_RESULT + feature, 0, .., ..]);
@@ -381,6 +381,17 @@ pub struct Model {
     networks: Vec<Vec<Layer>>,
     /// What is added to the predicted PSNR for the ends of the interval in which four of five true values lie,
     /// in dB.
+    pub interval: [f64; 2],
+    /// Where [`unfamiliar_masks`] says so.
+    pub unfamiliar: Unfamiliar,
+}
+
+/// What is different behind masks that predictions are uncertain behind.
+#[derive(Debug, Deserialize)]
+pub struct Unfamiliar {
+    /// What is added to the predicted PSNR, in dB.
+    pub offset: f32,
+    /// As that of the model.
     pub interval: [f64; 2],
 }
 
@@ -710,7 +721,9 @@ mod tests {
                 assert_eq!(encoding.components.len(), CHANNELS);
                 assert!(encoding.components.iter().all(|weights| weights.len() == components));
             }
-            assert!(model.interval[0] < 0.0 && model.interval[1] > 0.0);
+            let [low, high] = model.interval;
+            let [lower, higher] = model.unfamiliar.interval;
+            assert!(lower < low && low < 0.0 && 0.0 < high && high < higher);
         }
     }
 
@@ -781,7 +794,7 @@ mod tests {
 
     /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
     #[test]
-    fn masks_that_predictions_were_not_fitted_to_are_told_apart() {
+    fn masks_that_predictions_are_uncertain_behind_are_told_apart() {
         let unfamiliar = |masks: Array3<f32>| {
             let frames = Array3::zeros(masks.raw_dim());
             let op = SensingOperator::new(masks).unwrap();

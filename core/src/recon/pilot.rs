@@ -90,7 +90,7 @@ pub struct StageFinding {
     pub iterations: usize,
     /// Weight of the total variation along time, if it pays; else 0.
     pub temporal_weight: f32,
-    /// Shrinkage of changes along time, if any pays; else 0.
+    /// Shrinkage of changes along time; 0 in a stage that has none.
     pub temporal_shrinkage: f32,
     /// The same where nothing moves, if four times as much or more pays.
     pub rest_shrinkage: Option<f32>,
@@ -234,11 +234,10 @@ fn tell(
 type Variant = fn(&SensingOperator, &Stage, &Course) -> Option<Stage>;
 
 /// One after the other is run, and taken if it is better.
-const VARIANTS: [Variant; 8] = [
+const VARIANTS: [Variant; 7] = [
     without_time,
     with_fourfold_shrinkage,
     with_other_shrinkage,
-    without_shrinkage,
     with_more_variance,
     without_variance,
     with_noise,
@@ -268,11 +267,6 @@ fn with_other_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) ->
     }
     let times = if as_planned { 2.0 } else { 8.0 };
     Some(Stage { temporal_shrinkage: Some(times * shrunk(planned)?), ..taken.stage.clone() })
-}
-
-fn without_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    let as_planned = taken.stage.temporal_shrinkage == Some(shrunk(planned)?);
-    as_planned.then(|| Stage { temporal_shrinkage: None, ..taken.stage.clone() })
 }
 
 /// Where masks differ much it is at its bound.
@@ -313,7 +307,7 @@ impl Schedule {
         // As many as `VARIANTS` may ask for.
         let runs = |stage: &Stage| {
             1 + usize::from(stage.temporal_weight.is_some())
-                + 3 * usize::from(shrunk(stage).is_some())
+                + 2 * usize::from(shrunk(stage).is_some())
                 + stage.static_variance.map_or(0, |_| 2 + usize::from(stage.gamma.is_none()) * 2)
         };
         self.stages.iter().map(|stage| stage.planned_ns() * runs(stage) as f64).sum()
@@ -399,8 +393,7 @@ impl Course {
     /// A static variance gives up changes for what frames have in common, of which a measurement tells more
     /// than it counts in the frames: so for another one the difference must be thrice as clear. What fourfold
     /// shrinkage of changes spares a scene at rest hardly shows in a measurement: where it has left little of what
-    /// changed, it is enough not to be clearly worse, also for still more. For less it takes more: pixels that are
-    /// held out have what changes from their neighbours, and lose by shrinkage what the others keep.
+    /// changed, it is enough not to be clearly worse, also for still more.
     fn surpasses(&self, other: &Self) -> bool {
         if self.given_up {
             return false;
@@ -410,7 +403,7 @@ impl Course {
             return self.least() < other.least();
         }
         let (own, others) = (self.shrinkage(), other.shrinkage());
-        let errors = if self.stage.static_variance != other.stage.static_variance || own < others {
+        let errors = if self.stage.static_variance != other.stage.static_variance {
             3.0
         } else if self.stills(other) || own > others && other.at_rest {
             -1.5
@@ -822,7 +815,7 @@ mod tests {
         schedule.stages[1].static_variance = None;
         let mut steps = Steps(0);
         run(&op, y.view(), &schedule, &mut (), &mut steps).unwrap();
-        assert_eq!(steps.0, 40, "the plan, half of four times the shrinkage, and half of none");
+        assert_eq!(steps.0, 30, "the plan, and half of four times the shrinkage");
     }
 
     #[test]
