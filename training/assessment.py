@@ -43,6 +43,7 @@ BEST = eval_loop.BEST
 SPARE = 10.0        # dB above it up to which the fit follows
 COMPONENTS = 64     # of what the encoder sees
 NEAR = eval_loop.NEAR   # misses much larger than this weigh no more than one another in the fit
+LEAST_CASES = 5     # that an interval is fitted to
 AT_ONCE = 64        # blocks of a case that a step sees, in all its frames
 WHOLE = slice(14, 17)  # which features are of the whole frame
 JOINED = .6         # share of cases that a step sees with a part of another one
@@ -137,6 +138,8 @@ def cases(a):
 
 
 def make(a):
+    if len(a.out) > 1:
+        raise SystemExit(f"make writes to one folder, and --out names {len(a.out)}: {', '.join(a.out)}")
     part, parts = (int(number) for number in a.part.split('/'))
     for number, (name, scene, frames, pattern, (blur, leak), sigma, seeds) in enumerate(cases(a)):
         folder = f'{a.out[0]}/{name}'
@@ -444,6 +447,9 @@ def fit(a):
         # A little wider than four of five cases of the fit: other scenes are worse.
         outside = .08 if a.epochs else .1
         for of, moved in ((~unfamiliar, a.epochs and not first), (unfamiliar, True)):
+            if any(sum(of & (half == k) & (told < BEST)) < LEAST_CASES for k in (0, 1)):
+                raise SystemExit(f'{name}: an interval wants {LEAST_CASES} cases below {BEST:.0f} dB in each half of the scenes, behind masks that predictions are uncertain behind and behind '
+                                 f'others; of {len(cases)} cases {sum(unfamiliar)} are behind the former: make more')
             # What first runs leave is mostly better than BEST, and its median says nothing.
             *by_all, wrong[of], inside[of] = settle(true[of], told[of], half[of], not moved, outside)
             settled.append(by_all)
@@ -451,7 +457,7 @@ def fit(a):
         everywhere = np.ones(len(cases), bool)
         print(f'{name}: moved by {by:+.2f}; interval {interval.round(2)}; behind unfamiliar masks {by_unfamiliar:+.2f} and {of_unfamiliar.round(2)}; '
               f'correlation of the map {np.nanmedian(spread):.2f}')
-        kinds = {f'all, of {len(names)} scenes, each left out': everywhere} | {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
+        kinds = {f"all, of {len(names)} scenes, {'each left out' if a.epochs else 'in no fit'}": everywhere} | {pattern: [case.pattern == pattern for case in cases] for pattern in PATTERNS}
         kinds |= {'blurred or with light': [case.softened for case in cases], 'neither': [not case.softened for case in cases], 'unfamiliar': unfamiliar}
         kinds |= {f'{side}x{side}': [case.side * BLOCK == side for case in cases] for side in sorted(set(SIDES))}
         kinds |= {folder: [case.source == folder for case in cases] for folder in a.out if len(a.out) > 1}

@@ -340,7 +340,7 @@ mod tests {
         let fast = map(fast).unwrap().assessment;
         assert_eq!((fast.reasons[0].code.as_str(), fast.grade), ("fast_motion", Grade::Usable));
         assert!(fast.reasons[0].detail.contains("about 9 pixels"), "{fast:?}");
-        // Behind other masks than those of the fit there is more to doubt.
+        // Behind masks that are much alike and not sharp there is more to doubt.
         let other = tiles([25; 4]).into_iter().flatten();
         let other = other.map(|tile| Some(TileAssessment { unfamiliar: true, ..tile })).collect();
         let other = map(other).unwrap().assessment;

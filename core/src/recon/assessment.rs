@@ -792,7 +792,6 @@ mod tests {
         assert_eq!((around[[0, 0, 2, 1]], around[[0, 1, 2, 3]]), (16.0, 117.5));
     }
 
-    /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
     #[test]
     fn masks_that_predictions_are_uncertain_behind_are_told_apart() {
         let unfamiliar = |masks: Array3<f32>| {
@@ -819,6 +818,7 @@ mod tests {
         assert!(softened(squares(), 0.0, 0.4));
     }
 
+    /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
     #[test]
     fn more_texture_lets_expect_more_error() {
         let op = SensingOperator::new(iid_masks(4, 48, 48, 1).unwrap()).unwrap();
