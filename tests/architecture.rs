@@ -1,4 +1,5 @@
-//! Holds the architecture: who may know whom, and no circles of imports between files.
+//! Holds what Cargo can't: no circles of imports between files or folders of a crate, and libraries that only some
+//! files may name.
 //!
 //! The sources are parsed. A file depends on the files that define what its `use` lines and its
 //! paths name; re-exports are followed. Test code does not count, nor do the lines in which a
@@ -12,40 +13,31 @@ use std::path::{Path, PathBuf};
 
 use syn::visit::Visit;
 
-/// The sources of both crates. The service hands on the core's modules, so that `crate::recon` is one
-/// path in either.
-const SOURCES: [&str; 2] = ["src", "core/src"];
-
-/// Each folder of the sources, and the others that it may know.
-const LAYERS: &[(&str, &[&str])] = &[
-    ("formats", &[]),
-    ("optics", &["formats"]),
-    ("recon", &[]),
-    ("job", &["recon", "optics", "formats"]),
-    ("intake", &["optics", "formats", "job"]),
-    ("pipeline", &["recon", "optics", "formats", "job"]),
-    ("store", &["job", "formats"]),
-    ("worker", &["store", "pipeline", "intake", "job", "formats", "recon", "optics"]),
-    ("cluster", &["worker", "store", "pipeline", "job", "formats", "recon"]),
-    ("http", &["store", "pipeline", "intake", "job", "formats", "config"]),
+/// The folders of the crates' sources.
+const SOURCES: [&str; 7] = [
+    "src",
+    "crates/formats/src",
+    "crates/optics/src",
+    "crates/reconstruction/src",
+    "crates/engine/src",
+    "crates/store/src",
+    "crates/workers/src",
 ];
 
 /// Crates and modules that only these files and folders may name.
 const OWNERS: &[(&str, &[&str])] = &[
-    ("ort", &["core/src/recon/prior/onnx.rs"]),
-    ("sqlx", &["src/store/", "core/src/job/columns.rs"]),
+    ("ort", &["crates/reconstruction/src/prior/onnx.rs"]),
+    ("sqlx", &["crates/store/src/", "crates/engine/src/job/columns.rs"]),
     ("axum", &["src/http/", "src/cli/serve.rs"]),
-    ("tokio", &["src/http/", "src/store/", "src/worker/", "src/cluster/", "src/cli/"]),
-    ("async_nats", &["src/cluster/"]),
-    ("crate::cluster", &["src/cluster/", "src/cli/"]),
+    ("async_nats", &["crates/workers/src/nats/"]),
     ("crate::http", &["src/http/", "src/cli/serve.rs"]),
 ];
 
 /// Folders that know arrays and no files.
 const WITHOUT_FILES: (&[&str], &[&str], &[&str]) = (
-    &["core/src/recon/", "core/src/optics/"],
+    &["crates/reconstruction/src/", "crates/optics/src/"],
     &["std::fs", "std::path"],
-    &["core/src/recon/prior/onnx.rs"],
+    &["crates/reconstruction/src/prior/onnx.rs"],
 );
 
 /// A module's path from the crate's root.
@@ -198,26 +190,18 @@ fn read(text: &str, module: Module, place: &str, is_folder: bool) -> File {
     reader.file
 }
 
-/// All files of the library; those that hold nothing but tests are left out.
-fn read_all() -> BTreeMap<Module, File> {
+/// All files of one crate, and none that holds nothing but tests.
+fn read_crate(folder: &str) -> BTreeMap<Module, File> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut paths = Vec::new();
+    sources(&root.join(folder), &mut paths);
     let mut files = BTreeMap::new();
-    let paths = SOURCES.into_iter().flat_map(|folder| {
-        let mut paths = Vec::new();
-        sources(&root.join(folder), &mut paths);
-        paths.into_iter().map(move |path| (folder, path))
-    });
-    for (folder, path) in paths {
+    for path in paths {
         let within = path.strip_prefix(root.join(folder)).unwrap().with_extension("");
         let mut module: Module =
             within.iter().map(|word| word.to_string_lossy().into_owned()).collect();
         let tests = |word: &String| word == "tests" || word == "test_support";
-        let of_core = folder != "src";
-        if (of_core && module[0] == "lib")
-            || module[0] == "main"
-            || module[0] == "bin"
-            || module.iter().any(tests)
-        {
+        if module[0] == "main" || module.iter().any(tests) {
             continue;
         }
         let listing = module.last().is_some_and(|name| name == "mod" || name == "lib");
@@ -281,37 +265,56 @@ fn circles(edges: &BTreeMap<Module, BTreeSet<Module>>) -> BTreeSet<BTreeSet<Modu
     edges.keys().filter(|module| reached[*module].contains(*module)).map(circle).collect()
 }
 
-#[test]
-fn no_files_depend_on_each_other_in_a_circle() {
-    let edges = dependencies(&read_all());
+/// The dependencies between the children of each folder. A child that is a folder stands for all files below it.
+fn between_siblings(
+    edges: &BTreeMap<Module, BTreeSet<Module>>,
+) -> BTreeMap<Module, BTreeSet<Module>> {
+    let mut siblings: BTreeMap<Module, BTreeSet<Module>> = BTreeMap::new();
+    for (from, targets) in edges {
+        for to in targets {
+            let shared = from.iter().zip(to).take_while(|(a, b)| a == b).count();
+            let child = |module: &Module| module[..module.len().min(shared + 1)].to_vec();
+            let (from, to) = (child(from), child(to));
+            siblings.entry(to.clone()).or_default();
+            // A folder's own file depends on its children, and is no child of the folder.
+            if from.len() == to.len() {
+                siblings.entry(from).or_default().insert(to);
+            }
+        }
+    }
+    siblings
+}
+
+/// Describes each circle of `edges` in lines of text.
+fn described(folder: &str, edges: &BTreeMap<Module, BTreeSet<Module>>) -> String {
     let mut text = String::new();
-    for circle in circles(&edges) {
-        text += &format!("\na circle of {} files:\n", circle.len());
+    for circle in circles(edges) {
+        text += &format!("\n{folder}: a circle of {}:\n", circle.len());
         for module in &circle {
             let next: Vec<String> =
                 edges[module].intersection(&circle).map(|other| other.join("::")).collect();
             text += &format!("    {} -> {}\n", module.join("::"), next.join(", "));
         }
     }
+    text
+}
+
+#[test]
+fn no_files_depend_on_each_other_in_a_circle() {
+    let text: String = SOURCES
+        .iter()
+        .map(|folder| described(folder, &dependencies(&read_crate(folder))))
+        .collect();
     assert!(text.is_empty(), "{text}");
 }
 
 #[test]
-fn folders_know_only_what_they_may() {
-    let files = read_all();
-    let mut broken = Vec::new();
-    for (module, file) in &files {
-        let of = |(name, _): &&(&str, _)| module.first().is_some_and(|top| top == name);
-        let Some((folder, may)) = LAYERS.iter().find(of) else { continue };
-        // By the names that are written down: `job` hands on the schedule of `recon`.
-        let foreign = |path: &&Vec<String>| path.first().is_some_and(|top| top != folder);
-        for path in file.uses.iter().filter(foreign) {
-            if !may.contains(&path[0].as_str()) {
-                broken.push(format!("{}: {folder} must not know {}", file.place, path.join("::")));
-            }
-        }
-    }
-    assert!(broken.is_empty(), "{}", broken.join("\n"));
+fn no_folders_depend_on_each_other_in_a_circle() {
+    let text: String = SOURCES
+        .iter()
+        .map(|folder| described(folder, &between_siblings(&dependencies(&read_crate(folder)))))
+        .collect();
+    assert!(text.is_empty(), "{text}");
 }
 
 #[test]
@@ -320,7 +323,8 @@ fn crates_are_known_where_they_belong() {
         path.strip_prefix(root).is_some_and(|rest| rest.is_empty() || rest.starts_with("::"))
     };
     let mut broken = Vec::new();
-    for file in read_all().values() {
+    let crates = SOURCES.map(read_crate);
+    for file in crates.iter().flat_map(BTreeMap::values) {
         let named = |root: &str| {
             let of_ours = file.uses.iter().map(|path| format!("crate::{}", path.join("::")));
             file.foreign.iter().cloned().chain(of_ours).any(|path| starts(&path, root))
@@ -360,5 +364,14 @@ fn the_check_sees_what_it_should() {
     assert_eq!(edges[&module("a")], BTreeSet::new());
     let circle = BTreeSet::from([module("a::b"), module("a::c")]);
     assert_eq!(circles(&edges), BTreeSet::from([circle]));
+    let edge = |from: &str, to: &[&str]| (module(from), to.iter().map(|to| module(to)).collect());
+    let edges = BTreeMap::from([
+        edge("a", &["b::c"]),
+        edge("b", &["b::c", "b::d"]),
+        edge("b::c", &["b::d"]),
+        edge("b::d", &["a"]),
+    ]);
+    let folders = BTreeSet::from([module("a"), module("b")]);
+    assert_eq!(circles(&between_siblings(&edges)), BTreeSet::from([folders]));
     assert!(files[&module("a::d")].foreign.contains("std::fs"));
 }

@@ -2,8 +2,8 @@
 
 mod file;
 
-use sci_recon_core::formats::mat::SceneArray;
-use sci_recon_core::formats::{Axes, Expected, Wanted, open_array, open_stack};
+use formats::mat::SceneArray;
+use formats::{Axes, Expected, Wanted, open_array, open_stack};
 
 // Both kinds of archives, with arrays and with pictures: the corpus has one of each.
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {

@@ -4,6 +4,6 @@ mod file;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     file::with_file(bytes, |path| {
-        let _ = sci_recon_core::formats::exr::read_stack(path, &file::LIMITS);
+        let _ = formats::exr::read_stack(path, &file::LIMITS);
     });
 });

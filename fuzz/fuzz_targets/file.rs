@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use sci_recon_core::formats::{FrameReader, Limits};
+use formats::{FrameReader, Limits};
 
 /// In memory where there is such a folder: a file a run.
 static PLACE: LazyLock<PathBuf> = LazyLock::new(|| {

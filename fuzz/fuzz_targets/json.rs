@@ -1,6 +1,6 @@
 #![no_main]
 
-use sci_recon_core::job::{CalibrationId, JobRequest, Mosaic, SceneShape, Sequence, without_paths};
+use engine::job::{CalibrationId, JobRequest, Mosaic, SceneShape, Sequence, without_paths};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     if let Ok(text) = std::str::from_utf8(bytes) {

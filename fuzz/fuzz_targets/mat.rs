@@ -2,8 +2,8 @@
 
 mod file;
 
-use sci_recon_core::formats::mat::SceneArray;
-use sci_recon_core::formats::{Axes, Expected, Wanted, open_array};
+use formats::mat::SceneArray;
+use formats::{Axes, Expected, Wanted, open_array};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     file::with_file(bytes, |path| {

@@ -7,7 +7,7 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let magic = b"II\x2a\0".as_slice();
     let whole = if bytes.starts_with(magic) { bytes.to_vec() } else { [magic, bytes].concat() };
     file::with_file(&whole, |path| {
-        if let Ok(mut reader) = sci_recon_core::formats::open_stack(path, &file::LIMITS) {
+        if let Ok(mut reader) = formats::open_stack(path, &file::LIMITS) {
             file::drain(&mut *reader);
         }
     });

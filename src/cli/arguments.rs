@@ -10,11 +10,11 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use super::CliError;
 use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
-use crate::formats::Axes;
-use crate::job::{Algorithm, InvalidField, Mosaic, Sequence};
-use crate::pipeline::NetworkSource;
-use crate::recon::prior::onnx::Device;
-use crate::recon::schedule::Schedule;
+use engine::job::{Algorithm, InvalidField, Mosaic, Sequence};
+use engine::pipeline::NetworkSource;
+use formats::Axes;
+use reconstruction::prior::onnx::Device;
+use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
 use strum::{VariantArray, VariantNames};
 
@@ -187,8 +187,8 @@ fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> +
 #[cfg(test)]
 mod tests {
     use super::ScheduleArguments;
-    use crate::job::Algorithm;
     use clap::Parser;
+    use engine::job::Algorithm;
     use std::fs;
 
     #[derive(Debug, Parser)]

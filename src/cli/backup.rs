@@ -7,7 +7,7 @@ use clap::Args;
 use super::CliError;
 use super::wait::wait;
 use crate::cli::error::Result;
-use crate::store::{Backup, Purpose, Store};
+use store::{Backup, Purpose, Store};
 
 /// Copies a data folder while the service runs, and compares every file with the record of it. The copy
 /// appears when it is whole; until then it is NAME.unfinished, which no service takes. To restore it, serve

@@ -9,8 +9,8 @@ use serde::Deserialize;
 
 use super::{CliError, progress};
 use crate::cli::error::Result;
-use crate::formats::{Channels, FormatError, Limits, StackInfo, npy};
-use crate::intake::{CaptureFiles, Report, calibrate, report_page};
+use engine::intake::{CaptureFiles, Report, calibrate, report_page};
+use formats::{Channels, FormatError, Limits, StackInfo, npy};
 
 /// Make masks and a report from raw captures, without a server.
 #[derive(Debug, Args)]

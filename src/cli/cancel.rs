@@ -7,7 +7,7 @@ use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
 use super::wait::wait;
-use crate::job::JobId;
+use engine::job::JobId;
 
 /// Cancel jobs: each stops within an iteration.
 #[derive(Debug, Args)]

@@ -11,12 +11,12 @@ use ndarray::{Array2, Array3};
 use super::CliError;
 use super::arguments::NetworkArguments;
 use crate::cli::error::Result;
-use crate::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
-use crate::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
-use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
-use crate::recon::ReconError;
-use crate::recon::learned::{PictureSize, SnapshotNetwork, TensorInfo};
-use crate::recon::tile::TilePlan;
+use engine::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
+use engine::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
+use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
+use reconstruction::ReconError;
+use reconstruction::learned::{PictureSize, SnapshotNetwork, TensorInfo};
+use reconstruction::tile::TilePlan;
 
 /// How much the check stands back for others.
 const NICE: i32 = 10;

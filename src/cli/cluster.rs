@@ -6,9 +6,9 @@ use clap::{Args, Subcommand};
 
 use super::CliError;
 use super::wait::wait;
-use crate::cluster::{Authority, Check, ClusterError, Node, Program, configuration};
 use crate::config::{NatsArguments, VERSION};
-use crate::job::{Pool, Timestamp};
+use engine::job::{Pool, Timestamp};
+use workers::nats::{Authority, Check, ClusterError, Node, Program, configuration};
 
 /// Sets up the NATS server for workers on other machines, makes and revokes their credentials, and says
 /// what is missing.
@@ -135,7 +135,7 @@ fn make(init: &Init) -> Result<(), CliError> {
     for file in made.files {
         println!("nats-server -c {}", file.display());
     }
-    let hub = folder.path.join(crate::cluster::HUB_CREDENTIAL);
+    let hub = folder.path.join(workers::nats::HUB_CREDENTIAL);
     println!("sci-recon serve --nats-creds {} ...", hub.display());
     println!("sci-recon cluster worker create --keys {} --pool NAME", folder.path.display());
     for warning in made.warnings {

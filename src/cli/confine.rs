@@ -14,7 +14,7 @@ use rustix::process::{Resource, Rlimit, setrlimit};
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 
 use crate::config::EngineArguments;
-use crate::pipeline::networks::find_library;
+use engine::pipeline::networks::find_library;
 
 /// The newest version of Landlock that was tried; older kernels do what they can.
 const LANDLOCK: ABI = ABI::V5;

@@ -5,11 +5,11 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use super::serve::ServeError;
-use crate::formats::FormatError;
-use crate::intake::IntakeError;
-use crate::pipeline::PipelineError;
-use crate::pipeline::networks::NetworkError;
-use crate::recon::ReconError;
+use engine::intake::IntakeError;
+use engine::pipeline::PipelineError;
+use engine::pipeline::networks::NetworkError;
+use formats::FormatError;
+use reconstruction::ReconError;
 
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
 

@@ -9,7 +9,7 @@ use super::CliError;
 use super::client::{Client, ServiceArguments, Wanted};
 use super::error::Result;
 use super::wait::wait;
-use crate::job::{JobId, JobState};
+use engine::job::{JobId, JobState};
 
 /// Fetch results of a job that has succeeded. What was cut goes on where it was; nothing is overwritten.
 #[derive(Debug, Args)]

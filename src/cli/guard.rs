@@ -9,7 +9,7 @@ use tokio::process::{Child, Command};
 
 use super::CliError;
 use super::supervisor::{GRACE, HEALTHY, PAUSES, judge};
-use crate::store::WorkerEnd;
+use store::WorkerEnd;
 
 /// The exit code of a process whose settings can't be, or that a server refuses: another one would fare
 /// no better.

@@ -6,8 +6,8 @@ use clap::{Args, Subcommand};
 
 use super::wait::print_of_store;
 use crate::cli::error::Result;
-use crate::job::{JobId, JobState, Lab, Label, priority_error};
-use crate::store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
+use engine::job::{JobId, JobState, Lab, Label, priority_error};
+use store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
 
 /// Lists the jobs of all labs, cancels them, deletes them, and changes their priority. The service may be running.
 #[derive(Debug, Args)]

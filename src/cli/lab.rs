@@ -6,8 +6,8 @@ use clap::{Args, Subcommand};
 
 use super::wait::print_of_store;
 use crate::cli::error::Result;
-use crate::job::{Lab, Sha256};
-use crate::store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
+use engine::job::{Lab, Sha256};
+use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 
 /// Lists labs and their files, and sets their shares of the machine and their limits. The service may be running.
 ///

@@ -7,7 +7,7 @@ use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
 use super::wait::wait;
-use crate::job::JobState;
+use engine::job::JobState;
 
 /// List the lab's jobs, newest first.
 #[derive(Debug, Args)]

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::config::ServeArguments;
-use crate::store::{Store, StoreError};
+use store::{Store, StoreError};
 
 /// Time between two foldings of figures.
 const TICK: Duration = Duration::from_secs(5);

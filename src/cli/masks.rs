@@ -9,8 +9,8 @@ use serde::Serialize;
 use crate::cli::CliError;
 use crate::cli::error::Result;
 use crate::cli::optics::OpticsFile;
-use crate::intake::read_clip;
-use crate::optics::{
+use engine::intake::read_clip;
+use optics::{
     HybridAperture, Method, Multiplexing, Normalisation, Placement, check_patterns, generator,
     iid_masks, pattern_rank, single_apertures, soften,
 };

@@ -4,9 +4,9 @@ use std::path::Path;
 
 use super::CliError;
 use crate::cli::error::Result;
-use crate::job::{Algorithm, Cut, Schedule, Sequence, TileSpec};
-use crate::pipeline::networks::{ModelFile, ModelRecord, NetworkSource};
-use crate::recon::learned::{Interface, PictureSize};
+use engine::job::{Algorithm, Cut, Schedule, Sequence, TileSpec};
+use engine::pipeline::networks::{ModelFile, ModelRecord, NetworkSource};
+use reconstruction::learned::{Interface, PictureSize};
 
 /// An end-to-end network for one size of masks.
 pub struct Model {

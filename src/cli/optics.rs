@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::CliError;
 use crate::cli::error::Result;
-use crate::optics::{ApertureGrid, Camera, Circle, Draw, Geometry, Method, Placement};
+use optics::{ApertureGrid, Camera, Circle, Draw, Geometry, Method, Placement};
 
 /// The file of the defaults, with a comment for each number.
 const DEFAULTS: &str = include_str!("../../docs/optics.toml");

@@ -15,21 +15,21 @@ use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, axes, mos
 use super::model::{Model, cut};
 use super::progress::SnapshotBar;
 use crate::cli::error::Result;
-use crate::formats::mat::SceneArray;
-use crate::formats::{Axes, Channels};
-use crate::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
-use crate::job::{Algorithm, Assessment, Mosaic, SceneShape, Schedule, Sequence, Sha256};
-use crate::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
-use crate::pipeline::networks::NetworkSource;
-use crate::pipeline::pilot::full_schedule;
-use crate::pipeline::quality::{FrameQuality, Quality};
-use crate::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord};
-use crate::pipeline::scale::white;
-use crate::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
-use crate::pipeline::usage::{cpu_seconds, peak_rss_bytes};
-use crate::pipeline::write::{check_output, replace_result, write_result};
-use crate::recon::sequence::SequencePlan;
-use crate::recon::tile::TilePlan;
+use engine::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
+use engine::job::{Algorithm, Assessment, Mosaic, SceneShape, Schedule, Sequence, Sha256};
+use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
+use engine::pipeline::networks::NetworkSource;
+use engine::pipeline::pilot::full_schedule;
+use engine::pipeline::quality::{FrameQuality, Quality};
+use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord};
+use engine::pipeline::scale::white;
+use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
+use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
+use engine::pipeline::write::{check_output, replace_result, write_result};
+use formats::mat::SceneArray;
+use formats::{Axes, Channels};
+use reconstruction::sequence::SequencePlan;
+use reconstruction::tile::TilePlan;
 
 /// Reconstruct the frames of a snapshot, or of several that follow one another, from files, without a
 /// server.

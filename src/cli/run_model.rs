@@ -7,7 +7,7 @@ use clap::Args;
 use super::CliError;
 use super::arguments::NetworkArguments;
 use crate::cli::error::Result;
-use crate::worker::answer_worker;
+use workers::answer_worker;
 
 /// Runs a network for a worker, which tells it all on standard input.
 #[derive(Debug, Args)]

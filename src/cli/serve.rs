@@ -15,12 +15,12 @@ use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 #[cfg(feature = "nats")]
-use crate::cluster::{Access, ClusterError, Credential, Hub, Program, describe_metrics};
-#[cfg(feature = "nats")]
 use crate::config::{ClusterArguments, RemoteArguments, VERSION};
 use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, listen, router};
-use crate::store::{Purpose, Store, StoreError};
+use store::{Purpose, Store, StoreError};
+#[cfg(feature = "nats")]
+use workers::nats::{Access, ClusterError, Credential, Hub, Program, describe_metrics};
 
 /// How long open requests may take to end at a shutdown.
 const DRAIN: Duration = Duration::from_secs(20);

@@ -14,9 +14,9 @@ use super::arguments::mosaic;
 use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
 use crate::cli::error::Result;
-use crate::formats::{Channels, npy};
-use crate::intake::{read_clip, read_colours};
-use crate::optics::{Mosaic, OpticsError, illumination, measure, noisy};
+use engine::intake::{read_clip, read_colours};
+use formats::{Channels, npy};
+use optics::{Mosaic, OpticsError, illumination, measure, noisy};
 
 /// Simulate a snapshot: make masks and measure known frames through them.
 #[derive(Debug, Args)]

@@ -8,8 +8,8 @@ use serde_json::{Map, Value, json};
 use super::CliError;
 use super::arguments::{Snapshots, axes, mosaic, named_all, sequence};
 use super::client::{Client, Result};
-use crate::formats::Axes;
-use crate::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
+use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
+use formats::Axes;
 
 /// How jobs are made of measurements.
 #[derive(Debug, Args)]

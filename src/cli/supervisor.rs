@@ -14,9 +14,9 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::config::WorkerArguments;
-use crate::job::WorkerId;
-use crate::pipeline::usage::{kills_for_memory, peak_rss_of};
-use crate::store::{Store, WorkerEnd};
+use engine::job::WorkerId;
+use engine::pipeline::usage::{kills_for_memory, peak_rss_of};
+use store::{Store, WorkerEnd};
 
 /// How long a worker may take to give its task back.
 pub(super) const GRACE: Duration = Duration::from_secs(8);

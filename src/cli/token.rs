@@ -9,8 +9,8 @@ use clap::{Args, Subcommand};
 use super::CliError;
 use super::wait::wait;
 use crate::cli::error::Result;
-use crate::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
-use crate::store::{Purpose, Store, StoreError, Token};
+use engine::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
+use store::{Purpose, Store, StoreError, Token};
 
 /// Makes, lists and revokes tokens. With the first one the service is closed to all without one.
 #[derive(Debug, Args)]
@@ -183,7 +183,7 @@ impl From<StoreError> for CliError {
 #[cfg(test)]
 mod tests {
     use super::expiry;
-    use crate::job::Timestamp;
+    use engine::job::Timestamp;
 
     #[test]
     fn a_token_ends_at_a_moment_ahead() {

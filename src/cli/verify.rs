@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::CliError;
 use crate::cli::error::Result;
-use crate::store::{Audit, Purpose, Store};
+use store::{Audit, Purpose, Store};
 
 /// Compares all that is on record with the disk: every file's hash, and the database with itself. The folder
 /// may be a service's that runs, or a backup. Changes nothing. Ends with 1 if something is damaged or missing.

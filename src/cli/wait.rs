@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use super::CliError;
-use crate::store::{Purpose, Store};
+use store::{Purpose, Store};
 
 /// Runs `work` to its end on this thread.
 pub fn wait<T, E: Into<CliError>>(work: impl Future<Output = Result<T, E>>) -> Result<T, CliError> {

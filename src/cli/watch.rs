@@ -9,7 +9,7 @@ use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
 use super::progress;
 use super::wait::wait;
-use crate::job::JobId;
+use engine::job::JobId;
 
 /// Wait until jobs have ended; ends with 1 unless all have succeeded.
 #[derive(Debug, Args)]

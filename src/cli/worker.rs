@@ -13,15 +13,15 @@ use super::guard::guard;
 use super::{CliError, logging};
 use crate::cli::error::Result;
 #[cfg(feature = "nats")]
-use crate::cluster::{ClusterError, Program, Remote, RemoteSettings};
-#[cfg(feature = "nats")]
 use crate::config::VERSION;
 use crate::config::WorkerArguments;
-use crate::job::WorkerId;
-use crate::pipeline::NetworkSource;
-use crate::recon::prior::onnx::Device;
-use crate::store::{Purpose, Store, StoreError};
-use crate::worker::{Local, ModelCommand, Worker, WorkerError};
+use engine::job::WorkerId;
+use engine::pipeline::NetworkSource;
+use reconstruction::prior::onnx::Device;
+use store::{Purpose, Store, StoreError};
+#[cfg(feature = "nats")]
+use workers::nats::{ClusterError, Program, Remote, RemoteSettings};
+use workers::{Local, ModelCommand, Worker, WorkerError};
 
 /// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
 pub fn run(settings: &WorkerArguments) -> Result<()> {

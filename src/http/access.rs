@@ -19,8 +19,8 @@ use headers::{Cookie, HeaderMapExt};
 use rustix::system::uname;
 
 use super::error::{ApiError, Code, Result};
-use crate::job::{Lab, Role, Secret, Timestamp, TokenId};
-use crate::store::{Store, Token};
+use engine::job::{Lab, Role, Secret, Timestamp, TokenId};
+use store::{Store, Token};
 
 /// The cookie of a session, which `POST /v1/session` sets.
 pub(super) const SESSION: &str = "sci_recon_session";

@@ -13,8 +13,8 @@ use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
 use crate::config::ServeArguments;
-use crate::job::Lab;
-use crate::store::{Store, StoreError};
+use engine::job::Lab;
+use store::{Store, StoreError};
 
 /// What an upload that does not say its length reserves at a time.
 const STEP: u64 = 64 << 20;

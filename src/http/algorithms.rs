@@ -3,8 +3,8 @@
 use axum::Json;
 use serde::Serialize;
 
-use crate::job::{Algorithm, Schedule, TileSpec};
-use crate::pipeline::networks;
+use engine::job::{Algorithm, Schedule, TileSpec};
+use engine::pipeline::networks;
 use strum::VariantArray;
 
 #[derive(Debug, Serialize)]

@@ -11,13 +11,13 @@ use super::admission::Admission;
 use super::events::Events;
 use super::metrics::Metrics;
 use super::model_check::Checker;
-use super::pictures::Pictures;
+use super::rendering::Pictures;
 use super::running::Checks;
 use super::shares::Turns;
 use crate::config::ServeArguments;
-use crate::formats::Limits;
-use crate::job::{Timestamp, without_paths};
-use crate::store::Store;
+use engine::job::{Timestamp, without_paths};
+use formats::Limits;
+use store::Store;
 
 /// Labs of which a file is checked at the same time, so that a slow one keeps no other lab waiting.
 const CHECKS_AT_ONCE: usize = 4;

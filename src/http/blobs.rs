@@ -20,8 +20,8 @@ use super::extract::{Caller, Params, QueryOf, check_digest, check_encoding, cont
 use super::page::{Limit, PageBody};
 use super::shares::Place;
 use super::upload;
-use crate::job::{Sha256, Timestamp};
-use crate::store::{Blob, BlobRow, StagedBlob};
+use engine::job::{Sha256, Timestamp};
+use store::{Blob, BlobRow, StagedBlob};
 
 /// `POST /v1/blobs`: the file as the raw body, or as the field `file` of a form.
 pub(super) async fn create(

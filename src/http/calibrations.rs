@@ -18,11 +18,11 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
 use super::intake::{self, Desk, Prepared, Upload};
 use super::page::{Limit, PageBody, Renaming, ShowQuery};
-use crate::formats::Axes;
-use crate::formats::validate::MaskStatistics;
-use crate::intake::plan;
-use crate::job::{CalibrationId, Captures, Lab, Label, Mosaic, Sha256, Timestamp};
-use crate::store::{
+use engine::intake::plan;
+use engine::job::{CalibrationId, Captures, Lab, Label, Mosaic, Sha256, Timestamp};
+use formats::Axes;
+use formats::validate::MaskStatistics;
+use store::{
     Calibration, Filter, Inserted, Made, NewCalibration, NewCaptures, NewCheck, Page, RequestKey,
     Source, Span, StagedBlob, Unready,
 };

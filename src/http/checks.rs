@@ -16,8 +16,8 @@ use tokio_util::sync::CancellationToken;
 use super::access::{Access, Owner};
 use super::app::App;
 use super::error::{ApiError, Code, REQUEST_ID, Result};
-use crate::job::InvalidId;
-use crate::store::{Check, Inserted, Made, NewCheck, RequestKey, Source, StoreError};
+use engine::job::InvalidId;
+use store::{Check, Inserted, Made, NewCheck, RequestKey, Source, StoreError};
 
 /// How long a request waits for a check where it does not say.
 const PATIENCE: Duration = Duration::from_secs(10);

@@ -6,7 +6,7 @@ use headers::{ETag, HeaderMapExt, IfMatch, IfNoneMatch};
 use serde::Serialize;
 
 use super::error::{ApiError, Code, Result};
-use crate::job::Sha256;
+use engine::job::Sha256;
 
 /// A strong ETag: the hash of the content.
 pub(super) fn etag(sha256: &Sha256) -> String {

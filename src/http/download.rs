@@ -9,8 +9,8 @@ use tokio_util::io::ReaderStream;
 
 use super::conditional::{self, Wanted};
 use super::error::{ApiError, Code, Result};
-use crate::job::Sha256;
-use crate::store::StoreError;
+use engine::job::Sha256;
+use store::StoreError;
 
 /// What is told of a file.
 #[derive(Debug)]

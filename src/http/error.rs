@@ -10,10 +10,10 @@ use serde::Serialize;
 use serde_json::Value;
 use strum::{EnumString, IntoStaticStr, VariantArray};
 
-use crate::formats::FormatError;
-use crate::intake::IntakeError;
-use crate::job::InvalidField;
-use crate::store::StoreError;
+use engine::intake::IntakeError;
+use engine::job::InvalidField;
+use formats::FormatError;
+use store::StoreError;
 
 /// tus 1.0 has a status of its own for this.
 static CHECKSUM_STATUS: LazyLock<StatusCode> =

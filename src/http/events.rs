@@ -22,8 +22,8 @@ use tokio_util::sync::CancellationToken;
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use crate::job::{CalibrationId, JobId, Lab, MeasurementId};
-use crate::store::{CalibrationMark, CheckMark, JobMark, Store, StoreError};
+use engine::job::{CalibrationId, JobId, Lab, MeasurementId};
+use store::{CalibrationMark, CheckMark, JobMark, Store, StoreError};
 
 /// The longest time between two looks at all jobs.
 const LOOK: Duration = Duration::from_secs(1);

@@ -15,8 +15,8 @@ use serde::de::DeserializeOwned;
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use crate::job::{InvalidField, InvalidId, Lab, Sha256};
-use crate::store::{Inserted, Made, RequestKey};
+use engine::job::{InvalidField, InvalidId, Lab, Sha256};
+use store::{Inserted, Made, RequestKey};
 
 /// The service, and for whom a request to it is.
 pub(super) struct Caller(pub(super) App, pub(super) Access);

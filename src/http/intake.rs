@@ -1,4 +1,4 @@
-//! Uploads on their way to a calibration or measurement: what passes the checks of [`crate::intake`] is
+//! Uploads on their way to a calibration or measurement: what passes the checks of [`engine::intake`] is
 //! written as a prepared array. Blocks; of each lab one at a time runs, where blocking is allowed, and no longer
 //! than `--check-seconds`.
 
@@ -13,12 +13,12 @@ use super::access::Owner;
 use super::admission::Reservation;
 use super::app::App;
 use super::error::{ApiError, Code, Result, too_slow};
-use crate::formats::mat::SceneArray;
-use crate::formats::validate::MaskStatistics;
-use crate::formats::{Axes, FormatError, Limits, StackInfo, StackWriter, planar};
-use crate::intake::{self, Exposure, Source};
-use crate::job::{Finding, Label, Sha256};
-use crate::store::{BlobWriter, Calibration, StagedBlob, Store, StoreError};
+use engine::intake::{self, Exposure, Source};
+use engine::job::{Finding, Label, Sha256};
+use formats::mat::SceneArray;
+use formats::validate::MaskStatistics;
+use formats::{Axes, FormatError, Limits, StackInfo, StackWriter, planar};
+use store::{BlobWriter, Calibration, StagedBlob, Store, StoreError};
 
 /// What an upload turned out to be.
 pub(super) struct Prepared<T> {

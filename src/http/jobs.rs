@@ -15,12 +15,12 @@ use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, idempotency_key};
 use super::page::{Limit, PageBody, ShowQuery};
-use crate::job::{
+use engine::job::{
     Algorithm, Assessment, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec,
     JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule, Sequence,
     Sha256, SnapshotRange, TileSpec, Timestamp, priority_error,
 };
-use crate::store::{
+use store::{
     Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob, Page, Span, StoreError,
 };
 

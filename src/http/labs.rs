@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::app::App;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params};
-use crate::job::{InvalidField, Lab};
-use crate::store::{Entitlement, LabRow, LabUse, share_error};
+use engine::job::{InvalidField, Lab};
+use store::{Entitlement, LabRow, LabUse, share_error};
 
 #[derive(Debug, Serialize)]
 pub(super) struct LabBody {

@@ -5,8 +5,8 @@ use serde::Serialize;
 
 use super::error::Result;
 use super::extract::Caller;
-use crate::job::{Lab, Role, Timestamp, TokenId};
-use crate::store::LabUse;
+use engine::job::{Lab, Role, Timestamp, TokenId};
+use store::LabUse;
 
 #[derive(Debug, Serialize)]
 pub(super) struct MeBody {

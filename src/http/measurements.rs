@@ -17,12 +17,12 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::intake::{self, Desk, Prepared, Upload};
 use super::page::{ListQuery, PageBody, Renaming, ShowQuery};
-use crate::formats::{Axes, StackInfo};
-use crate::intake::Exposure;
-use crate::job::{
+use engine::intake::Exposure;
+use engine::job::{
     CalibrationId, Finding, InvalidField, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp,
 };
-use crate::store::{
+use formats::{Axes, StackInfo};
+use store::{
     Check, Inserted, Made, Measurement, NewCheck, NewMeasurement, Page, RequestKey, Source,
     StagedBlob,
 };

@@ -7,8 +7,8 @@ use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogra
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
 use strum::VariantArray;
 
-use crate::job::JobState;
-use crate::store::{LabFigures, TaskTotals};
+use engine::job::JobState;
+use store::{LabFigures, TaskTotals};
 
 const REQUEST_SECONDS: &str = "sci_recon_http_request_duration_seconds";
 const BUCKETS: [f64; 10] = [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0, 30.0];
@@ -175,8 +175,8 @@ mod tests {
     use std::collections::HashMap;
 
     use super::{Figures, MOST_LABS};
-    use crate::job::JobState;
-    use crate::store::LabFigures;
+    use engine::job::JobState;
+    use store::LabFigures;
 
     #[test]
     fn many_labs_are_added_up() {

@@ -31,6 +31,7 @@ mod page;
 mod pictures;
 mod problems;
 mod quality;
+mod rendering;
 mod reports;
 mod results;
 mod resumption;

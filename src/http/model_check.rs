@@ -10,8 +10,8 @@ use tokio::process::Command;
 use super::error::{ApiError, Code, Result};
 use super::shares::Turns;
 use crate::config::{EngineArguments, ServeArguments};
-use crate::job::{Lab, ModelFacts, ModelVerdict, without_paths};
-use crate::store::NewCalibration;
+use engine::job::{Lab, ModelFacts, ModelVerdict, without_paths};
+use store::NewCalibration;
 
 /// The longest check: loading the network and one run.
 const TIME: Duration = Duration::from_secs(300);

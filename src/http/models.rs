@@ -11,8 +11,8 @@ use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
 use super::intake;
 use super::page::{ListQuery, PageBody, Renaming};
-use crate::job::{CalibrationId, Label, ModelId, Sha256};
-use crate::store::{Inserted, Made, Model, NewModel, RequestKey};
+use engine::job::{CalibrationId, Label, ModelId, Sha256};
+use store::{Inserted, Made, Model, NewModel, RequestKey};
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -5,8 +5,8 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::app::App;
-use crate::job::{CalibrationId, Label, Timestamp};
-use crate::store::{Filter, Page, Span};
+use engine::job::{CalibrationId, Label, Timestamp};
+use store::{Filter, Page, Span};
 
 /// How many items a page has where nobody says.
 const DEFAULT: u32 = 50;

@@ -13,11 +13,11 @@ use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
 use super::results::result_file;
-use crate::formats::mat::SceneArray;
-use crate::formats::{Axes, Channels, FormatError, Limits, npy};
-use crate::intake::{Opened, Source};
-use crate::job::{JobId, SceneShape, Sha256};
-use crate::pipeline::quality::{FrameQuality, Quality};
+use engine::intake::{Opened, Source};
+use engine::job::{JobId, SceneShape, Sha256};
+use engine::pipeline::quality::{FrameQuality, Quality};
+use formats::mat::SceneArray;
+use formats::{Axes, Channels, FormatError, Limits, npy};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -7,8 +7,8 @@ use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
-use crate::intake::report_page;
-use crate::job::{CalibrationId, CalibrationReport, Lab};
+use engine::intake::report_page;
+use engine::job::{CalibrationId, CalibrationReport, Lab};
 
 /// What the browser may load: our own style and pictures, and no script at all.
 const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \

@@ -12,8 +12,8 @@ use super::download::Download;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
-use crate::job::{JobId, JobState, ResultFile};
-use crate::store::{Job, StoreError};
+use engine::job::{JobId, JobState, ResultFile};
+use store::{Job, StoreError};
 
 #[derive(Debug, Serialize)]
 pub(super) struct SnapshotBody {
@@ -185,7 +185,7 @@ pub(super) fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String
 #[cfg(test)]
 mod tests {
     use super::{frame_file, href};
-    use crate::job::JobId;
+    use engine::job::JobId;
 
     #[test]
     fn frames_are_named_by_number_and_kind() {

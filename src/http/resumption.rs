@@ -4,7 +4,7 @@ use super::app::App;
 use super::calibrations::CalibrationRequest;
 use super::checks::resume;
 use super::measurements::MeasurementRequest;
-use crate::store::{Made, StoreError};
+use store::{Made, StoreError};
 
 impl App {
     /// Begins again the checks that the server before did not bring to their end. To be called before the first

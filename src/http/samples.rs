@@ -15,9 +15,9 @@ use super::extract::{Body, Caller, idempotency_key};
 use super::intake;
 use super::jobs::{self, JobBody};
 use super::measurements::{self, MeasurementRequest};
-use crate::intake::sample;
-use crate::job::{Algorithm, JobRequest, Label, Sha256, SnapshotSelection};
-use crate::store::{RequestKey, StagedBlob, Store};
+use engine::intake::sample;
+use engine::job::{Algorithm, JobRequest, Label, Sha256, SnapshotSelection};
+use store::{RequestKey, StagedBlob, Store};
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

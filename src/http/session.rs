@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::access::{SESSION, missing};
 use super::error::{ApiError, Code, Result};
 use super::extract::Caller;
-use crate::job::{Secret, Timestamp, TokenId};
+use engine::job::{Secret, Timestamp, TokenId};
 
 /// How long a session lasts, if its token lasts as long.
 const LIFE: Duration = Duration::from_secs(7 * 86_400);

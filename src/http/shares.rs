@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::error::{ApiError, Code, Result};
-use crate::job::Lab;
+use engine::job::Lab;
 
 /// Places for what takes long. A lab has half of them at most; one that has none always gets one, also if all
 /// are taken.

@@ -16,8 +16,8 @@ use super::error::Result;
 use super::extract::Caller;
 use super::metrics::Figures;
 use crate::config::VERSION;
-use crate::job::{JobState, TaskState, Timestamp};
-use crate::store::{StoreError, WorkerRow};
+use engine::job::{JobState, TaskState, Timestamp};
+use store::{StoreError, WorkerRow};
 use strum::VariantArray;
 
 /// Workers that were silent for longer are not counted.

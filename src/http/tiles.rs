@@ -8,8 +8,8 @@ use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
-use crate::job::{JobId, SnapshotRange};
-use crate::store::{TileHistory, TileState};
+use engine::job::{JobId, SnapshotRange};
+use store::{TileHistory, TileState};
 
 #[derive(Debug, Serialize)]
 struct TilesBody {

@@ -10,7 +10,7 @@ use tokio::sync::mpsc;
 use super::admission::Reservation;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use crate::store::{StagedBlob, Store, StoreError};
+use store::{StagedBlob, Store, StoreError};
 
 /// Chunks between the network and the disk.
 pub(super) const CHUNKS: usize = 4;

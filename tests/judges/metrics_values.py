@@ -1,4 +1,4 @@
-"""Print the values that the unit test of core/src/recon/metrics.rs holds ours to.
+"""Print the values that the unit test of crates/reconstruction/src/metrics.rs holds ours to.
 
     pip install scikit-image && python tests/judges/metrics_values.py
 """

@@ -171,8 +171,8 @@ async fn a_token_ends_at_its_time_and_says_so_and_its_last_use_is_known() {
 
 /// The moment in so many seconds, as text.
 fn jiff_now(seconds: i64) -> String {
-    let now = sci_recon::job::Timestamp::now();
-    sci_recon::job::Timestamp(now.0 + 1000 * seconds).to_string()
+    let now = engine::job::Timestamp::now();
+    engine::job::Timestamp(now.0 + 1000 * seconds).to_string()
 }
 
 #[tokio::test]

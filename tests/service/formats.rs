@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use engine::intake::Source;
+use formats::mat::SceneArray;
+use formats::{Limits, read_stack};
 use ndarray::Array3;
-use sci_recon::formats::mat::SceneArray;
-use sci_recon::formats::{Limits, read_stack};
-use sci_recon::intake::Source;
 use serde::Deserialize;
 use serde_json::{Value, json};
 

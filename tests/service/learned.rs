@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use sci_recon::pipeline::usage::peak_rss_of;
+use engine::pipeline::usage::peak_rss_of;
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
@@ -261,17 +261,4 @@ fn the_command_line_runs_a_network_too() {
         .unwrap();
     let verdict: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert!(verdict["refused"].is_string(), "the weights lie in its working folder: {verdict}");
-    // In the tables: a row where the network fits, none where it does not.
-    std::fs::create_dir(folder.path().join("clips")).unwrap();
-    std::fs::copy(&masks, folder.path().join("clips/noise.npy")).unwrap();
-    let (clips, tables) = (file("clips"), file("tables"));
-    let output = Command::new(env!("CARGO_BIN_EXE_sci-recon-experiments"))
-        .args(["tables", "--clips", &clips, "--scales", "48", "--cr", "4", "--out", &tables])
-        .args(["--algorithms", "gap-tv", "--learned", network])
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && said.contains("no learned"), "{said}");
-    let text = String::from_utf8_lossy(&output.stdout);
-    assert!(text.contains("| learned | - |"), "{text}");
 }

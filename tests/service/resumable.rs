@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use rand::{Rng, RngCore, SeedableRng};
 use reqwest::{Method, RequestBuilder};
-use sci_recon::store::{Purpose, Store};
 use serde_json::{Value, json};
+use store::{Purpose, Store};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 

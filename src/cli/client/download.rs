@@ -12,8 +12,8 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 
 use super::{Client, Result, again, refusal};
 use crate::cli::CliError;
-use crate::job::Sha256;
-use crate::store::LockedFile;
+use engine::job::Sha256;
+use store::LockedFile;
 
 /// Time between looks whether a file has been made.
 const MADE: Duration = Duration::from_secs(1);

@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::{Client, Result, refused};
 use crate::cli::CliError;
 use crate::cli::progress;
-use crate::job::{JobState, Sha256, SnapshotRange, Timestamp};
+use engine::job::{JobState, Sha256, SnapshotRange, Timestamp};
 
 #[derive(Debug, Clone, Deserialize)]
 pub(in crate::cli) struct Job {

@@ -12,7 +12,7 @@ use uuid::Uuid;
 
 use super::{Client, ClientError, Result, again, refusal};
 use crate::cli::CliError;
-use crate::job::Sha256;
+use engine::job::Sha256;
 
 /// Bytes of a piece.
 const PIECE: u64 = 4 << 20;

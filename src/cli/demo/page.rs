@@ -9,7 +9,7 @@ use ndarray::{Array3, Axis};
 use super::report::{PAGE, Report};
 use crate::cli::CliError;
 use crate::cli::error::Result;
-use crate::formats::{Channels, Limits, png, read_stack};
+use formats::{Channels, Limits, png, read_stack};
 
 /// The folder of its pictures.
 pub(super) const PICTURES: &str = "pictures";

@@ -7,8 +7,8 @@ use serde::Serialize;
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
-use crate::formats::Channels;
-use crate::pipeline::quality::{self, FrameQuality};
+use engine::pipeline::quality::{self, FrameQuality};
+use formats::Channels;
 
 /// The page that shows it.
 pub(super) const PAGE: &str = "report.html";

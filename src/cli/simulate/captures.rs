@@ -8,8 +8,8 @@ use serde::Serialize;
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
-use crate::formats::npy;
-use crate::optics::{Camera, generator, measure};
+use formats::npy;
+use optics::{Camera, generator, measure};
 
 /// Share of the background that the lithography mask lets through.
 const BACKGROUND_THROUGH_MASK: f64 = 0.5;

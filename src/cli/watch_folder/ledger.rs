@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::cli::CliError;
 use crate::cli::error::Result;
 use crate::cli::submission::Recipe;
-use crate::store::LockedFile;
+use store::LockedFile;
 
 /// A file as it was when it was taken up: another size or time is another file.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]

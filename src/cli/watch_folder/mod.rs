@@ -25,7 +25,7 @@ use super::client::{Client, ClientError, Job, ServiceArguments, Wanted, place};
 use super::error::Result;
 use super::submission::{Recipe, SubmissionArguments};
 use super::wait::wait;
-use crate::job::JobState;
+use engine::job::JobState;
 use ledger::{Entry, Ledger, Shot, Stage};
 
 /// Names of files that may hold snapshots; what they are, their first bytes tell.

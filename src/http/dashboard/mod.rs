@@ -15,7 +15,7 @@ use flate2::write::GzEncoder;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::Params;
-use crate::job::Sha256;
+use engine::job::Sha256;
 
 /// What the browser may load and run: our own files, and pictures that a module has fetched.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \

@@ -10,7 +10,7 @@ use super::super::error::Result;
 use super::super::extract::{Caller, Params};
 use super::super::results::{attachment, result_file};
 use super::composed::{Composed, Framing, Part, Piece};
-use crate::job::JobId;
+use engine::job::JobId;
 
 /// 45 stands for version 4.5, the first with files above 4 GiB.
 const VERSION: u16 = 45;
@@ -181,7 +181,7 @@ mod tests {
     use flate2::Crc;
 
     use super::{Part, Piece, parts};
-    use crate::job::{ResultFile, Sha256};
+    use engine::job::{ResultFile, Sha256};
 
     fn files(sizes: &[u64]) -> Vec<(String, Piece)> {
         let file = |(index, size): (usize, &u64)| {

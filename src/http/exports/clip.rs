@@ -16,10 +16,10 @@ use super::super::extract::{Caller, Params};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, result_file};
 use super::composed::{Composed, Part, Piece};
-use crate::formats::{Channels, bigtiff, npy};
-use crate::job::JobId;
-use crate::pipeline::manifest::CameraRecord;
-use crate::store::Job;
+use engine::job::JobId;
+use engine::pipeline::manifest::CameraRecord;
+use formats::{Channels, bigtiff, npy};
+use store::Job;
 
 const ARRAY: &str = "frames.npy";
 

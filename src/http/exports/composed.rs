@@ -18,8 +18,8 @@ use super::super::app::App;
 use super::super::download::{self, Download};
 use super::super::error::{ApiError, Result};
 use super::lines::Lines;
-use crate::job::{ResultFile, Sha256};
-use crate::store::{Job, StoreError};
+use engine::job::{ResultFile, Sha256};
+use store::{Job, StoreError};
 
 /// A result file of a snapshot, or of the whole job.
 #[derive(Debug, Clone)]

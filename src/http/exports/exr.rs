@@ -15,9 +15,9 @@ use super::super::results::{attachment, media_type, result_file, send};
 use super::clip::{Clip, behind_header};
 use super::composed::{Composed, Part, Piece};
 use super::lines::{Lines, Make};
-use crate::formats::exr::{Layered, SIGMA};
-use crate::job::SceneShape;
-use crate::pipeline::assessment::{BLOCK, blocks};
+use engine::job::SceneShape;
+use engine::pipeline::assessment::{BLOCK, blocks};
+use formats::exr::{Layered, SIGMA};
 
 const STACK: &str = "stack.exr";
 

@@ -10,8 +10,8 @@ use super::super::download::Download;
 use super::super::error::{ApiError, Code, Result};
 use super::super::results::{file_name, media_type};
 use super::clip::Clip;
-use crate::job::LEAST_MOVIE_SIDE;
-use crate::store::{Movie, StoreError};
+use engine::job::LEAST_MOVIE_SIDE;
+use store::{Movie, StoreError};
 
 const NAME: &str = "movie.mp4";
 /// Seconds after which to ask again.

@@ -1,9 +1,7 @@
 //! Pictures for looking at: frames, measurements and masks as 8-bit PNG, whole and reduced, or in
 //! tiles at any zoom, with a window of contrast. The numbers themselves are in the results.
 
-mod cache;
 mod names;
-mod render;
 mod source;
 
 use std::sync::Arc;
@@ -12,17 +10,16 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
-pub(super) use cache::Pictures;
 use names::Named;
 pub(super) use names::{OfBlob, OfCalibration, OfJob, OfMeasurement};
-use render::{Picture, Region, TILE};
 
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf};
-use crate::formats::png;
-use crate::job::Sha256;
+use super::rendering::{self, Picture, Region, TILE};
+use engine::job::Sha256;
+use formats::png;
 
 /// Pixels of a preview's longer side: default, and the range.
 const PREVIEW: usize = 512;
@@ -120,7 +117,7 @@ pub(super) async fn spread<N: Named>(
     let (height, width) = (picture.height, picture.width);
     let levels = picture.level_within(TILE);
     let region = picture.whole(picture.level_within(PREVIEW));
-    let found = render::spread(&*app.pictures.reduced(Arc::new(picture), region).await?);
+    let found = rendering::spread(&*app.pictures.reduced(Arc::new(picture), region).await?);
     let (minimum, maximum, low, high) = (found.minimum, found.maximum, found.low, found.high);
     let body = SpreadBody { height, width, tile: TILE, levels, minimum, maximum, low, high };
     conditional::json(&body, &headers)
@@ -156,7 +153,7 @@ async fn draw(
     let values = app.pictures.reduced(Arc::new(picture), region).await?;
     let encode = tokio::task::spawn_blocking(move || {
         let (black, white) = window.unwrap_or_else(|| {
-            let found = render::spread(&values);
+            let found = rendering::spread(&values);
             (found.low, if found.high > found.low { found.high } else { found.low + 1.0 })
         });
         png::encode_u8(values.view(), channels, black, white)

@@ -5,17 +5,17 @@ use std::sync::Arc;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
-use super::render::Picture;
 use super::source::{DoneTile, Files, Stack, Unfinished, errors, sent};
-use crate::formats;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::intake;
 use crate::http::jobs::with_snapshot;
+use crate::http::rendering::Picture;
 use crate::http::results::result_file;
-use crate::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
-use crate::pipeline::records::TileTaskRecord;
-use crate::store::{Calibration, Job, Measurement, StoreError, TileResult};
+use engine::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
+use engine::pipeline::records::TileTaskRecord;
+use formats;
+use store::{Calibration, Job, Measurement, StoreError, TileResult};
 
 /// What can be seen of a job's snapshot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

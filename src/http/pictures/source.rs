@@ -8,10 +8,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ndarray::{Array2, Array3, Axis, s};
 
-use super::render::Picture;
-use crate::formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
-use crate::job::{MARGIN, Mosaic, Sha256};
-use crate::pipeline::assessment::BLOCK;
+use crate::http::rendering::Picture;
+use engine::job::{MARGIN, Mosaic, Sha256};
+use engine::pipeline::assessment::BLOCK;
+use formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
 
 /// A stack of f32 \[frames, rows, columns\] of which windows are read.
 #[derive(Debug, Clone)]
@@ -345,7 +345,7 @@ mod tests {
     use std::sync::Arc;
 
     use super::{DoneTile, Files, Mosaic, Stack, Unfinished};
-    use crate::formats::{npy, planar};
+    use formats::{npy, planar};
     use ndarray::{Array3, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {

@@ -8,7 +8,7 @@ use crate::http::admission::Reservation;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::upload::{CHUNKS, Pace, next};
-use crate::store::{PartialFile, StoreError};
+use store::{PartialFile, StoreError};
 
 /// Appends what comes. A cut connection keeps what has come before it, unless a checksum was named
 /// for the piece: then all of the piece counts, or nothing. The file stays locked until its row says so.

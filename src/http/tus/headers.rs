@@ -4,7 +4,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha1::Digest;
 
-use crate::job::Sha256;
+use engine::job::Sha256;
 
 /// The longest `Upload-Metadata` that is kept.
 const MAX_METADATA: usize = 4096;

@@ -17,8 +17,8 @@ use super::app::App;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, request_key};
 use super::page::{Limit, PageBody};
-use crate::job::{Lab, PartialId, Sha256, Timestamp};
-use crate::store::{FIRST_RESERVE, FoundPartial, Inserted, Made, NewPartial, Partial, PartialFile};
+use engine::job::{Lab, PartialId, Sha256, Timestamp};
+use store::{FIRST_RESERVE, FoundPartial, Inserted, Made, NewPartial, Partial, PartialFile};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -131,7 +131,7 @@ fn expected(metadata: &str) -> Result<Option<Sha256>, String> {
         return Ok(None);
     };
     let text = String::from_utf8(value).map_err(|_| "the metadata's sha256 is no text")?;
-    text.parse().map(Some).map_err(|error: crate::job::InvalidText| error.to_string())
+    text.parse().map(Some).map_err(|error: engine::job::InvalidText| error.to_string())
 }
 
 /// `HEAD /v1/uploads/{upload}`: how far it is.

@@ -1,0 +1,353 @@
+//! Masks from raw captures, and what is to be told of masks.
+//!
+//! Captures are read one frame at a time and added to running sums, so that memory holds a few planes
+//! however many repeats there are.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use ndarray::{Array2, Array3, Axis, s};
+
+use super::IntakeError;
+use crate::intake::error::Result;
+use crate::job::{CalibrationReport, Captures, Finding, MOST_SECONDS, planned_seconds};
+use formats::planar::{self, Reader};
+use formats::{
+    self, Channels, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo,
+    StackWriter, png, read_stack,
+};
+use optics::{
+    Average, Calibrator, CaptureFigures, MaskFigures, MaskStudy, PatternFigures, References,
+    Repeats, check_patterns, judge_captures, judge_masks,
+};
+
+/// Bytes of the masks that are looked at in one go.
+const BAND_BYTES: usize = 64 << 20;
+/// Longest side of a picture of a report, in pixels.
+const PICTURE: usize = 640;
+/// The share of the work that averaging is; writing the masks and looking at them are a tenth each.
+const AVERAGING: f64 = 0.8;
+
+pub type CaptureFiles = Captures<PathBuf>;
+
+/// Hears how much of the work is done, on \[0,1\]; false asks to stop.
+pub type Progress<'a> = dyn FnMut(f64) -> bool + 'a;
+
+/// What is known of masks that were made of captures.
+#[derive(Debug)]
+pub struct Calibrated {
+    pub report: Report,
+    /// How the captures are stored.
+    pub sample: SampleType,
+    /// Values below 0 that were set to 0.
+    pub clipped_negatives: u64,
+}
+
+#[derive(Debug)]
+pub struct Report {
+    /// What is known of the masks.
+    pub report: CalibrationReport,
+    /// Pictures by name, as PNG.
+    pub maps: Vec<(String, Vec<u8>)>,
+}
+
+/// Makes masks \[B,H,W\] on \[0,1\] of captures, and a report on them.
+///
+/// Their scale is known only after the last of them: until then they lie in `scratch`, a file that is
+/// there. Then `open` is asked for the writer of such a stack, and each mask is written. Returns what is
+/// known of the masks, and what the writer wrote to.
+/// Errors: captures or patterns that can't be read or used; I/O; a stop; those of `open`.
+pub fn calibrate<W: Write>(
+    files: &CaptureFiles,
+    limits: &Limits,
+    scratch: &Path,
+    open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, FormatError>,
+    progress: &mut Progress<'_>,
+) -> Result<(Calibrated, W)> {
+    // Checked before hours of averaging.
+    let patterns = read_patterns(files, limits)?;
+    let captured = average_masks(files, limits, scratch, progress)?;
+    let raw = Reader::open(scratch, limits)?;
+    let masks = write_scaled(&raw, captured.scale, open(raw.info())?, progress)?;
+    let figures = study(&raw, captured.scale, progress)?;
+    let report = tell(&figures, Some(&captured), patterns.as_ref())?;
+    let Captured { sample, clipped_negatives, .. } = captured;
+    Ok((Calibrated { report, sample, clipped_negatives }, masks))
+}
+
+/// The report on masks \[B,H,W\] on \[0,1\] that were sent as such.
+/// Errors: masks that can't be read; a stop.
+pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
+    tell(&study(masks, 1.0, progress)?, None, None)
+}
+
+/// What a calibration of captures will take.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plan {
+    /// Rows and columns of the captures.
+    pub size: (usize, usize),
+    /// Of the masks that are made.
+    pub bytes: u64,
+    /// Of processor time.
+    pub seconds: f64,
+}
+
+/// Looks at the headers of captures: they must be stacks of one size, and not more than can be averaged in
+/// [`MOST_SECONDS`].
+/// Errors: files that can't be read, or differ in size, by their place in a request; too many of them.
+pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
+    let (mut first, mut captured) = (None, 0);
+    for (place, paths) in files.lists() {
+        for (index, path) in paths.iter().enumerate() {
+            let place = format!("{place}/{index}");
+            let opened = formats::open_stack(path, limits);
+            let info = *opened.map_err(IntakeError::format(&place))?.info();
+            let (height, width) = *first.get_or_insert((info.height, info.width));
+            if (info.height, info.width) != (height, width) {
+                let detail = format!(
+                    "this capture is {}x{} (rows x columns), but those before it are {height}x{width}",
+                    info.height, info.width
+                );
+                return Err(IntakeError::Size { place, detail });
+            }
+            captured += info.frames as u64;
+        }
+    }
+    let (height, width) = first.unwrap_or_default();
+    let (masks, pixels) = (files.masks.len(), height * width);
+    let seconds = planned_seconds(captured * pixels as u64, masks, pixels);
+    if seconds > MOST_SECONDS {
+        let detail = format!(
+            "{captured} captures of {height}x{width} pixels would take {seconds:.0} s of a core, and may take \
+             {MOST_SECONDS}: take fewer repeats of each"
+        );
+        return Err(IntakeError::Size { place: "/captures".into(), detail });
+    }
+    Ok(Plan { size: (height, width), bytes: (masks * pixels * size_of::<f32>()) as u64, seconds })
+}
+
+/// What the captures of masks have told.
+struct Captured {
+    /// The masks' scale: the share of the white's light where a mask is 1.
+    scale: f32,
+    figures: CaptureFigures,
+    /// `white - black`.
+    illumination: Array2<f32>,
+    sample: SampleType,
+    clipped_negatives: u64,
+}
+
+/// Averages captures frame by frame and writes the masks \[B,H,W\], not yet divided by their largest
+/// value, to `raw`.
+fn average_masks(
+    files: &CaptureFiles,
+    limits: &Limits,
+    raw: &Path,
+    progress: &mut Progress<'_>,
+) -> Result<Captured> {
+    let total = files.masks.len() + 3;
+    let mut done = 0;
+    let mut average = |name: &str, paths: &[PathBuf]| {
+        let whole = |share: f64| (f64::from(done) + share) / total as f64 * AVERAGING;
+        let place = |index| format!("captures of {name}, file {}", index + 1);
+        let mut heard = |share| progress(whole(share));
+        let averaged = average(paths, files.saturation, limits, place, &mut heard);
+        done += 1;
+        averaged
+    };
+    let (white, sample) = average("white", &files.white)?;
+    let (black, _) = average("black", &files.black)?;
+    let black_with_mask = match files.black_with_mask.as_slice() {
+        [] => None,
+        paths => Some(average("black_with_mask", paths)?.0),
+    };
+    let references = References { white, black, black_with_mask };
+    let calibrator = Calibrator::new(references)
+        .map_err(|error| IntakeError::content("reference images", &error))?;
+    let (height, width) = calibrator.illumination().dim();
+    let raw = File::options().write(true).open(raw).map_err(FormatError::io("open the file"))?;
+    let mut writer = planar::writer(BufWriter::new(raw), files.masks.len(), height, width)?;
+    let (mut patterns, mut scale, mut clipped) = (Vec::new(), 0.0f32, 0);
+    for (index, paths) in files.masks.iter().enumerate() {
+        let name = format!("pattern {index} (counted from 0)");
+        let (capture, _) = average(&name, paths)?;
+        let mask =
+            calibrator.mask(&capture).map_err(|error| IntakeError::content(&name, &error))?;
+        writer.write_frame(mask.values.view())?;
+        scale = scale.max(mask.largest);
+        clipped += mask.not_positive;
+        patterns.push(PatternFigures::new(&mask, capture.saturated, capture.drift));
+    }
+    writer.finish()?;
+    if scale <= 0.0 {
+        return Err(IntakeError::content("patterns", &"no pattern is brighter than the dark"));
+    }
+    let figures = CaptureFigures::new(&calibrator, patterns);
+    let illumination = calibrator.illumination().to_owned();
+    Ok(Captured { scale, figures, illumination, sample, clipped_negatives: clipped })
+}
+
+/// The average of all frames of some files; `place` is what errors call each.
+pub(super) fn average(
+    paths: &[PathBuf],
+    saturation: Option<u32>,
+    limits: &Limits,
+    place: impl Fn(usize) -> String,
+    progress: &mut Progress<'_>,
+) -> Result<(Average, SampleType)> {
+    let (mut repeats, mut sample) = (None, SampleType::F32);
+    for (index, path) in paths.iter().enumerate() {
+        let failed = |source| IntakeError::format(place(index))(source);
+        let mut reader = formats::open_stack(path, limits).map_err(failed)?;
+        let info = *reader.info();
+        sample = info.sample;
+        let full = full_number(sample, saturation);
+        let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, full));
+        let mut frame = 0;
+        while let Some(capture) = reader.next_frame().map_err(failed)? {
+            let added = repeats.add(capture.view());
+            added.map_err(|error| IntakeError::content(place(index), &error))?;
+            frame += 1;
+            let share = frame as f64 / info.frames as f64;
+            go_on(progress, (index as f64 + share) / paths.len() as f64)?;
+        }
+    }
+    let average = repeats.unwrap_or_else(|| Repeats::new(0, 0, None)).average();
+    Ok((average.map_err(|error| IntakeError::content(place(0), &error))?, sample))
+}
+
+/// The stored number from which on a pixel is full: the one stated, or the largest of the type.
+/// Floats have none: there it must be stated.
+#[allow(clippy::cast_precision_loss)] // cameras' numbers are small
+pub(super) fn full_number(sample: SampleType, stated: Option<u32>) -> Option<f32> {
+    let largest = sample.default_full_scale().filter(|largest| *largest != FullScale::ONE);
+    let largest = largest.map(FullScale::value);
+    stated.map(|value| value as f32).or(largest)
+}
+
+fn go_on(progress: &mut Progress<'_>, share: f64) -> Result<()> {
+    if progress(share) { Ok(()) } else { Err(IntakeError::Stopped) }
+}
+
+/// Divides masks by their scale, so that the largest value is 1.
+fn divide(masks: &mut Array3<f32>, scale: f32) {
+    masks.mapv_inplace(|value| (value / scale).min(1.0));
+}
+
+fn write_scaled<W: Write>(
+    raw: &Reader,
+    scale: f32,
+    mut to: StackWriter<W>,
+    progress: &mut Progress<'_>,
+) -> Result<W> {
+    let StackInfo { frames, height, width, .. } = *raw.info();
+    for frame in 0..frames {
+        let mut mask = raw.read_window(frame..frame + 1, 0..height, 0..width)?;
+        divide(&mut mask, scale);
+        to.write_frame(mask.index_axis(Axis(0), 0))?;
+        go_on(progress, AVERAGING + 0.1 * (frame + 1) as f64 / frames as f64)?;
+    }
+    Ok(to.finish()?)
+}
+
+/// The report on masks. `captured` is known if they were made of captures, `patterns` if somebody told
+/// the patterns that were meant.
+fn tell(
+    figures: &MaskFigures,
+    captured: Option<&Captured>,
+    patterns: Option<&Array3<f32>>,
+) -> Result<Report> {
+    let mut findings = judge_masks(figures, patterns.map(|patterns| patterns.view()));
+    let mut maps = vec![
+        ("mean".to_owned(), picture(&figures.mean)?),
+        ("deviation".to_owned(), picture(&figures.deviation)?),
+        ("gram".to_owned(), picture(&figures.gram)?),
+    ];
+    if let Some(captured) = captured {
+        findings.extend(judge_captures(&captured.figures));
+        maps.push(("illumination".to_owned(), picture(&captured.illumination)?));
+    }
+    let findings = findings.into_iter().map(Finding::from).collect();
+    let captures = captured.map(|captured| (&captured.figures, captured.scale));
+    let names = maps.iter().map(|(name, _)| name.clone()).collect();
+    Ok(Report { report: CalibrationReport::new(figures, captures, findings, names), maps })
+}
+
+/// Looks at masks, once they are divided by `scale`, band by band.
+fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<MaskFigures> {
+    let StackInfo { frames, height, width, .. } = *masks.info();
+    let refused = |error| IntakeError::content("masks", &error);
+    let rows = (BAND_BYTES / (frames * width * size_of::<f32>())).clamp(1, height);
+    let mut study = MaskStudy::new(frames, height, width);
+    for start in (0..height).step_by(rows) {
+        let rows: Range<usize> = start..(start + rows).min(height);
+        let end = rows.end;
+        let mut band = masks.read_window(0..frames, rows, 0..width)?;
+        divide(&mut band, scale);
+        study.add(band.view()).map_err(refused)?;
+        go_on(progress, 0.9 + 0.1 * end as f64 / height as f64)?;
+    }
+    study.finish().map_err(refused)
+}
+
+/// The patterns that were shown \[B,h,w\], on \[0,1\], if there is a file of them.
+fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<f32>>> {
+    let Some(path) = &files.patterns else { return Ok(None) };
+    let (info, patterns) = read_stack(path, limits).map_err(IntakeError::format("patterns"))?;
+    let patterns = patterns / info.default_full_scale.unwrap_or(FullScale::ONE).value();
+    check_patterns(patterns.view(), files.masks.len())
+        .map_err(|error| IntakeError::content("patterns", &error))?;
+    Ok(Some(patterns))
+}
+
+/// A picture of a map, small enough to look at: block means, black at 0, white at the largest.
+fn picture(map: &Array2<f32>) -> Result<Vec<u8>, FormatError> {
+    let (height, width) = map.dim();
+    let side = height.max(width).div_ceil(PICTURE).max(1);
+    let small = Array2::from_shape_fn((height.div_ceil(side), width.div_ceil(side)), |(i, j)| {
+        let rows = i * side..((i + 1) * side).min(height);
+        let columns = j * side..((j + 1) * side).min(width);
+        map.slice(s![rows, columns]).mean().unwrap_or(0.0)
+    });
+    let largest = small.fold(0.0f32, |largest, &value| largest.max(value));
+    png::encode_u8(small.view(), Channels::Grey, 0.0, if largest > 0.0 { largest } else { 1.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::{CaptureFiles, plan};
+    use crate::job::MOST_SECONDS;
+    use formats::Limits;
+
+    #[test]
+    fn what_takes_too_long_is_refused_before_it_begins() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("repeats.npy");
+        let mut header = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
+        header.extend(b"{'descr': '|u1', 'fortran_order': False, 'shape': (20, 3000, 3000), }");
+        header.resize(127, b' ');
+        header.push(b'\n');
+        let mut file = std::fs::File::create(&path).unwrap();
+        file.write_all(&header).unwrap();
+        // A hole: nothing of it is read.
+        file.set_len(128 + 20 * 3000 * 3000).unwrap();
+        let files = |masks: usize, repeats: usize| CaptureFiles {
+            masks: vec![vec![path.clone(); repeats]; masks],
+            white: vec![path.clone()],
+            black: vec![path.clone()],
+            black_with_mask: Vec::new(),
+            patterns: None,
+            saturation: None,
+        };
+        let planned = plan(&files(10, 2), &Limits::default()).unwrap();
+        assert_eq!(planned.bytes, 10 * 3000 * 3000 * 4);
+        assert!((20.0..60.0).contains(&planned.seconds), "{planned:?}");
+        let refused = plan(&files(64, 60), &Limits::default()).unwrap_err().to_string();
+        assert!(refused.contains("76840 captures"), "{refused}");
+        assert!(refused.contains(&format!("may take {MOST_SECONDS}")), "{refused}");
+    }
+}

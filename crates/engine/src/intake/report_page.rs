@@ -1,0 +1,237 @@
+//! The report of a calibration as a page: plain HTML with pictures, no script, no style of its own.
+
+use maud::{DOCTYPE, Markup, html};
+
+use crate::job::{CalibrationReport, CaptureReport, Finding, Grade, MaskReport, Severity};
+
+/// Side of a cell of the correlation matrix, in pixels.
+const CELL: usize = 16;
+
+/// The page of a report; `title` names the calibration. Pictures are looked for in `maps/` beside it,
+/// and the style where the service has it: without one it is plain.
+pub fn report_page(title: &str, report: &CalibrationReport) -> String {
+    let page = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                title { "Calibration " (title) }
+                link rel="stylesheet" href="../../../dashboard/style.css";
+            }
+            body {
+                main {
+                    h1 { "Calibration " (title) }
+                    (verdict(report))
+                    h2 { "Masks" }
+                    (masks(&report.masks, report))
+                    @if let Some(captures) = &report.captures {
+                        h2 { "Captures" }
+                        (captured(captures))
+                        (patterns(captures))
+                    }
+                    h2 { "How alike the masks are" }
+                    (correlation(&report.masks))
+                    @for map in &report.maps {
+                        h2 { (caption(map)) }
+                        p { img src={ "maps/" (map) ".png" } alt=(caption(map)); }
+                    }
+                }
+            }
+        }
+    };
+    page.into_string()
+}
+
+fn verdict(report: &CalibrationReport) -> Markup {
+    let (class, text) = match report.grade {
+        Grade::Good => ("good", "Good: nothing is wrong with it."),
+        Grade::Usable => ("warn", "Usable, but it could be better:"),
+        Grade::Bad => ("trouble", "Bad: frames made with it will be wrong:"),
+    };
+    html! {
+        p class=(class) { strong { (text) } }
+        @for finding in &report.findings { (trouble(finding)) }
+    }
+}
+
+fn trouble(finding: &Finding) -> Markup {
+    let class = match finding.severity {
+        Severity::Warning => "warn",
+        Severity::Error => "trouble",
+    };
+    html! {
+        p class=(class) {
+            code { (finding.code) } " " (finding.detail) br;
+            "What to do: " (finding.remedy) "."
+        }
+    }
+}
+
+fn masks(masks: &MaskReport, report: &CalibrationReport) -> Markup {
+    let pixels = (report.height * report.width) as f64;
+    let share = |count: u64, of: f64| format!("{count} ({})", percent(count as f64 / of));
+    table(&[
+        (
+            "Size (frames x rows x columns)",
+            format!("{} x {} x {}", report.frames, report.height, report.width),
+        ),
+        ("Mean", number(masks.mean)),
+        ("Deviation over the frames", number(masks.deviation)),
+        (
+            "1 % and 99 % of all values are below",
+            format!("{} and {}", number(masks.percentile_1), number(masks.percentile_99)),
+        ),
+        (
+            "Correlation between frames, mean and largest",
+            format!(
+                "{} and {}",
+                optional(masks.correlation_mean),
+                optional(masks.correlation_largest)
+            ),
+        ),
+        ("Gram diagonal: smallest, mean, largest", masks.gram.map(number).join(", ")),
+        ("Dead pixels (dark in all masks)", share(masks.dead_pixels, pixels)),
+        ("Stuck pixels (open in all masks)", share(masks.stuck_pixels, pixels)),
+        ("Values at 0", share(masks.values_at_zero, pixels * report.frames as f64)),
+    ])
+}
+
+fn captured(captures: &CaptureReport) -> Markup {
+    let range = captures.dynamic_range_db.map(|db| format!("{db:.1} dB"));
+    table(&[
+        ("Light throughput", percent(captures.light_throughput)),
+        ("Share of the light where a mask is 1", percent(captures.mask_scale)),
+        ("Noise of the averaged masks", optional(captures.noise)),
+        ("Dynamic range (deviation over noise)", range.unwrap_or_else(|| "not known".into())),
+        (
+            "White, black, black with mask (as stored)",
+            format!(
+                "{:.1}, {:.1}, {}",
+                captures.white_level,
+                captures.black_level,
+                captures
+                    .black_with_mask_level
+                    .map_or("none (Eq. 7)".into(), |level| format!("{level:.1}"))
+            ),
+        ),
+        ("Full pixels of the white", share(captures.white_saturated)),
+        ("Illumination: darkest over brightest part", share(captures.illumination_flatness)),
+        ("Pixels whose white is not above their black", percent(captures.denominator_not_positive)),
+        ("Pixels whose white is hardly above their black", percent(captures.denominator_too_dark)),
+    ])
+}
+
+fn patterns(captures: &CaptureReport) -> Markup {
+    html! {
+        table {
+            thead { tr {
+                @for name in ["Pattern", "Light", "At or below 0", "Too far below 0 for noise", "Noise", "Full", "Drift of the light"] {
+                    th scope="col" { (name) }
+                }
+            } }
+            tbody {
+                @for (index, pattern) in captures.patterns.iter().enumerate() {
+                    tr {
+                        th scope="row" { (index) }
+                        td { (percent(pattern.light)) }
+                        td { (percent(pattern.not_positive)) }
+                        td { (percent(pattern.negative)) }
+                        td { (optional(pattern.noise)) }
+                        td { (share(pattern.saturated)) }
+                        td { (percent(pattern.drift)) }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The matrix as squares, white for 0 and dark blue for 1.
+fn correlation(masks: &MaskReport) -> Markup {
+    let side = masks.correlation.len() * CELL;
+    html! {
+        svg xmlns="http://www.w3.org/2000/svg" width=(side) height=(side) role="img"
+            aria-label="Correlation of each mask with each other" {
+            @for (k, row) in masks.correlation.iter().enumerate() {
+                @for (l, value) in row.iter().enumerate() {
+                    rect x=(l * CELL) y=(k * CELL) width=(CELL) height=(CELL) fill=(shade(*value)) {
+                        title { "masks " (k) " and " (l) ": " (number(*value)) }
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // clamped to a byte
+fn shade(value: f64) -> String {
+    let level = value.clamp(0.0, 1.0);
+    let mix = |dark: f64| (255.0 + (dark - 255.0) * level).round() as u8;
+    format!("#{:02x}{:02x}{:02x}", mix(11.0), mix(40.0), mix(120.0))
+}
+
+fn caption(map: &str) -> String {
+    match map {
+        "mean" => "Mean of each pixel over the frames".into(),
+        "deviation" => "Deviation of each pixel over the frames".into(),
+        "gram" => "Gram diagonal: sum of squares of each pixel (black: nothing is known)".into(),
+        "illumination" => "Illumination: white less black".into(),
+        other => other.into(),
+    }
+}
+
+fn table(rows: &[(&str, String)]) -> Markup {
+    html! {
+        table { tbody {
+            @for (name, value) in rows { tr { th scope="row" { (name) } td { (value) } } }
+        } }
+    }
+}
+
+fn number(value: f64) -> String {
+    format!("{value:.4}")
+}
+
+fn optional(value: Option<f64>) -> String {
+    value.map_or_else(|| "not known".into(), number)
+}
+
+fn percent(value: f64) -> String {
+    format!("{:.2} %", value * 100.0)
+}
+
+fn share(value: Option<f64>) -> String {
+    value.map_or_else(|| "not known".into(), percent)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::report_page;
+    use crate::job::{CalibrationReport, Finding, Severity};
+    use optics::{MaskStudy, random_squares};
+
+    #[test]
+    fn a_page_shows_everything_and_runs_nothing() {
+        let (masks, _) = random_squares(4, 16, 16, 1).unwrap();
+        let mut study = MaskStudy::new(4, 16, 16);
+        study.add(masks.view()).unwrap();
+        let finding = Finding {
+            code: "swapped_order".into(),
+            severity: Severity::Error,
+            detail: "masks 1 and 2".into(),
+            remedy: "swap them".into(),
+            frames: vec![1, 2],
+            snapshot: None,
+        };
+        let maps = vec!["gram".to_owned()];
+        let report = CalibrationReport::new(&study.finish().unwrap(), None, vec![finding], maps);
+        let page = report_page("<b>bench</b> 3", &report);
+        assert!(page.contains("&lt;b&gt;bench&lt;/b&gt; 3"), "names are text");
+        assert!(page.contains("Bad: frames") && page.contains("swapped_order"));
+        assert!(page.contains("maps/gram.png") && page.matches("<rect").count() == 16);
+        for forbidden in ["<script", " style=", "<style", "http://www.w3.org/2000/svg\" onload"] {
+            assert!(!page.contains(forbidden), "{forbidden}");
+        }
+    }
+}

@@ -1,0 +1,41 @@
+//! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
+
+mod access;
+mod algorithm;
+mod assessment;
+mod captures;
+#[cfg(feature = "sqlite")]
+mod columns;
+mod ids;
+mod memory;
+mod model;
+mod pool;
+mod report;
+mod request;
+mod shape;
+mod state;
+mod task;
+mod text;
+
+pub use access::{Lab, Role, Secret};
+pub use algorithm::Algorithm;
+pub use assessment::Assessment;
+pub use captures::{Captures, MOST_MASKS, MOST_SECONDS, planned_seconds};
+pub use ids::{
+    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
+};
+pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
+pub use optics::{MARGIN, Mosaic};
+pub use pool::{InvalidPool, Pool};
+pub use reconstruction::schedule::Schedule;
+pub use report::{
+    CalibrationReport, CaptureReport, Finding, Grade, MaskReport, PatternReport, Severity,
+};
+pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
+pub use shape::{Cut, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
+pub use state::{IllegalTransition, JobState};
+pub use task::{
+    LEAST_MOVIE_SIDE, MOVIE_SIDE, ResultFile, TaskKind, TaskProgress, TaskStage, TaskState,
+    movie_step,
+};
+pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

@@ -1,0 +1,278 @@
+//! Small values as text: labels and hashes, each checked once when it is made; times; and what is
+//! wrong with a text.
+
+use std::fmt;
+use std::io::{self, BufReader, Read};
+use std::str::FromStr;
+use std::time::Duration;
+
+use derive_more::Display;
+use serde::Serialize;
+use serde_with::{DeserializeFromStr, SerializeDisplay};
+
+use reconstruction::schedule::Schedule;
+
+/// A text from a user that does not have the form it should have.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct InvalidText(String);
+
+impl InvalidText {
+    pub(super) fn new(text: String) -> Self {
+        Self(text)
+    }
+}
+
+/// One thing wrong with a request, and where it stands.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct InvalidField {
+    /// JSON pointer (RFC 6901) into the request.
+    pub pointer: String,
+    pub detail: String,
+}
+
+impl InvalidField {
+    pub fn new(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
+        Self { pointer: pointer.into(), detail: detail.into() }
+    }
+
+    /// All that is wrong with a schedule, with places in it.
+    pub fn of_schedule(schedule: &Schedule) -> Vec<Self> {
+        let faults = schedule.faults().into_iter();
+        faults.map(|(pointer, error)| Self::new(pointer, error.to_string())).collect()
+    }
+
+    /// The same error seen from one level further up.
+    pub fn under(mut self, parent: &str) -> Self {
+        self.pointer.insert_str(0, parent);
+        self
+    }
+}
+
+/// A name that a user gives to a thing. It is shown and searched for, and never becomes a path.
+#[derive(Debug, Clone, PartialEq, Eq, Display, SerializeDisplay, DeserializeFromStr)]
+pub struct Label(String);
+
+impl Label {
+    /// The most characters that a label has.
+    pub const MAX_CHARS: usize = 200;
+
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl FromStr for Label {
+    type Err = InvalidText;
+
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
+        let length = text.chars().count();
+        if text.trim().is_empty() {
+            return Err(InvalidText("a name must not be blank; leave it out instead".into()));
+        }
+        if length > Self::MAX_CHARS {
+            return Err(InvalidText(format!(
+                "the name has {length} characters; at most {} are taken",
+                Self::MAX_CHARS
+            )));
+        }
+        match text.chars().position(char::is_control) {
+            Some(at) => Err(InvalidText(format!(
+                "the name holds a control character at position {at}; names are printable text"
+            ))),
+            None => Ok(Self(text.to_owned())),
+        }
+    }
+}
+
+/// The SHA-256 hash of a file's bytes, which is also the file's address in the store.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, SerializeDisplay, DeserializeFromStr,
+)]
+pub struct Sha256([u8; 32]);
+
+impl Sha256 {
+    /// The hash with these 32 bytes.
+    pub fn new(bytes: [u8; 32]) -> Self {
+        Self(bytes)
+    }
+
+    pub fn bytes(&self) -> [u8; 32] {
+        self.0
+    }
+
+    /// The hash and the number of the bytes that are left to read.
+    pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
+        use sha2::Digest;
+        let mut hasher = sha2::Sha256::new();
+        let size = io::copy(&mut BufReader::with_capacity(256 * 1024, reader), &mut hasher)?;
+        Ok((Self(hasher.finalize().into()), size))
+    }
+
+    pub fn of(bytes: &[u8]) -> Self {
+        use sha2::Digest;
+        Self(sha2::Sha256::digest(bytes).into())
+    }
+}
+
+impl fmt::Display for Sha256 {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&hex::encode(self.0))
+    }
+}
+
+impl FromStr for Sha256 {
+    type Err = InvalidText;
+
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
+        let mut bytes = [0; 32];
+        let upper = text.bytes().any(|digit| digit.is_ascii_uppercase());
+        if upper || hex::decode_to_slice(text, &mut bytes).is_err() {
+            return Err(InvalidText(format!(
+                "{:?} is not a SHA-256 hash; it should be 64 lower-case hexadecimal digits",
+                text.chars().take(80).collect::<String>()
+            )));
+        }
+        Ok(Self(bytes))
+    }
+}
+
+/// A moment: milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text, always in UTC.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay, DeserializeFromStr,
+)]
+pub struct Timestamp(pub i64);
+
+impl FromStr for Timestamp {
+    type Err = InvalidText;
+
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
+        let moment: Result<jiff::Timestamp, _> = text.parse();
+        moment.map(|moment| Self(moment.as_millisecond())).map_err(|_| {
+            InvalidText(format!(
+                "{:?} is no moment; it should be like 2026-11-21T10:39:01Z",
+                text.chars().take(80).collect::<String>()
+            ))
+        })
+    }
+}
+
+impl Timestamp {
+    /// The wall clock's time.
+    pub fn now() -> Self {
+        Self(jiff::Timestamp::now().as_millisecond())
+    }
+
+    fn moment(self) -> jiff::Timestamp {
+        jiff::Timestamp::from_millisecond(self.0).unwrap_or(jiff::Timestamp::MAX)
+    }
+
+    /// As in the headers of HTTP (RFC 9110).
+    pub fn http_date(self) -> String {
+        let printer = jiff::fmt::rfc2822::DateTimePrinter::new();
+        // Fails only before the year 0.
+        printer.timestamp_to_rfc9110_string(&self.moment()).unwrap_or_default()
+    }
+
+    /// The moment that is so much later.
+    pub fn after(self, time: Duration) -> Self {
+        Self(self.0.saturating_add(i64::try_from(time.as_millis()).unwrap_or(i64::MAX)))
+    }
+
+    /// Seconds from `earlier` to this moment, not below zero.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn seconds_since(self, earlier: Self) -> f64 {
+        (self.0 - earlier.0).max(0) as f64 / 1000.0
+    }
+}
+
+impl fmt::Display for Timestamp {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.3}", self.moment())
+    }
+}
+
+/// The text with each absolute path in it cut down to its last part: how the folders of the service
+/// are named is nobody's business, and what failed can still be told.
+pub fn without_paths(text: &str) -> String {
+    let mut clean = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = start_of_path(rest) {
+        let (before, path) = rest.split_at(at);
+        let end = path.find(ends_path).unwrap_or(path.len());
+        let (path, after) = path.split_at(end);
+        clean.push_str(before);
+        clean.push_str(path.trim_end_matches('/').rsplit('/').next().unwrap_or_default());
+        rest = after;
+    }
+    clean + rest
+}
+
+/// Where the first path with at least two parts begins.
+fn start_of_path(text: &str) -> Option<usize> {
+    let slashes = text.match_indices('/').map(|(at, _)| at);
+    slashes.into_iter().find(|&at| {
+        let before = text[..at].chars().next_back();
+        let path = &text[at + 1..];
+        let end = path.find(ends_path).unwrap_or(path.len());
+        // "and/or" and "s/m" are no paths; the slashes of "file:///x/y" and "/x/y" begin one.
+        !before.is_some_and(|c| c.is_alphanumeric()) && path[..end].trim_matches('/').contains('/')
+    })
+}
+
+fn ends_path(c: char) -> bool {
+    c.is_whitespace() || matches!(c, '"' | '\'' | '`' | ':' | ',' | ';' | '(' | ')' | '<' | '>')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Label, Sha256, Timestamp, without_paths};
+
+    #[test]
+    fn times_are_written_as_rfc_3339() {
+        assert_eq!(Timestamp(0).to_string(), "1970-01-01T00:00:00.000Z");
+        assert_eq!(Timestamp(951_827_696_789).to_string(), "2000-02-29T12:34:56.789Z");
+        assert_eq!(Timestamp(1_798_761_599_999).to_string(), "2026-12-31T23:59:59.999Z");
+        for text in ["2000-02-29T12:34:56.789Z", "2000-02-29T13:34:56.789+01:00"] {
+            assert_eq!(text.parse(), Ok(Timestamp(951_827_696_789)), "{text}");
+        }
+        for bad in ["", "2000-02-30T00:00:00Z", "yesterday", "2000-02-29", "951827696"] {
+            assert!(bad.parse::<Timestamp>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn hashes_print_and_parse() {
+        let empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855";
+        assert_eq!(Sha256::of(b"").to_string(), empty);
+        assert_eq!(empty.parse::<Sha256>().unwrap(), Sha256::of(b""));
+        for bad in ["", "e3b0", &empty.to_uppercase(), &format!("{empty}0"), "../../etc/passwd"] {
+            assert!(bad.parse::<Sha256>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn labels_are_printable_and_short() {
+        assert!("run 7, f/8, \u{3b1} = 3".parse::<Label>().is_ok());
+        assert!("../../etc/passwd".parse::<Label>().is_ok(), "a label is not a path");
+        for bad in ["", "  ", "a\nb", "a\0b", "\u{1b}[31m", &"x".repeat(201)] {
+            assert!(bad.parse::<Label>().is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn paths_go_and_what_failed_stays() {
+        for (text, clean) in [
+            ("can't write /srv/sci/tmp/019a: No space left", "can't write 019a: No space left"),
+            ("there is no file /nowhere/lib.so; name it", "there is no file lib.so; name it"),
+            ("load \"/a/b/c.so\" (/x/y): both/or", "load \"c.so\" (y): both/or"),
+            ("/a/b and /c/d/", "b and d"),
+            ("file:///root/x/y failed", "file:y failed"),
+            ("speed in m/s, 1/2, / and /tmp", "speed in m/s, 1/2, / and /tmp"),
+            ("\u{e9}/\u{e9}/ \u{e9} /\u{e9}/\u{e9}", "\u{e9}/\u{e9}/ \u{e9} \u{e9}"),
+            ("", ""),
+        ] {
+            assert_eq!(without_paths(text), clean);
+        }
+    }
+}

@@ -1,0 +1,175 @@
+//! The frames of one snapshot, or of several one after the other, as a movie.
+
+use std::fs::File;
+use std::io::{BufWriter, Seek, Write};
+use std::path::{Path, PathBuf};
+
+use ndarray::{Array2, Axis, s};
+
+use super::error::{PipelineError, Result};
+use super::progress::Monitor;
+use crate::job::{SceneShape, Sha256, TaskStage, movie_step};
+use formats::movie::{self, Clip, MovieWriter};
+use formats::{Channels, Limits, WindowReader, npy, png};
+
+const NAME: &str = "movie.mp4";
+/// Samples that are read at a time: 16 MiB.
+const BAND: usize = 4 << 20;
+
+/// What a movie is made of.
+#[derive(Debug)]
+pub struct MovieTask {
+    pub shape: SceneShape,
+    /// What is shown as white; black is 0, as in the PNGs of the frames.
+    pub white: f32,
+    /// Frames of a second of the scene, if they are known.
+    pub scene_fps: Option<f64>,
+    /// The frames of each snapshot (`frames.npy`), and the hash that the file should have.
+    pub clips: Vec<(PathBuf, Sha256)>,
+}
+
+/// Writes the movie to `path`, an empty file. Sides above [`crate::job::MOVIE_SIDE`] are halved, until none is; a pixel
+/// is then the mean of those that it stands for. One frame is held at a time.
+/// Errors: [`PipelineError::Result`] if a file is damaged; I/O.
+pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
+    let SceneShape { frames, height, width, .. } = task.shape;
+    let channels = task.shape.channels();
+    let step = movie_step(height, width);
+    let title = task.scene_fps.map_or(String::new(), |fps| {
+        format!("{} frames/s, played at {}", (1e3 * fps).round() / 1e3, movie::FPS)
+    });
+    let count = frames * task.clips.len();
+    let clip = Clip {
+        shape: (count, height.div_ceil(step), width.div_ceil(step)),
+        channels,
+        title: &title,
+    };
+    let file = File::options().write(true).open(path);
+    let file = file.map_err(|source| PipelineError::File { name: NAME.into(), source })?;
+    let mut writer = movie::writer(BufWriter::new(file), &clip)?;
+    for (index, (array, sha256)) in task.clips.iter().enumerate() {
+        let reader = checked(array, *sha256)?;
+        monitor.check()?;
+        for k in 0..frames {
+            write_frame(&mut writer, &reader, k, (channels, step, task.white))?;
+            monitor.check()?;
+            let done = (index * frames + k + 1) as f64 / count as f64;
+            monitor.reach(TaskStage::Writing, done);
+        }
+    }
+    writer.finish()?;
+    Ok(())
+}
+
+/// Opens the frames of a snapshot, whose bytes are those on record.
+fn checked(path: &Path, expected: Sha256) -> Result<WindowReader> {
+    let name = || "frames.npy".to_owned();
+    let unreadable = |source| PipelineError::File { name: name(), source };
+    let found = Sha256::of_reader(&mut File::open(path).map_err(unreadable)?);
+    if found.map_err(unreadable)?.0 != expected {
+        return Err(PipelineError::Result(name()));
+    }
+    Ok(npy::open_windows(path, &Limits::default())?)
+}
+
+/// Reads frame `k` in bands of rows, and adds it to the movie.
+fn write_frame<W: Write + Seek>(
+    writer: &mut MovieWriter<W>,
+    reader: &WindowReader,
+    k: usize,
+    (channels, step, white): (Channels, usize, f32),
+) -> Result<()> {
+    let (height, samples) = (reader.info().height, reader.info().width);
+    let width = samples / channels.count();
+    let size = (height.div_ceil(step), width.div_ceil(step) * channels.count());
+    let mut levels = Array2::zeros(size);
+    let band = (BAND / (step * samples)).max(1);
+    for start in (0..size.0).step_by(band) {
+        let end = (start + band).min(size.0);
+        let rows = start * step..(end * step).min(height);
+        let values = reader.read_window(k..k + 1, rows, 0..samples)?;
+        let values = reduced(values.index_axis_move(Axis(0), 0), channels, step);
+        levels.slice_mut(s![start..end, ..]).assign(&values.map(png::level_u8(0.0, white)));
+    }
+    Ok(writer.write_frame(levels.view())?)
+}
+
+/// Means of `step` x `step` pixels; fewer at the last row and column.
+fn reduced(values: Array2<f32>, channels: Channels, step: usize) -> Array2<f32> {
+    if step == 1 {
+        return values;
+    }
+    let (height, samples) = values.dim();
+    let count = channels.count();
+    let width = samples / count;
+    Array2::from_shape_fn((height.div_ceil(step), width.div_ceil(step) * count), |(i, at)| {
+        let (j, channel) = (at / count, at % count);
+        let rows = i * step..((i + 1) * step).min(height);
+        let columns = j * step..((j + 1) * step).min(width);
+        let first = columns.start * count + channel;
+        let part = values.slice(s![rows, first..columns.end * count;count.cast_signed()]);
+        part.sum() / part.len() as f32
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array2, Array3, array, s};
+    use shiguredo_mp4::boxes::SampleEntry;
+    use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
+
+    use super::{MovieTask, reduced, write};
+    use crate::job::{SceneShape, Sha256};
+    use crate::pipeline::PipelineError;
+    use crate::pipeline::progress::Monitor;
+    use formats::{Channels, npy};
+
+    #[test]
+    fn large_pictures_are_halved_and_damaged_ones_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let array = folder.path().join("frames.npy");
+        let frames = Array3::from_shape_fn((2, 77, 3841), |(k, i, j)| ((k + i + j) % 5) as f32);
+        npy::write_f32(&array, frames.view()).unwrap();
+        let sha256 = Sha256::of(&std::fs::read(&array).unwrap());
+        let shape = SceneShape { frames: 2, height: 77, width: 3841, snapshots: 2, mosaic: None };
+        let task = |sha256| MovieTask {
+            shape,
+            white: 4.0,
+            scene_fps: Some(100.0),
+            clips: vec![(array.clone(), sha256); 2],
+        };
+        let path = folder.path().join("movie.mp4");
+        std::fs::write(&path, "").unwrap();
+        let monitor = Monitor::default();
+        write(&path, &task(sha256), &monitor).unwrap();
+        assert_eq!(monitor.progress().fraction, 1.0);
+        let bytes = std::fs::read(&path).unwrap();
+        let mut demuxer = Mp4FileDemuxer::new();
+        demuxer.handle_input(Input { position: 0, data: &bytes });
+        let mut count = 0;
+        while let Some(sample) = demuxer.next_sample().unwrap() {
+            if let Some(SampleEntry::Av01(entry)) = sample.sample_entry {
+                assert_eq!((entry.visual.height, entry.visual.width), (20, 961));
+            }
+            count += 1;
+        }
+        assert_eq!(count, 4);
+        let damaged = write(&path, &task(Sha256::of(b"other")), &monitor);
+        assert!(matches!(damaged, Err(PipelineError::Result(_))), "{damaged:?}");
+        monitor.stop();
+        let stopped = write(&path, &task(sha256), &monitor);
+        assert!(matches!(stopped, Err(PipelineError::Stopped)), "{stopped:?}");
+    }
+
+    #[test]
+    fn each_pixel_is_the_mean_of_those_it_stands_for() {
+        let values = array![[1.0, 2.0, 3.0], [5.0, 6.0, 7.0], [9.0, 10.0, 11.0]];
+        assert_eq!(reduced(values, Channels::Grey, 2), array![[3.5, 5.0], [9.5, 11.0]]);
+        let colours = Array2::from_shape_fn((5, 21), |(i, j)| (100 * (j % 3) + i + j / 3) as f32);
+        let found = reduced(colours.clone(), Channels::Rgb, 4);
+        for c in 0..3 {
+            let grey = reduced(colours.slice(s![.., c..;3]).to_owned(), Channels::Grey, 4);
+            assert_eq!(found.slice(s![.., c..;3]), grey);
+        }
+    }
+}

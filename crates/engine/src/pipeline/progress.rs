@@ -1,0 +1,314 @@
+//! How far a computation is, and how it is stopped.
+
+use std::ops::Range;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use super::error::{PipelineError, Result};
+use crate::job::{TaskProgress, TaskStage};
+use reconstruction::schedule::Schedule;
+use reconstruction::solver::{Control, Observer, Progress};
+
+/// What a computing thread and whoever watches over it tell each other.
+#[derive(Debug)]
+pub struct Monitor {
+    /// Where the task stands, and its last sign of life.
+    progress: Mutex<(TaskProgress, Instant)>,
+    /// How the solver went, and whether there is more of it than was last told.
+    history: Mutex<(History, bool)>,
+    stop: AtomicBool,
+}
+
+impl Default for Monitor {
+    fn default() -> Self {
+        let progress = Mutex::new((TaskProgress::START, Instant::now()));
+        Self { progress, history: Mutex::default(), stop: AtomicBool::new(false) }
+    }
+}
+
+impl Monitor {
+    fn lock(&self) -> MutexGuard<'_, (TaskProgress, Instant)> {
+        // Whole values are stored: a poisoned lock holds a good one.
+        self.progress.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub fn progress(&self) -> TaskProgress {
+        self.lock().0
+    }
+
+    /// How long ago the computing thread gave its last sign of life.
+    pub fn silence(&self) -> Duration {
+        self.lock().1.elapsed()
+    }
+
+    /// A sign of life: where the task stands now.
+    pub fn set_progress(&self, progress: TaskProgress) {
+        *self.lock() = (progress, Instant::now());
+    }
+
+    /// The same for a stage that counts no iterations.
+    pub fn reach(&self, stage: TaskStage, fraction: f64) {
+        self.set_progress(TaskProgress { stage, fraction, ..self.progress() });
+    }
+
+    /// How the solver went, as JSON; none if that was told before and nothing came after.
+    pub fn news(&self) -> Option<String> {
+        let mut history = self.history.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::take(&mut history.1).then(|| history.0.to_json())
+    }
+
+    /// Asks the computing thread to stop at the next opportunity.
+    pub fn stop(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    /// True once [`Monitor::stop`] was called.
+    pub fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// A sign of life; [`PipelineError::Stopped`] once [`Monitor::stop`] was called.
+    pub fn check(&self) -> Result<()> {
+        self.lock().1 = Instant::now();
+        if self.stopped() { Err(PipelineError::Stopped) } else { Ok(()) }
+    }
+
+    /// An observer of one run of a schedule, which reports here.
+    pub fn observe(&self, schedule: Schedule) -> impl Observer {
+        MonitorObserver {
+            monitor: self,
+            share: ShareDone::new(schedule),
+            part: 0.0..1.0,
+            passes: 0,
+        }
+    }
+}
+
+struct MonitorObserver<'a> {
+    monitor: &'a Monitor,
+    share: ShareDone,
+    /// The share of the task that the solver's run is.
+    part: Range<f64>,
+    passes: u32,
+}
+
+impl Observer for MonitorObserver<'_> {
+    fn iteration(&mut self, progress: &Progress) -> Control {
+        self.passes += u32::from(progress.deep);
+        {
+            let history = &self.monitor.history;
+            let mut history = history.lock().unwrap_or_else(PoisonError::into_inner);
+            history.0.note(progress);
+            history.1 = true;
+        }
+        self.monitor.set_progress(TaskProgress {
+            stage: stage(progress),
+            iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),
+            passes: self.passes,
+            fraction: self.part.start
+                + (self.part.end - self.part.start) * self.share.after(progress),
+        });
+        if self.monitor.stopped() { Control::Cancel } else { Control::Continue }
+    }
+
+    fn part(&mut self, share: Range<f64>) {
+        self.share.restart();
+        self.part = share;
+        // A plot shows one run of the solver: the last.
+        *self.monitor.history.lock().unwrap_or_else(PoisonError::into_inner) = Default::default();
+    }
+}
+
+fn stage(progress: &Progress) -> TaskStage {
+    match (progress.deep, progress.sigma) {
+        (true, _) => TaskStage::Deep,
+        (false, Some(_)) => TaskStage::Nonlocal,
+        (false, None) => TaskStage::Tv,
+    }
+}
+
+/// Turns the solver's progress into the share of the planned cost that is behind it.
+#[derive(Debug, Clone)]
+pub(super) struct ShareDone {
+    schedule: Schedule,
+    stage: usize,
+    iterations: usize,
+}
+
+impl ShareDone {
+    pub(super) fn new(schedule: Schedule) -> Self {
+        Self { schedule, stage: 0, iterations: 0 }
+    }
+
+    /// To be called where another run of the schedule begins.
+    pub(super) fn restart(&mut self) {
+        (self.stage, self.iterations) = (0, 0);
+    }
+
+    /// The share on \[0,1\] after the iteration that `progress` tells of; to be called for
+    /// every iteration. A stage that ends early lets the share jump.
+    pub(super) fn after(&mut self, progress: &Progress) -> f64 {
+        if progress.stage != self.stage {
+            (self.stage, self.iterations) = (progress.stage, 0);
+        }
+        self.iterations += 1;
+        self.schedule.share_done(self.stage, self.iterations)
+    }
+}
+
+/// The most points that are kept, beside the last.
+const POINTS: usize = 128;
+
+/// What an iteration told.
+#[derive(Debug, Clone, Copy)]
+struct Point {
+    iteration: usize,
+    residual: f32,
+    change: f32,
+    sigma: Option<f32>,
+}
+
+/// A record of iterations that is thinned out as it grows: of many, every second, fourth, eighth ...
+/// is kept, and always the last.
+#[derive(Debug, Default)]
+struct History {
+    points: Vec<Point>,
+    last: Option<Point>,
+    /// Iterations seen, of which each 2^`thinned`-th is kept.
+    seen: usize,
+    thinned: u32,
+}
+
+impl History {
+    /// Takes note of an iteration.
+    fn note(&mut self, progress: &Progress) {
+        let point = Point {
+            iteration: progress.done,
+            residual: progress.residual,
+            change: progress.change,
+            sigma: progress.sigma,
+        };
+        if self.points.len() == POINTS {
+            let mut index = 0;
+            self.points.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.thinned += 1;
+        }
+        if self.seen.is_multiple_of(1 << self.thinned) {
+            self.points.push(point);
+        }
+        self.seen += 1;
+        self.last = Some(point);
+    }
+
+    /// \[\[iteration, residual, change, sigma or null\], ...\] as JSON.
+    fn to_json(&self) -> String {
+        let kept = self.points.last().map(|point| point.iteration);
+        let last = self.last.filter(|last| Some(last.iteration) != kept);
+        let show = |point: &Point| {
+            let sigma = point.sigma.map_or(Value::Null, rounded);
+            json!([point.iteration, rounded(point.residual), rounded(point.change), sigma])
+        };
+        Value::from_iter(self.points.iter().chain(&last).map(show)).to_string()
+    }
+}
+
+/// Four digits are more than a plot shows.
+fn rounded(value: f32) -> Value {
+    let text = format!("{value:.3e}");
+    // What is not finite has no place in JSON.
+    text.parse::<f64>().ok().filter(|value| value.is_finite()).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{History, POINTS, ShareDone, stage};
+    use reconstruction::prior::SIGMA;
+    use reconstruction::prior::registry::PRIORS;
+    use reconstruction::schedule::Schedule;
+    use reconstruction::solver::Progress;
+    use serde_json::Value;
+
+    fn after(iterations: usize) -> Vec<Value> {
+        let mut history = History::default();
+        for done in 1..=iterations {
+            let (residual, change) = (1.0 / done as f32, f32::INFINITY);
+            let sigma = (done % 2 == 0).then_some(0.1);
+            history.note(&Progress {
+                stage: 0,
+                done,
+                planned: 9,
+                residual,
+                change,
+                sigma,
+                deep: false,
+            });
+        }
+        serde_json::from_str(&history.to_json()).unwrap()
+    }
+
+    #[test]
+    fn few_iterations_are_all_kept() {
+        assert_eq!(after(0), Vec::<Value>::new());
+        let points = after(3);
+        assert_eq!(points[0], serde_json::json!([1, 1.0, null, null]));
+        assert_eq!(points[1], serde_json::json!([2, 0.5, null, 0.1]));
+        assert_eq!(points[2], serde_json::json!([3, 0.3333, null, null]));
+    }
+
+    #[test]
+    fn many_are_thinned_out_evenly_with_the_first_and_the_last() {
+        for iterations in [POINTS, POINTS + 1, 1000, 9999, 10_000] {
+            let points = after(iterations);
+            assert!((POINTS / 2..=POINTS + 1).contains(&points.len()), "{}", points.len());
+            let at: Vec<u64> = points.iter().map(|point| point[0].as_u64().unwrap()).collect();
+            assert_eq!((at[0], at[at.len() - 1]), (1, iterations as u64));
+            let steps: Vec<u64> = at.windows(2).map(|pair| pair[1] - pair[0]).collect();
+            let (even, rest) = steps.split_at(steps.len() - 1);
+            assert!(even.iter().all(|step| *step == steps[0]) && rest[0] <= steps[0], "{steps:?}");
+        }
+    }
+
+    #[test]
+    fn an_early_end_of_a_stage_jumps_to_its_end() {
+        let schedule = Schedule::pnp_ffdnet();
+        let passes = schedule.stages[1].iterations;
+        let mut share = ShareDone::new(schedule);
+        let at = |stage, done| Progress {
+            stage,
+            done,
+            planned: 64,
+            residual: 0.1,
+            change: 0.1,
+            sigma: None,
+            deep: stage > 0,
+        };
+        let first = share.after(&at(0, 1));
+        // The stage of total variation ended after three iterations.
+        let mut last = first;
+        for pass in 1..=passes {
+            let now = share.after(&at(1, 3 + pass));
+            assert!(now > last);
+            last = now;
+        }
+        assert!(first < 0.01);
+        assert!((last - 1.0).abs() < 1e-9, "{last}");
+    }
+
+    #[test]
+    fn a_job_tells_which_prior_is_at_work() {
+        for prior in PRIORS {
+            let (deep, sigma) = (prior.network().is_some(), prior.takes(&SIGMA).then_some(0.1));
+            let (residual, change) = (0.1, 0.1);
+            let progress =
+                Progress { stage: 0, done: 1, planned: 2, residual, change, sigma, deep };
+            let expected = if deep { "deep" } else { prior.name() };
+            assert_eq!(stage(&progress).to_string(), expected);
+        }
+    }
+}

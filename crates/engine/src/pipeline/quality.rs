@@ -1,0 +1,102 @@
+//! How good frames are where the truth is known: PSNR and SSIM, frame by frame, so that memory holds
+//! one of each.
+
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
+use serde::Serialize;
+
+use formats::Channels;
+use reconstruction::{ReconError, metrics};
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct FrameQuality {
+    /// The frame, from 1.
+    pub frame: usize,
+    /// In dB; infinite if the frame equals its truth.
+    pub psnr: f64,
+    /// None for a frame that is smaller than the window of SSIM.
+    pub ssim: Option<f64>,
+}
+
+impl FrameQuality {
+    /// Of the frame \[H,W\] with index `k`, from 0, on \[0,1\]; of colours \[H,3W\] over all samples of red, green and
+    /// blue, the SSIM as the mean of the three.
+    pub fn of(
+        k: usize,
+        frame: ArrayView2<'_, f32>,
+        truth: ArrayView2<'_, f32>,
+        channels: Channels,
+    ) -> Result<Self, ReconError> {
+        let (frame, truth) = (frame.insert_axis(Axis(0)), truth.insert_axis(Axis(0)));
+        let psnr = metrics::psnr(frame, truth)?;
+        let count = channels.count();
+        let ssim = |channel: usize| {
+            let of = s![.., .., channel..;count.cast_signed()];
+            metrics::ssim(frame.slice(of), truth.slice(of))
+        };
+        // Of frames that PSNR takes, SSIM refuses only those that are too small.
+        let ssim = (0..count).map(ssim).sum::<Result<f64, _>>().ok();
+        Ok(Self { frame: k + 1, psnr, ssim: ssim.map(|sum| sum / count as f64) })
+    }
+}
+
+/// How good all frames of a snapshot are.
+#[derive(Debug, Clone, Serialize)]
+pub struct Quality {
+    /// Mean over the frames, in dB.
+    pub psnr: f64,
+    /// Mean over the frames; none if one of them has none.
+    pub ssim: Option<f64>,
+    pub frames: Vec<FrameQuality>,
+}
+
+impl Quality {
+    /// Of frames \[H,W\], or of colours \[H,3W\], by their index, against as many true ones.
+    pub fn of_frames(
+        frame: impl Fn(usize) -> Array2<f32>,
+        truth: ArrayView3<'_, f32>,
+        channels: Channels,
+    ) -> Result<Self, ReconError> {
+        let frames = truth.outer_iter().enumerate();
+        let frames = frames.map(|(k, truth)| FrameQuality::of(k, frame(k).view(), truth, channels));
+        Ok(frames.collect::<Result<Vec<_>, _>>()?.into())
+    }
+}
+
+impl From<Vec<FrameQuality>> for Quality {
+    fn from(frames: Vec<FrameQuality>) -> Self {
+        let count = frames.len().max(1) as f64;
+        let psnr = frames.iter().map(|frame| frame.psnr).sum::<f64>() / count;
+        let ssim = frames.iter().map(|frame| frame.ssim).sum::<Option<f64>>();
+        Self { psnr, ssim: ssim.map(|sum| sum / count), frames }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::FrameQuality;
+    use formats::Channels;
+    use ndarray::Array2;
+
+    /// Of the same frames scikit-image says `peak_signal_noise_ratio(truth, frame, data_range=1)` and
+    /// `structural_similarity(truth, frame, data_range=1, channel_axis=-1)`.
+    #[test]
+    fn colours_are_compared_over_all_samples() {
+        let wave = |i: usize, j: usize, c: usize, phase: f64| {
+            let (i, j, c) = (i as f64, j as f64, c as f64);
+            (0.5 + 0.4 * (0.3 * i + 0.2 * j + c + phase).sin() * (0.11 * i * j).cos()) as f32
+        };
+        let frame = |phase: f64| {
+            Array2::from_shape_fn((20, 93), |(i, at)| {
+                wave(i, at / 3, at % 3, phase * (at % 3) as f64)
+            })
+        };
+        let (truth, found) = (frame(0.0), frame(0.2));
+        let quality = FrameQuality::of(4, found.view(), truth.view(), Channels::Rgb).unwrap();
+        assert_eq!(quality.frame, 5);
+        assert!((quality.psnr - PSNR).abs() < 1e-4, "{}", quality.psnr);
+        assert!((quality.ssim.unwrap() - SSIM).abs() < 1e-4, "{:?}", quality.ssim);
+    }
+
+    const PSNR: f64 = 25.432_150;
+    const SSIM: f64 = 0.964_991;
+}

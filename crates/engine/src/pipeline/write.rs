@@ -1,0 +1,274 @@
+//! The folder of a result: frames as EXR, npy and PNG, and the manifest.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter};
+use std::path::Path;
+
+use ndarray::{Array2, ArrayView3};
+use rayon::prelude::*;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::error::{PipelineError, Result};
+use super::manifest::{Manifest, SCHEMA_FAMILY, frame_attributes};
+use crate::job::{ResultFile, Sha256};
+use formats::{Channels, exr, npy, png};
+
+const FRAMES: &str = "frames";
+const PNGS: &str = "png";
+const STACK: &str = "stack.exr";
+const ARRAY: &str = "frames.npy";
+/// The frames as a colour sensor saw them.
+const SEEN: &str = "mosaic.npy";
+/// The expected error of blocks of the frames.
+const ERROR: &str = "error.npy";
+const MANIFEST: &str = "manifest.json";
+/// All that a result's folder holds, the manifest last.
+const NAMES: [&str; 7] = [FRAMES, PNGS, STACK, ARRAY, SEEN, ERROR, MANIFEST];
+
+/// Writes `frames/frame_0001.exr` and so on, `png/frame_0001.png` and so on (white as in the
+/// manifest, black is 0), `stack.exr`, `frames.npy` (float32 \[B,H,W\]), and at last the manifest
+/// with the list of these files. All of them are on the disk (fsync) when this returns, and each
+/// was read once, for its hash.
+///
+/// Frames of a mosaic get their colours: EXR has the channels R, G and B then, PNG has colours,
+/// `frames.npy` is \[B,H,W,3\], and `mosaic.npy` \[B,H,W\] has them as the sensor saw them.
+///
+/// `error.npy` has the expected error of the frames \[B, rows, columns of blocks\], if there is one.
+///
+/// `frame(k)` \[H,W\] is asked once for each frame, in order; memory holds one.
+///
+/// Returns all files, the manifest last.
+/// Errors: those of `frame`, and those of writing. A folder that was begun stays behind.
+pub fn write_result(
+    folder: &Path,
+    mut manifest: Manifest,
+    error: Option<ArrayView3<'_, f32>>,
+    mut frame: impl FnMut(usize) -> Result<Array2<f32>>,
+) -> Result<Vec<ResultFile>> {
+    for name in [FRAMES, PNGS] {
+        fs::create_dir_all(folder.join(name)).map_err(failed(name))?;
+    }
+    let attributes = frame_attributes(&manifest.content);
+    let (height, width) = (manifest.content.height, manifest.content.width);
+    let (count, white) = (manifest.content.frames, manifest.content.recipe.scale.white);
+    let array = BufWriter::new(File::create(folder.join(ARRAY)).map_err(failed(ARRAY))?);
+    let shape = manifest.content.recipe.shape;
+    let channels = shape.channels();
+    let mut array = npy::writer(array, (count, height, width), channels)?;
+    let mut seen = match shape.mosaic {
+        None => None,
+        Some(mosaic) => {
+            let file = BufWriter::new(File::create(folder.join(SEEN)).map_err(failed(SEEN))?);
+            Some((mosaic, npy::writer(file, (count, height, width), Channels::Grey)?))
+        }
+    };
+    let stack = folder.join(STACK);
+    exr::write_stack(&stack, (height, width), channels, &attributes, |k| {
+        let mut frame = frame(k)?;
+        if let Some((mosaic, seen)) = &mut seen {
+            seen.write_frame(frame.view())?;
+            frame = mosaic.colours(frame.view(), (0, 0));
+        }
+        exr::write_frame(&folder.join(frame_name(k)), frame.view(), channels, &attributes[k])?;
+        png::write_u16(&folder.join(png_name(k)), frame.view(), channels, 0.0, white)?;
+        array.write_frame(frame.view())?;
+        Ok::<_, PipelineError>(frame)
+    })?;
+    array.finish()?;
+    let names = (0..count).map(frame_name).chain((0..count).map(png_name));
+    let mut names: Vec<_> = names.chain([STACK.to_owned(), ARRAY.to_owned()]).collect();
+    if let Some((_, seen)) = seen {
+        seen.finish()?;
+        names.push(SEEN.to_owned());
+    }
+    if let Some(error) = error {
+        let file = BufWriter::new(File::create(folder.join(ERROR)).map_err(failed(ERROR))?);
+        let mut writer = npy::writer(file, error.dim(), Channels::Grey)?;
+        error.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
+        writer.finish()?;
+        names.push(ERROR.to_owned());
+    }
+    let files = &mut manifest.content.files;
+    // Side by side: a disk brings many files to safety in the time of a few.
+    *files = names.into_par_iter().map(|name| settle(folder, name)).collect::<Result<_, _>>()?;
+    let mut all = files.clone();
+    for name in [FRAMES, PNGS] {
+        sync_dir(folder, name)?;
+    }
+    all.push(write_manifest(folder, &manifest)?);
+    Ok(all)
+}
+
+/// Writes a `manifest.json`; it and its folder are on the disk (fsync) when this returns.
+pub fn write_manifest(folder: &Path, manifest: &impl Serialize) -> Result<ResultFile> {
+    let text =
+        serde_json::to_string_pretty(manifest).map_err(|error| failed(MANIFEST)(error.into()))?;
+    fs::write(folder.join(MANIFEST), text + "\n").map_err(failed(MANIFEST))?;
+    let file = settle(folder, MANIFEST.to_owned())?;
+    sync_dir(folder, "")?;
+    Ok(file)
+}
+
+/// Refuses a folder that holds files with the names of a result, but no manifest of ours.
+pub fn check_output(folder: &Path) -> Result<()> {
+    // Of any version of this program: the form of manifests changes.
+    let manifest = fs::read(folder.join(MANIFEST)).ok();
+    let manifest = manifest.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
+    let schema = manifest.as_ref().and_then(|manifest| manifest["schema"].as_str());
+    if schema.is_some_and(|schema| schema.starts_with(SCHEMA_FAMILY)) {
+        return Ok(());
+    }
+    match NAMES.into_iter().find(|name| folder.join(name).exists()) {
+        Some(name) => Err(PipelineError::Foreign { name: name.to_owned() }),
+        None => Ok(()),
+    }
+}
+
+/// Moves the result in `made` to `folder`, in place of an earlier result; other files there
+/// stay. Both must be on one file system.
+/// Errors: as [`check_output`], or a file can't be moved.
+pub fn replace_result(made: &Path, folder: &Path) -> Result<()> {
+    check_output(folder)?;
+    // The old manifest goes last and the new one comes last: what lies beside a manifest
+    // is what it describes.
+    for name in NAMES {
+        let old = folder.join(name);
+        let removed = match old.symlink_metadata() {
+            Ok(old_one) if old_one.is_dir() => fs::remove_dir_all(old),
+            Ok(_) => fs::remove_file(old),
+            Err(_) => Ok(()),
+        };
+        removed.map_err(failed(name))?;
+    }
+    // Not every result has all of them.
+    for name in NAMES.into_iter().filter(|name| made.join(name).exists()) {
+        fs::rename(made.join(name), folder.join(name)).map_err(failed(name))?;
+    }
+    Ok(())
+}
+
+fn frame_name(k: usize) -> String {
+    format!("{FRAMES}/frame_{:04}.exr", k + 1)
+}
+
+fn png_name(k: usize) -> String {
+    format!("{PNGS}/frame_{:04}.png", k + 1)
+}
+
+fn failed(name: &str) -> impl FnOnce(io::Error) -> PipelineError {
+    move |source| PipelineError::File { name: name.to_owned(), source }
+}
+
+/// Brings a file to the disk and takes its size and hash.
+fn settle(folder: &Path, name: String) -> Result<ResultFile> {
+    let measured = || -> io::Result<(Sha256, u64)> {
+        let mut file = File::open(folder.join(&name))?;
+        file.sync_all()?;
+        Sha256::of_reader(&mut file)
+    };
+    let (sha256, size) = measured().map_err(failed(&name))?;
+    Ok(ResultFile { name, size, sha256 })
+}
+
+fn sync_dir(folder: &Path, name: &str) -> Result<()> {
+    File::open(folder.join(name)).and_then(|dir| dir.sync_all()).map_err(failed(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{check_output, replace_result, write_result};
+    use crate::job::{Mosaic, ResultFile, Sha256};
+    use crate::pipeline::manifest::sample;
+    use formats::{Limits, exr, npy, open_colours, read_stack};
+    use ndarray::{Array2, Array3, Axis};
+    use std::fs;
+    use std::path::Path;
+
+    fn frame(k: usize) -> Array2<f32> {
+        Array2::from_shape_fn((20, 24), |(i, j)| (i * 24 + j) as f32 * 0.01 - k as f32)
+    }
+
+    fn write(folder: &Path, frames: usize) -> Vec<ResultFile> {
+        write_result(folder, sample(frames), None, |k| Ok(frame(k))).unwrap()
+    }
+
+    #[test]
+    fn every_file_is_there_and_as_the_list_says() {
+        let folder = tempfile::tempdir().unwrap();
+        let files = write(folder.path(), 3);
+        let names: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
+        assert_eq!(names.len(), 9);
+        assert_eq!(names[0], "frames/frame_0001.exr");
+        assert_eq!(names.last(), Some(&"manifest.json"));
+        for file in &files {
+            let path = folder.path().join(&file.name);
+            assert_eq!(path.metadata().unwrap().len(), file.size);
+            assert_eq!(Sha256::of(&fs::read(path).unwrap()), file.sha256);
+        }
+        let expected = Array3::from_shape_fn((3, 20, 24), |(k, i, j)| frame(k)[[i, j]]);
+        let array = folder.path().join("frames.npy");
+        assert_eq!(read_stack(&array, &Limits::default()).unwrap().1, expected);
+        let stack = folder.path().join("stack.exr");
+        assert_eq!(exr::read_stack(&stack, &Limits::default()).unwrap().1, expected);
+        let text = fs::read(folder.path().join("manifest.json")).unwrap();
+        let manifest: serde_json::Value = serde_json::from_slice(&text).unwrap();
+        assert_eq!(manifest["content"]["files"], serde_json::to_value(&files[..8]).unwrap());
+    }
+
+    #[test]
+    fn frames_of_a_mosaic_get_their_colours() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut manifest = sample(2);
+        manifest.content.recipe.shape.mosaic = Some(Mosaic::Gbrg);
+        let files = write_result(folder.path(), manifest, None, |k| Ok(frame(k))).unwrap();
+        assert!(files.iter().any(|file| file.name == "mosaic.npy"));
+        let path = |name: &str| folder.path().join(name);
+        let array = |name: &str| {
+            let windows = npy::open_windows(&path(name), &Limits::default()).unwrap();
+            let info = *windows.info();
+            windows.read_window(0..info.frames, 0..info.height, 0..info.width).unwrap()
+        };
+        let (seen, colours) = (array("mosaic.npy"), array("frames.npy"));
+        assert_eq!((seen.dim(), colours.dim()), ((2, 20, 24), (2, 20, 72)));
+        for k in 0..2 {
+            assert_eq!(seen.index_axis(Axis(0), k), frame(k));
+            let expected = Mosaic::Gbrg.colours(frame(k).view(), (0, 0));
+            assert_eq!(colours.index_axis(Axis(0), k), expected);
+        }
+        assert_eq!(exr::read_stack(&path("stack.exr"), &Limits::default()).unwrap().1, colours);
+        let mut picture = open_colours(&path("png/frame_0001.png"), &Limits::default()).unwrap();
+        assert_eq!(picture.as_mut().unwrap().info().width, 72);
+        let text = fs::read(path("manifest.json")).unwrap();
+        let manifest: serde_json::Value = serde_json::from_slice(&text).unwrap();
+        let colour = serde_json::json!({"mosaic": "gbrg", "demosaicking": Mosaic::DEMOSAICKING});
+        assert_eq!(manifest["content"]["colour"], colour);
+        // Without a mosaic nothing of the earlier colours stays.
+        let grey = tempfile::tempdir_in(folder.path()).unwrap();
+        write(grey.path(), 2);
+        replace_result(grey.path(), folder.path()).unwrap();
+        assert!(!path("mosaic.npy").exists());
+    }
+
+    #[test]
+    fn an_earlier_result_is_replaced_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, second) = (folder.path().join("a"), folder.path().join("b"));
+        fs::create_dir_all(&first).unwrap();
+        fs::create_dir_all(&second).unwrap();
+        write(&first, 5);
+        fs::write(first.join("notes.txt"), "mine").unwrap();
+        write(&second, 2);
+        replace_result(&second, &first).unwrap();
+        assert_eq!(fs::read_dir(first.join("frames")).unwrap().count(), 2);
+        assert_eq!(fs::read_to_string(first.join("notes.txt")).unwrap(), "mine");
+    }
+
+    #[test]
+    fn folders_with_frames_of_somebody_else_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir(folder.path().join("frames")).unwrap();
+        let error = check_output(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("\"frames\""), "{error}");
+    }
+}

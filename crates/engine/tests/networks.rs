@@ -1,0 +1,102 @@
+//! The shipped networks, run by ONNX Runtime through the denoisers of the reconstruction.
+
+#![allow(clippy::unwrap_used)] // helpers of tests
+
+use std::path::PathBuf;
+
+use ndarray::{Array3, ArrayView3, s};
+use rand::{Rng, SeedableRng};
+use reconstruction::prior::network::ClipDenoiser;
+use reconstruction::prior::onnx::{Device, Runtime};
+use reconstruction::prior::{CHANNELS, Denoiser, Network, Networks};
+use sci_recon_engine::pipeline::networks::{self, NetworkSource, WarmNetworks};
+
+/// The library, or none (said aloud) where it has not been fetched.
+fn library() -> Option<PathBuf> {
+    let library = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from).filter(|p| p.exists());
+    if library.is_none() {
+        eprintln!("skipped: no libonnxruntime (run scripts/fetch-onnxruntime.sh)");
+    }
+    library
+}
+
+fn network(which: Network) -> Option<ClipDenoiser> {
+    let runtime = Runtime::open(&library()?, Device::Cpu).unwrap();
+    let files: Vec<_> = networks::carried(which).files.iter().map(|(_, file)| *file).collect();
+    Some(ClipDenoiser::load(&runtime, which, &files).unwrap())
+}
+
+fn noisy(frames: usize, height: usize, width: usize) -> (Array3<f32>, Array3<f32>) {
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+    let clean = Array3::from_shape_fn((frames, height, width), |(k, i, j)| {
+        0.5 + 0.3 * ((i + 2 * k) as f32 * 0.15).sin() * (j as f32 * 0.1).cos()
+    });
+    let noisy = clean.mapv(|x: f32| x + 0.35 * (rng.random::<f32>() - 0.5));
+    (clean, noisy)
+}
+
+fn mean_square(a: &Array3<f32>, b: &Array3<f32>) -> f32 {
+    (a - b).mapv(|d| d * d).mean().unwrap()
+}
+
+#[test]
+fn noise_falls_for_any_size_and_any_number_of_frames() {
+    let Some(mut network) = network(Network::FastDvdNet) else { return };
+    for (frames, height, width) in [(1, 32, 32), (2, 33, 46), (7, 50, 31)] {
+        let (clean, mut video) = noisy(frames, height, width);
+        let before = mean_square(&video, &clean);
+        network.denoise(&mut video, 0.1).unwrap();
+        let after = mean_square(&video, &clean);
+        assert!(after < 0.2 * before, "{frames}x{height}x{width}: {before} to {after}");
+    }
+}
+
+#[test]
+fn a_frame_does_not_depend_on_how_the_clip_is_chunked() {
+    let Some(mut network) = network(Network::FastDvdNet) else { return };
+    // 300x300: two frames at once; the middle of 9 depends on its 4 neighbours alone.
+    let (_, video) = noisy(9, 300, 300);
+    let mut long = video.clone();
+    network.denoise(&mut long, 0.1).unwrap();
+    let mut short = video.slice(s![2..7, .., ..]).to_owned();
+    network.denoise(&mut short, 0.1).unwrap();
+    assert_eq!(long.slice(s![4, .., ..]), short.slice(s![2, .., ..]));
+}
+
+#[test]
+fn the_encoder_tells_of_each_block_and_of_no_other_frames_than_those_beside() {
+    let Some(library) = library() else { return };
+    let source = NetworkSource::new(Some(library), Device::Cpu);
+    let mut networks = WarmNetworks::new(source);
+    let mut encode =
+        |frames: ArrayView3<'_, f32>| networks.encoder().unwrap().unwrap().encode(frames).unwrap();
+    let (clean, noisy) = noisy(9, 300, 290);
+    let seen = encode(noisy.view());
+    assert_eq!(seen.dim(), (CHANNELS, 9, 19, 19));
+    let alone = encode(noisy.slice(s![3..6, .., ..]));
+    let difference = &seen.slice(s![.., 4, .., ..]) - &alone.slice(s![.., 1, .., ..]);
+    assert!(difference.iter().all(|d| d.abs() < 1e-5));
+    // What reaches a block lies within 40 pixels of it.
+    let mut half = clean.clone();
+    half.slice_mut(s![.., .., ..128]).assign(&noisy.slice(s![.., .., ..128]));
+    let change = (&encode(half.view()) - &encode(clean.view())).mapv(f32::abs);
+    assert!(change.slice(s![.., .., .., ..8]).mean().unwrap() > 0.1);
+    assert!(change.slice(s![.., .., .., 11..]).iter().all(|d| *d == 0.0));
+}
+
+#[test]
+fn eight_bits_change_little() {
+    let (Some(mut exact), Some(mut quick)) =
+        (network(Network::FastDvdNet), network(Network::FastDvdNetInt8))
+    else {
+        return;
+    };
+    let (clean, mut frames) = noisy(6, 64, 64);
+    let mut other = frames.clone();
+    exact.denoise(&mut frames, 0.1).unwrap();
+    quick.denoise(&mut other, 0.1).unwrap();
+    let (error, change) = (mean_square(&frames, &clean), mean_square(&frames, &other));
+    assert!(change > 0.0, "these are the same weights");
+    // 12 % is measured: its steps are wide enough for lights far above the white (models/fastdvdnet-gray-int8/README.md).
+    assert!(change < 0.2 * error, "{change} where the network's own error is {error}");
+}

@@ -1,0 +1,122 @@
+//! Reading back what was written: EXR files whose parts are frames of one size.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use ::exr::block;
+use ::exr::block::reader::ChunksReader;
+use ::exr::error::Error as ExrError;
+use ::exr::meta::attribute::{AttributeValue, SampleType, Text};
+use ::exr::meta::header::Header;
+use ndarray::Array3;
+
+use super::{FRAME_TIME, names};
+use crate::error::Result;
+use crate::{Channels, Format, FormatError, Limits};
+
+/// What a part says about its frame.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Part {
+    /// The part's name, empty where there is none.
+    pub name: String,
+    /// The string attributes that OpenEXR does not define itself.
+    pub texts: BTreeMap<String, String>,
+    /// The frame's time in seconds.
+    pub frame_time_s: Option<f64>,
+    /// Numerator and denominator of the frames a second.
+    pub frames_per_second: Option<(i32, u32)>,
+}
+
+/// Reads all parts; the frames have the axes (frame, row, column), and those of colours red, green and blue of each
+/// pixel one after the other.
+///
+/// Errors: I/O; [`FormatError::Unsupported`] for parts of differing sizes or with other channels
+/// than one `Y`, or `R`, `G` and `B`, all float32; limits and malformed files.
+pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32>)> {
+    let file = File::open(path).map_err(FormatError::io("open the EXR file"))?;
+    let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
+    limits.check_file(Format::Exr, length)?;
+    let strict = true;
+    let reader = block::read(BufReader::new(file), strict).map_err(error)?;
+    let headers = reader.headers().to_vec();
+    let (height, width, channels) = common_form(&headers)?;
+    limits.check_shape(Format::Exr, headers.len() as u64, height as u64, width as u64)?;
+    let count = channels.count();
+    let mut stack = Array3::zeros((headers.len(), height, width * count));
+    let mut blocks = reader.all_chunks(strict).map_err(error)?.sequential_decompressor(strict);
+    while let Some(block) = blocks.decompress_next_block() {
+        let block = block.map_err(error)?;
+        let (samples, _) = block.data.as_chunks::<4>();
+        let first = block.index.pixel_position.1;
+        let mut frame = stack.index_axis_mut(ndarray::Axis(0), block.index.layer);
+        // Of each row one channel after the other.
+        for (index, line) in samples.chunks(width).enumerate() {
+            let (row, channel) = (first + index / count, names(channels)[index % count].1);
+            let pixels = frame.row_mut(row).into_iter().skip(channel).step_by(count);
+            for (pixel, sample) in pixels.zip(line) {
+                *pixel = f32::from_ne_bytes(*sample);
+            }
+        }
+    }
+    Ok((headers.iter().map(part).collect(), stack))
+}
+
+/// Rows, columns and channels.
+fn common_form(headers: &[Header]) -> Result<(usize, usize, Channels)> {
+    let channels_of = |header: &Header| {
+        let found = &header.channels.list;
+        let fits = |channels: &Channels| {
+            let mut pairs = found.iter().zip(names(*channels));
+            found.len() == channels.count()
+                && pairs.all(|(c, (name, _))| c.name.eq(name) && c.sample_type == SampleType::F32)
+        };
+        [Channels::Grey, Channels::Rgb].into_iter().find(fits)
+    };
+    let mut forms = headers.iter().map(|header| {
+        let scan_lines = matches!(header.blocks, ::exr::meta::BlockDescription::ScanLines);
+        let channels = channels_of(header).filter(|_| scan_lines)?;
+        Some((header.layer_size.1, header.layer_size.0, channels))
+    });
+    match forms.next() {
+        Some(Some(first)) if forms.all(|form| form == Some(first)) => Ok(first),
+        _ => Err(FormatError::Unsupported {
+            format: Format::Exr,
+            found: "other parts".to_owned(),
+            accepted: "parts of one size with one float32 channel Y, or R, G and B, in scan lines",
+        }),
+    }
+}
+
+fn part(header: &Header) -> Part {
+    let own = &header.own_attributes;
+    let mut part = Part {
+        name: own.layer_name.as_ref().map(text).unwrap_or_default(),
+        frames_per_second: own.frames_per_second,
+        ..Part::default()
+    };
+    for (name, value) in &own.other {
+        match value {
+            AttributeValue::Text(value) => {
+                part.texts.insert(text(name), text(value));
+            }
+            AttributeValue::F64(seconds) if name.eq(FRAME_TIME) => {
+                part.frame_time_s = Some(*seconds);
+            }
+            _ => {}
+        }
+    }
+    part
+}
+
+fn text(text: &Text) -> String {
+    String::from_utf8_lossy(text.as_slice()).into_owned()
+}
+
+fn error(error: ExrError) -> FormatError {
+    match error {
+        ExrError::Io(source) => FormatError::Io { action: "read the EXR file", source },
+        other => FormatError::malformed(Format::Exr, other.to_string()),
+    }
+}

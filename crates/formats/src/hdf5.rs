@@ -1,0 +1,285 @@
+//! HDF5: MATLAB's level 7.3, h5py and others. One array of a file, frame by frame.
+//!
+//! What is no MATLAB file usually has the axes (frame, row, column) or (row, column). MATLAB writes its axes, usually
+//! (row, column, frame), in reverse, so there a frame comes as (column, row).
+//!
+//! `hdf5-reader` is pure Rust and reads this file alone: a binding to libhdf5 would follow references to external
+//! files, so that an upload could read the server's. Ranges are read, not mapped: a file that is cut while it is
+//! read is an error, not a signal.
+
+use std::fs::File;
+use std::sync::Arc;
+
+use hdf5_reader::error::Error;
+use hdf5_reader::storage::{DynStorage, FileStorage};
+use hdf5_reader::{
+    ByteOrder as StoredOrder, Dataset, Datatype, H5Type, Hdf5File, OpenOptions, SliceInfo,
+    SliceInfoElem,
+};
+
+use super::array::{self, ArrayReader, Samples};
+use super::axes::{Expected, Writer};
+use super::samples::{self, ByteOrder};
+use super::scene::{SceneArray, list};
+use super::{Format, FormatError, FrameReader, Limits, SampleType};
+use crate::error::Result;
+
+/// Chunks that a frame touches are decoded once for all frames they hold, and kept so long. A file whose frames need
+/// more would be decoded again for each frame.
+const CHUNK_CACHE_BYTES: usize = 128 << 20;
+
+/// The numbers of one array of an HDF5 file.
+struct Hdf5Samples {
+    dataset: Dataset,
+    /// Numbers of one entry of the first axis; of all of them in an array of two dimensions.
+    entry: usize,
+    /// The next entry.
+    next: u64,
+    truth: bool,
+}
+
+/// Opens the array of `file` with this name, which is what `array` says. Errors: no HDF5; no such array; too large;
+/// another type; [`FormatError::AxesAmbiguous`].
+pub(super) fn open(
+    file: File,
+    (array, name, expected): (SceneArray, &str, &Expected),
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
+    let options = OpenOptions {
+        chunk_cache_bytes: CHUNK_CACHE_BYTES,
+        max_chunk_bytes: CHUNK_CACHE_BYTES,
+        ..OpenOptions::default()
+    };
+    let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
+    let (groups, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
+    let dataset = match file.dataset(name) {
+        Ok(dataset) => dataset,
+        Err(Error::Io(source)) => return Err(error(Error::Io(source))),
+        Err(other) if names.iter().any(|there| there == name) => {
+            return Err(error(other));
+        }
+        Err(_) if groups.iter().any(|there| there == name) => {
+            return Err(unsupported(GROUP.to_owned()));
+        }
+        Err(_) => {
+            let (format, name) = (Format::Hdf5, name.to_owned());
+            return Err(FormatError::MissingArray { format, name, present: list(&names) });
+        }
+    };
+    let class = dataset.attribute("MATLAB_class").ok();
+    let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
+    let sample = match (stored(dataset.dtype()), class.as_deref()) {
+        (Some((SampleType::U8, _)), Some("logical")) => SampleType::Bool,
+        (Some(_), Some("char")) => return Err(unsupported("text".to_owned())),
+        (Some((sample, _)), _) => sample,
+        (None, _) => return Err(unsupported(describe(dataset.dtype()))),
+    };
+    let mut shape = dataset.shape().to_vec();
+    let writer = if class.is_some() { Writer::Matlab } else { Writer::Rows };
+    if writer == Writer::Matlab {
+        shape.reverse();
+    }
+    let arranged = expected.arrange((Format::Hdf5, writer), &shape)?;
+    let arranged = arranged.ok_or_else(|| many_axes(shape.len(), writer))?;
+    let mut info = array::info(Format::Hdf5, sample, &arranged, limits)?;
+    check_chunks(&dataset, sample)?;
+    if writer == Writer::Matlab {
+        info.default_full_scale = Some(array.default_full_scale());
+    }
+    let entries = match *dataset.shape() {
+        [first, _, _] => usize::try_from(first).unwrap_or(usize::MAX),
+        _ => 1,
+    };
+    let entry = info.frames * info.height * info.width / entries;
+    let samples = Hdf5Samples { dataset, entry, next: 0, truth: sample == SampleType::Bool };
+    Ok(Box::new(ArrayReader::new(samples, info, arranged.layout)))
+}
+
+impl Samples for Hdf5Samples {
+    fn rewind(&mut self) -> Result<()> {
+        self.next = 0;
+        Ok(())
+    }
+
+    fn read(&mut self, count: usize) -> Result<Vec<f32>> {
+        let all = SliceInfoElem::Slice { start: 0, end: u64::MAX, step: 1 };
+        let mut selections = vec![all; self.dataset.ndim()];
+        if let [first, _, _] = &mut *selections {
+            let (start, end) = (self.next, self.next + (count / self.entry) as u64);
+            *first = SliceInfoElem::Slice { start, end, step: 1 };
+            self.next = end;
+        }
+        let values = self.dataset.read_slice::<Value>(&SliceInfo { selections }).map_err(error)?;
+        let mut values: Vec<f32> = values.into_iter().map(|Value(value)| value).collect();
+        if self.truth {
+            values.iter_mut().for_each(|value| *value = f32::from(u8::from(*value != 0.0)));
+        }
+        Ok(values)
+    }
+}
+
+/// A sample of any type that is accepted, as float32.
+#[derive(Clone)]
+struct Value(f32);
+
+impl H5Type for Value {
+    fn hdf5_type() -> Datatype {
+        f32::hdf5_type()
+    }
+
+    fn from_bytes(bytes: &[u8], dtype: &Datatype) -> hdf5_reader::error::Result<Self> {
+        let decoded = Self::decode_vec(bytes, dtype, 1).and_then(|values| values.ok()?.pop());
+        decoded.ok_or_else(|| Error::InvalidData("a sample is cut short".to_owned()))
+    }
+
+    fn element_size(dtype: &Datatype) -> usize {
+        // A type that is not accepted is refused before anything is read.
+        stored(dtype).map_or(1, |(sample, _)| sample.bytes())
+    }
+
+    fn decode_vec(
+        raw: &[u8],
+        dtype: &Datatype,
+        count: usize,
+    ) -> Option<hdf5_reader::error::Result<Vec<Self>>> {
+        let (sample, order) = stored(dtype)?;
+        let bytes = raw.get(..count.checked_mul(sample.bytes())?)?;
+        Some(Ok(samples::decode(bytes, sample, order).into_iter().map(Value).collect()))
+    }
+}
+
+/// How numbers of a type are stored, if they are accepted.
+fn stored(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
+    let (sample, order) = match dtype {
+        Datatype::FixedPoint { size, signed, byte_order } => {
+            let sample = match (size, signed) {
+                (1, false) => SampleType::U8,
+                (1, true) => SampleType::I8,
+                (2, false) => SampleType::U16,
+                (2, true) => SampleType::I16,
+                (4, false) => SampleType::U32,
+                (4, true) => SampleType::I32,
+                (8, false) => SampleType::U64,
+                (8, true) => SampleType::I64,
+                _ => return None,
+            };
+            (sample, byte_order)
+        }
+        Datatype::FloatingPoint { size, byte_order } => {
+            let sample = match size {
+                2 => SampleType::F16,
+                4 => SampleType::F32,
+                8 => SampleType::F64,
+                _ => return None,
+            };
+            (sample, byte_order)
+        }
+        // h5py's truth values: an enumeration of FALSE and TRUE.
+        Datatype::Enum { base, members } if members.len() == 2 => {
+            return match stored(base)? {
+                (SampleType::I8 | SampleType::U8, order) => Some((SampleType::Bool, order)),
+                _ => None,
+            };
+        }
+        _ => return None,
+    };
+    let order = match order {
+        StoredOrder::LittleEndian => ByteOrder::Little,
+        StoredOrder::BigEndian => ByteOrder::Big,
+    };
+    Some((sample, order))
+}
+
+/// What people call the types that are refused.
+fn describe(dtype: &Datatype) -> String {
+    let name = match dtype {
+        Datatype::String { .. } | Datatype::VarLen { .. } => "text",
+        Datatype::Compound { .. } => {
+            "records, perhaps complex numbers (absolute values: python -c \"import h5py, numpy; \
+             numpy.save('out.npy', numpy.abs(h5py.File('in.h5')['mask'][()]))\")"
+        }
+        Datatype::Reference { .. } => {
+            "references, perhaps a cell array (of a frame each: python -c \"import h5py, numpy; f = \
+             h5py.File('in.mat'); numpy.save('out.npy', [f[cell][()].T for cell in f['mask'][()].ravel()])\")"
+        }
+        Datatype::Enum { .. } => "an enumeration",
+        _ => "numbers of an unknown type",
+    };
+    name.to_owned()
+}
+
+/// Refuses chunks of which those that one entry of the first axis touches don't fit into the cache.
+fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
+    let Some(chunk) = dataset.chunks() else { return Ok(()) };
+    let ([.., height, width], Some(depth)) = (dataset.shape(), chunk.first()) else {
+        return Ok(());
+    };
+    let depth = if chunk.len() == 3 { u64::from(*depth) } else { 1 };
+    let round = |side: u64, chunk: Option<&u32>| {
+        side.next_multiple_of(chunk.map_or(1, |n| u64::from(*n).max(1)))
+    };
+    let plane =
+        round(*height, chunk.iter().rev().nth(1)).saturating_mul(round(*width, chunk.last()));
+    let bytes = plane.saturating_mul(depth).saturating_mul(sample.bytes() as u64);
+    if bytes <= CHUNK_CACHE_BYTES as u64 {
+        return Ok(());
+    }
+    Err(FormatError::OverLimit {
+        format: Format::Hdf5,
+        what: "the size of the chunks that hold one entry of the first axis (save with chunks of one each, in \
+               h5py chunks=(1, height, width))",
+        value: bytes,
+        limit: CHUNK_CACHE_BYTES as u64,
+    })
+}
+
+/// What MATLAB makes of a struct.
+const GROUP: &str = "a group, perhaps a struct (its first field: python -c \"import h5py, numpy; s = \
+     h5py.File('in.mat')['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0][()].T, -1, 0))\")";
+
+/// An array of pictures along several axes.
+fn many_axes(count: usize, writer: Writer) -> FormatError {
+    let line = match writer {
+        Writer::Matlab => {
+            "a = h5py.File('in.mat')['mask'][()]; numpy.save('out.npy', \
+             a.reshape(-1, *a.shape[-2:]).transpose(0, 2, 1))"
+        }
+        Writer::Rows | Writer::Fortran => {
+            "a = h5py.File('in.h5')['mask'][()]; numpy.save('out.npy', a.reshape(-1, *a.shape[-2:]))"
+        }
+    };
+    let line = format!("python -c \"import h5py, numpy; {line}\"");
+    unsupported(format!(
+        "an array of {count} dimensions (all pictures, one after the other: {line})"
+    ))
+}
+
+fn unsupported(found: String) -> FormatError {
+    FormatError::Unsupported {
+        format: Format::Hdf5,
+        found,
+        accepted: "integers and floats of 8 to 64 bits and truth values, in 2 or 3 dimensions",
+    }
+}
+
+fn error(error: Error) -> FormatError {
+    match error {
+        Error::Io(source) => FormatError::Io { action: "read the HDF5 file", source },
+        Error::UnexpectedEof { offset, needed, available } => FormatError::Truncated {
+            format: Format::Hdf5,
+            promised: format!("{needed} bytes at {offset}"),
+            present: format!("{available} bytes"),
+        },
+        other => FormatError::malformed(
+            Format::Hdf5,
+            format!(
+                "{other} (if h5py reads it: python -c \"import h5py, numpy; numpy.save('out.npy', \
+                 h5py.File('in.h5')['mask'][()])\")"
+            ),
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,143 @@
+use ndarray::Array3;
+use proptest::prelude::{any, prop, proptest};
+use strum::VariantNames;
+
+use crate::mat::SceneArray;
+use crate::test_support::{assert_names, file, sample};
+use crate::{
+    Axes, Expected, Format, FormatError, FullScale, Limits, SampleType, StackInfo, Wanted, collect,
+    open_array, read_stack,
+};
+
+fn read(name: &str, array: SceneArray) -> Result<(StackInfo, Array3<f32>), FormatError> {
+    collect(&mut *open_array(&sample(name), array, &Limits::default())?)
+}
+
+fn masks() -> Array3<f32> {
+    Array3::from_shape_fn((3, 4, 5), |(k, i, j)| ((k + 2 * i + 3 * j) % 2) as f32)
+}
+
+fn snapshots() -> Array3<f32> {
+    Array3::from_shape_fn((2, 4, 5), |(k, i, j)| (100 * k + 10 * i + j) as f32)
+}
+
+#[test]
+fn arrays_of_h5py_are_read() {
+    let (info, values) = read("h5py.h5", SceneArray::Masks).unwrap();
+    assert_eq!((info.format, info.sample), (Format::Hdf5, SampleType::Bool));
+    assert_eq!((info.default_full_scale, values), (Some(FullScale::ONE), masks()));
+    let (info, values) = read("h5py.h5", SceneArray::Measurements).unwrap();
+    assert_eq!((info.sample, values), (SampleType::U16, snapshots()));
+    assert_eq!(info.default_full_scale, SampleType::U16.default_full_scale());
+    let (info, values) = read("h5py.h5", SceneArray::Truth).unwrap();
+    assert_eq!((info.sample, values), (SampleType::F32, snapshots()));
+    let (info, values) = read("types.h5", SceneArray::Masks).unwrap();
+    assert_eq!((info.sample, info.default_full_scale, values), (SampleType::I64, None, masks()));
+    let (info, values) = read("types.h5", SceneArray::Measurements).unwrap();
+    assert_eq!((info.sample, values), (SampleType::F16, snapshots()));
+}
+
+#[test]
+fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
+    let open = |file: &str, name: &str| {
+        let wanted = Wanted { name: Some(name), ..SceneArray::Measurements.into() };
+        collect(&mut *open_array(&sample(file), wanted, &Limits::default())?)
+    };
+    for file in ["names.h5", "names.mat"] {
+        assert_eq!(open(file, "shots").unwrap().1, snapshots(), "{file}");
+        for name in ["nothing", "no/thing", "", "/"] {
+            let error = open(file, name).unwrap_err();
+            assert!(error.is_callers_fault(), "{file} {name}: {error:?}");
+            assert_names(&error.to_string(), &["'shots'", "array"]);
+        }
+    }
+    assert_eq!(open("names.h5", "calibrated/masks").unwrap().1, masks());
+    let group = open("names.h5", "calibrated").unwrap_err();
+    assert!(group.is_callers_fault(), "{group:?}");
+}
+
+#[test]
+fn axes_in_every_order_are_read() {
+    for name in Axes::VARIANTS {
+        let axes: Axes = name.parse().unwrap();
+        for place in ["", "packed/", "matlab/"] {
+            let name = format!("{place}{axes}");
+            let expected = Expected { axes: Some(axes), ..Expected::default() };
+            let array = SceneArray::Measurements;
+            let wanted = Wanted { array, name: Some(&name), expected };
+            let reader = open_array(&sample("axes.h5"), wanted, &Limits::default());
+            let (info, values) = collect(&mut *reader.unwrap()).unwrap();
+            assert_eq!((info.axes, values), (Some(axes), snapshots()), "{name}");
+        }
+    }
+}
+
+#[test]
+fn arrays_of_matlab_have_its_axes_and_scales() {
+    let (info, values) = read("matlab73.mat", SceneArray::Masks).unwrap();
+    assert_eq!((info.sample, info.frames, info.height, info.width), (SampleType::Bool, 3, 4, 5));
+    assert_eq!((info.default_full_scale, values), (Some(FullScale::ONE), masks()));
+    let (info, values) = read("matlab73.mat", SceneArray::Measurements).unwrap();
+    assert_eq!(
+        (info.sample, info.default_full_scale),
+        (SampleType::F64, Some(FullScale::EIGHT_BIT))
+    );
+    assert_eq!(values, snapshots());
+    let (info, values) = read("matlab73.mat", SceneArray::Truth).unwrap();
+    assert_eq!((info.sample, values), (SampleType::I32, snapshots()));
+}
+
+#[test]
+fn what_is_refused_says_what_would_be_right() {
+    let complex = read("types.h5", SceneArray::Truth).unwrap_err();
+    assert_names(&complex.to_string(), &["HDF5", "complex", "integers and floats"]);
+    let small = Limits { max_frames: 2, ..Limits::default() };
+    let Err(large) = open_array(&sample("h5py.h5"), SceneArray::Masks, &small) else { panic!() };
+    assert_names(&large.to_string(), &["number of frames is 3", "limit is 2"]);
+    let error = read_stack(&sample("h5py.h5"), &Limits::default()).unwrap_err();
+    assert_names(&error.to_string(), &["HDF5", "a scene of several arrays"]);
+}
+
+#[test]
+fn whole_numbers_and_half_floats_of_numpy_are_read() {
+    for (name, sample_type) in [
+        ("masks-int64.npy", SampleType::I64),
+        ("masks-int32-big.npy", SampleType::I32),
+        ("masks-int8.npy", SampleType::I8),
+        ("masks-float16.npy", SampleType::F16),
+    ] {
+        let (info, values) = read_stack(&sample(name), &Limits::default()).unwrap();
+        assert_eq!((info.sample, values), (sample_type, masks()), "{name}");
+    }
+    let (info, values) = read_stack(&sample("mask-1-bit.png"), &Limits::default()).unwrap();
+    assert_eq!(info.sample, SampleType::Bool);
+    assert_eq!(values, masks().slice_move(ndarray::s![..1, .., ..]));
+}
+
+proptest! {
+    /// Any result is right, but a read must end, and what it blames is the file.
+    #[test]
+    fn damaged_files_end_in_an_error_or_in_numbers(
+        name in prop::sample::select(vec!["h5py.h5", "types.h5", "matlab73.mat"]),
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..8),
+        keep in any::<prop::sample::Index>(),
+        cut in any::<bool>(),
+    ) {
+        let mut bytes = std::fs::read(sample(name)).unwrap();
+        for (place, value) in changes {
+            let place = place.index(bytes.len());
+            bytes[place] = value;
+        }
+        if cut {
+            bytes.truncate(keep.index(bytes.len()));
+        }
+        let damaged = file(&bytes);
+        for array in [SceneArray::Masks, SceneArray::Measurements, SceneArray::Truth] {
+            let limits = Limits { max_frames: 16, max_side: 64, ..Limits::default() };
+            let read = open_array(damaged.path(), array, &limits).and_then(|mut r| collect(&mut *r));
+            if let Err(error) = read {
+                assert!(error.is_callers_fault(), "{error:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! MATLAB's files, as which the community's benchmark scenes come: they have the arrays `mask`,
+//! `meas`, `orig` (level 5; level 7.3 is HDF5, `hdf5.rs`).
+//!
+//! The frame axis usually is the last one in MATLAB and is the first one here; rows and columns stay what they
+//! are. MATLAB stores columns one after another, so a frame is contiguous then and is read alone.
+//!
+//! The reader is our own: the crate `matfile` inflates compressed arrays without a bound, keeps
+//! all of them in memory, passes over damaged ones in silence and can panic on hostile sizes.
+//! It serves the tests as a second opinion.
+
+mod element;
+mod header;
+
+use std::fs::File;
+use std::io::BufReader;
+
+use element::{Content, Element, Elements};
+use header::{ArrayHeader, read_data_tag};
+
+use super::array::{self, ArrayReader, Samples};
+use super::axes::{Expected, Layout, Writer};
+use super::samples::{self, ByteOrder};
+pub use super::scene::SceneArray;
+use super::scene::list;
+use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use crate::error::Result;
+
+/// Opens the array of this name. Errors: [`FormatError::MissingArray`]; a damaged file; an array of another class
+/// than double, single, logical and integers; too large.
+pub(super) fn open(
+    file: File,
+    length: u64,
+    (array, name, expected): (SceneArray, &str, &Expected),
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let again = file.try_clone().map_err(FormatError::io("open the file"))?;
+    let mut elements = Elements::new(BufReader::new(file), length)?;
+    let mut present = Vec::new();
+    while let Some(element) = elements.next()? {
+        let header = ArrayHeader::read(&mut elements.look_into(element)?)?;
+        if header.name == name {
+            let order = elements.order();
+            let content = elements.into_content(element)?;
+            let (samples, info, layout) =
+                MatSamples::new((content, again), (element, order), (array, expected), limits)?;
+            return Ok(Box::new(ArrayReader::new(samples, info, layout)));
+        }
+        present.push(header.name);
+    }
+    let (format, name) = (Format::Mat, name.to_owned());
+    Err(FormatError::MissingArray { format, name, present: list(&present) })
+}
+
+/// The numbers of one array.
+struct MatSamples {
+    content: Content<BufReader<File>>,
+    /// The same file, to begin again.
+    file: File,
+    element: Element,
+    order: ByteOrder,
+    storage: SampleType,
+}
+
+impl MatSamples {
+    fn new(
+        (mut content, file): (Content<BufReader<File>>, File),
+        (element, order): (Element, ByteOrder),
+        (array, expected): (SceneArray, &Expected),
+        limits: &Limits,
+    ) -> Result<(Self, StackInfo, Layout)> {
+        let header = ArrayHeader::read(&mut content)?;
+        let sample = header.sample_type()?;
+        let arranged = expected.arrange((Format::Mat, Writer::Matlab), &header.dimensions)?;
+        let arranged = arranged.ok_or_else(|| FormatError::Unsupported {
+            format: Format::Mat,
+            found: format!(
+                "'{}' with {} dimensions (all pictures, one after the other: python -c \"import numpy, scipy.io; \
+                 a = scipy.io.loadmat('in.mat')['mask']; numpy.save('out.npy', \
+                 numpy.moveaxis(a.reshape(*a.shape[:2], -1, order='F'), -1, 0))\")",
+                header.name,
+                header.dimensions.len()
+            ),
+            accepted: "(row, column, frame) or (row, column)",
+        })?;
+        let info = array::info(Format::Mat, sample, &arranged, limits)?;
+        let (storage, bytes) = read_data_tag(&mut content, &header)?;
+        content.check_can_hold(&header.name, bytes)?;
+        let info = StackInfo { default_full_scale: Some(array.default_full_scale()), ..info };
+        Ok((Self { content, file, element, order, storage }, info, arranged.layout))
+    }
+}
+
+impl Samples for MatSamples {
+    fn rewind(&mut self) -> Result<()> {
+        let file = self.file.try_clone().map_err(FormatError::io("open the file"))?;
+        self.content = Content::open(BufReader::new(file), self.element, self.order)?;
+        let header = ArrayHeader::read(&mut self.content)?;
+        read_data_tag(&mut self.content, &header).map(drop)
+    }
+
+    fn read(&mut self, count: usize) -> Result<Vec<f32>> {
+        let mut bytes = vec![0; count * self.storage.bytes()];
+        self.content.fill(&mut bytes)?;
+        Ok(samples::decode(&bytes, self.storage, self.order))
+    }
+
+    fn finish(&mut self) -> Result<()> {
+        self.content.finish()
+    }
+}
+
+#[cfg(test)]
+mod tests;

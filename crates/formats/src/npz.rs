@@ -1,0 +1,47 @@
+//! NumPy's archives of several arrays: a ZIP whose members are npy files.
+
+use std::fs::File;
+use std::sync::Arc;
+
+use super::axes::Expected;
+use super::member::{Member, MemberReader};
+use super::npy;
+use super::scene::{SceneArray, list};
+use super::{Format, FormatError, FrameReader, Limits};
+use crate::error::Result;
+
+/// What the name of each member ends with.
+pub(super) const EXTENSION: &str = ".npy";
+
+/// Opens the array of this name; without one the only array, or the one with the usual name of `array`.
+/// Errors: [`FormatError::MissingArray`], and those of npy files.
+pub(super) fn open(
+    archive: Arc<File>,
+    members: Vec<Member>,
+    (array, name, expected): (SceneArray, Option<&str>, &Expected),
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let mut arrays: Vec<(String, Member)> = members
+        .into_iter()
+        .filter_map(|member| Some((member.name.strip_suffix(EXTENSION)?.to_owned(), member)))
+        .collect();
+    let named = |wanted: &str| arrays.iter().position(|(name, _)| name == wanted);
+    let found = match name {
+        Some(name) => named(name),
+        None if arrays.len() == 1 => Some(0),
+        None => array.names().iter().find_map(|name| named(name)),
+    };
+    let Some(found) = found else {
+        let names: Vec<String> = arrays.into_iter().map(|(name, _)| name).collect();
+        let (format, name) = (Format::Npz, name.unwrap_or(array.name()).to_owned());
+        return Err(FormatError::MissingArray { format, name, present: list(&names) });
+    };
+    let (_, member) = arrays.swap_remove(found);
+    let length = member.size;
+    limits.check_file(Format::Npz, length)?;
+    let reader = MemberReader::new(archive, member);
+    Ok(Box::new(npy::open(reader, length, (Format::Npz, expected), limits)?))
+}
+
+#[cfg(test)]
+pub(super) mod tests;

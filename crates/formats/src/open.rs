@@ -1,0 +1,194 @@
+//! Files of any format as stacks of frames.
+
+use std::fs::File;
+use std::io::{Read, Seek};
+use std::path::Path;
+use std::sync::Arc;
+
+use ndarray::Array3;
+
+use super::format::{HEAD_BYTES, describe};
+use super::mat::{self, SceneArray};
+use super::pictures::Pictures;
+use super::{
+    Axes, Expected, Format, FormatError, FrameReader, Limits, StackInfo, hdf5, npy, npz, png, tar,
+    tiff, zip,
+};
+use crate::error::Result;
+
+const ACCEPTED: &str =
+    "npy, npz, TIFF, PNG (1, 8 or 16 bit grey), .mat, HDF5, and a ZIP or tar of numbered pictures";
+
+/// Which array of a file is meant if it has several, and what is known of it.
+#[derive(Debug, Clone, Copy)]
+pub struct Wanted<'a> {
+    /// What the array is.
+    pub array: SceneArray,
+    /// What it is called there; none for [`SceneArray::name`].
+    pub name: Option<&'a str>,
+    /// What is known of it.
+    pub expected: Expected,
+}
+
+impl From<SceneArray> for Wanted<'_> {
+    fn from(array: SceneArray) -> Self {
+        Self { array, name: None, expected: Expected::default() }
+    }
+}
+
+/// Opens a stack of frames. The format is told by the file's first bytes, never by its name.
+///
+/// npy: (frame, row, column) or (row, column) of integers, floats or bool. TIFF and
+/// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 1, 8
+/// or 16 bit. ZIP and tar: numbered pictures. Errors say what is wrong with the file; see [`FormatError`].
+pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
+    open_any(path, None, limits)
+}
+
+/// The same, or one array of a file of several: .mat, HDF5, npz. [`StackInfo::default_full_scale`] of MATLAB's files is
+/// [`SceneArray::default_full_scale`]. Errors: also [`FormatError::MissingArray`], [`FormatError::NoNames`],
+/// [`FormatError::AxesAmbiguous`] and [`FormatError::NoAxes`].
+pub fn open_array<'a>(
+    path: &Path,
+    wanted: impl Into<Wanted<'a>>,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    open_any(path, Some(wanted.into()), limits)
+}
+
+fn open_any(
+    path: &Path,
+    wanted: Option<Wanted<'_>>,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let (file, length, format) = open(path)?;
+    limits.check_file(format, length)?;
+    if format == Format::Zip {
+        return open_zip(file, length, wanted, limits);
+    }
+    let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
+    if let (Format::Mat | Format::Hdf5, Some(Wanted { array, name, .. })) = (format, wanted) {
+        let wanted = (array, name.unwrap_or(array.name()), &expected);
+        return match format {
+            Format::Mat => mat::open(file, length, wanted, limits),
+            _ => hdf5::open(file, wanted, limits),
+        };
+    }
+    if wanted.is_some_and(|wanted| wanted.name.is_some()) {
+        return Err(FormatError::NoNames);
+    }
+    if format == Format::Npy {
+        return Ok(Box::new(npy::open(file, length, (format, &expected), limits)?));
+    }
+    let reader: Box<dyn FrameReader + Send> = match format {
+        Format::Tiff => tiff::open(file, length, limits)?,
+        Format::Png => Box::new(png::PngReader::open(file, length, limits)?),
+        Format::Tar => {
+            let members = (format, tar::members(&file, length)?);
+            Box::new(Pictures::open(Arc::new(file), members, limits)?)
+        }
+        Format::Mat | Format::Hdf5 => return Err(several(format)),
+        Format::Exr => {
+            let found = "it is an EXR file (channel Y of each part: python -c \"import numpy, OpenEXR; f = \
+                         OpenEXR.File('in.exr', separate_channels=True); numpy.save('out.npy', \
+                         [part.channels['Y'].pixels for part in f.parts])\")";
+            return Err(FormatError::UnknownFormat { found: found.to_owned(), accepted: ACCEPTED });
+        }
+        Format::Npy | Format::Zip | Format::Npz | Format::Planar => {
+            return Err(FormatError::UnknownFormat {
+                found: format!("it is a {format} file"),
+                accepted: ACCEPTED,
+            });
+        }
+    };
+    of_pictures(reader, &expected)
+}
+
+/// A ZIP of arrays, or of pictures.
+fn open_zip(
+    file: File,
+    length: u64,
+    wanted: Option<Wanted<'_>>,
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let members = zip::members(&file, length)?;
+    let arrays = members.iter().filter(|member| member.name.ends_with(npz::EXTENSION)).count();
+    match wanted {
+        Some(Wanted { array, name, expected }) if arrays > 0 => {
+            npz::open(Arc::new(file), members, (array, name, &expected), limits)
+        }
+        None if arrays == 1 => {
+            let only = (SceneArray::Truth, None, &Expected::default());
+            npz::open(Arc::new(file), members, only, limits)
+        }
+        None if arrays > 1 => Err(several(Format::Npz)),
+        Some(Wanted { name: Some(_), .. }) => Err(FormatError::NoNames),
+        _ => {
+            let pictures = Pictures::open(Arc::new(file), (Format::Zip, members), limits)?;
+            let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
+            of_pictures(Box::new(pictures), &expected)
+        }
+    }
+}
+
+/// A stack of pictures, whose axes are known. Errors: [`FormatError::NoAxes`].
+fn of_pictures(
+    reader: Box<dyn FrameReader + Send>,
+    expected: &Expected,
+) -> Result<Box<dyn FrameReader + Send>> {
+    match expected.axes {
+        None | Some(Axes::FrameRowColumn) => Ok(reader),
+        Some(_) => Err(FormatError::NoAxes(reader.info().format)),
+    }
+}
+
+fn several(format: Format) -> FormatError {
+    FormatError::Unsupported {
+        format,
+        found: "a scene of several arrays".to_owned(),
+        accepted: "one stack a file here; name the file as a scene",
+    }
+}
+
+/// Reads a whole stack into memory, axes (frame, row, column), values as stored.
+///
+/// For files that are known to be small; large ones are read with [`open_stack`].
+pub fn read_stack(path: &Path, limits: &Limits) -> Result<(StackInfo, Array3<f32>)> {
+    collect(&mut *open_stack(path, limits)?)
+}
+
+/// Reads the remaining frames of a reader into one array.
+pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Array3<f32>)> {
+    let info = *reader.info();
+    // Grown frame by frame: a compressed file may promise far more than it then delivers.
+    let mut values = Vec::new();
+    let mut frames = 0;
+    while let Some(frame) = reader.next_frame()? {
+        values.extend(frame.iter());
+        frames += 1;
+    }
+    let stack = Array3::from_shape_vec((frames, info.height, info.width), values)
+        .map_err(|error| FormatError::Internal(error.to_string()))?;
+    Ok((info, stack))
+}
+
+/// Opens a file and tells its length and format.
+pub(super) fn open(path: &Path) -> Result<(File, u64, Format)> {
+    let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
+    let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
+    let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };
+    if !metadata.is_file() {
+        return Err(unknown("it is no regular file".to_owned()));
+    }
+    if metadata.len() == 0 {
+        return Err(unknown("it is empty".to_owned()));
+    }
+    let mut head = Vec::new();
+    (&mut file)
+        .take(HEAD_BYTES)
+        .read_to_end(&mut head)
+        .map_err(FormatError::io("read the file"))?;
+    file.rewind().map_err(FormatError::io("read the file"))?;
+    let format = Format::sniff(&head).ok_or_else(|| unknown(describe(&head)))?;
+    Ok((file, metadata.len(), format))
+}

@@ -1,0 +1,168 @@
+use ::zip::write::SimpleFileOptions;
+use ndarray::Array3;
+use proptest::prelude::{any, proptest};
+
+use super::split;
+use crate::npz::tests::archive;
+use crate::test_support::{assert_names, file, ramp, read, read_as, refusal, sample, survive};
+use crate::{Axes, Channels, Format, Limits, SampleType, open_stack, png};
+
+/// The frames as PNG pictures of 8 bits.
+fn pictures(stack: &Array3<f32>) -> Vec<Vec<u8>> {
+    stack
+        .outer_iter()
+        .map(|frame| png::encode_u8(frame, Channels::Grey, 0.0, 255.0).unwrap())
+        .collect()
+}
+
+fn zipped(members: &[(&str, Vec<u8>)]) -> Vec<u8> {
+    archive(members, SimpleFileOptions::default())
+}
+
+/// A header of tar and its content.
+fn tar_member(name: &str, kind: u8, content: &[u8]) -> Vec<u8> {
+    let mut head = vec![0; 512];
+    head[..name.len()].copy_from_slice(name.as_bytes());
+    head[124..136].copy_from_slice(format!("{:011o}\0", content.len()).as_bytes());
+    head[148..156].fill(b' ');
+    head[156] = kind;
+    head[257..265].copy_from_slice(b"ustar\x0000");
+    let sum: u64 = head.iter().map(|byte| u64::from(*byte)).sum();
+    head[148..156].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
+    head.extend(content);
+    head.resize(head.len().next_multiple_of(512), 0);
+    head
+}
+
+fn tar(members: &[(&str, Vec<u8>)]) -> Vec<u8> {
+    let members = members.iter().map(|(name, content)| tar_member(name, b'0', content));
+    members.chain([vec![0; 1024]]).flatten().collect()
+}
+
+#[test]
+fn pictures_come_in_the_order_of_their_numbers() {
+    let stack = ramp((3, 4, 5), 200);
+    let pngs = pictures(&stack);
+    let members = |names: [&'static str; 3]| -> Vec<(&str, Vec<u8>)> {
+        [1, 2, 0].map(|k| (names[k], pngs[k].clone())).into()
+    };
+    for names in [
+        ["shot_9.png", "shot_10.png", "shot_11.png"],
+        ["run 2/0001.png", "run 2/0002.png", "run 2/0003.png"],
+        ["7", "8", "9"],
+    ] {
+        for (bytes, format) in
+            [(zipped(&members(names)), Format::Zip), (tar(&members(names)), Format::Tar)]
+        {
+            let (info, found) = read(&bytes).unwrap();
+            assert_eq!((info.format, info.sample, info.axes), (format, SampleType::U8, None));
+            assert_eq!(found, stack, "{names:?}");
+            assert!(read_as(file(&bytes).path(), Axes::FrameRowColumn).is_ok());
+            let other = read_as(file(&bytes).path(), Axes::RowColumnFrame).unwrap_err();
+            assert_names(&other.to_string(), &["leave axes out"]);
+        }
+    }
+    let tiff = std::fs::read(sample("mask-1-bit.tif")).unwrap();
+    let (info, _) = read(&zipped(&[("m1.tif", tiff.clone()), ("m2.tif", tiff)])).unwrap();
+    assert_eq!((info.frames, info.sample), (2, SampleType::Bool));
+}
+
+#[test]
+fn what_systems_add_is_left_out_and_all_else_refused() {
+    let png = pictures(&ramp((1, 4, 5), 200)).remove(0);
+    let several = |names: &[&'static str]| -> Vec<(&str, Vec<u8>)> {
+        names.iter().map(|name| (*name, png.clone())).collect()
+    };
+    let mut members = several(&["a1.png", "a2.png"]);
+    members.push(("__MACOSX/._a1.png", b"no picture".to_vec()));
+    members.push((".DS_Store", b"no picture".to_vec()));
+    assert_eq!(read(&zipped(&members)).unwrap().0.frames, 2);
+    for (names, words) in [
+        (
+            &["a1.png", "a2.png", "a4.png"][..],
+            &["'a4.png' after 'a2.png'", "missing", "zipfile"][..],
+        ),
+        (&["a1.png", "a01.png"], &["same number"]),
+        (&["a1.png", "b2.png"], &["'b2.png' beside 'aN.png'"]),
+        (&["a1.png", "a2.PNG"], &["'a2.PNG'"]),
+        (&["a1.png", "read me.png"], &["'read me.png'", "without a number"]),
+        (&["a1/mask.png"], &["without a number"]),
+        (&["a99999999999999999999.png"], &["without a number"]),
+    ] {
+        let message = refusal(&zipped(&several(names)));
+        assert_names(&message, words);
+        assert_names(&refusal(&tar(&several(names))), &words[..1]);
+    }
+    assert_names(&refusal(&zipped(&[])), &["no pictures"]);
+    assert_names(&refusal(&zipped(&[("a1.txt", b"text".to_vec())])), &["'a1.txt'", "no PNG"]);
+    let pages = std::fs::read(sample("masks-bool.tif")).unwrap();
+    assert_names(&refusal(&zipped(&[("a1.tif", pages)])), &["3 pages"]);
+    let other = pictures(&ramp((1, 5, 4), 200)).remove(0);
+    let mixed = [("a1.png", png.clone()), ("a2.png", other)];
+    assert_names(&refusal(&zipped(&mixed)), &["'a2.png' is 5x4 uint8, but 'a1.png' is 4x5"]);
+    let damaged = [("a1.png", png[..40].to_vec())];
+    assert_names(&refusal(&zipped(&damaged)), &["'a1.png': PNG"]);
+    let path = file(&zipped(&several(&["a1.png", "a2.png", "a3.png"])));
+    let limits = Limits { max_frames: 2, ..Limits::default() };
+    let message = open_stack(path.path(), &limits).err().unwrap().to_string();
+    assert_names(&message, &["number of frames is 3"]);
+}
+
+#[test]
+fn a_tar_is_held_to_its_length_and_its_sums() {
+    let png = pictures(&ramp((1, 4, 5), 200)).remove(0);
+    let whole = tar(&[("a1.png", png.clone()), ("a2.png", png.clone())]);
+    assert!(read(&whole).is_ok());
+    let mut wrong = whole.clone();
+    wrong[0] = b'b';
+    assert_names(&refusal(&wrong), &["header at byte 0 is damaged"]);
+    assert_names(&refusal(&whole[..530]), &["cut short"]);
+    // Names of any length have a member of their own; links and folders are no frames.
+    let long = format!("{}/a7.png", "folder".repeat(40));
+    let pax = format!("{} path={long}\n", long.len() + 10);
+    for (kind, name) in [(b'L', format!("{long}\0")), (b'x', pax)] {
+        let bytes: Vec<u8> = [
+            tar_member("links", b'2', b""),
+            tar_member("folder", b'5', b""),
+            tar_member("name", kind, name.as_bytes()),
+            tar_member("cut", b'0', &png),
+        ]
+        .concat();
+        assert_eq!(read(&bytes).unwrap().0.frames, 1);
+    }
+    let endless = tar_member("name", b'L', &vec![b'a'; 1 << 17]);
+    assert_names(&refusal(&endless), &["a name of 131072 bytes"]);
+    let device = tar_member("sparse", b'S', b"");
+    assert_names(&refusal(&device), &["kind 'S'", "regular files"]);
+}
+
+#[test]
+fn the_last_number_of_a_name_counts() {
+    assert_eq!(split("a/b2_003.tif"), Some(("a/b2_", 3, ".tif")));
+    assert_eq!(split("17"), Some(("", 17, "")));
+    assert_eq!(split("mp4.png"), Some(("mp", 4, ".png")));
+    assert_eq!(split("ä1.png"), Some(("ä", 1, ".png")));
+    for name in ["", "a.png", "a.7", "1/a.png", "a99999999999999999999.png"] {
+        assert_eq!(split(name), None, "{name}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_damaged_file_is_read_or_refused(position in 0usize..10_000, value in any::<u8>(), zip in any::<bool>()) {
+        let pngs = pictures(&ramp((2, 4, 5), 200));
+        let members = [("a1.png", pngs[0].clone()), ("a2.png", pngs[1].clone())];
+        let mut bytes = if zip { zipped(&members) } else { tar(&members) };
+        let position = position % bytes.len();
+        bytes[position] = value;
+        survive(&bytes);
+        survive(&bytes[..position]);
+    }
+
+    #[test]
+    fn any_name_is_split_or_not(name in ".{0,20}") {
+        if let Some((before, _, after)) = split(&name) {
+            assert!(name.starts_with(before) && name.ends_with(after));
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! PNG: one frame in, frames of 8 or 16 bits out.
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, Write};
+use std::path::Path;
+
+use ::png::{
+    BitDepth, ColorType, Compression, Decoder, DecodingError, Encoder, EncodingError,
+    Limits as DecoderLimits, Transformations,
+};
+use ndarray::{Array2, ArrayView2};
+
+use super::samples::{self, ByteOrder};
+use super::{Channels, Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use crate::error::Result;
+
+/// Deflate expands a byte to at most 1032.
+const MAX_EXPANSION: u64 = 1032;
+
+/// Room for the decoder's own buffers and for chunks that are not pixels.
+const DECODER_BYTES: usize = 16 << 20;
+
+/// A PNG, a stack of one frame.
+pub(super) struct PngReader<R: Read + Seek> {
+    decoder: Option<::png::Reader<BufReader<R>>>,
+    info: StackInfo,
+}
+
+impl<R: Read + Seek> PngReader<R> {
+    /// Reads the header of `file` (`length` bytes long) and checks it against the limits and the
+    /// length. Gamma and colour profiles are not applied: the stored numbers count.
+    pub(super) fn open(file: R, length: u64, limits: &Limits) -> Result<Self> {
+        let mut decoder = decoder(file);
+        let header = decoder.read_header_info().map_err(decoding_error)?;
+        let sample = match (header.color_type, header.bit_depth) {
+            (ColorType::Grayscale, BitDepth::One) => SampleType::Bool,
+            (ColorType::Grayscale, BitDepth::Eight) => SampleType::U8,
+            (ColorType::Grayscale, BitDepth::Sixteen) => SampleType::U16,
+            (color, depth) => return Err(unsupported(format!("{color:?}, {depth:?} bit"))),
+        };
+        Self::new(decoder, (sample, Channels::Grey), length, limits)
+    }
+
+    /// The same of a picture of red, green and blue; none for a grey one.
+    pub(super) fn open_colours(file: R, length: u64, limits: &Limits) -> Result<Option<Self>> {
+        let mut decoder = decoder(file);
+        let header = decoder.read_header_info().map_err(decoding_error)?;
+        let sample = match (header.color_type, header.bit_depth) {
+            (ColorType::Rgb, BitDepth::Eight) => SampleType::U8,
+            (ColorType::Rgb, BitDepth::Sixteen) => SampleType::U16,
+            _ => return Ok(None),
+        };
+        Self::new(decoder, (sample, Channels::Rgb), length, limits).map(Some)
+    }
+
+    fn new(
+        mut decoder: Decoder<BufReader<R>>,
+        (sample, channels): (SampleType, Channels),
+        length: u64,
+        limits: &Limits,
+    ) -> Result<Self> {
+        let header = decoder.read_header_info().map_err(decoding_error)?;
+        let (height, width) = (header.height, header.width);
+        limits.check_shape(Format::Png, 1, height.into(), width.into())?;
+        let samples = width as usize * channels.count();
+        let info = StackInfo::new(Format::Png, sample, 1, height as usize, samples);
+        let promised = (row_bytes(&info) * info.height) as u64;
+        if length.saturating_mul(MAX_EXPANSION) < promised {
+            return Err(FormatError::Truncated {
+                format: Format::Png,
+                promised: format!("{height}x{width} {sample} ({promised} bytes of pixels)"),
+                present: format!("{length} bytes, too few even for perfect compression"),
+            });
+        }
+        let reader = decoder.read_info().map_err(decoding_error)?;
+        if reader.info().animation_control.is_some() {
+            return Err(FormatError::Unsupported {
+                format: Format::Png,
+                found: "an animation".to_owned(),
+                accepted: "one image (all of them as one array: python -c \"import numpy; from PIL import Image, \
+                           ImageSequence; numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
+                           ImageSequence.Iterator(Image.open('in.png'))])\")",
+            });
+        }
+        Ok(Self { decoder: Some(reader), info })
+    }
+}
+
+/// Of stored numbers as they are.
+fn decoder<R: Read + Seek>(file: R) -> Decoder<BufReader<R>> {
+    let limits = DecoderLimits { bytes: DECODER_BYTES };
+    let mut decoder = Decoder::new_with_limits(BufReader::new(file), limits);
+    decoder.set_transformations(Transformations::IDENTITY);
+    decoder.set_ignore_text_chunk(true);
+    decoder.set_ignore_iccp_chunk(true);
+    decoder
+}
+
+impl<R: Read + Seek> FrameReader for PngReader<R> {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
+        let Some(mut decoder) = self.decoder.take() else {
+            return Ok(None);
+        };
+        let StackInfo { height, width, sample, .. } = self.info;
+        let mut bytes = vec![0; row_bytes(&self.info) * height];
+        decoder.next_frame(&mut bytes).map_err(decoding_error)?;
+        if sample == SampleType::Bool {
+            let row =
+                |row: &[u8]| (0..width).map(|j| row[j / 8] >> (7 - j % 8) & 1).collect::<Vec<_>>();
+            bytes = bytes.chunks_exact(row_bytes(&self.info)).flat_map(row).collect();
+        }
+        samples::frame(height, width, samples::decode(&bytes, sample, ByteOrder::Big)).map(Some)
+    }
+}
+
+/// Bytes of a stored row: of one bit a pixel, rows begin at whole bytes.
+fn row_bytes(info: &StackInfo) -> usize {
+    if info.sample == SampleType::Bool {
+        info.width.div_ceil(8)
+    } else {
+        info.width * info.sample.bytes()
+    }
+}
+
+/// Writes (or overwrites) `path` with a 16-bit PNG for looking at: `black` becomes 0, `white`
+/// 65535, linear between, clipped outside; NaN becomes 0. `frame` has the axes (row, column), and for each pixel
+/// as many values as there are channels.
+///
+/// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
+pub fn write_u16(
+    path: &Path,
+    frame: ArrayView2<'_, f32>,
+    channels: Channels,
+    black: f32,
+    white: f32,
+) -> Result<()> {
+    let file = File::create(path).map_err(FormatError::io("create the PNG"))?;
+    encode_u16(BufWriter::new(file), frame, channels, (black, white))
+}
+
+/// An 8-bit PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
+/// outside; NaN becomes 0. `frame` has the axes (row, column), and for each pixel as many values as there are
+/// channels.
+/// Errors: [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without
+/// pixels.
+pub fn encode_u8(
+    frame: ArrayView2<'_, f32>,
+    channels: Channels,
+    black: f32,
+    white: f32,
+) -> Result<Vec<u8>> {
+    let bytes: Vec<u8> = frame.iter().map(level_u8(black, white)).collect();
+    let mut png = Vec::new();
+    encode(&mut png, frame.dim(), (channels, BitDepth::Eight), (black, white), &bytes)?;
+    Ok(png)
+}
+
+/// What a value becomes in pictures of 8 bits for looking at: see [`encode_u8`].
+pub fn level_u8(black: f32, white: f32) -> impl Fn(&f32) -> u8 {
+    let factor = 255.0 / (white - black);
+    move |value| ((value - black) * factor).round() as u8
+}
+
+fn encode_u16(
+    writer: impl Write,
+    frame: ArrayView2<'_, f32>,
+    channels: Channels,
+    (black, white): (f32, f32),
+) -> Result<()> {
+    let factor = 65535.0 / (white - black);
+    let bytes: Vec<u8> =
+        frame.iter().flat_map(|v| (((v - black) * factor).round() as u16).to_be_bytes()).collect();
+    encode(writer, frame.dim(), (channels, BitDepth::Sixteen), (black, white), &bytes)
+}
+
+fn encode(
+    writer: impl Write,
+    (height, samples): (usize, usize),
+    (channels, depth): (Channels, BitDepth),
+    (black, white): (f32, f32),
+    bytes: &[u8],
+) -> Result<()> {
+    if !(black.is_finite() && white.is_finite() && black < white) {
+        return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
+    }
+    let width = samples / channels.count();
+    let [height, width] = [height, width].map(|n| u32::try_from(n).unwrap_or(0));
+    let mut encoder = Encoder::new(writer, width, height);
+    encoder.set_color(match channels {
+        Channels::Grey => ColorType::Grayscale,
+        Channels::Rgb => ColorType::Rgb,
+    });
+    encoder.set_depth(depth);
+    // The low bits are noise: more effort buys little.
+    encoder.set_compression(Compression::Fast);
+    let mut png = encoder.write_header().map_err(encoding_error)?;
+    png.write_image_data(bytes).map_err(encoding_error)?;
+    png.finish().map_err(encoding_error)
+}
+
+fn unsupported(found: String) -> FormatError {
+    FormatError::Unsupported {
+        format: Format::Png,
+        found,
+        accepted: "Grayscale without alpha, One, Eight or Sixteen bit, one image (grey of a colour picture: \
+                   python -c \"from PIL import Image; Image.open('in.png').convert('L').save('out.png')\")",
+    }
+}
+
+fn decoding_error(error: DecodingError) -> FormatError {
+    match error {
+        DecodingError::IoError(source) if source.kind() == ErrorKind::UnexpectedEof => {
+            FormatError::Truncated {
+                format: Format::Png,
+                promised: "a whole image".to_owned(),
+                present: "only its beginning".to_owned(),
+            }
+        }
+        DecodingError::IoError(source) => FormatError::Io { action: "read the PNG", source },
+        other => FormatError::malformed(Format::Png, other.to_string()),
+    }
+}
+
+fn encoding_error(error: EncodingError) -> FormatError {
+    match error {
+        EncodingError::IoError(source) => FormatError::Io { action: "write the PNG", source },
+        other => FormatError::Internal(format!("PNG: {other}")),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,130 @@
+//! Samples as bytes: from any accepted type to f32, and from f32 to little-endian bytes.
+
+use std::io::{self, ErrorKind, Write};
+
+use half::f16;
+use ndarray::{Array2, ArrayView2};
+
+use super::{Format, FormatError, SampleType};
+use crate::error::Result;
+
+/// The order of the bytes of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ByteOrder {
+    Little,
+    Big,
+}
+
+/// Decodes whole samples; a remainder shorter than a sample is ignored by construction of the callers.
+pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<f32> {
+    use ByteOrder::{Big, Little};
+    match (sample, order) {
+        (SampleType::Bool, _) => bytes.iter().map(|&b| f32::from(u8::from(b != 0))).collect(),
+        (SampleType::U8, _) => bytes.iter().map(|&b| f32::from(b)).collect(),
+        (SampleType::U16, Little) => each(bytes, |b| f32::from(u16::from_le_bytes(b))),
+        (SampleType::U16, Big) => each(bytes, |b| f32::from(u16::from_be_bytes(b))),
+        (SampleType::I8, _) => each(bytes, |b| f32::from(i8::from_le_bytes(b))),
+        (SampleType::I16, Little) => each(bytes, |b| f32::from(i16::from_le_bytes(b))),
+        (SampleType::I16, Big) => each(bytes, |b| f32::from(i16::from_be_bytes(b))),
+        (SampleType::I32, Little) => each(bytes, |b| i32::from_le_bytes(b) as f32),
+        (SampleType::I32, Big) => each(bytes, |b| i32::from_be_bytes(b) as f32),
+        (SampleType::I64, Little) => each(bytes, |b| i64::from_le_bytes(b) as f32),
+        (SampleType::I64, Big) => each(bytes, |b| i64::from_be_bytes(b) as f32),
+        (SampleType::U32, Little) => each(bytes, |b| u32::from_le_bytes(b) as f32),
+        (SampleType::U32, Big) => each(bytes, |b| u32::from_be_bytes(b) as f32),
+        (SampleType::U64, Little) => each(bytes, |b| u64::from_le_bytes(b) as f32),
+        (SampleType::U64, Big) => each(bytes, |b| u64::from_be_bytes(b) as f32),
+        (SampleType::F16, Little) => each(bytes, |b| f16::from_le_bytes(b).to_f32()),
+        (SampleType::F16, Big) => each(bytes, |b| f16::from_be_bytes(b).to_f32()),
+        (SampleType::F32, Little) => each(bytes, f32::from_le_bytes),
+        (SampleType::F32, Big) => each(bytes, f32::from_be_bytes),
+        (SampleType::F64, Little) => each(bytes, |b| f64::from_le_bytes(b) as f32),
+        (SampleType::F64, Big) => each(bytes, |b| f64::from_be_bytes(b) as f32),
+    }
+}
+
+/// Converts whole samples of N bytes.
+pub(super) fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f32) -> Vec<f32> {
+    let (samples, _) = bytes.as_chunks::<N>();
+    samples.iter().map(|&sample| convert(sample)).collect()
+}
+
+/// A frame from its samples in row order.
+pub(super) fn frame(height: usize, width: usize, samples: Vec<f32>) -> Result<Array2<f32>> {
+    let count = samples.len();
+    Array2::from_shape_vec((height, width), samples).map_err(|_| {
+        FormatError::Internal(format!("{count} samples for a frame of {height}x{width}"))
+    })
+}
+
+/// Why bytes could not be read. Decompressors report bad data as I/O errors too: only the system's own carry a
+/// number.
+pub(super) fn read_error(format: Format, source: io::Error) -> FormatError {
+    if source.raw_os_error().is_some() {
+        return FormatError::Io { action: "read the file", source };
+    }
+    match source.kind() {
+        ErrorKind::UnexpectedEof => FormatError::Truncated {
+            format,
+            promised: "more numbers".to_owned(),
+            present: "no more bytes".to_owned(),
+        },
+        _ => FormatError::malformed(format, format!("compressed data: {source}")),
+    }
+}
+
+/// Writes the f32 frames of a stack one after another as little-endian rows, behind a header that
+/// [`super::planar::writer`] or [`super::npy::writer`] has written.
+#[derive(Debug)]
+pub struct StackWriter<W> {
+    writer: W,
+    frames: usize,
+    height: usize,
+    width: usize,
+    written: usize,
+    row: Vec<u8>,
+}
+
+impl<W: Write> StackWriter<W> {
+    pub(super) fn new(writer: W, frames: usize, height: usize, width: usize) -> Self {
+        Self { writer, frames, height, width, written: 0, row: Vec::with_capacity(width * 4) }
+    }
+
+    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
+    pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<()> {
+        if frame.dim() != (self.height, self.width) || self.written == self.frames {
+            return Err(FormatError::Internal(format!(
+                "frame {} of size {:?} written to a stack of {} frames of {}x{}",
+                self.written,
+                frame.dim(),
+                self.frames,
+                self.height,
+                self.width
+            )));
+        }
+        self.write_rows(frame).map_err(FormatError::io("write the frame"))?;
+        self.written += 1;
+        Ok(())
+    }
+
+    fn write_rows(&mut self, frame: ArrayView2<'_, f32>) -> io::Result<()> {
+        for row in frame.rows() {
+            self.row.clear();
+            self.row.extend(row.iter().flat_map(|v| v.to_le_bytes()));
+            self.writer.write_all(&self.row)?;
+        }
+        Ok(())
+    }
+
+    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
+    pub fn finish(mut self) -> Result<W> {
+        if self.written != self.frames {
+            return Err(FormatError::Internal(format!(
+                "{} of {} frames written",
+                self.written, self.frames
+            )));
+        }
+        self.writer.flush().map_err(FormatError::io("write the file"))?;
+        Ok(self.writer)
+    }
+}

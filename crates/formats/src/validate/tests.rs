@@ -1,0 +1,121 @@
+use ndarray::{Array3, array};
+
+use super::{MaskStatistics, check_masks, check_snapshots};
+use crate::test_support::assert_names;
+use crate::{Format, FormatError, FrameReader, FullScale, SampleType, StackInfo};
+
+/// A stack in memory.
+struct Stack {
+    info: StackInfo,
+    frames: Vec<ndarray::Array2<f32>>,
+}
+
+impl Stack {
+    fn new(stack: Array3<f32>) -> Self {
+        let (frames, height, width) = stack.dim();
+        let info = StackInfo::new(Format::Npy, SampleType::F32, frames, height, width);
+        Self { info, frames: stack.outer_iter().rev().map(|f| f.to_owned()).collect() }
+    }
+}
+
+impl FrameReader for Stack {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<ndarray::Array2<f32>>, FormatError> {
+        Ok(self.frames.pop())
+    }
+}
+
+fn masks(
+    stack: Array3<f32>,
+    full_scale: f32,
+) -> Result<(MaskStatistics, Array3<f32>), FormatError> {
+    let mut out = Array3::zeros(stack.dim());
+    let mut k = 0;
+    let scale = FullScale::new(full_scale)?;
+    let statistics = check_masks(&mut Stack::new(stack), scale, |frame| {
+        out.index_axis_mut(ndarray::Axis(0), k).assign(&frame);
+        k += 1;
+        Ok(())
+    })?;
+    Ok((statistics, out))
+}
+
+fn measurement(stack: Array3<f32>, full_scale: f32) -> Result<Array3<f32>, FormatError> {
+    let mut out = Array3::zeros(stack.dim());
+    let mut k = 0;
+    let scale = FullScale::new(full_scale)?;
+    check_snapshots(&mut Stack::new(stack), scale, |snapshot| {
+        out.index_axis_mut(ndarray::Axis(0), k).assign(&snapshot);
+        k += 1;
+        Ok(())
+    })?;
+    Ok(out)
+}
+
+#[test]
+fn masks_are_scaled_clipped_and_counted() {
+    let raw = array![[[0.0, 255.0], [-3.0, 51.0]], [[0.0, 0.0], [102.0, -1.0]]];
+    let (statistics, scaled) = masks(raw, 255.0).unwrap();
+    assert_eq!(scaled, array![[[0.0, 1.0], [0.0, 0.2]], [[0.0, 0.0], [0.4, 0.0]]]);
+    assert_eq!((statistics.dead_pixels, statistics.clipped_negative), (1, 2));
+    assert!((statistics.mean - 1.6 / 8.0).abs() < 1e-7);
+}
+
+#[test]
+fn a_rounding_above_one_is_tolerated_and_no_more() {
+    let (_, scaled) = masks(array![[[1.0 + 5e-7, 0.5]]], 1.0).unwrap();
+    assert_eq!(scaled, array![[[1.0, 0.5]]]);
+    let error = masks(array![[[0.1, 2.0]], [[7.0, 128.0]]], 1.0).unwrap_err();
+    assert_names(&error.to_string(), &["128", "frame 1, row 0, column 1", "full_scale"]);
+}
+
+#[test]
+fn nan_infinities_and_zero_masks_are_refused() {
+    let error = masks(array![[[0.5, 0.5]], [[0.5, f32::NAN]]], 1.0).unwrap_err();
+    assert_names(&error.to_string(), &["NaN", "frame 1, row 0, column 1"]);
+    let error = masks(array![[[f32::NEG_INFINITY, 0.5]]], 1.0).unwrap_err();
+    assert_names(&error.to_string(), &["-inf", "frame 0, row 0, column 0"]);
+    let error = masks(array![[[0.0, -1.0]], [[0.0, 0.0]]], 1.0).unwrap_err();
+    assert!(matches!(error, FormatError::AllMasksZero { frames: 2 }), "{error}");
+    let error = masks(array![[[1.0]], [[0.0]], [[0.0]]], 1.0).unwrap_err();
+    assert!(matches!(error, FormatError::MaskFrameZero { frame: 1, frames: 3 }), "{error}");
+}
+
+#[test]
+fn a_mask_whose_square_vanishes_is_dead() {
+    let (statistics, _) = masks(array![[[1e-30, 1.0]]], 1.0).unwrap();
+    assert_eq!(statistics.dead_pixels, 1);
+}
+
+#[test]
+fn measurements_keep_their_sign_and_range() {
+    let scaled = measurement(array![[[510.0, -51.0]]], 255.0).unwrap();
+    assert_eq!(scaled, array![[[2.0, -0.2]]]);
+}
+
+#[test]
+fn empty_snapshots_and_nan_are_refused() {
+    let error = measurement(array![[[1.0]], [[0.0]]], 1.0).unwrap_err();
+    assert_names(&error.to_string(), &["snapshot 1 of 2", "zero everywhere"]);
+    let error = measurement(array![[[1.0, f32::INFINITY]]], 1.0).unwrap_err();
+    assert_names(&error.to_string(), &["measurement", "inf", "column 1"]);
+}
+
+#[test]
+fn a_full_scale_is_finite_and_positive() {
+    for value in [0.0, -1.0, f32::NAN, f32::INFINITY, 1e-40] {
+        assert!(matches!(FullScale::new(value), Err(FormatError::FullScale(_))), "{value}");
+    }
+    assert_eq!(FullScale::new(4095.0).unwrap().value(), 4095.0);
+}
+
+#[test]
+fn the_error_of_a_sink_comes_through() {
+    let mut stack = Stack::new(array![[[1.0]]]);
+    let full = || FormatError::Io { action: "write", source: std::io::Error::other("disk full") };
+    let error = check_masks(&mut stack, FullScale::ONE, |_| Err(full())).unwrap_err();
+    assert!(!error.is_callers_fault());
+}

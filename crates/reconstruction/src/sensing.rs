@@ -1,0 +1,595 @@
+//! The sensing operator of a snapshot camera and its projection.
+
+use std::ops::Range;
+
+use multiversion::multiversion;
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
+use std::f32::consts::PI;
+
+use super::error::{ReconError, Result, shape_text};
+
+/// `H` of `y_s = (Hx)_s = sum_k C_k x_(sB+k)`, for one set of masks `C` \[B,H,W\] on \[0,1\] and a
+/// run of `S` snapshots, one after the other, whose frames `x` \[S B,H,W\] are joined: block by block it is
+/// the operator of one snapshot.
+///
+/// `H H^T` is diagonal with `sum_k C_k^2` on it (the sum of *squares*: the sum of the masks
+/// is the same only if they are binary). Where it is 0 the pixel is dead: no frame reaches
+/// it, and the projection leaves it alone.
+#[derive(Debug, Clone)]
+pub struct SensingOperator {
+    masks: Array3<f32>,
+    gram: Array2<f32>,
+    /// Of each snapshot \[S,H,W\]: they differ where pixels are kept from the projection.
+    inverse_gram: Array3<f32>,
+}
+
+impl SensingOperator {
+    /// Of one snapshot. Takes masks \[B,H,W\], all finite and not all 0.
+    pub fn new(masks: Array3<f32>) -> Result<Self> {
+        let (frames, height, width) = masks.dim();
+        if frames == 0 || height == 0 || width == 0 {
+            return Err(ReconError::Shape {
+                what: "the mask stack",
+                found: shape_text(masks.shape()),
+                expected: "at least one frame of one pixel".into(),
+            });
+        }
+        if let Some(((k, i, j), value)) = masks.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            return Err(ReconError::Parameter {
+                name: "a mask value",
+                value: format!("{value} at frame {k}, row {i}, column {j}"),
+                range: "finite",
+            });
+        }
+        let masks = masks.as_standard_layout().into_owned();
+        let mut gram = Array2::zeros((height, width));
+        for mask in masks.outer_iter() {
+            gram.zip_mut_with(&mask, |sum: &mut f32, &c| *sum += c * c);
+        }
+        if gram.iter().all(|&g| g == 0.0) {
+            return Err(ReconError::DarkMasks { frames });
+        }
+        let inverse_gram = invert(&gram, 1);
+        Ok(Self { masks, gram, inverse_gram })
+    }
+
+    /// The same for a run of so many snapshots, at least 1, behind these masks.
+    pub fn over(self, snapshots: usize) -> Result<Self> {
+        if snapshots == 0 {
+            return Err(ReconError::Parameter {
+                name: "the number of snapshots",
+                value: snapshots.to_string(),
+                range: "at least 1",
+            });
+        }
+        let inverse_gram = invert(&self.gram, snapshots);
+        Ok(Self { inverse_gram, ..self })
+    }
+
+    /// Keeps some pixels of the measurement, given by snapshot, row and column, from the projection, as if
+    /// no mask reached them.
+    pub(super) fn without(mut self, pixels: &[(usize, usize, usize)]) -> Self {
+        for &pixel in pixels {
+            self.inverse_gram[pixel] = 0.0;
+        }
+        self
+    }
+
+    /// The masks \[B,H,W\].
+    pub fn masks(&self) -> ArrayView3<'_, f32> {
+        self.masks.view()
+    }
+
+    /// Snapshots of the run.
+    pub fn snapshots(&self) -> usize {
+        self.inverse_gram.dim().0
+    }
+
+    /// (frames of all snapshots, height, width).
+    pub fn dim(&self) -> (usize, usize, usize) {
+        let (frames, height, width) = self.masks.dim();
+        (self.snapshots() * frames, height, width)
+    }
+
+    /// The size of the measurement: (snapshots, height, width).
+    pub(super) fn measurement_dim(&self) -> (usize, usize, usize) {
+        self.inverse_gram.dim()
+    }
+
+    /// The diagonal of `H H^T` \[H,W\], the same for each snapshot: `sum_k C_k^2`.
+    pub fn gram(&self) -> ArrayView2<'_, f32> {
+        self.gram.view()
+    }
+
+    /// The share of the masks' energy that changes from frame to frame: 0 where all masks are alike, about 1/2 where
+    /// each opens half of its pixels by chance.
+    fn contrast(&self) -> f32 {
+        (1.0 - self.steady_gram().sum() / self.gram.sum()).max(0.0)
+    }
+
+    /// Whether masks differ so much that a measurement tells the changes from what frames have in common.
+    pub(super) fn differ_much(&self) -> bool {
+        self.contrast() >= HIGH_CONTRAST
+    }
+
+    /// The part of the gram diagonal that masks have in common \[H,W\]: `B` times the square of their mean.
+    pub(super) fn steady_gram(&self) -> Array2<f32> {
+        let frames = self.masks.dim().0 as f32;
+        let mean = self.masks.mean_axis(Axis(0)).unwrap_or_default();
+        mean.mapv(|mean| frames * mean.powi(2))
+    }
+
+    /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a
+    /// snapshot's frames at a pixel, with the cosines `Psi` of the DCT-II, and `s` = `static_variance` times what
+    /// masks of this contrast and number bear of it ([`static_share`]).
+    ///
+    /// Where masks are alike a measurement says well what all frames have in common, and hardly what changes from
+    /// one to the next: so this is where the error is, slow changes first. The projection along the masks
+    /// themselves puts nearly all of a residual into what the frames have in common, and the prior has to take it
+    /// out again.
+    pub(super) fn error_covariance(&self, static_variance: f32) -> Array2<f32> {
+        let frames = self.masks.dim().0;
+        let share = static_share(self.contrast(), frames);
+        let common = (static_variance * share).max(LEAST_STATIC_VARIANCE);
+        let count = frames as f32;
+        let cosine = |m: usize, k: usize| {
+            let norm = if m == 0 { 1.0 / count } else { 2.0 / count }.sqrt();
+            norm * (PI * m as f32 * (k as f32 + 0.5) / count).cos()
+        };
+        let variance = |m: usize| if m == 0 { common } else { (m as f32).powf(-DECAY) };
+        Array2::from_shape_fn((frames, frames), |(j, k)| {
+            (0..frames).map(|m| variance(m) * cosine(m, j) * cosine(m, k)).sum()
+        })
+    }
+
+    /// Pixels that no mask reaches.
+    pub fn dead_pixels(&self) -> usize {
+        self.gram.iter().filter(|&&g| g == 0.0).count()
+    }
+
+    /// `Hx` \[S,H,W\] of frames `x` \[S B,H,W\].
+    pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
+        let (count, height, width) = self.dim();
+        self.check("the frame stack", frames.shape(), &[count, height, width])?;
+        let mut y = Array3::zeros(self.inverse_gram.raw_dim());
+        let blocks = frames.axis_chunks_iter(Axis(0), self.masks.dim().0);
+        for (mut y, block) in y.outer_iter_mut().zip(blocks) {
+            for (mask, frame) in self.masks.outer_iter().zip(block.outer_iter()) {
+                ndarray::azip!((sum in &mut y, &c in &mask, &x in &frame) *sum += c * x);
+            }
+        }
+        Ok(y)
+    }
+
+    /// `H^T y` \[S B,H,W\] of a measurement `y` \[S,H,W\].
+    pub fn adjoint(&self, y: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
+        self.check("the measurement", y.shape(), self.inverse_gram.shape())?;
+        let mut frames = Array3::zeros(self.dim());
+        for (mut block, y) in
+            frames.axis_chunks_iter_mut(Axis(0), self.masks.dim().0).zip(y.outer_iter())
+        {
+            for (mut frame, mask) in block.outer_iter_mut().zip(self.masks.outer_iter()) {
+                ndarray::azip!((x in &mut frame, &c in &mask, &y in &y) *x = c * y);
+            }
+        }
+        Ok(frames)
+    }
+
+    /// One projection of GAP: `x = v + R H^T (H R H^T + gamma)^-1 (t - H v)` with the target
+    /// `t = y`, or, accelerated, `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that
+    /// is the published `y1 += y - H v` (Liao et al. 2014), with 0 it is plain GAP.
+    ///
+    /// `R` and `gamma` are what is supposed of the frames' errors and of the noise. Of `R H^T` no frame takes more than
+    /// [`AGAINST`] against the residual.
+    ///
+    /// Only `rows` of each snapshot are done; they need no other. `y` and `y1` are \[S,H,W\], `v` and `x`
+    /// \[S B,H,W\], all of the operator's size and in standard layout. Returns `||y - H v||^2` of the rows.
+    pub(super) fn project(
+        &self,
+        rows: Range<usize>,
+        y: &Array3<f32>,
+        y1: Option<(&mut Array3<f32>, f32)>,
+        supposed: &Statistics,
+        v: &Array3<f32>,
+        x: &mut Array3<f32>,
+    ) -> f64 {
+        let (frames, height, width) = self.masks.dim();
+        let plane = height * width;
+        let (Some(masks), Some(inverse), Some(y), Some(v), Some(x)) = (
+            self.masks.as_slice(),
+            self.inverse_gram.as_slice(),
+            y.as_slice(),
+            v.as_slice(),
+            x.as_slice_mut(),
+        ) else {
+            unreachable!("arrays of the solver are in standard layout")
+        };
+        let mut accelerated = y1.and_then(|(y1, memory)| Some((y1.as_slice_mut()?, memory)));
+        let covariance = supposed.covariance.as_ref().and_then(|covariance| covariance.as_slice());
+        let gamma = supposed.gamma;
+        let mut sum = vec![0.0f32; width];
+        // `R C` of a row of all frames, and the inverse that belongs to it.
+        let mut directions = vec![0.0f32; if covariance.is_some() { frames * width } else { 0 }];
+        let (mut weights, mut bounds) = (vec![0.0f32; width], vec![0.0f32; width]);
+        let mut squares = 0.0f64;
+        for snapshot in 0..self.snapshots() {
+            let block = snapshot * frames * plane..(snapshot + 1) * frames * plane;
+            let (v, x) = (&v[block.clone()], &mut x[block]);
+            // Row by row over all frames: a row of v and of the masks is still in cache when the
+            // correction is added.
+            for start in rows.clone().map(|row| row * width) {
+                let stack = Stack { plane, start, width, frames };
+                let row = snapshot * plane + start..snapshot * plane + start + width;
+                let target =
+                    accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
+                let (y, inverse) = (&y[row.clone()], &inverse[row]);
+                let (step, inverse) = match covariance {
+                    None if gamma == 0.0 => ((masks, stack), inverse),
+                    None => {
+                        add_noise(gamma, inverse, &mut weights);
+                        ((masks, stack), &*weights)
+                    }
+                    Some(covariance) => {
+                        directions_of_row(
+                            (masks, stack),
+                            (covariance, gamma),
+                            inverse,
+                            &mut directions,
+                            (&mut weights, &mut bounds),
+                        );
+                        ((&*directions, Stack { plane: width, start: 0, ..stack }), &*weights)
+                    }
+                };
+                squares += project_row(stack, masks, v, x, y, target, (step, inverse), &mut sum);
+            }
+        }
+        squares
+    }
+
+    fn check(&self, what: &'static str, found: &[usize], expected: &[usize]) -> Result<()> {
+        if found == expected {
+            return Ok(());
+        }
+        Err(ReconError::Shape { what, found: shape_text(found), expected: shape_text(expected) })
+    }
+}
+
+/// Of the brightest pixel's gram: what is darker than this is divided by this. At such a pixel noise outweighs
+/// light, and the division would make thousands of it.
+const DARKEST: f32 = 1e-3;
+/// The same where all pixels are dark.
+const BLACK: f32 = 1e-6;
+
+/// `(H H^T)^-1` \[S,H,W\], bounded where hardly any light comes through.
+fn invert(gram: &Array2<f32>, snapshots: usize) -> Array3<f32> {
+    let brightest = gram.iter().copied().fold(0.0, f32::max);
+    let least = (DARKEST * brightest).max(BLACK);
+    let inverse = gram.mapv(|g| if g > 0.0 { 1.0 / g.max(least) } else { 0.0 });
+    let mut all = Array3::zeros((snapshots, gram.nrows(), gram.ncols()));
+    all.outer_iter_mut().for_each(|mut of_one| of_one.assign(&inverse));
+    all
+}
+
+/// What a projection supposes of the frames' errors and of the noise, both in the same unit.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Statistics {
+    /// Covariance \[B,B\] of the frames' errors at a pixel of a snapshot; the identity where there is none.
+    pub(super) covariance: Option<Array2<f32>>,
+    /// Variance of a measured pixel's noise. With 0 plain GAP forces `y = Hx`.
+    pub(super) gamma: f32,
+}
+
+/// How the variance of the error's changes falls from the slowest of them on: as `m^-DECAY` in the index `m` of
+/// the cosine. Measured after total variation and after the network, behind all kinds of masks, it falls by
+/// exponents of 0 to 2.6; as the projection's, more than 0.5 gains less, and 0 loses where there is noise.
+const DECAY: f32 = 0.4;
+
+/// The contrast of masks at which they are no longer much alike.
+const HIGH_CONTRAST: f32 = 0.125;
+
+/// What `B` masks of contrast `c` bear of the static variance: `min((c / 0.125)^1.5, n, max(n (c / c0)^0.9, 0.55))`
+/// with `n = (10 / B)^0.5`, and nine tenths of the contrast of independent binary masks as `c0`.
+///
+/// With the default's 0.55 the best static variance is 0.07 at a contrast of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06,
+/// 0.3 at 0.084, 0.25 to 0.3 from there to 0.17, and 0.3 to 0.4 at 0.25, where optics blur binary masks or let light
+/// through closed pixels; behind independent binary ones (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from
+/// Cr 16 on (docs/experiments.md).
+fn static_share(contrast: f32, frames: usize) -> f32 {
+    let count = frames as f32;
+    let many = (10.0 / count).sqrt();
+    let alike = (contrast / HIGH_CONTRAST).powf(1.5);
+    let blurred = many * (contrast / (0.45 * (1.0 - 1.0 / count))).powf(0.9);
+    alike.min(many).min(blurred.max(0.551))
+}
+
+/// Of masks that are all alike nothing else than what frames have in common can be told, so it must not be 0.
+const LEAST_STATIC_VARIANCE: f32 = 0.01;
+
+/// One row through all frames of a stack in standard layout.
+#[derive(Clone, Copy)]
+struct Stack {
+    plane: usize,
+    start: usize,
+    width: usize,
+    frames: usize,
+}
+
+/// The most that a frame may take against the correction of a measured pixel, as a share of it. A covariance
+/// lets a residual raise frames whose masks are more open than others, and lower the rest. Where a prior
+/// takes the error of some frames out and leaves that of others as it is, the error `e` left is multiplied by
+/// `1 - sum c d / (C R C^T)` over the frames that keep it, each time: if `c d < 0` there, it grows. Behind
+/// masks that are much alike single pixels of still fine texture came to values of -6 and 9 that way, for a
+/// loss of up to 11 dB.
+const AGAINST: f32 = 0.02;
+
+/// `R C` \[B,W\] of a row, no product with `C` below [`AGAINST`] of their sum, and its `(H R H^T + gamma)^-1`
+/// \[W\] from `(H H^T)^-1`, with the bound of [`invert`] in it; 0 where that is 0.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn directions_of_row(
+    (masks, stack): (&[f32], Stack),
+    (covariance, gamma): (&[f32], f32),
+    inverse: &[f32],
+    directions: &mut [f32],
+    (weights, bounds): (&mut [f32], &mut [f32]),
+) {
+    let Stack { plane, start, width, frames } = stack;
+    let mask = |k: usize| &masks[k * plane + start..][..width];
+    // The noise first, and what the bound has added.
+    weights.iter_mut().zip(inverse).for_each(|(weight, &inverse)| *weight = 1.0 / inverse + gamma);
+    for k in 0..frames {
+        let direction = &mut directions[k * width..][..width];
+        direction.fill(0.0);
+        for (j, &r) in covariance[k * frames..][..frames].iter().enumerate() {
+            for (d, &c) in direction.iter_mut().zip(mask(j)) {
+                *d += r * c;
+            }
+        }
+        for ((weight, &d), &c) in weights.iter_mut().zip(&*direction).zip(mask(k)) {
+            *weight += c * (d - c);
+        }
+    }
+    bounds.iter_mut().zip(&*weights).for_each(|(bound, weight)| *bound = -AGAINST * weight);
+    for k in 0..frames {
+        let direction = &mut directions[k * width..][..width];
+        let parts = direction.iter_mut().zip(mask(k)).zip(&*bounds);
+        for (((d, &c), &bound), weight) in parts.zip(&mut *weights) {
+            // What is below the bound comes up to it; where no light comes through nothing is.
+            let missing = (bound - c * *d).max(0.0);
+            *weight += missing;
+            *d += if c > 0.0 { missing / c } else { 0.0 };
+        }
+    }
+    for (weight, &inverse) in weights.iter_mut().zip(inverse) {
+        *weight = if inverse > 0.0 { 1.0 / *weight } else { 0.0 };
+    }
+}
+
+/// `(H H^T + gamma)^-1` \[W\] of a row from `(H H^T)^-1`; 0 where that is 0.
+fn add_noise(gamma: f32, inverse: &[f32], weights: &mut [f32]) {
+    for (weight, &inverse) in weights.iter_mut().zip(inverse) {
+        *weight = inverse / (1.0 + gamma * inverse);
+    }
+}
+
+#[allow(clippy::too_many_arguments)] // one kernel over plain slices, so that it vectorises
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn project_row(
+    stack: Stack,
+    masks: &[f32],
+    v: &[f32],
+    x: &mut [f32],
+    y: &[f32],
+    y1: Option<(&mut [f32], f32)>,
+    ((directions, along), inverse): ((&[f32], Stack), &[f32]),
+    sum: &mut [f32],
+) -> f64 {
+    let Stack { plane, start, width, frames } = stack;
+    sum.fill(0.0);
+    for k in 0..frames {
+        let row = k * plane + start..k * plane + start + width;
+        for ((s, &c), &value) in sum.iter_mut().zip(&masks[row.clone()]).zip(&v[row]) {
+            *s += c * value;
+        }
+    }
+    let squares = squared_distance(y, sum);
+    match y1 {
+        Some((y1, memory)) => {
+            for (((s, &y), t), &inverse) in sum.iter_mut().zip(y).zip(y1).zip(inverse) {
+                *t = y + memory * (*t - *s);
+                *s = (*t - *s) * inverse;
+            }
+        }
+        None => {
+            for ((s, &y), &inverse) in sum.iter_mut().zip(y).zip(inverse) {
+                *s = (y - *s) * inverse;
+            }
+        }
+    }
+    for k in 0..frames {
+        let row = k * plane + start..k * plane + start + width;
+        let (v, x) = (&v[row.clone()], &mut x[row]);
+        let direction = &directions[k * along.plane + along.start..][..width];
+        for (((x, &v), &d), &s) in x.iter_mut().zip(v).zip(direction).zip(&*sum) {
+            *x = v + d * s;
+        }
+    }
+    f64::from(squares)
+}
+
+/// `||a - b||^2`.
+#[inline(always)]
+fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+    // Sums side by side: one after the other they would wait for each other.
+    let mut sums = [0.0f32; 128];
+    for (a, b) in a.chunks(128).zip(b.chunks(128)) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += (a - b) * (a - b);
+        }
+    }
+    sums.iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{SensingOperator, Statistics};
+    use ndarray::Array3;
+    use proptest::prelude::{any, proptest};
+
+    fn random(seed: u64, dim: (usize, usize, usize)) -> Array3<f32> {
+        use rand::{Rng, SeedableRng};
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        Array3::from_shape_fn(dim, |_| rng.random::<f32>())
+    }
+
+    proptest! {
+        #[test]
+        fn adjoint_is_the_adjoint(
+            seed in any::<u64>(),
+            snapshots in 1usize..4,
+            dim in (1usize..5, 1usize..9, 1usize..9),
+        ) {
+            let op = SensingOperator::new(random(seed, dim)).unwrap().over(snapshots).unwrap();
+            let x = random(seed ^ 1, op.dim());
+            let y = random(seed ^ 2, (snapshots, dim.1, dim.2));
+            let left: f32 = (&op.forward(x.view()).unwrap() * &y).sum();
+            let right: f32 = (&op.adjoint(y.view()).unwrap() * &x).sum();
+            assert!((left - right).abs() <= 1e-4 * left.abs().max(1.0), "{left} {right}");
+        }
+
+        #[test]
+        fn plain_projection_meets_the_measurement(
+            seed in any::<u64>(),
+            snapshots in 1usize..4,
+            dim in (1usize..5, 1usize..9, 1usize..20),
+        ) {
+            let op = SensingOperator::new(random(seed, dim)).unwrap().over(snapshots).unwrap();
+            let truth = random(seed ^ 1, op.dim());
+            let y = op.forward(truth.view()).unwrap();
+            let v = random(seed ^ 2, op.dim());
+            let mut x = Array3::zeros(op.dim());
+            let squares = op.project(0..dim.1, &y, None, &Statistics::default(), &v, &mut x);
+            let before = &y - &op.forward(v.view()).unwrap();
+            let after = &y - &op.forward(x.view()).unwrap();
+            let expected: f64 = before.iter().map(|&r| f64::from(r * r)).sum();
+            assert!((squares - expected).abs() <= 1e-4 * expected.max(1e-3));
+            let dark = op.gram().iter().copied().fold(0.0, f32::max) * super::DARKEST;
+            for after in after.outer_iter() {
+                for (residual, gram) in after.iter().zip(op.gram()) {
+                    assert!(residual.abs() < 1e-4 || *gram <= dark, "{residual} {gram}");
+                }
+            }
+        }
+    }
+
+    /// The sum of the covariance is the variance of what frames have in common times their number.
+    #[test]
+    fn less_of_the_error_is_supposed_to_be_common_where_masks_are_alike() {
+        let common = |masks: Array3<f32>| {
+            let frames = masks.dim().0 as f32;
+            SensingOperator::new(masks).unwrap().error_covariance(0.5).sum() / frames
+        };
+        let near = |found: f32, wanted: f32| {
+            assert!((found - wanted).abs() < 0.02, "{found}, not {wanted}")
+        };
+        let masks = |contrast: f32| random(3, (4, 32, 32)).mapv(|c| 1.0 + contrast * (c - 0.5));
+        // Of the variance of four frames 3/4 shows as change.
+        near(common(masks(1.0)), 0.5 * (0.0577f32 / 0.125).powf(1.5));
+        near(common(masks(0.0)), 0.01);
+        let binary = |frames: usize| random(3, (frames, 32, 32)).mapv(f32::round);
+        near(common(binary(4)), 0.5 * 2.5f32.sqrt());
+        near(common(binary(20)), 0.5 * 0.5f32.sqrt());
+        // Light through closed pixels: half and a third of the contrast of binary masks.
+        let leaking = |frames: usize, light: f32| {
+            common(random(3, (frames, 32, 32)).mapv(|c| light + (1.0 - light) * c.round()))
+        };
+        near(leaking(10, 0.23), 0.5 * 0.65);
+        near(leaking(10, 0.42), 0.5 * 0.551);
+    }
+
+    /// A prior that takes the error of all frames out but one leaves there what the projection makes of it.
+    #[test]
+    fn an_error_that_a_prior_keeps_in_some_frames_does_not_grow() {
+        // As alike as those of a hybrid coded aperture.
+        let masks = random(5, (16, 12, 12)).mapv(|c| 0.4 + 0.3 * c);
+        let op = SensingOperator::new(masks).unwrap();
+        let covariance = Some(op.error_covariance(0.5));
+        let supposed = Statistics { covariance, gamma: 0.0 };
+        let y = Array3::zeros((1, 12, 12));
+        for kept in 0..16 {
+            let mut v = Array3::zeros((16, 12, 12));
+            v.slice_mut(ndarray::s![kept, .., ..]).fill(1.0);
+            let mut x = Array3::zeros((16, 12, 12));
+            for _ in 0..65 {
+                op.project(0..12, &y, None, &supposed, &v, &mut x);
+                v.slice_mut(ndarray::s![kept, .., ..]).assign(&x.slice(ndarray::s![kept, .., ..]));
+            }
+            // 1.02^65.
+            let most = v.iter().copied().fold(0.0, f32::max);
+            assert!(most < 3.63, "frame {kept}: {most}");
+        }
+    }
+
+    #[test]
+    fn dead_pixels_are_left_alone() {
+        let mut masks = random(3, (2, 3, 3));
+        masks.slice_mut(ndarray::s![.., 1, 1]).fill(0.0);
+        let op = SensingOperator::new(masks).unwrap();
+        assert_eq!(op.dead_pixels(), 1);
+        let v = random(4, (2, 3, 3));
+        let mut x = Array3::zeros((2, 3, 3));
+        let mut y1 = Array3::from_elem((1, 3, 3), 5.0);
+        op.project(
+            0..3,
+            &Array3::from_elem((1, 3, 3), 1.0),
+            Some((&mut y1, 1.0)),
+            &Statistics::default(),
+            &v,
+            &mut x,
+        );
+        assert_eq!(x[[0, 1, 1]], v[[0, 1, 1]]);
+        assert!(x.iter().all(|value| value.is_finite()));
+        assert!(op.over(0).is_err());
+    }
+
+    #[test]
+    fn noise_where_hardly_any_light_comes_through_stays_noise() {
+        let mut masks = random(3, (4, 3, 3));
+        masks.slice_mut(ndarray::s![.., 1, 1]).fill(1e-7);
+        let op = SensingOperator::new(masks).unwrap();
+        let v = random(4, (4, 3, 3));
+        let mut y = op.forward(v.view()).unwrap();
+        y[[0, 1, 1]] += 0.04;
+        let mut x = Array3::zeros((4, 3, 3));
+        op.project(0..3, &y, None, &Statistics::default(), &v, &mut x);
+        let change = (&x - &v).mapv(f32::abs);
+        assert!(change.iter().all(|change| *change < 1e-3), "{change}");
+    }
+
+    #[test]
+    fn dark_and_broken_masks_are_refused() {
+        let dark = SensingOperator::new(Array3::zeros((4, 2, 2))).unwrap_err();
+        assert!(dark.to_string().contains("all 4 frames"), "{dark}");
+        let mut masks = Array3::ones((1, 2, 2));
+        masks[[0, 1, 0]] = f32::NAN;
+        let broken = SensingOperator::new(masks).unwrap_err();
+        assert!(broken.to_string().contains("frame 0, row 1, column 0"), "{broken}");
+    }
+
+    #[test]
+    fn the_adjoint_belongs_to_the_forward_model_of_the_optics() {
+        use rand::SeedableRng;
+        // <H x, y> = <x, H^T y>, with masks of the whole chain of optics.
+        let (masks, _) = optics::random_squares(4, 12, 9, 3).unwrap();
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let frames =
+            Array3::from_shape_simple_fn((4, 12, 9), || rand::Rng::random::<f32>(&mut rng));
+        let y = ndarray::Array2::from_shape_simple_fn((12, 9), || {
+            rand::Rng::random::<f32>(&mut rng) - 0.5
+        });
+        let forward = optics::measure(masks.view(), frames.view()).unwrap();
+        let op = SensingOperator::new(masks).unwrap();
+        let adjoint = op.adjoint(y.view().insert_axis(ndarray::Axis(0))).unwrap();
+        let (left, right) = ((&forward * &y).sum(), (&frames * &adjoint).sum());
+        assert!((left - right).abs() < 1e-4 * left.abs().max(1.0), "{left} {right}");
+    }
+}

@@ -1,0 +1,249 @@
+//! What pixels that the solver did not see tell of the error of its frames.
+//!
+//! At a held-out pixel `y - Hv = sum_k C_k e_k + n` of the frames' errors `e` and the noise `n`. The pixel's
+//! masks had no part in `v`, so that `E (y - Hv)^2 = a S + b D + sigma^2`, with the variances `a` of what the
+//! errors have in common and `b` of their changes (cosines along time), and the gram's two parts, `S` of what
+//! the masks have in common and `D`. These parts differ from pixel to pixel: a fit tells `a`, `b` and
+//! `sigma^2` apart, and `(a + (B - 1) b) / B` is the mean squared error of the frames. Errors are larger in
+//! some places than in others, so `a` and `b` are multiples of what is seen nearby: of the residuals of other
+//! held-out pixels, and of the frames' texture and motion.
+
+use ndarray::{Array2, ArrayView3, Axis, s};
+use serde::{Deserialize, Serialize};
+
+use super::held_out::HeldOut;
+use super::sensing::SensingOperator;
+
+/// What is told, in dB, of the mean square of a voxel.
+pub const SIGNS: [&str; 8] = [
+    "residual after the first stage",
+    "residual of the frames",
+    "error, by residuals and texture nearby",
+    "what the frames have in common of it",
+    "error, by residuals nearby, if there is no noise",
+    "error, by texture nearby",
+    "residual where there is least texture",
+    "residual where there is most texture",
+];
+
+/// Values of [`SIGNS`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Signs(pub [f32; SIGNS.len()]);
+
+/// Below this, squares are rounding.
+const FLOOR: f64 = 1e-7;
+/// Standard deviation, in pixels, of the weights of residuals nearby.
+const NEARBY: f64 = 3.0;
+/// The weight of the mean of all residuals among them.
+const FAR: f64 = 0.1;
+/// Texture is that of a square of so many pixels to each side.
+const REACH: usize = 3;
+/// The share of pixels that have least texture, and that have most.
+const QUIET: f64 = 0.2;
+/// Steps of the fit, after which nothing changes any more.
+const STEPS: usize = 150;
+
+impl Signs {
+    /// Of one snapshot `y` \[1,H,W\] at the pixels that were held out of its reconstruction: `early` are the
+    /// frames \[B,H,W\] after the first stage, `last` those at its end, all on the scale on which the scene
+    /// is on \[0,1\]. None if no pixel was held out.
+    pub(super) fn of(
+        (op, y): (&SensingOperator, ArrayView3<'_, f32>),
+        held_out: &HeldOut,
+        early: ArrayView3<'_, f32>,
+        last: ArrayView3<'_, f32>,
+    ) -> Option<Self> {
+        let count = held_out.pixels.len() as f64;
+        if held_out.pixels.is_empty() {
+            return None;
+        }
+        let residuals = held_out.residuals(op, y, last);
+        let gram = op.gram();
+        let common = op.steady_gram();
+        let at = |image: &dyn Fn((usize, usize)) -> f64| -> Vec<f64> {
+            held_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
+        };
+        let shared = at(&|p| f64::from(common[p]));
+        let changing = at(&|p| f64::from((gram[p] - common[p]).max(0.0)));
+        let mean_gram = at(&|p| f64::from(gram[p])).iter().sum::<f64>() / count;
+        let texture = texture(last);
+        let texture = at(&|p| texture[p]);
+
+        let near = nearby(held_out, &residuals);
+        let rough = scaled(texture.iter().map(|texture| texture.sqrt()));
+        let both = scaled(near.iter().zip(&rough).map(|(near, rough)| (near * rough).sqrt()));
+        let frames = last.len_of(Axis(0)) as f64;
+        let error = |scale: &[f64], noise: bool| {
+            let times = |part: &[f64]| part.iter().zip(scale).map(|(part, s)| part * s).collect();
+            let mut parts: Vec<Vec<f64>> = vec![times(&shared), times(&changing)];
+            if noise {
+                parts.push(vec![1.0; residuals.len()]);
+            }
+            let variances = variances(&residuals, &parts);
+            ((variances[0] + (frames - 1.0) * variances[1]) / frames, variances[0] / frames)
+        };
+        let first = held_out.residuals(op, y, early);
+        let mean = |squares: &[f64]| squares.iter().sum::<f64>() / squares.len() as f64 / mean_gram;
+        let [quiet, loud] = extremes(&texture, &residuals);
+        let (told, common) = error(&both, true);
+        let told = [
+            mean(&first),
+            mean(&residuals),
+            told,
+            common,
+            error(&near, false).0,
+            error(&rough, true).0,
+            quiet / mean_gram,
+            loud / mean_gram,
+        ];
+        Some(Self(told.map(|square| (10.0 * square.max(FLOOR).log10()) as f32)))
+    }
+}
+
+/// Values divided by their mean.
+fn scaled(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut values: Vec<f64> = values.collect();
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    values.iter_mut().for_each(|value| *value = (*value / mean.max(FLOOR)).max(FLOOR));
+    values
+}
+
+/// The weighted mean of the residuals around each pixel without its own, in units of the mean of all.
+fn nearby(held_out: &HeldOut, residuals: &[f64]) -> Vec<f64> {
+    let mean = residuals.iter().sum::<f64>() / residuals.len() as f64;
+    let around = |(index, &(_, i, j)): (usize, &(usize, usize, usize))| {
+        let (mut sum, mut weights) = (FAR * mean, FAR);
+        for (other, &(_, row, column)) in held_out.pixels.iter().enumerate() {
+            let distance = (i.abs_diff(row).pow(2) + j.abs_diff(column).pow(2)) as f64;
+            if other != index && distance < (4.0 * NEARBY).powi(2) {
+                let weight = (-0.5 * distance / NEARBY.powi(2)).exp();
+                sum += weight * residuals[other];
+                weights += weight;
+            }
+        }
+        sum / weights
+    };
+    scaled(held_out.pixels.iter().enumerate().map(around))
+}
+
+/// Squared steps from pixel to pixel and from frame to frame, in the mean over the frames and a square around
+/// each pixel \[H,W\].
+fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
+    let (count, height, width) = frames.dim();
+    let mut steps = Array2::<f64>::zeros((height, width));
+    for (k, frame) in frames.outer_iter().enumerate() {
+        let next = (k + 1 < count).then(|| frames.index_axis(Axis(0), k + 1));
+        for ((i, j), sum) in steps.indexed_iter_mut() {
+            let here = frame[[i, j]];
+            let step =
+                |there: Option<&f32>| there.map_or(0.0, |there| f64::from(there - here).powi(2));
+            let beside = step(frame.get((i + 1, j))) + step(frame.get((i, j + 1)));
+            let later = step(next.as_ref().and_then(|next| next.get((i, j))));
+            *sum += beside / count as f64 + later / (count - 1).max(1) as f64;
+        }
+    }
+    Array2::from_shape_fn((height, width), |(i, j)| {
+        let rows = i.saturating_sub(REACH)..height.min(i + REACH + 1);
+        let columns = j.saturating_sub(REACH)..width.min(j + REACH + 1);
+        steps.slice(s![rows, columns]).mean().unwrap_or(0.0)
+    })
+}
+
+/// The mean square where there is least texture, and where there is most.
+fn extremes(texture: &[f64], squares: &[f64]) -> [f64; 2] {
+    let mut order: Vec<usize> = (0..texture.len()).collect();
+    order.sort_by(|a, b| texture[*a].total_cmp(&texture[*b]));
+    let count = ((texture.len() as f64 * QUIET) as usize).max(1);
+    let mean = |of: &[usize]| of.iter().map(|index| squares[*index]).sum::<f64>() / count as f64;
+    [mean(&order[..count]), mean(&order[order.len() - count..])]
+}
+
+/// The factors, none below 0, of parts whose sum is the expectation of each square: the most likely ones
+/// where these are squares of Gaussian numbers, by multiplicative steps (Févotte, Bertin and Durrieu, Neural
+/// Computation 2009).
+fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
+    let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+    let all = parts.iter().flatten().sum::<f64>() / squares.len() as f64;
+    let mut factors = vec![mean / all.max(FLOOR); parts.len()];
+    for _ in 0..STEPS {
+        let mut gains = vec![(0.0, 0.0); parts.len()];
+        for (pixel, square) in squares.iter().enumerate() {
+            let sum = parts.iter().zip(&factors).map(|(part, factor)| part[pixel] * factor);
+            let expected = sum.sum::<f64>() + 1e-9;
+            for ((up, down), part) in gains.iter_mut().zip(parts) {
+                *up += part[pixel] * square / expected.powi(2);
+                *down += part[pixel] / expected;
+            }
+        }
+        for (factor, (up, down)) in factors.iter_mut().zip(gains) {
+            *factor *= (up / f64::max(down, 1e-30)).sqrt();
+        }
+    }
+    factors
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Signs, variances};
+    use crate::held_out::HeldOut;
+    use crate::sensing::SensingOperator;
+    use ndarray::Array3;
+    use optics::iid_masks;
+    use rand::{Rng, SeedableRng};
+    use rand_distr::StandardNormal;
+
+    fn random() -> rand_chacha::ChaCha8Rng {
+        rand_chacha::ChaCha8Rng::seed_from_u64(4)
+    }
+
+    #[test]
+    fn variances_of_parts_are_found() {
+        let mut random = random();
+        let parts: Vec<Vec<f64>> =
+            (0..2).map(|_| (0..20_000).map(|_| random.random::<f64>()).collect()).collect();
+        let square = |(a, b): (&f64, &f64)| {
+            (3.0 * a + 0.5 * b) * random.sample::<f64, _>(StandardNormal).powi(2)
+        };
+        let squares: Vec<f64> = parts[0].iter().zip(&parts[1]).map(square).collect();
+        let found = variances(&squares, &parts);
+        assert!(
+            (found[0] / 3.0 - 1.0).abs() < 0.05 && (found[1] / 0.5 - 1.0).abs() < 0.2,
+            "{found:?}"
+        );
+    }
+
+    /// Errors of a known size where there is texture, in the left half, with noise everywhere and without.
+    #[test]
+    fn the_error_of_frames_is_told_from_noise() {
+        let (frames, side) = (8, 192);
+        let masks = iid_masks(frames, side, side, 3).unwrap();
+        let op = SensingOperator::new(masks).unwrap();
+        let held_out = HeldOut::of(&op, 0);
+        let left = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
+        let truth = Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
+            0.5 + 0.2 * left(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+        });
+        for (error, noise) in [(0.03f32, 0.0f32), (0.03, 0.06), (0.1, 0.06)] {
+            let mut random = random();
+            let mut normal = |deviation: f32| deviation * random.sample::<f32, _>(StandardNormal);
+            let mut found = truth.clone();
+            found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * left(j));
+            let y = op.forward(truth.view()).unwrap().mapv(|y| y + normal(noise));
+            let told = Signs::of((&op, y.view()), &held_out, found.view(), found.view()).unwrap();
+            let decibels = |square: f32| 10.0 * square.log10();
+            let expected = decibels(error.powi(2) / 2.0);
+            let Signs([early, late, both, _, without_noise, by_texture, quiet, _]) = told;
+            assert_eq!(early, late);
+            assert!((by_texture - expected).abs() < 2.5, "{error}, {noise}: {told:?}");
+            assert!((both - expected).abs() < 4.0, "{error}, {noise}: {told:?}");
+            if noise == 0.0 {
+                assert!(quiet < expected - 10.0, "{told:?}");
+            } else {
+                // Half of the pixels are open.
+                assert!((quiet - decibels(noise.powi(2) / 4.0)).abs() < 1.5, "{told:?}");
+                assert!(without_noise > expected + 2.0, "noise is taken for an error: {told:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! How old things are. Wall clocks are set back and forth: what was stored while one was a year behind is not a
+//! year old when it is right again. So age is also counted in the time for which the service has run.
+
+use std::time::Duration;
+
+use super::Store;
+use super::error::Result;
+use super::rows::{sql, sql_scalar};
+use engine::job::Timestamp;
+
+/// No age that anybody asks for is longer (a year, in milliseconds).
+const LONGEST: i64 = 366 * 86_400_000;
+
+impl Store {
+    /// Notes what time it is, and that the service has run for so long since the last note.
+    pub async fn note_time(&self, since: Duration) -> Result<()> {
+        let since = i64::try_from(since.as_millis()).unwrap_or(LONGEST);
+        let mut transaction = self.write().await?;
+        // Of two notes without time between them the earlier one counts.
+        sql!(
+            "INSERT INTO clock (run, wall)
+             VALUES ((SELECT coalesce(max(run), 0) FROM clock) + ?, ?)
+             ON CONFLICT (run) DO UPDATE SET wall = min(wall, excluded.wall)",
+            [since, Timestamp::now()]
+        )
+        .execute(&mut *transaction)
+        .await?;
+        sql!("DELETE FROM clock WHERE run < (SELECT max(run) FROM clock) - ?", [LONGEST])
+            .execute(&mut *transaction)
+            .await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// The moment before which a thing was stamped that is older than this by the clock, and by the time for
+    /// which the service has run: no later than any time that was noted within this time of running.
+    pub async fn ago(&self, age: Duration) -> Result<Timestamp> {
+        let age = i64::try_from(age.as_millis()).unwrap_or(LONGEST);
+        let seen: Option<i64> = sql_scalar!(
+            "SELECT min(wall) FROM clock WHERE run >= (SELECT max(run) FROM clock) - ?",
+            [age]
+        )
+        .fetch_one(&self.readers)
+        .await?;
+        let by_the_clock = Timestamp::now().0.saturating_sub(age);
+        Ok(Timestamp(seen.map_or(by_the_clock, |seen| seen.min(by_the_clock))))
+    }
+}

@@ -1,0 +1,212 @@
+//! The data folder: where each thing lies, and the file operations that survive a power cut.
+
+use std::fs::{self, File, TryLockError};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use super::error::{Result, StoreError};
+use super::locked::LockedFile;
+use engine::job::{JobId, PartialId, Sha256};
+
+/// The folder with all that the service keeps.
+///
+/// ```text
+/// sci-recon.db          records
+/// sci-recon.json        the marker: which folder this is, for the database to be compared with
+/// blobs/ab/cdef...      files by the SHA-256 of their bytes
+/// results/JOB/          manifest.json and one folder for each snapshot
+/// partial/ID            uploads that come in pieces
+/// quarantine/TIME/      what no record knows of, for some days
+/// before-updates/       copies of the database from before updates of the program
+/// tmp/                  files that are being written, locked by their writers
+/// ```
+#[derive(Debug, Clone)]
+pub struct DataDir {
+    root: Arc<Path>,
+}
+
+impl DataDir {
+    /// Makes the folder where it is missing.
+    pub(crate) fn create(root: &Path) -> Result<Self> {
+        fs::create_dir_all(root).map_err(StoreError::io("make the folder", root))?;
+        Self::find(root)
+    }
+
+    /// The folder, which must be there.
+    pub(crate) fn find(root: &Path) -> Result<Self> {
+        match root.canonicalize() {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                Err(StoreError::NoFolder(root.to_owned()))
+            }
+            path => Ok(Self { root: path.map_err(StoreError::io("find", root))?.into() }),
+        }
+    }
+
+    /// Makes the folders in it, where they are missing.
+    pub(crate) fn fill(&self) -> Result<()> {
+        for path in [self.blobs(), self.all_results(), self.partials(), self.tmp()] {
+            fs::create_dir_all(&path).map_err(StoreError::io("make the folder", &path))?;
+        }
+        sync_dir(&self.root)
+    }
+
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    pub(crate) fn database(&self) -> PathBuf {
+        self.root.join("sci-recon.db")
+    }
+
+    /// Where the file with this hash lies, if it is in the store.
+    pub fn blob(&self, sha256: &Sha256) -> PathBuf {
+        let hex = sha256.to_string();
+        self.blobs().join(&hex[..2]).join(&hex[2..])
+    }
+
+    pub(crate) fn blobs(&self) -> PathBuf {
+        self.root.join("blobs")
+    }
+
+    pub(crate) fn all_results(&self) -> PathBuf {
+        self.root.join("results")
+    }
+
+    pub fn results(&self, job: JobId) -> PathBuf {
+        self.all_results().join(job.to_string())
+    }
+
+    pub fn snapshot_results(&self, job: JobId, snapshot: u32) -> PathBuf {
+        self.results(job).join(format!("snapshot_{snapshot:04}"))
+    }
+
+    pub(crate) fn partials(&self) -> PathBuf {
+        self.root.join("partial")
+    }
+
+    pub(crate) fn partial(&self, id: PartialId) -> PathBuf {
+        self.partials().join(id.to_string())
+    }
+
+    pub(crate) fn tmp(&self) -> PathBuf {
+        self.root.join("tmp")
+    }
+
+    /// Copies of the database from before updates of the program.
+    pub(crate) fn before_updates(&self) -> PathBuf {
+        self.root.join("before-updates")
+    }
+
+    /// What no row knows of is kept here for some days.
+    pub(crate) fn quarantine(&self) -> PathBuf {
+        self.root.join("quarantine")
+    }
+
+    /// Takes the lock of the server, of which there is one for each folder.
+    pub(crate) fn lock_server(&self) -> Result<LockedFile> {
+        let path = self.root.join("server.lock");
+        let file = File::create(&path).map_err(StoreError::io("make", &path))?;
+        match LockedFile::take(file) {
+            Ok(file) => Ok(file),
+            Err(TryLockError::WouldBlock) => Err(StoreError::Taken(self.root.to_path_buf())),
+            Err(TryLockError::Error(error)) => Err(StoreError::io("lock", &path)(error)),
+        }
+    }
+
+    /// Removes what dead processes left in `tmp`: whatever nobody holds the lock of. Says how much.
+    pub fn sweep_tmp(&self) -> Result<usize> {
+        let tmp = self.tmp();
+        let mut removed = 0;
+        for entry in fs::read_dir(&tmp).map_err(StoreError::io("read the folder", &tmp))? {
+            let path = entry.map_err(StoreError::io("read the folder", &tmp))?.path();
+            let Ok(file) = File::open(&path) else { continue };
+            // A moment passes between a file's making and its lock.
+            if is_young(&file, Duration::from_secs(10)) || file.try_lock().is_err() {
+                continue;
+            }
+            if remove(&path).is_ok() {
+                removed += 1;
+            }
+        }
+        Ok(removed)
+    }
+
+    /// Bytes that are free on the disk of this folder, and its size.
+    pub fn disk(&self) -> Result<(u64, u64)> {
+        let stat = rustix::fs::statvfs(&*self.root).map_err(|error| {
+            StoreError::io("ask for the free space of", &self.root)(error.into())
+        })?;
+        Ok((stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize))
+    }
+}
+
+fn is_young(file: &File, age: Duration) -> bool {
+    let modified = file.metadata().and_then(|meta| meta.modified());
+    modified.is_ok_and(|at| SystemTime::now().duration_since(at).is_ok_and(|past| past < age))
+}
+
+/// Runs work on files, which blocks, where it may block.
+pub(crate) async fn on_files<T, F>(work: F) -> Result<T>
+where
+    T: Send + 'static,
+    F: FnOnce() -> Result<T> + Send + 'static,
+{
+    tokio::task::spawn_blocking(work).await.map_err(|_| StoreError::Interrupted)?
+}
+
+/// The paths in a folder; none if it is no folder, or gone.
+pub(crate) fn children(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = match fs::read_dir(folder) {
+        Err(_) if !folder.is_dir() => return Ok(Vec::new()),
+        entries => entries.map_err(StoreError::io("read the folder", folder))?,
+    };
+    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+    paths.collect::<Result<_, _>>().map_err(StoreError::io("read the folder", folder))
+}
+
+/// Writes a folder's entries to the disk: without it a rename may be forgotten in a power cut.
+pub(crate) fn sync_dir(path: &Path) -> Result<()> {
+    File::open(path)
+        .and_then(|dir| dir.sync_all())
+        .map_err(StoreError::io("write to the disk the folder", path))
+}
+
+/// Lets nobody but the owner look into a folder, or into a file.
+pub(crate) fn restrict(path: &Path) -> Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    let is_dir = fs::metadata(path).is_ok_and(|meta| meta.is_dir());
+    let mode = fs::Permissions::from_mode(if is_dir { 0o700 } else { 0o600 });
+    fs::set_permissions(path, mode).map_err(StoreError::io("keep for its owner", path))
+}
+
+/// Renames a file or folder that is on the disk already, for good.
+pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<()> {
+    fs::rename(from, to).map_err(StoreError::io("move a file to", to))?;
+    to.parent().map_or(Ok(()), sync_dir)
+}
+
+/// Makes one folder, for good. It may be there already.
+pub(crate) fn make_dir_durably(path: &Path) -> Result<()> {
+    match fs::create_dir(path) {
+        Ok(()) => path.parent().map_or(Ok(()), sync_dir),
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
+        Err(error) => Err(StoreError::io("make the folder", path)(error)),
+    }
+}
+
+/// Removes a file or a folder with all in it. It may be gone already.
+pub(crate) fn remove(path: &Path) -> Result<()> {
+    let result = match fs::symlink_metadata(path) {
+        Ok(meta) if meta.is_dir() => fs::remove_dir_all(path),
+        Ok(_) => fs::remove_file(path),
+        Err(error) => Err(error),
+    };
+    match result {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(StoreError::io("remove", path)(error))
+        }
+        _ => Ok(()),
+    }
+}

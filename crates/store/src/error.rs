@@ -1,0 +1,161 @@
+//! What can go wrong in the store.
+
+use std::path::{Path, PathBuf};
+
+use engine::job::IllegalTransition;
+
+pub type Result<T, E = StoreError> = std::result::Result<T, E>;
+
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    #[error("the database failed: {0}")]
+    Database(#[from] sqlx::Error),
+    #[error("the database can't be brought up to date: {0}")]
+    Migrate(#[from] sqlx::migrate::MigrateError),
+    #[error(
+        "the database can't be brought up to date: {error}. Its copy from before is {copy}; the version \
+         before serves it (docs/operations.md, upgrade and rollback)",
+        copy = copy.display()
+    )]
+    Upgrade { error: sqlx::migrate::MigrateError, copy: PathBuf },
+    #[error(
+        "{folder}: the database was brought up to date by version {by} (schema {found}); this is version \
+         {own} (schema {schema}). Nothing was changed. To go on, start that version again, or go back{copy} \
+         (docs/operations.md, upgrade and rollback)",
+        folder = folder.display(),
+        own = env!("CARGO_PKG_VERSION"),
+        copy = copy.as_ref().map_or(String::new(), |path| format!(" to {}", path.display()))
+    )]
+    Newer {
+        folder: PathBuf,
+        /// The version that wrote the marker.
+        by: String,
+        found: i64,
+        schema: i64,
+        /// The last copy from before that this program can serve.
+        copy: Option<PathBuf>,
+    },
+    #[error("can't {action} {path}: {source}", path = path.display())]
+    Io { action: &'static str, path: PathBuf, source: std::io::Error },
+    #[error("the database holds {value:?} as {column}, which can't be")]
+    Corrupt { column: &'static str, value: String },
+    #[error("{path} is no data folder of a service", path = .0.display())]
+    NoFolder(PathBuf),
+    #[error(
+        "another server uses {path}; stop it first, or give this one its own --data",
+        path = .0.display()
+    )]
+    Taken(PathBuf),
+    #[error("{folder}: {found}. Nothing was changed. To go on, {remedy}", folder = folder.display())]
+    Refused { folder: PathBuf, found: String, remedy: &'static str },
+    #[error("there is no {what} {id}")]
+    NotFound { what: &'static str, id: String },
+    #[error("{}", unready(*.id, .error.as_deref()))]
+    Unready {
+        id: engine::job::CalibrationId,
+        /// Why there will be none; none while they are made.
+        error: Option<String>,
+    },
+    #[error("{}", unchecked(*.id, .error.as_deref()))]
+    Unchecked {
+        id: engine::job::MeasurementId,
+        /// Why it did not pass; none while the check goes on.
+        error: Option<String>,
+    },
+    #[error("the {what} is used by {users} {by}; delete those first")]
+    InUse { what: &'static str, by: &'static str, users: u64 },
+    #[error("a calibration, a measurement or a model needs the file {0}; delete that first")]
+    FileInUse(engine::job::Sha256),
+    #[error("{0}")]
+    State(#[from] IllegalTransition),
+    #[error("the job is {0}; cancel it before it is deleted")]
+    NotFinal(engine::job::JobState),
+    #[error("the job is {0}: its priority no longer matters")]
+    Ended(engine::job::JobState),
+    #[error("the hash should be {expected}, the bytes have {found}")]
+    HashMismatch { expected: engine::job::Sha256, found: engine::job::Sha256 },
+    /// Of an upload in pieces, bytes are lost that were on the disk.
+    #[error(
+        "{found} bytes of upload {id} are on the disk, fewer than the {recorded} on record: delete it \
+         and send the file again"
+    )]
+    Short { id: engine::job::PartialId, found: u64, recorded: u64 },
+    /// A stored file is gone, or its bytes are not those on record.
+    #[error("the {what} {name} is damaged on the disk of the service; {}", if *what == "result" {
+        "retry its job, and it is made again"
+    } else {
+        "send it, or what it was made of, again"
+    })]
+    Damaged { what: &'static str, name: String },
+    /// The data changed faster than they could be written out.
+    #[error(
+        "in {0} tries no moment was found at which nothing was deleted; try again when less is done"
+    )]
+    Restless(u32),
+    #[error("{jobs} jobs {whose}wait or run, and no more than {most} may")]
+    QueueFull { whose: &'static str, jobs: u64, most: u64 },
+    #[error("it needs {needed} bytes, and the {whose} keeps {kept} of the {limit} it may")]
+    Quota { whose: &'static str, kept: u64, needed: u64, limit: u64 },
+    #[error("{0} uploads of this lab are not complete; end some before another is begun")]
+    ManyPartials(u64),
+    #[error("the Idempotency-Key {key:?} was used for another request, which made {what} {id}")]
+    KeyReused { key: String, what: &'static str, id: String },
+    /// A task that blocks was broken off, as at shutdown.
+    #[error("the work was broken off")]
+    Interrupted,
+}
+
+fn unready(id: engine::job::CalibrationId, error: Option<&str>) -> String {
+    match error {
+        None => {
+            format!(
+                "the masks of calibration {id} are still being made or checked; ask again in a moment"
+            )
+        }
+        Some(error) => format!("calibration {id} has failed: {error}"),
+    }
+}
+
+fn unchecked(id: engine::job::MeasurementId, error: Option<&str>) -> String {
+    match error {
+        None => format!("measurement {id} is still being checked; ask again in a moment"),
+        Some(error) => format!("measurement {id} has not passed its check: {error}"),
+    }
+}
+
+impl StoreError {
+    /// There is no such thing of this kind.
+    pub(super) fn missing(what: &'static str, id: impl ToString) -> Self {
+        Self::NotFound { what, id: id.to_string() }
+    }
+
+    /// Wraps an I/O error with what was tried on what.
+    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
+
+    /// True if others had the database for too long.
+    pub fn is_busy(&self) -> bool {
+        match self {
+            // SQLITE_BUSY and SQLITE_LOCKED, which may come with a reason in the upper bits
+            Self::Database(sqlx::Error::Database(error)) => error
+                .code()
+                .and_then(|code| code.parse::<u32>().ok())
+                .is_some_and(|code| matches!(code & 0xff, 5 | 6)),
+            Self::Database(sqlx::Error::PoolTimedOut) => true,
+            _ => false,
+        }
+    }
+
+    /// True if the disk is full or a quota is used up.
+    pub fn is_disk_full(&self) -> bool {
+        use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+        match self {
+            Self::Io { source, .. } => matches!(source.kind(), StorageFull | QuotaExceeded),
+            // SQLITE_FULL
+            Self::Database(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
+            _ => false,
+        }
+    }
+}

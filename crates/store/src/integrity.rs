@@ -1,0 +1,316 @@
+//! Whether stored files have the bytes on record: asked before a file is handed out, and by a slow look at
+//! all of them in between.
+//!
+//! A file is read whole the first time that it is asked for. What was found holds until the file changes
+//! (its inode, size or time), or until the slow look finds that the disk has changed it by itself.
+
+use std::fs::File;
+use std::io::{Read, Seek};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use rustix::fs::{Advice, fadvise};
+
+use super::error::{Result, StoreError};
+use super::hashes::{Digester, Digests, Identity, digest, open};
+use super::records::{self, Place, Record};
+use super::rows::{sql, sql_scalar};
+use super::{DataDir, Job, Store, on_files};
+use engine::job::{ResultFile, Sha256, Timestamp};
+
+/// Bytes that the slow look reads at a time.
+const SLICE: usize = 1 << 20;
+/// Time from the begin of a slow look to that of the next.
+const ROUND: Duration = Duration::from_secs(86_400);
+/// Pause of the slow look when the database or the disk has failed, or when it is done.
+const PAUSE: Duration = Duration::from_secs(10);
+
+/// What a comparison of all records with the disk has found.
+#[derive(Debug, Default)]
+pub struct Audit {
+    /// Files that are on record.
+    pub files: u64,
+    /// Bytes that were read of them.
+    pub bytes: u64,
+    /// What SQLite says of the database: `ok`, or what is wrong.
+    pub database: String,
+    /// Files that are there with other bytes than those on record.
+    pub damaged: Vec<String>,
+    /// Files that are on record and not there.
+    pub missing: Vec<String>,
+    /// Blobs, results of jobs and uploads in pieces that no record knows of.
+    pub unknown: usize,
+}
+
+impl Audit {
+    /// True if all that is on record is there as it should be.
+    pub fn is_good(&self) -> bool {
+        self.damaged.is_empty() && self.missing.is_empty() && self.database == "ok"
+    }
+}
+
+impl Store {
+    /// Opens a result file of a snapshot (or, with none, of the whole job).
+    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet; [`StoreError::Damaged`] if it
+    /// is gone, or its bytes are not those on record.
+    pub async fn open_result(
+        &self,
+        job: &Job,
+        snapshot: Option<u32>,
+        name: &str,
+    ) -> Result<(ResultFile, PathBuf, File)> {
+        let (file, path) = self.result_file(job, snapshot, name).await?;
+        let (opened, _) = self.open_intact(&result_record(job, snapshot, &file)).await?;
+        Ok((file, path, opened))
+    }
+
+    /// The CRC-32 of a result file of a snapshot (or, with none, of the whole job).
+    /// Errors: as [`Self::open_result`].
+    pub async fn result_crc32(&self, job: &Job, snapshot: Option<u32>, name: &str) -> Result<u32> {
+        let (file, _) = self.result_file(job, snapshot, name).await?;
+        Ok(self.open_intact(&result_record(job, snapshot, &file)).await?.1.crc32)
+    }
+
+    /// Opens a stored file, whose bytes are those of its name.
+    /// Errors: [`StoreError::Damaged`] if it is gone, or its bytes are others.
+    pub async fn open_blob(&self, sha256: Sha256) -> Result<File> {
+        Ok(self.open_intact(&Record { place: Place::Blob(sha256), sha256 }).await?.0)
+    }
+
+    /// Where a stored file lies, whose bytes are those of its name.
+    /// Errors: [`StoreError::Damaged`] if it is gone, or its bytes are others.
+    pub async fn intact_blob(&self, sha256: Sha256) -> Result<PathBuf> {
+        self.open_blob(sha256).await?;
+        Ok(self.dir().blob(&sha256))
+    }
+
+    async fn open_intact(&self, record: &Record) -> Result<(File, Digests)> {
+        let path = record.path(self.dir());
+        let opened = on_files(move || open(&path)).await?;
+        let Some((mut file, meta)) = opened else { return Err(self.damaged(record).await) };
+        let hashing = async {
+            let again = file.try_clone().map_err(StoreError::io("open", self.dir().root()))?;
+            let hashed = on_files(move || digest(again)).await?;
+            Ok::<_, StoreError>(hashed)
+        };
+        let found = self.hashes.0.get_or_insert_async(&Identity::of(&meta), hashing).await?;
+        if found.sha256 != record.sha256 {
+            return Err(self.damaged(record).await);
+        }
+        on_files(move || {
+            file.rewind().map_err(StoreError::io("read", Path::new("a stored file")))?;
+            Ok((file, found))
+        })
+        .await
+    }
+
+    /// Notes that a file is damaged, unless it is not on record any more, and makes an error of it.
+    async fn damaged(&self, record: &Record) -> StoreError {
+        let name = record.name(self.dir());
+        if let Err(error) = self.mark(record).await {
+            tracing::error!(file = name, %error, "that a file is damaged can't be noted");
+        }
+        match &record.place {
+            Place::Blob(sha256) => StoreError::Damaged { what: "upload", name: sha256.to_string() },
+            Place::Result { name, .. } => {
+                StoreError::Damaged { what: "result", name: name.clone() }
+            }
+        }
+    }
+
+    async fn mark(&self, record: &Record) -> Result<()> {
+        let now = Timestamp::now();
+        let marked = match &record.place {
+            Place::Blob(sha256) => {
+                let mark =
+                    "UPDATE blobs SET damaged_at = ? WHERE sha256 = ? AND damaged_at IS NULL";
+                sql!(mark, [now, sha256])
+            }
+            Place::Result { job, snapshot, name } => sql!(
+                "UPDATE result_files SET damaged_at = ?
+                 WHERE job = ? AND snapshot = ? AND name = ? AND sha256 = ? AND damaged_at IS NULL",
+                [now, job, snapshot, name, record.sha256]
+            ),
+        };
+        if marked.execute(&self.writer).await?.rows_affected() > 0 {
+            let file = record.name(self.dir());
+            tracing::error!(
+                file,
+                "a stored file is missing or has other bytes than those on record"
+            );
+        }
+        Ok(())
+    }
+
+    /// Stored files that are known to be damaged or missing.
+    pub async fn damaged_files(&self) -> Result<u64> {
+        let count = "SELECT (SELECT count(*) FROM blobs WHERE damaged_at IS NOT NULL)
+                          + (SELECT count(*) FROM result_files WHERE damaged_at IS NOT NULL)";
+        Ok(sql_scalar!(count, []).fetch_one(&self.readers).await?)
+    }
+
+    /// Compares all records with the disk, and asks SQLite whether the database is sound. Changes nothing.
+    pub async fn verify(&self) -> Result<Audit> {
+        let mut audit = Audit::default();
+        let verdicts: Vec<String> =
+            sql_scalar!("PRAGMA integrity_check(10)", []).fetch_all(&self.readers).await?;
+        audit.database = verdicts.join("; ");
+        let mut after = None;
+        loop {
+            let page = records::page(&mut *self.readers.acquire().await?, after.as_ref()).await?;
+            let Some(last) = page.last() else { break };
+            after = Some(last.place.clone());
+            for record in page {
+                let path = record.path(self.dir());
+                let found = on_files(move || {
+                    let Some((file, meta)) = open(&path)? else { return Ok(None) };
+                    Ok(Some((digest(file)?.sha256, meta.len())))
+                })
+                .await?;
+                self.compare(&record, found, &mut audit).await?;
+            }
+        }
+        let partials = records::partials(&mut *self.readers.acquire().await?).await?;
+        for (id, received) in partials {
+            let bytes = self.partial_bytes(id).await?;
+            let still = records::partials(&mut *self.readers.acquire().await?).await?;
+            if bytes < received && still.iter().any(|(other, _)| *other == id) {
+                audit.damaged.push(format!("partial/{id}"));
+            }
+        }
+        audit.unknown = self.unknown_things().await?;
+        Ok(audit)
+    }
+
+    async fn compare(
+        &self,
+        record: &Record,
+        found: Option<(Sha256, u64)>,
+        audit: &mut Audit,
+    ) -> Result<()> {
+        audit.files += 1;
+        audit.bytes += found.map_or(0, |(_, bytes)| bytes);
+        if found.is_some_and(|(sha256, _)| sha256 == record.sha256)
+            // It may have been deleted or replaced meanwhile.
+            || !records::stands(&mut *self.readers.acquire().await?, record).await?
+        {
+            return Ok(());
+        }
+        let list = if found.is_some() { &mut audit.damaged } else { &mut audit.missing };
+        list.push(record.name(self.dir()));
+        Ok(())
+    }
+
+    /// Looks at all stored files again and again, at most once a day, reading `rate` bytes in a second, and
+    /// notes what is damaged. Where it stands is on record: a restart goes on there.
+    pub async fn scrub(&self, rate: u64) {
+        loop {
+            let pause = match self.scrub_page(rate).await {
+                Ok(pause) => pause,
+                Err(error) => {
+                    tracing::error!(%error, "the look at the stored files was interrupted");
+                    PAUSE
+                }
+            };
+            tokio::time::sleep(pause).await;
+        }
+    }
+
+    /// Looks at the next page of files; says how long to wait for the page after it.
+    async fn scrub_page(&self, rate: u64) -> Result<Duration> {
+        let now = Timestamp::now();
+        sql!("INSERT INTO scrub (one, started_at) VALUES (1, ?) ON CONFLICT DO NOTHING", [now])
+            .execute(&self.writer)
+            .await?;
+        let row: (Timestamp, Option<sqlx::types::Json<Place>>) =
+            sqlx::query_as("SELECT started_at, place FROM scrub").fetch_one(&self.readers).await?;
+        let (started_at, place) = (row.0, row.1.map(|json| json.0));
+        let page = records::page(&mut *self.readers.acquire().await?, place.as_ref()).await?;
+        let Some(last) = page.last() else {
+            // A clock that was set back does not hold it up for longer than a round.
+            let since = Duration::from_millis(now.0.abs_diff(started_at.0));
+            let left = ROUND.saturating_sub(since);
+            if !left.is_zero() {
+                return Ok(left.min(PAUSE));
+            }
+            sql!("UPDATE scrub SET started_at = ?, place = NULL", [now])
+                .execute(&self.writer)
+                .await?;
+            return Ok(PAUSE);
+        };
+        for record in &page {
+            self.scrub_file(record, rate).await?;
+        }
+        sql!("UPDATE scrub SET place = ?", [sqlx::types::Json(&last.place)])
+            .execute(&self.writer)
+            .await?;
+        Ok(Duration::ZERO)
+    }
+
+    async fn scrub_file(&self, record: &Record, rate: u64) -> Result<()> {
+        let path = record.path(self.dir());
+        let opened = on_files(move || open(&path)).await?;
+        let found = match opened {
+            None => None,
+            Some((file, meta)) => {
+                let digests = read_slowly(file, rate).await?;
+                self.hashes.0.insert(Identity::of(&meta), digests);
+                Some(digests.sha256)
+            }
+        };
+        if found != Some(record.sha256)
+            && records::stands(&mut *self.readers.acquire().await?, record).await?
+        {
+            self.mark(record).await?;
+        }
+        Ok(())
+    }
+}
+
+fn result_record(job: &Job, snapshot: Option<u32>, file: &ResultFile) -> Record {
+    let place = Place::Result {
+        job: job.id,
+        snapshot: snapshot.map_or(super::tables::results::WHOLE_JOB, i64::from),
+        name: file.name.clone(),
+    };
+    Record { place, sha256: file.sha256 }
+}
+
+/// Hashes a file as it lies on the disk, not as the kernel remembers it, and stays below this rate. Between
+/// slices it can be broken off.
+async fn read_slowly(file: File, rate: u64) -> Result<Digests> {
+    // Advice alone: where it is not taken, what the kernel remembers is hashed.
+    let _ = fadvise(&file, 0, None, Advice::DontNeed);
+    let mut state = (file, Digester::default());
+    loop {
+        let (next, count) = on_files(move || {
+            let (mut file, mut digester) = state;
+            let mut buffer = vec![0; SLICE];
+            let count = file
+                .read(&mut buffer)
+                .map_err(StoreError::io("read", Path::new("a stored file")))?;
+            digester.update(&buffer[..count]);
+            Ok(((file, digester), count))
+        })
+        .await?;
+        state = next;
+        if count == 0 {
+            break;
+        }
+        #[allow(clippy::cast_precision_loss)] // a pause
+        tokio::time::sleep(Duration::from_secs_f64(count as f64 / rate.max(1) as f64)).await;
+    }
+    let (file, digester) = state;
+    let _ = fadvise(&file, 0, None, Advice::DontNeed);
+    Ok(digester.finish())
+}
+
+impl Record {
+    /// Whether the file at this path has the bytes on record.
+    pub(super) fn is_at(&self, dir: &DataDir) -> Result<bool> {
+        match open(&self.path(dir))? {
+            Some((file, _)) => Ok(digest(file)?.sha256 == self.sha256),
+            None => Ok(false),
+        }
+    }
+}

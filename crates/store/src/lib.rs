@@ -1,0 +1,231 @@
+//! All that lasts: SQLite for the records, content-addressed files for the arrays.
+//!
+//! The server and every worker process open the same folder. Files are put in place and removed
+//! while the writer's lock of the database is held, so that a file and its row can't part when two
+//! processes work on the same content: the database is the one mutex of the service. No transaction
+//! is open while anything is computed or uploaded.
+//!
+//! What comes in goes through `submit` to the `queue`, and from there to the `tables`; nothing
+//! goes the other way.
+//!
+//! # Errors
+//! Every function that asks the database fails if the database does, and every one that changes files
+//! fails if the disk does ([`StoreError`]). What a lab has nothing under is `NotFound`, and what others
+//! refer to is not deleted (`InUse`). Their descriptions name only what else can go wrong.
+
+use crate::error::Result;
+mod backup;
+mod cleaning;
+mod clock;
+mod dir;
+mod error;
+mod hashes;
+mod identity;
+mod integrity;
+mod locked;
+mod queue;
+mod records;
+mod rows;
+mod staging;
+mod submit;
+mod tables;
+#[cfg(test)]
+mod tests;
+mod upgrade;
+mod watch;
+
+use std::path::Path;
+use std::sync::atomic::AtomicUsize;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use sqlx::sqlite::{
+    Sqlite, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
+};
+use sqlx::{Connection, SqlitePool};
+
+pub use backup::Backup;
+pub use dir::DataDir;
+pub(crate) use dir::on_files;
+pub use error::StoreError;
+pub use identity::Purpose;
+pub use integrity::Audit;
+pub use locked::LockedFile;
+pub use queue::{
+    Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Estimate,
+    Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
+    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
+    WorkerEnd,
+};
+pub use rows::{Filter, Page, Span};
+pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
+pub use submit::{NewCaptures, NewJob};
+pub use tables::{
+    Blob, BlobRow, Calibration, CalibrationMark, Check, CheckMark, Entitlement, FIRST_RESERVE,
+    FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made,
+    Measurement, Model, NewCalibration, NewCheck, NewMeasurement, NewModel, NewPartial, Origin,
+    Partial, PartialFile, RequestKey, Source, TaskCounts, TaskRecord, TaskTotals, TileHistory,
+    TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow, WorkerTask, share_error,
+};
+pub use watch::Watcher;
+
+/// The store: a handle that is cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Store {
+    dir: DataDir,
+    /// One connection: within a process, writers wait for each other here and not in SQLite.
+    writer: SqlitePool,
+    readers: SqlitePool,
+    /// What is ahead of every job, as it was a moment ago.
+    forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
+    /// Hashes of files that were read before they were handed out.
+    hashes: Arc<hashes::Hashes>,
+    /// How much is being removed from the disk.
+    going: Arc<AtomicUsize>,
+    /// What was last found wrong with the database.
+    damage: Arc<Mutex<Option<String>>>,
+    /// The lock of the server, if this is its store.
+    _server: Option<Arc<LockedFile>>,
+}
+
+static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("../../migrations");
+
+/// The number of the newest migration.
+fn schema() -> i64 {
+    MIGRATIONS.iter().map(|migration| migration.version).max().unwrap_or_default()
+}
+
+/// A transaction that holds the writer's lock from its start, so that it can't fail half-way
+/// because another process began to write.
+pub(crate) type WriteTransaction = sqlx::Transaction<'static, Sqlite>;
+
+impl Store {
+    /// Opens the store in `root`.
+    /// Errors: if the folder is none, is another server's, or does not belong to its database; if
+    /// it can't be written; or if a newer version of this program has changed the database.
+    pub async fn open(root: &Path, purpose: Purpose) -> Result<Self> {
+        let serves = purpose != Purpose::Use;
+        let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
+        let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
+        identity::check(&dir, purpose, schema()).await?;
+        dir.fill()?;
+        let copy = if serves { upgrade::save(&dir, schema()).await? } else { None };
+        let options = SqliteConnectOptions::new()
+            .filename(dir.database())
+            .create_if_missing(serves)
+            .foreign_keys(true)
+            .busy_timeout(Duration::from_secs(15))
+            .journal_mode(SqliteJournalMode::Wal)
+            // A worker may write to the data folder alone, and not where SQLite puts its temporary files.
+            .pragma("temp_store", "memory")
+            // NORMAL survives a killed process, but a power cut could take back the last commits,
+            // and an answered request must not be lost. Commits are few (a heartbeat of each
+            // worker every two seconds), so a sync for each costs nothing that is felt.
+            .synchronous(SqliteSynchronous::Full);
+        let writer = SqlitePoolOptions::new()
+            .max_connections(1)
+            .idle_timeout(None)
+            .max_lifetime(None)
+            // After some errors, such as a full disk, SQLite has rolled back by itself; sqlx then
+            // fails to roll back again and holds the transaction to be open for ever.
+            .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
+            .connect_with(options.clone());
+        let writer = writer.await?;
+        // Where the folder is only used, nothing is left to do: this refuses a newer database.
+        MIGRATIONS.run(&writer).await.map_err(|error| match copy {
+            Some(copy) => StoreError::Upgrade { error, copy },
+            None => error.into(),
+        })?;
+        let readers = SqlitePoolOptions::new()
+            .max_connections(4)
+            .idle_timeout(None)
+            .max_lifetime(None)
+            .connect_with(options.read_only(true))
+            .await?;
+        let (forecast, hashes) = (Arc::default(), Arc::default());
+        let store = Self {
+            dir,
+            writer,
+            readers,
+            forecast,
+            hashes,
+            going: Arc::default(),
+            damage: Arc::default(),
+            _server: server,
+        };
+        if serves {
+            for path in [store.dir.root().to_owned(), store.dir.database()] {
+                if let Err(error) = dir::restrict(&path) {
+                    tracing::warn!(%error, "others may look into the data");
+                }
+            }
+            store.note_time(Duration::ZERO).await?;
+            identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
+            store.write_marker().await?;
+            store.advance_generation().await?;
+        }
+        Ok(store)
+    }
+
+    /// Lets the database and the marker be newer than all copies of them; see `identity.rs`.
+    pub async fn advance_generation(&self) -> Result<()> {
+        sqlx::query("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
+        self.write_marker().await
+    }
+
+    async fn write_marker(&self) -> Result<()> {
+        let marker = identity::marker(&mut *self.writer.acquire().await?, schema()).await?;
+        let (root, draft) = (self.dir.root().to_owned(), self.temporary_path());
+        on_files(move || identity::write(&root, &draft, &marker)).await
+    }
+
+    pub fn dir(&self) -> &DataDir {
+        &self.dir
+    }
+
+    /// Waits for running statements and closes all connections.
+    pub async fn close(&self) {
+        self.readers.close().await;
+        self.writer.close().await;
+    }
+
+    /// Asks the database for an answer.
+    pub async fn ping(&self) -> Result<()> {
+        sqlx::query("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
+        Ok(())
+    }
+
+    /// Has SQLite look for damage in the whole database, and remembers what it says.
+    pub async fn look_at_database(&self) -> Result<()> {
+        let verdict: String =
+            sqlx::query_scalar("PRAGMA quick_check(1)").fetch_one(&self.readers).await?;
+        let damage = Some(verdict).filter(|verdict| verdict != "ok");
+        if let Some(damage) = &damage {
+            tracing::error!(damage, "the database is damaged");
+        }
+        *self.damage.lock().unwrap_or_else(PoisonError::into_inner) = damage;
+        Ok(())
+    }
+
+    /// What is wrong with the database, if the last look has found something.
+    pub fn database_damage(&self) -> Option<String> {
+        self.damage.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Tries whether files can be made and written.
+    pub async fn try_disk(&self) -> Result<()> {
+        let (store, byte) = (self.clone(), b"?");
+        on_files(move || {
+            let mut file = store.blob_writer()?;
+            let written = std::io::Write::write_all(&mut file, byte);
+            written.map_err(StoreError::io("write to", &store.dir().tmp()))?;
+            // Dropped, and so removed.
+            file.finish().map(|_| ())
+        })
+        .await
+    }
+
+    pub(crate) async fn write(&self) -> Result<WriteTransaction> {
+        Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
+    }
+}

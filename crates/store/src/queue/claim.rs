@@ -1,0 +1,381 @@
+//! How a worker gets a task, with all that it needs to do it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde_json::Value;
+use sqlx::sqlite::SqliteRow;
+use sqlx::types::Json;
+use sqlx::{AssertSqlSafe, FromRow, Row, SqliteConnection};
+
+use super::lease::{self, LONGEST_LEASE, Lease, Loss};
+use crate::Store;
+use crate::error::{Result, StoreError};
+use crate::rows::{sql, sql_as, sql_scalar};
+use crate::tables::calibrations::Calibration;
+use crate::tables::measurements::Measurement;
+use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
+use crate::tables::{jobs, workers};
+use engine::job::{
+    CalibrationId, Captures, JobId, JobSpec, JobState, Label, Sha256, TaskKind, TaskStage,
+    TaskState, Timestamp, WorkerId,
+};
+
+/// The longest pause of a task after a failure, in milliseconds: one that ends later was noted before
+/// the clock was set back.
+const LONGEST_PAUSE: i64 = 60_000;
+
+/// A task with all that a worker needs to do it.
+#[derive(Debug, Clone)]
+pub struct ClaimedTask {
+    /// The right to it, to be shown with every message about it.
+    pub lease: Lease,
+    pub kind: TaskKind,
+    /// Its planned processor time in seconds.
+    pub cost: f64,
+    pub work: Work,
+}
+
+#[derive(Debug, Clone)]
+pub enum Work {
+    Job(Box<JobTask>),
+    /// A calibration's masks, or the report on them.
+    Calibration(Box<CalibrationTask>),
+    Movie(Box<MovieWork>),
+}
+
+#[derive(Debug, Clone)]
+pub struct JobTask {
+    pub job: JobId,
+    pub spec: JobSpec,
+    pub calibration: Calibration,
+    pub measurement: Measurement,
+    /// What the job's prepare task recorded; none for that task itself.
+    pub prepared: Option<Value>,
+    /// What its pilot recorded, if it has one that is done.
+    pub pilot: Option<Value>,
+    /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan.
+    pub tiles: Vec<TileResult>,
+    /// For the manifest: all other tasks of the job, in order.
+    pub records: Vec<TaskRecord>,
+}
+
+#[derive(Debug, Clone, FromRow)]
+pub struct CalibrationTask {
+    pub calibration: CalibrationId,
+    pub name: Option<Label>,
+    /// Captures, of which masks are to be made; none where only a report on the masks is.
+    #[sqlx(json(nullable))]
+    pub captures: Option<Captures>,
+    /// The masks, a planar array, if they are there.
+    pub masks: Option<Sha256>,
+}
+
+/// A movie that is to be made.
+#[derive(Debug, Clone)]
+pub struct MovieWork {
+    pub job: JobId,
+    pub spec: JobSpec,
+    pub measurement: Measurement,
+    /// What the job's prepare task recorded.
+    pub prepared: Option<Value>,
+    /// Of each snapshot the array with its frames, and the hash that it should have.
+    pub arrays: Vec<(PathBuf, Sha256)>,
+}
+
+/// Who asks for a task, and so which tasks may be handed out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Claimant<'a> {
+    /// A worker of this machine that does all there is.
+    Local,
+    /// One that leaves the tiles to other machines.
+    WithoutTiles,
+    /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
+    /// run out.
+    Pool(&'a str),
+}
+
+impl Claimant<'_> {
+    /// The statement that tells whether there may be work: a task that is ready, or a lease that has run
+    /// out. Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
+    fn look(self) -> String {
+        let Choice { kinds, by_lab, .. } = self.choice();
+        format!(
+            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks {by_lab} WHERE state = 'ready' {kinds}
+                                        AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
+                 OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
+                                AND lease_until NOT BETWEEN ?1 AND ?1 + ?3)"
+        )
+    }
+
+    /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of
+    /// the lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see
+    /// [`take`].
+    fn take(self) -> String {
+        let Choice { kinds, by_lab, by_job } = self.choice();
+        let ready = format!("state = 'ready' {kinds} AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6");
+        format!(
+            "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
+                 stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
+             WHERE id = (
+                 SELECT tasks.id FROM (
+                     -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
+                     SELECT finish, (SELECT id FROM tasks {by_lab}
+                                     WHERE {ready} AND tasks.lab = labs.lab
+                                     ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
+                     FROM labs
+                     UNION ALL
+                     SELECT finish, (SELECT id FROM tasks {by_job}
+                                     WHERE {ready}
+                                       AND job = (SELECT id FROM jobs
+                                                  WHERE jobs.state = 'running' AND jobs.lab = labs.lab
+                                                    AND EXISTS (SELECT 1 FROM tasks {by_job}
+                                                                WHERE job = jobs.id AND {ready})
+                                                  ORDER BY priority DESC, id LIMIT 1)
+                                     ORDER BY ordinal LIMIT 1)
+                     FROM labs)
+                 JOIN tasks ON tasks.id = task
+                 LEFT JOIN jobs ON jobs.id = job
+                 ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
+                     jobs.state = 'running' DESC, job, ordinal, tasks.id
+                 LIMIT 1)
+             RETURNING id, job, calibration, movie, lab, kind, snapshot, snapshots, tile, attempt, cost"
+        )
+    }
+
+    fn choice(self) -> Choice {
+        match self {
+            Self::Local => Choice { kinds: "", by_lab: "", by_job: "" },
+            Self::WithoutTiles => Choice {
+                kinds: "AND kind <> 'tile'",
+                by_lab: "INDEXED BY tasks_others",
+                by_job: "INDEXED BY tasks_others_of_job",
+            },
+            Self::Pool(_) => Choice { kinds: "AND kind = 'tile'", by_lab: "", by_job: "" },
+        }
+    }
+}
+
+/// Which tasks a claimant may have, and the indexes that lead past those that it may not.
+struct Choice {
+    kinds: &'static str,
+    by_lab: &'static str,
+    by_job: &'static str,
+}
+
+impl Store {
+    /// Hands out the next task of any kind, if there is one.
+    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
+        self.claim_as(Claimant::Local, worker, length).await
+    }
+
+    /// Hands out the next task that this claimant may have, if there is one.
+    pub async fn claim_as(
+        &self,
+        claimant: Claimant<'_>,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>> {
+        let now = Timestamp::now().0;
+        if !self.may_have_work(claimant, now).await? {
+            return Ok(None);
+        }
+        let mut transaction = self.write().await?;
+        lease::reap(&mut transaction, now).await?;
+        let claimed = take(&mut transaction, claimant, worker, length, now).await?;
+        let Some(row) = claimed else {
+            transaction.commit().await?;
+            return Ok(None);
+        };
+        let lease =
+            Lease { task: row.try_get("id")?, attempt: row.try_get("attempt")?, worker, length };
+        let (owner, kind) = (tasks::owner(&row)?, tasks::kind(&row)?);
+        sql!(
+            "INSERT INTO attempts (task, attempt, worker, started_at) VALUES (?, ?, ?, ?)",
+            [lease.task, lease.attempt, worker, now]
+        )
+        .execute(&mut *transaction)
+        .await?;
+        if let Owner::Job(job) = owner
+            && jobs::state(&mut transaction, job).await? == JobState::Queued
+        {
+            jobs::set_state(&mut transaction, job, JobState::Running, None).await?;
+        }
+        if let Claimant::Pool(pool) = claimant {
+            hand_over(&mut transaction, &lease, pool).await?;
+        }
+        workers::seen(&mut transaction, worker).await?;
+        transaction.commit().await?;
+        match self.work(owner, kind).await {
+            Ok(work) => Ok(Some(ClaimedTask { lease, kind, cost: row.try_get("cost")?, work })),
+            Err(error) => {
+                self.part(&lease, &Loss::Lost(error.to_string())).await?;
+                Err(error)
+            }
+        }
+    }
+
+    /// All that a task needs.
+    pub(super) async fn work(&self, owner: Owner, kind: TaskKind) -> Result<Work, StoreError> {
+        match owner {
+            Owner::Job(job) => self.job_task(job, kind).await,
+            Owner::Calibration(id) => self.calibration_task(id).await,
+            Owner::Movie(job) => self.movie_work(job, kind.snapshot()).await,
+        }
+    }
+
+    /// Looks without the lock: most of the time there is nothing to do.
+    async fn may_have_work(&self, claimant: Claimant<'_>, now: i64) -> Result<bool> {
+        let found = sql!(AssertSqlSafe(claimant.look()), [now, LONGEST_PAUSE, LONGEST_LEASE])
+            .fetch_optional(&self.readers)
+            .await?;
+        Ok(found.is_some())
+    }
+
+    async fn job_task(&self, job: JobId, kind: TaskKind) -> Result<Work> {
+        let facts = sql_as!(
+            "SELECT spec,
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot
+             FROM jobs WHERE id = ?",
+            [job]
+        );
+        type Record = Option<Json<Value>>;
+        let (Json(spec), prepared, pilot): (Json<JobSpec>, Record, Record) =
+            facts.fetch_one(&self.readers).await?;
+        let calibration = self.find_calibration(None, spec.calibration).await?;
+        let measurement = self.find_measurement(None, spec.measurement).await?;
+        let (mut tiles, mut records) = (Vec::new(), Vec::new());
+        match kind {
+            TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
+            TaskKind::Manifest => records = self.task_records(job).await?,
+            _ => {}
+        }
+        let (prepared, pilot) = (prepared.map(|json| json.0), pilot.map(|json| json.0));
+        Ok(Work::Job(Box::new(JobTask {
+            job,
+            spec,
+            calibration,
+            measurement,
+            prepared,
+            pilot,
+            tiles,
+            records,
+        })))
+    }
+
+    async fn movie_work(&self, job: JobId, snapshot: Option<u32>) -> Result<Work> {
+        let job = self.job_of_any_lab(job).await?;
+        let measurement = self.find_measurement(None, job.spec.measurement).await?;
+        let prepared: Option<Json<Value>> =
+            sql_scalar!("SELECT record FROM tasks WHERE job = ? AND kind = 'prepare'", [job.id])
+                .fetch_one(&self.readers)
+                .await?;
+        let mut arrays = Vec::new();
+        for snapshot in
+            snapshot.map_or_else(|| job.spec.snapshots.indices().collect(), |one| vec![one])
+        {
+            let (file, path) = self.result_file(&job, Some(snapshot), "frames.npy").await?;
+            arrays.push((path, file.sha256));
+        }
+        let prepared = prepared.map(|json| json.0);
+        let work = MovieWork { job: job.id, spec: job.spec, measurement, prepared, arrays };
+        Ok(Work::Movie(Box::new(work)))
+    }
+
+    async fn calibration_task(&self, id: CalibrationId) -> Result<Work> {
+        let task = sql_as!(
+            "SELECT calibration, name, captures,
+                 (SELECT prepared FROM calibrations WHERE id = calibration) AS masks
+             FROM calibration_requests WHERE calibration = ?",
+            [id]
+        );
+        let task = task.fetch_optional(&self.readers).await?;
+        let task = task.ok_or_else(|| StoreError::missing("calibration", id))?;
+        Ok(Work::Calibration(Box::new(task)))
+    }
+}
+
+/// Takes the next task, and advances its lab's tag.
+async fn take(
+    connection: &mut SqliteConnection,
+    claimant: Claimant<'_>,
+    worker: WorkerId,
+    length: Duration,
+    now: i64,
+) -> Result<Option<SqliteRow>> {
+    let row = sql!(
+        AssertSqlSafe(claimant.take()),
+        [
+            TaskState::Running,
+            worker,
+            Lease::until(length, now),
+            TaskStage::Reading,
+            now,
+            LONGEST_PAUSE
+        ]
+    )
+    .fetch_optional(&mut *connection)
+    .await?;
+    let Some(row) = row else { return Ok(None) };
+    // A lab that wanted nothing for a while begins where the others are: what it left them is not owed to it.
+    sql!(
+        "UPDATE labs SET start = max(finish, clock), finish = max(finish, clock) + ?2 / share
+         FROM (SELECT max(start) AS clock FROM labs) WHERE lab = ?1",
+        [row.try_get::<String, _>("lab")?, row.try_get::<f64, _>("cost")?]
+    )
+    .execute(connection)
+    .await?;
+    Ok(Some(row))
+}
+
+/// Notes that a tile that was claimed a moment ago is out with a pool.
+async fn hand_over(
+    connection: &mut SqliteConnection,
+    lease: &Lease,
+    pool: &str,
+) -> Result<(), StoreError> {
+    sql!(
+        "INSERT INTO remote_tasks (task, pool, attempt) VALUES (?, ?, ?)",
+        [lease.task, pool, lease.attempt]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!("UPDATE tasks SET lease_until = NULL WHERE id = ?", [lease.task])
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::{AssertSqlSafe, Row};
+
+    use super::Claimant;
+    use crate::{Purpose, Store};
+
+    /// What SQLite reads of `tasks` for a statement, line by line.
+    async fn plan(store: &Store, text: &str) -> Vec<String> {
+        let explained = sqlx::query(AssertSqlSafe(format!("EXPLAIN QUERY PLAN {text}")));
+        let rows = explained.fetch_all(&store.readers).await.unwrap();
+        let lines = rows.iter().map(|row| row.get::<String, _>("detail"));
+        lines.filter(|line| line.contains(" tasks")).collect()
+    }
+
+    #[tokio::test]
+    async fn who_takes_no_tiles_reads_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let purpose = Purpose::Serve { accept_database: false };
+        let store = Store::open(folder.path(), purpose).await.unwrap();
+        let claimant = Claimant::WithoutTiles;
+        // The look for leases that have run out reads what runs.
+        for (text, others) in [(claimant.look(), 1), (claimant.take(), 0)] {
+            let plan = plan(&store, &text).await;
+            let good = ["INDEX tasks_others", "PRIMARY KEY (id=?)"];
+            let bad: Vec<_> =
+                plan.iter().filter(|line| !good.iter().any(|good| line.contains(good))).collect();
+            assert!(plan.iter().any(|line| line.contains(good[0])), "{plan:#?}");
+            assert_eq!(bad.len(), others, "{bad:#?} of {plan:#?}");
+        }
+    }
+}

@@ -1,0 +1,199 @@
+//! How a task ends well: what it has made is stored, and what waited for it goes on.
+
+use serde::Deserialize;
+use serde_json::Value;
+use sqlx::SqliteConnection;
+use sqlx::types::Json;
+
+use super::lease::{self, Heartbeat, Lease, Outcome};
+use super::{graph, job};
+use crate::error::{Result, StoreError};
+use crate::rows::sql;
+use crate::staging::{StagedBlob, StagedDir};
+use crate::tables::blobs::Origin;
+use crate::tables::calibrations::{self, NewCalibration};
+use crate::tables::reports;
+use crate::tables::tasks::Owner;
+use crate::tables::{results, sums};
+use crate::{Store, dir, on_files};
+use engine::job::{
+    Assessment, CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind,
+    TaskProgress, TaskState, Timestamp,
+};
+
+#[derive(Debug)]
+pub struct Completion {
+    /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
+    pub progress: TaskProgress,
+    /// What is to be remembered of it, for the manifest.
+    pub record: Value,
+    pub product: Product,
+}
+
+#[derive(Debug)]
+pub enum Product {
+    /// Nothing but its record (prepare).
+    Record,
+    /// The share of their planned cost that the tiles still have, on \[0,1\] (pilot).
+    TileCost(f64),
+    /// A tile, a preview or a movie.
+    File(StagedBlob),
+    /// The files of a snapshot (assemble) or of the job (manifest), which are on the disk.
+    Files(StagedDir, Vec<ResultFile>),
+    Calibration(Box<CalibrationDone>),
+}
+
+#[derive(Debug)]
+pub struct CalibrationDone {
+    /// The masks and what is known of them, if they were made of captures.
+    pub masks: Option<(NewCalibration, StagedBlob)>,
+    pub report: CalibrationReport,
+    /// Pictures by name, as PNG.
+    pub maps: Vec<(String, Vec<u8>)>,
+}
+
+impl Store {
+    /// Stores what a task has made and moves its job on. Says [`Heartbeat::Lost`] if the lease has
+    /// run out and the task was claimed again, or it was deleted; nothing is stored then. If this
+    /// fails, the task is still the worker's.
+    pub async fn complete(&self, lease: &Lease, completion: Completion) -> Result<Heartbeat> {
+        let mut transaction = self.write().await?;
+        let Some((owner, kind)) = lease::held(&mut transaction, lease).await? else {
+            return Ok(Heartbeat::Lost);
+        };
+        let mut result = None;
+        match (owner, completion.product) {
+            (Owner::Job(_), Product::Record) => {}
+            (Owner::Job(job), Product::TileCost(share)) => {
+                graph::scale_tiles(&mut transaction, job, share).await?;
+            }
+            (Owner::Job(_) | Owner::Movie(_), Product::File(staged)) => {
+                result = Some(staged.sha256());
+                self.publish(&mut transaction, staged, Origin::Tile).await?;
+            }
+            (Owner::Job(job), Product::Files(staged, files)) => {
+                results::record(&mut transaction, job, kind.snapshot(), &files).await?;
+                self.put_files(job, kind, staged, files).await?;
+            }
+            (Owner::Calibration(id), Product::Calibration(done)) => {
+                self.calibrated(&mut transaction, id, *done).await?;
+            }
+            (Owner::Job(_), Product::Calibration(_))
+            | (Owner::Calibration(_) | Owner::Movie(_), _) => {
+                let value = kind.into_str().to_owned();
+                return Err(StoreError::Corrupt { column: "kind", value });
+            }
+        }
+        finish(&mut transaction, lease, &completion.progress, &completion.record, result).await?;
+        if let Owner::Job(job) = owner {
+            graph::unblock(&mut transaction, job, kind).await?;
+            if kind == TaskKind::Manifest {
+                let record = &completion.record;
+                let assessment = Option::<Assessment>::deserialize(record).map_err(|_| {
+                    StoreError::Corrupt { column: "record", value: record.to_string() }
+                })?;
+                self.succeed(&mut transaction, job, assessment).await?;
+            }
+            job::settle(&mut transaction, job).await?;
+            sums::recount(&mut transaction, job).await?;
+        }
+        transaction.commit().await?;
+        Ok(Heartbeat::Continue)
+    }
+
+    /// Moves result files to their place, under the lock of the caller's transaction.
+    async fn put_files(
+        &self,
+        job: JobId,
+        kind: TaskKind,
+        staged: StagedDir,
+        files: Vec<ResultFile>,
+    ) -> Result<()> {
+        let folder = self.dir().results(job);
+        let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));
+        on_files(move || {
+            dir::make_dir_durably(&folder)?;
+            match place {
+                Some(place) => staged.put(&place),
+                None => staged.put_files(&folder, &files),
+            }
+        })
+        .await
+    }
+
+    /// Writes what was made for a calibration; its captures are needed no more.
+    async fn calibrated(
+        &self,
+        transaction: &mut SqliteConnection,
+        id: CalibrationId,
+        done: CalibrationDone,
+    ) -> Result<()> {
+        if let Some((facts, staged)) = done.masks {
+            let prepared = staged.sha256();
+            self.publish(transaction, staged, Origin::Prepared).await?;
+            calibrations::insert_made(transaction, id, prepared, facts).await?;
+        }
+        if let Some(warning) = done.report.warning() {
+            sql!(
+                "UPDATE jobs SET spec = json_insert(spec, '$.warnings[#]', json(?))
+                 WHERE calibration = ? AND finished_at IS NULL",
+                [Json(&warning), id]
+            )
+            .execute(&mut *transaction)
+            .await?;
+        }
+        reports::insert(transaction, id, &done.report, done.maps).await
+    }
+}
+
+async fn finish(
+    connection: &mut SqliteConnection,
+    lease: &Lease,
+    progress: &TaskProgress,
+    record: &Value,
+    result: Option<Sha256>,
+) -> Result<()> {
+    let TaskProgress { iterations, passes, fraction, .. } = *progress;
+    sql!(
+        "UPDATE tasks SET state = ?9, worker = NULL, lease_until = NULL, stage = NULL,
+             iterations = ?1, passes = ?2, fraction = ?3, record = ?4, result = ?5,
+             seconds = (?6 - (SELECT started_at FROM attempts
+                              WHERE task = id AND attempt = ?8)) / 1000.0
+         WHERE id = ?7",
+        [
+            iterations,
+            passes,
+            fraction.clamp(0.0, 1.0),
+            record,
+            result,
+            Timestamp::now(),
+            lease.task,
+            lease.attempt,
+            TaskState::Done
+        ]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!(
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
+             SELECT kind, 1, coalesce(seconds, 0), iterations, passes, coalesce(seconds, 0),
+                 iif(kind = 'tile', cost * fraction, cost) FROM tasks WHERE id = ?
+         ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
+             iterations = iterations + excluded.iterations, passes = passes + excluded.passes,
+             recent_seconds = 0.97 * recent_seconds + excluded.recent_seconds,
+             recent_cost = 0.97 * recent_cost + excluded.recent_cost",
+        [lease.task]
+    )
+    .execute(&mut *connection)
+    .await?;
+    // Of tiles the processor's time is known; the others are short and run on one core.
+    sql!(
+        "INSERT INTO lab_totals (lab, cpu_seconds)
+             SELECT lab, coalesce(record ->> '$.cpu_seconds', seconds, 0.0) FROM tasks WHERE id = ?
+         ON CONFLICT (lab) DO UPDATE SET cpu_seconds = cpu_seconds + excluded.cpu_seconds",
+        [lease.task]
+    )
+    .execute(&mut *connection)
+    .await?;
+    lease::end_attempt(connection, lease.task, Outcome::Done, None).await
+}

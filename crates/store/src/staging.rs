@@ -1,0 +1,245 @@
+//! Files on their way into the store: written under a temporary name, hashed, brought to the disk.
+//!
+//! Whoever writes holds a lock on the file, so that the sweep can tell it from what a dead process
+//! left. What is dropped before it is stored is removed.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use sha2::Digest;
+use uuid::Uuid;
+
+use super::Store;
+use super::error::{Result, StoreError};
+use super::locked::LockedFile;
+use super::{dir, on_files};
+use engine::job::{ResultFile, Sha256};
+
+/// A temporary file or folder; its lock and its removal.
+#[derive(Debug)]
+struct Temporary {
+    path: PathBuf,
+    /// Open for the lock alone.
+    _lock: LockedFile,
+    /// Set when the content has found its place.
+    moved: bool,
+}
+
+impl Temporary {
+    fn new(path: PathBuf, lock: File) -> Result<Self> {
+        let lock = LockedFile::wait(lock).map_err(StoreError::io("lock", &path))?;
+        Ok(Self { path, _lock: lock, moved: false })
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        if !self.moved {
+            // Nothing depends on it: what stays is swept at the next start.
+            let _ = dir::remove(&self.path);
+        }
+    }
+}
+
+impl Store {
+    pub(super) fn temporary_path(&self) -> PathBuf {
+        self.dir().tmp().join(Uuid::now_v7().to_string())
+    }
+
+    /// A new file that is hashed while it is written. Blocks on the disk.
+    pub fn blob_writer(&self) -> Result<BlobWriter> {
+        let staged = self.staged_path()?;
+        let path = &staged.0.path;
+        let file = File::options().write(true).open(path);
+        let file = file.map_err(StoreError::io("open", path))?;
+        let file = BufWriter::with_capacity(256 * 1024, file);
+        Ok(BlobWriter { file, temporary: staged.0, hasher: sha2::Sha256::new(), size: 0 })
+    }
+
+    /// A new empty file for a writer that wants a path. Blocks on the disk.
+    pub fn staged_path(&self) -> Result<StagedPath> {
+        let path = self.temporary_path();
+        let lock = File::create_new(&path).map_err(StoreError::io("make", &path))?;
+        Ok(StagedPath(Temporary::new(path, lock)?))
+    }
+
+    /// A second name for a file that is there, on its way into the store; `lock` holds the file's lock
+    /// already. Blocks on the disk.
+    pub(super) fn staged_link(&self, original: &Path, lock: File) -> Result<StagedPath> {
+        let path = self.temporary_path();
+        fs::hard_link(original, &path).map_err(StoreError::io("link", &path))?;
+        Ok(StagedPath(Temporary::new(path, lock)?))
+    }
+
+    /// Takes a file or a folder out of its place, at once and as a whole; its bytes go in the background, as large
+    /// files take long and others wait for the lock of the database. It may be gone already.
+    pub(super) async fn discard(&self, place: PathBuf) -> Result<()> {
+        let rest = self.temporary_path();
+        let moved = rest.clone();
+        let found = on_files(move || match fs::rename(&place, &moved) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(StoreError::io("remove", &place)(error)),
+            Ok(()) => place.parent().map_or(Ok(()), dir::sync_dir).map(|()| true),
+        })
+        .await?;
+        if found {
+            let going = self.going.clone();
+            going.fetch_add(1, Ordering::AcqRel);
+            tokio::spawn(async move {
+                // What a crash or an error leaves of it is swept.
+                let _ = on_files(move || dir::remove(&rest)).await;
+                going.fetch_sub(1, Ordering::AcqRel);
+            });
+        }
+        Ok(())
+    }
+
+    /// Waits until the bytes of all that was discarded are gone.
+    pub(super) async fn discarded(&self) {
+        while self.going.load(Ordering::Acquire) > 0 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+
+    /// A new empty folder for the results of a task. Blocks on the disk.
+    pub fn staged_dir(&self) -> Result<StagedDir> {
+        let path = self.temporary_path();
+        fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
+        let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
+        Ok(StagedDir(Temporary::new(path, lock)?))
+    }
+}
+
+/// A file that is hashed while it is written.
+#[derive(Debug)]
+pub struct BlobWriter {
+    temporary: Temporary,
+    file: BufWriter<File>,
+    hasher: sha2::Sha256,
+    size: u64,
+}
+
+impl BlobWriter {
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Brings the file to the disk.
+    pub fn finish(mut self) -> Result<StagedBlob> {
+        let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
+        synced.map_err(StoreError::io("write to the disk", &self.temporary.path))?;
+        let sha256 = Sha256::new(self.hasher.finalize().into());
+        Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
+    }
+}
+
+impl Write for BlobWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let count = self.file.write(bytes)?;
+        self.hasher.update(&bytes[..count]);
+        self.size += count as u64;
+        Ok(count)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// A temporary file that some other code writes.
+#[derive(Debug)]
+pub struct StagedPath(Temporary);
+
+impl StagedPath {
+    /// The path to write to. The file is there and empty; it must not be replaced by another one.
+    pub fn path(&self) -> &Path {
+        &self.0.path
+    }
+
+    /// Reads the file back to hash it, and brings it to the disk.
+    pub fn finish(self) -> Result<StagedBlob> {
+        let path = &self.0.path;
+        let mut file = File::open(path).map_err(StoreError::io("open", path))?;
+        let (sha256, size) = Sha256::of_reader(&mut file).map_err(StoreError::io("read", path))?;
+        file.sync_all().map_err(StoreError::io("write to the disk", path))?;
+        Ok(StagedBlob { temporary: self.0, sha256, size })
+    }
+}
+
+/// A file that is on the disk, but not yet in the store.
+#[derive(Debug)]
+pub struct StagedBlob {
+    temporary: Temporary,
+    sha256: Sha256,
+    size: u64,
+}
+
+impl StagedBlob {
+    pub fn sha256(&self) -> Sha256 {
+        self.sha256
+    }
+
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Where it lies until it is stored.
+    pub fn path(&self) -> &Path {
+        &self.temporary.path
+    }
+
+    /// Moves the file to its place. The writer's lock of the database must be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<()> {
+        if let Some(folder) = place.parent() {
+            dir::make_dir_durably(folder)?;
+        }
+        // Also over a file that is there: it has the same bytes, or is damaged. Its bytes go in the background:
+        // how long that takes would tell that another lab had sent the same.
+        let old = self.temporary.path.with_extension("old");
+        let replaced = fs::hard_link(place, &old).is_ok();
+        dir::rename_durably(&self.temporary.path, place)?;
+        if replaced {
+            std::thread::spawn(move || dir::remove(&old));
+        }
+        // Two names of one file stay two: it was stored before, by an attempt that a crash ended.
+        dir::remove(&self.temporary.path)?;
+        self.temporary.moved = true;
+        Ok(())
+    }
+}
+
+/// A temporary folder in which a task writes its result files. Whoever writes brings them to the
+/// disk.
+#[derive(Debug)]
+pub struct StagedDir(Temporary);
+
+impl StagedDir {
+    pub fn path(&self) -> &Path {
+        &self.0.path
+    }
+
+    /// Moves the folder to `place`; what was there goes. The writer's lock must be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<()> {
+        if place.exists() {
+            let old = self.0.path.with_extension("old");
+            dir::rename_durably(place, &old)?;
+            dir::rename_durably(&self.0.path, place)?;
+            self.0.moved = true;
+            return dir::remove(&old);
+        }
+        dir::rename_durably(&self.0.path, place)?;
+        self.0.moved = true;
+        Ok(())
+    }
+
+    /// Moves the files, not the folder, into the folder `place`. The writer's lock must be held.
+    pub(super) fn put_files(self, place: &Path, files: &[ResultFile]) -> Result<()> {
+        for file in files {
+            dir::rename_durably(&self.0.path.join(&file.name), &place.join(&file.name))?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,260 @@
+//! Table `blobs`: files by the hash of their bytes.
+
+use serde::Serialize;
+use sqlx::{FromRow, SqliteConnection};
+use strum::Display;
+
+use crate::error::{Result, StoreError};
+use crate::rows::{Page, integer, sql, sql_as, sql_scalar};
+use crate::staging::StagedBlob;
+use crate::tables::quota;
+use crate::{Store, on_files};
+use engine::job::{Lab, Sha256, Timestamp, TokenId};
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+pub struct Blob {
+    /// The hash of its bytes, which is its address.
+    pub sha256: Sha256,
+    pub size: u64,
+    /// When the lab first sent it.
+    pub created_at: Timestamp,
+}
+
+/// An upload in a list.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+pub struct BlobRow {
+    #[serde(flatten)]
+    #[sqlx(flatten)]
+    pub blob: Blob,
+    /// True while something of the lab refers to it: it is not deleted then.
+    pub in_use: bool,
+}
+
+/// The condition under which something of a lab refers to an upload of its, named as columns of `h`.
+macro_rules! in_use {
+    () => {
+        "(EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = h.sha256)
+          OR EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = h.sha256)
+          OR EXISTS (SELECT 1 FROM calibration_captures AS c
+                     JOIN calibration_requests AS r USING (calibration)
+                     WHERE r.lab = h.lab AND c.sha256 = h.sha256)
+          OR EXISTS (SELECT 1 FROM check_files AS f JOIN checks USING (id)
+                     WHERE checks.lab = h.lab AND f.sha256 = h.sha256)
+          OR EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = h.sha256))"
+    };
+}
+
+/// Where a file comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[strum(serialize_all = "snake_case")]
+pub enum Origin {
+    Upload,
+    /// It was derived from an upload.
+    Prepared,
+    /// A task made it.
+    Tile,
+}
+
+impl Store {
+    /// Stores an upload of a lab. Says whether it is new to the lab: that another one has it shows
+    /// nowhere. It counts against the limit of the token that sent it first.
+    /// Errors: [`StoreError::Quota`].
+    pub async fn store_upload(
+        &self,
+        lab: &Lab,
+        token: Option<TokenId>,
+        staged: StagedBlob,
+    ) -> Result<(Blob, bool)> {
+        let sha256 = staged.sha256();
+        let mut transaction = self.write().await?;
+        let before = held(&mut transaction, lab, sha256).await?;
+        if before.is_none() {
+            quota::check(&mut transaction, lab, token, staged.size()).await?;
+        }
+        self.hold(&mut transaction, lab, token, staged).await?;
+        let blob = held(&mut transaction, lab, sha256).await?;
+        transaction.commit().await?;
+        let blob = blob.ok_or_else(|| StoreError::missing("blob", sha256))?;
+        Ok((blob, before.is_none()))
+    }
+
+    /// Puts an upload in its place and writes down that the lab has sent it.
+    pub(super) async fn hold(
+        &self,
+        transaction: &mut SqliteConnection,
+        lab: &Lab,
+        token: Option<TokenId>,
+        staged: StagedBlob,
+    ) -> Result<()> {
+        let (sha256, now) = (staged.sha256(), Timestamp::now());
+        self.publish(transaction, staged, Origin::Upload).await?;
+        sql!(
+            "INSERT INTO holdings (lab, sha256, token, created_at, touched_at)
+             VALUES (?, ?, ?, ?, ?)
+             ON CONFLICT (lab, sha256) DO UPDATE SET touched_at = excluded.touched_at",
+            [lab, sha256, token, now, now]
+        )
+        .execute(transaction)
+        .await?;
+        Ok(())
+    }
+
+    pub async fn upload(&self, lab: &Lab, sha256: Sha256) -> Result<Blob> {
+        let mut connection = self.readers.acquire().await?;
+        held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))
+    }
+
+    /// A page of the lab's uploads, newest first, after the one that `after` tells of.
+    pub async fn uploads(
+        &self,
+        lab: &Lab,
+        after: Option<(Timestamp, Sha256)>,
+        limit: u32,
+    ) -> Result<Page<BlobRow>> {
+        let (time, sha256) = after.unzip();
+        let items = sql_as!(
+            concat!(
+                "SELECT h.sha256, size, h.created_at, ",
+                in_use!(),
+                " AS in_use
+                 FROM holdings AS h JOIN blobs USING (sha256)
+                 WHERE h.lab = ?1 AND (?2 IS NULL OR (h.created_at, h.sha256) < (?2, ?3))
+                 ORDER BY h.created_at DESC, h.sha256 DESC LIMIT ?4"
+            ),
+            [lab, time, sha256, i64::from(limit) + 1]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        Ok(Page::cut(items, limit))
+    }
+
+    /// Deletes an upload of a lab to which nothing of the lab refers. Its bytes go with it if nobody else
+    /// has them.
+    pub async fn delete_upload(&self, lab: &Lab, sha256: Sha256) -> Result<()> {
+        let mut transaction = self.write().await?;
+        let used: Option<bool> = sql_scalar!(
+            concat!("SELECT ", in_use!(), " FROM holdings AS h WHERE lab = ? AND sha256 = ?"),
+            [lab, sha256]
+        )
+        .fetch_optional(&mut *transaction)
+        .await?;
+        match used {
+            None => return Err(StoreError::missing("blob", sha256)),
+            Some(true) => return Err(StoreError::FileInUse(sha256)),
+            Some(false) => {}
+        }
+        sql!("DELETE FROM holdings WHERE lab = ? AND sha256 = ?", [lab, sha256])
+            .execute(&mut *transaction)
+            .await?;
+        self.release(&mut transaction, sha256).await?;
+        transaction.commit().await?;
+        Ok(())
+    }
+
+    /// Puts a file in its place and writes its row, in one step for all other processes.
+    pub(crate) async fn publish(
+        &self,
+        transaction: &mut SqliteConnection,
+        staged: StagedBlob,
+        origin: Origin,
+    ) -> Result<()> {
+        let (sha256, size) = (staged.sha256(), staged.size());
+        let place = self.dir().blob(&sha256);
+        on_files(move || staged.put(&place)).await?;
+        let now = Timestamp::now();
+        sql!(
+            "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)
+             VALUES (?, ?, ?, ?, ?)
+             ON CONFLICT (sha256) DO UPDATE SET
+                 touched_at = excluded.touched_at, damaged_at = NULL,
+                 origin = CASE excluded.origin WHEN 'upload' THEN 'upload' ELSE origin END",
+            [sha256, integer(size), origin.to_string(), now, now]
+        )
+        .execute(transaction)
+        .await?;
+        Ok(())
+    }
+
+    /// Removes a derived file if nothing refers to it any more. Uploads are left to [`Self::collect`].
+    pub(crate) async fn release(
+        &self,
+        transaction: &mut SqliteConnection,
+        sha256: Sha256,
+    ) -> Result<()> {
+        let removed = sql!(
+            "DELETE FROM blobs WHERE sha256 = ?1
+                 AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM calibration_captures WHERE sha256 = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM check_files WHERE sha256 = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM models WHERE file = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)",
+            [sha256]
+        )
+        .execute(transaction)
+        .await?;
+        if removed.rows_affected() == 0 {
+            return Ok(());
+        }
+        // Before the commit: after it, another process could put the same content in place.
+        self.discard(self.dir().blob(&sha256)).await
+    }
+
+    /// Removes the uploads that nothing refers to and nobody has sent since `before`, and checks from before that
+    /// were not passed. Says how many uploads.
+    pub async fn collect(&self, before: Timestamp) -> Result<usize> {
+        let mut transaction = self.write().await?;
+        sql!("DELETE FROM checks WHERE problem IS NOT NULL AND created_at < ?", [before])
+            .execute(&mut *transaction)
+            .await?;
+        sql!(
+            concat!("DELETE FROM holdings AS h WHERE touched_at < ? AND NOT ", in_use!()),
+            [before]
+        )
+        .execute(&mut *transaction)
+        .await?;
+        let hashes: Vec<Sha256> = sql_scalar!(
+            "DELETE FROM blobs WHERE touched_at < ?
+               AND NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
+               AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
+               AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
+               AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c
+                               WHERE c.sha256 = blobs.sha256)
+               AND NOT EXISTS (SELECT 1 FROM check_files AS f WHERE f.sha256 = blobs.sha256)
+               AND NOT EXISTS (SELECT 1 FROM models WHERE file = sha256)
+               AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
+             RETURNING sha256",
+            [before]
+        )
+        .fetch_all(&mut *transaction)
+        .await?;
+        for sha256 in &hashes {
+            self.discard(self.dir().blob(sha256)).await?;
+        }
+        transaction.commit().await?;
+        Ok(hashes.len())
+    }
+
+    /// Number and bytes of all stored files.
+    pub async fn blob_totals(&self) -> Result<(u64, u64)> {
+        let totals = "SELECT count(*), coalesce(sum(size), 0) FROM blobs";
+        Ok(sqlx::query_as(totals).fetch_one(&self.readers).await?)
+    }
+}
+
+/// The file, if the lab has uploaded it.
+async fn held(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+    sha256: Sha256,
+) -> Result<Option<Blob>> {
+    let blob = sql_as!(
+        "SELECT sha256, size, holdings.created_at FROM holdings JOIN blobs USING (sha256)
+         WHERE lab = ? AND sha256 = ?",
+        [lab, sha256]
+    )
+    .fetch_optional(connection)
+    .await?;
+    Ok(blob)
+}

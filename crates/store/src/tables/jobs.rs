@@ -1,0 +1,186 @@
+//! Table `jobs`. What becomes of a job is the queue's business.
+
+use sqlx::types::Json;
+use sqlx::{AssertSqlSafe, FromRow, SqliteConnection};
+
+use crate::Store;
+use crate::error::{Result, StoreError};
+use crate::rows::{Page, Span, integer, sql, sql_as, sql_scalar};
+use engine::job::{
+    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
+    Timestamp,
+};
+
+#[derive(Debug, Clone, PartialEq, FromRow)]
+pub struct Job {
+    pub id: JobId,
+    pub lab: Lab,
+    #[sqlx(json)]
+    pub spec: JobSpec,
+    pub state: JobState,
+    pub error: Option<String>,
+    pub created_at: Timestamp,
+    /// When its first task was claimed.
+    pub started_at: Option<Timestamp>,
+    pub finished_at: Option<Timestamp>,
+    /// How good its frames are expected to be; none until they are there, and where nothing can be told.
+    #[sqlx(json(nullable))]
+    pub assessment: Option<Assessment>,
+}
+
+#[derive(Debug, Clone, Default)]
+pub struct JobFilter {
+    /// Only those in one of these states; none for all.
+    pub states: Option<Vec<JobState>>,
+    pub calibration: Option<CalibrationId>,
+    pub measurement: Option<MeasurementId>,
+    pub label: Option<Label>,
+    /// Only those with this text in the label or the identifier, in upper or lower case.
+    pub search: Option<Label>,
+    pub created: Span,
+    /// Only those older than this one.
+    pub after: Option<JobId>,
+}
+
+/// What a user changes of a job.
+#[derive(Debug, Clone, Default)]
+pub struct JobChanges {
+    /// The new label, or none any more.
+    pub label: Option<Option<Label>>,
+    pub priority: Option<i32>,
+}
+
+impl Store {
+    pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job> {
+        let job = sql_as!("SELECT * FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
+        job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
+    }
+
+    /// A job, whosever it is.
+    pub async fn job_of_any_lab(&self, id: JobId) -> Result<Job> {
+        let job = sql_as!("SELECT * FROM jobs WHERE id = ?", [id]);
+        job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
+    }
+
+    /// The jobs of a lab, or of all labs, newest first.
+    pub async fn jobs(
+        &self,
+        lab: Option<&Lab>,
+        filter: &JobFilter,
+        limit: u32,
+    ) -> Result<Page<Job>> {
+        // Not one text for both: the index by lab would not be used.
+        let of = if lab.is_some() { "lab = ?8" } else { "?8 IS NULL" };
+        let text = format!(
+            "SELECT * FROM jobs
+             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
+               AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
+               AND (?5 IS NULL OR label = ?5)
+               AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
+               AND (?9 IS NULL OR created_at >= ?9) AND (?10 IS NULL OR created_at < ?10)
+             AND {of}
+             ORDER BY id DESC LIMIT ?7"
+        );
+        let items = sql_as!(
+            AssertSqlSafe(text),
+            [
+                filter.after,
+                filter.states.as_ref().map(Json),
+                filter.calibration,
+                filter.measurement,
+                &filter.label,
+                &filter.search,
+                i64::from(limit) + 1,
+                lab,
+                filter.created.from,
+                filter.created.before
+            ]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        Ok(Page::cut(items, limit))
+    }
+
+    /// The state of the lab's job.
+    pub async fn job_state(&self, lab: &Lab, id: JobId) -> Result<JobState> {
+        let state = sql_scalar!("SELECT state FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
+        state.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
+    }
+
+    pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
+        let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
+        Ok(sqlx::query_as(counts).fetch_all(&self.readers).await?)
+    }
+}
+
+/// Writes the row of a job with the hash of its request, and the user's key if there is one.
+pub async fn insert(
+    connection: &mut SqliteConnection,
+    id: JobId,
+    lab: &Lab,
+    spec: &JobSpec,
+    (request, key): (Sha256, Option<String>),
+) -> Result<()> {
+    sql!(
+        "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
+             idempotency_key, request, created_at, lab, disk_bytes, model)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            id,
+            spec.calibration,
+            spec.measurement,
+            &spec.label,
+            Json(spec),
+            JobState::Queued,
+            spec.priority,
+            key,
+            request,
+            Timestamp::now(),
+            lab,
+            integer(spec.disk_bytes()),
+            spec.model.as_ref().map(|model| model.id)
+        ]
+    )
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+pub async fn state(connection: &mut SqliteConnection, id: JobId) -> Result<JobState> {
+    let state = sql_scalar!("SELECT state FROM jobs WHERE id = ?", [id]);
+    state.fetch_optional(connection).await?.ok_or_else(|| StoreError::missing("job", id))
+}
+
+/// Takes a legal step to another state and notes the time.
+pub async fn set_state(
+    connection: &mut SqliteConnection,
+    id: JobId,
+    to: JobState,
+    error: Option<&str>,
+) -> Result<()> {
+    let to = state(connection, id).await?.step(to)?;
+    let now = Timestamp::now();
+    if to == JobState::Running {
+        // Before `started_at` is set: a job that is taken up again has waited once.
+        sql!(
+            "INSERT INTO lab_totals (lab, jobs_begun, wait_seconds)
+                 SELECT lab, 1, max(?1 - created_at, 0) / 1000.0 FROM jobs
+                 WHERE id = ?2 AND started_at IS NULL
+             ON CONFLICT (lab) DO UPDATE SET jobs_begun = jobs_begun + 1,
+                 wait_seconds = wait_seconds + excluded.wait_seconds",
+            [now, id]
+        )
+        .execute(&mut *connection)
+        .await?;
+    }
+    sql!(
+        "UPDATE jobs SET state = ?1, error = ?2,
+             started_at = coalesce(started_at, ?3),
+             finished_at = ?4
+         WHERE id = ?5",
+        [to, error, (to == JobState::Running).then_some(now), to.is_final().then_some(now), id]
+    )
+    .execute(connection)
+    .await?;
+    Ok(())
+}

@@ -1,0 +1,389 @@
+//! Table `partials`: uploads that come in pieces, and may go on after a cut or a crash.
+
+use std::fs::{File, TryLockError};
+use std::io::{Seek, SeekFrom, Write};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use sqlx::FromRow;
+
+use crate::error::{Result, StoreError};
+use crate::locked::LockedFile;
+use crate::rows::{Page, integer, sql, sql_as, sql_scalar};
+use crate::tables::keys::{self, Inserted, Made, RequestKey};
+use crate::tables::quota;
+use crate::{Store, dir, on_files};
+use engine::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
+
+#[derive(Debug, Clone, FromRow)]
+pub struct NewPartial {
+    pub lab: Lab,
+    /// Whose limit it counts against.
+    pub token: Option<TokenId>,
+    /// Bytes of the whole file.
+    pub length: u64,
+    /// What the client tells of the file, as it was sent.
+    pub metadata: String,
+    /// The hash that the client says the whole file has.
+    pub expected: Option<Sha256>,
+}
+
+#[derive(Debug, Clone, FromRow)]
+pub struct Partial {
+    pub id: PartialId,
+    /// What was said when it was begun.
+    #[sqlx(flatten)]
+    pub facts: NewPartial,
+    /// Bytes that are on the disk.
+    pub received: u64,
+    /// The hash of the stored file, once all is there.
+    pub result: Option<Sha256>,
+    /// When it is given up if nothing more comes.
+    pub expires_at: Timestamp,
+}
+
+/// Bytes that are reserved for an upload of which little has come. More are as it grows, so that nobody takes
+/// the disk by an announcement.
+pub const FIRST_RESERVE: u64 = 64 << 20;
+/// How long an upload is kept of which nothing has come.
+const EMPTY: Duration = Duration::from_secs(3600);
+
+/// The file of a partial upload and its row, for one request alone: the lock of the file is held until
+/// this is dropped, over data and row, so that nobody appends at an offset that is no longer true.
+#[derive(Debug)]
+pub struct PartialFile {
+    upload: Partial,
+    file: LockedFile,
+    path: PathBuf,
+}
+
+/// What a request finds that wants to go on with an upload.
+#[derive(Debug)]
+pub enum FoundPartial {
+    /// The file, behind the last byte on record.
+    Open(PartialFile),
+    /// Another request has it.
+    Busy,
+    /// All has come and is stored.
+    Stored(Partial),
+}
+
+impl PartialFile {
+    /// The row, as it stands under the lock.
+    pub fn upload(&self) -> &Partial {
+        &self.upload
+    }
+
+    /// True if nothing is missing but to store it.
+    pub fn is_complete(&self) -> bool {
+        self.upload.received == self.upload.facts.length
+    }
+
+    /// Drops what was written without being recorded. A file that lacks bytes on record is refused: to
+    /// extend it would make zeros of them.
+    fn ready(mut file: LockedFile, path: PathBuf, upload: Partial) -> Result<Self> {
+        let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
+        if bytes < upload.received {
+            return Err(short(&upload, bytes));
+        }
+        if bytes > upload.received {
+            file.set_len(upload.received).map_err(StoreError::io("shorten", &path))?;
+        }
+        file.seek(SeekFrom::Start(upload.received)).map_err(StoreError::io("read", &path))?;
+        Ok(Self { upload, file, path })
+    }
+
+    /// Appends bytes. Blocks.
+    pub fn append(&mut self, bytes: &[u8]) -> Result<()> {
+        self.file.write_all(bytes).map_err(StoreError::io("write", &self.path))
+    }
+
+    /// Brings all to the disk. Blocks.
+    pub fn sync(&self) -> Result<()> {
+        self.file.sync_data().map_err(StoreError::io("write to the disk", &self.path))
+    }
+}
+
+/// The lock of a partial file.
+enum Lock {
+    Taken(LockedFile),
+    Busy,
+    Gone,
+}
+
+fn lock(path: &Path) -> Result<Lock> {
+    let file = match File::options().write(true).open(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Lock::Gone),
+        file => file.map_err(StoreError::io("open", path))?,
+    };
+    let file = match LockedFile::take(file) {
+        Ok(file) => file,
+        Err(TryLockError::WouldBlock) => return Ok(Lock::Busy),
+        Err(TryLockError::Error(error)) => return Err(StoreError::io("lock", path)(error)),
+    };
+    // Whoever had the lock before may have stored or ended the upload: the file that was opened may be
+    // a blob by now, which nobody may write to.
+    let opened = file.metadata().map_err(StoreError::io("read", path))?;
+    let same = std::fs::metadata(path)
+        .is_ok_and(|now| (now.dev(), now.ino()) == (opened.dev(), opened.ino()));
+    Ok(if same { Lock::Taken(file) } else { Lock::Gone })
+}
+
+impl Store {
+    /// Begins an upload, which is given up when nothing more has come for `age`; sooner if nothing has at all.
+    /// Errors: [`StoreError::KeyReused`]; [`StoreError::Quota`]; [`StoreError::ManyPartials`].
+    pub async fn begin_partial(
+        &self,
+        facts: NewPartial,
+        age: Duration,
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<PartialId>> {
+        let id = PartialId::new();
+        let expires_at = after(age.min(EMPTY));
+        let path = self.dir().partial(id);
+        // Locked until its row is there, so that it is nobody's for no moment.
+        let made = path.clone();
+        let _lock = on_files(move || {
+            let file = File::create_new(&path).map_err(StoreError::io("make", &path))?;
+            let file = LockedFile::wait(file).map_err(StoreError::io("lock", &path))?;
+            path.parent().map_or(Ok(()), dir::sync_dir)?;
+            Ok(file)
+        })
+        .await?;
+        let written = self.write_partial(id, &facts, expires_at, key).await;
+        if !matches!(written, Ok(Inserted::New(_))) {
+            on_files(move || dir::remove(&made)).await?;
+        }
+        written
+    }
+
+    async fn write_partial(
+        &self,
+        id: PartialId,
+        facts: &NewPartial,
+        expires_at: Timestamp,
+        key: Option<&RequestKey>,
+    ) -> Result<Inserted<PartialId>> {
+        let mut transaction = self.write().await?;
+        if let Some(before) = keys::found(&mut transaction, &facts.lab, Made::Upload, key).await? {
+            return Ok(Inserted::Before(before));
+        }
+        quota::check_partials(&mut transaction, &facts.lab).await?;
+        quota::check(&mut transaction, &facts.lab, facts.token, facts.length).await?;
+        sql!(
+            "INSERT INTO partials (id, lab, token, length, metadata, expected, expires_at)
+             VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [
+                id,
+                &facts.lab,
+                facts.token,
+                integer(facts.length),
+                &facts.metadata,
+                facts.expected,
+                expires_at
+            ]
+        )
+        .execute(&mut *transaction)
+        .await?;
+        keys::insert(&mut transaction, &facts.lab, Made::Upload, key, id).await?;
+        transaction.commit().await?;
+        Ok(Inserted::New(id))
+    }
+
+    /// A page of the lab's uploads in pieces that have not expired, newest first, older than `after`.
+    pub async fn partials(
+        &self,
+        lab: &Lab,
+        after: Option<PartialId>,
+        limit: u32,
+    ) -> Result<Page<Partial>> {
+        let items = sql_as!(
+            "SELECT * FROM partials
+             WHERE lab = ?1 AND expires_at > ?2 AND (?3 IS NULL OR id < ?3)
+             ORDER BY id DESC LIMIT ?4",
+            [lab, Timestamp::now(), after, i64::from(limit) + 1]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        Ok(Page::cut(items, limit))
+    }
+
+    /// The lab's upload with this identifier, also if it has expired and was not removed yet.
+    pub async fn partial(&self, lab: &Lab, id: PartialId) -> Result<Partial> {
+        let partial = sql_as!("SELECT * FROM partials WHERE id = ? AND lab = ?", [id, lab])
+            .fetch_optional(&self.readers)
+            .await?;
+        partial.ok_or_else(|| StoreError::missing("upload", id))
+    }
+
+    /// Takes an upload for this request alone, unless another one has it.
+    /// Errors: [`StoreError::NotFound`] if it is gone; [`StoreError::Short`] if bytes on record are
+    /// lost.
+    pub async fn open_partial(&self, lab: &Lab, id: PartialId) -> Result<FoundPartial> {
+        let upload = self.partial(lab, id).await?;
+        if upload.result.is_some() {
+            return Ok(FoundPartial::Stored(upload));
+        }
+        let path = self.dir().partial(id);
+        let locked = path.clone();
+        let file = match on_files(move || lock(&locked)).await? {
+            Lock::Taken(file) => Some(file),
+            Lock::Busy => return Ok(FoundPartial::Busy),
+            Lock::Gone => None,
+        };
+        // Again, now that nobody changes it.
+        let upload = self.partial(lab, id).await?;
+        if upload.result.is_some() {
+            return Ok(FoundPartial::Stored(upload));
+        }
+        let file = file.ok_or_else(|| short(&upload, 0))?;
+        let ready = on_files(move || PartialFile::ready(file, path, upload)).await?;
+        Ok(FoundPartial::Open(ready))
+    }
+
+    /// Bytes of an upload's file as it lies on the disk; 0 if there is none.
+    pub async fn partial_bytes(&self, id: PartialId) -> Result<u64> {
+        let path = self.dir().partial(id);
+        on_files(move || match std::fs::metadata(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(0),
+            meta => Ok(meta.map_err(StoreError::io("read", &path))?.len()),
+        })
+        .await
+    }
+
+    /// Records that `bytes` more are on the disk, and puts off the end.
+    pub async fn advance_partial(
+        &self,
+        partial: &mut PartialFile,
+        bytes: u64,
+        age: Duration,
+    ) -> Result<()> {
+        let upload = &mut partial.upload;
+        let (received, expires_at) = (upload.received + bytes, after(age));
+        let changed = sql!(
+            "UPDATE partials SET received = ?, expires_at = ? WHERE id = ? AND received = ?",
+            [integer(received), expires_at, upload.id, integer(upload.received)]
+        )
+        .execute(&self.writer)
+        .await?;
+        if changed.rows_affected() == 0 {
+            return Err(StoreError::missing("upload", upload.id));
+        }
+        (upload.received, upload.expires_at) = (received, expires_at);
+        Ok(())
+    }
+
+    /// Moves an upload of which all bytes are there into the store, as an upload of its lab. Its
+    /// hash is that of the file as it lies on the disk.
+    /// Errors: [`StoreError::HashMismatch`] if the client named another hash; the upload is ended
+    /// then. [`StoreError::Short`] if the file has not the length that was announced.
+    pub async fn finish_partial(&self, partial: PartialFile) -> Result<Partial> {
+        // The file is open, and so locked, until the upload is stored and its row says so.
+        let PartialFile { mut upload, file, path } = partial;
+        let lock = file.try_clone().map_err(StoreError::io("open", &path))?;
+        let (store, original) = (self.clone(), path.clone());
+        // Under a second name, so that the bytes are not lost if the rest fails.
+        let staged = on_files(move || store.staged_link(&original, lock)?.finish()).await?;
+        if staged.size() != upload.facts.length {
+            return Err(short(&upload, staged.size()));
+        }
+        let found = staged.sha256();
+        if let Some(expected) = upload.facts.expected.filter(|expected| *expected != found) {
+            self.end_partial(upload.id).await?;
+            return Err(StoreError::HashMismatch { expected, found });
+        }
+        // Its bytes were counted from its announcement on: no limit is asked again.
+        let mut transaction = self.write().await?;
+        self.hold(&mut transaction, &upload.facts.lab, upload.facts.token, staged).await?;
+        sql!("UPDATE partials SET result = ? WHERE id = ?", [found, upload.id])
+            .execute(&mut *transaction)
+            .await?;
+        transaction.commit().await?;
+        on_files(move || dir::remove(&path)).await?;
+        upload.result = Some(found);
+        Ok(upload)
+    }
+
+    /// Ends an upload that no other request has; what has come of it goes. False if it is busy.
+    pub async fn delete_partial(&self, id: PartialId) -> Result<bool> {
+        let path = self.dir().partial(id);
+        let lock = on_files(move || lock(&path)).await?;
+        if !matches!(lock, Lock::Busy) {
+            self.end_partial(id).await?;
+            return Ok(true);
+        }
+        Ok(false)
+    }
+
+    /// Removes the row and the file, whose lock must be held.
+    async fn end_partial(&self, id: PartialId) -> Result<()> {
+        sql!("DELETE FROM partials WHERE id = ?", [id]).execute(&self.writer).await?;
+        let path = self.dir().partial(id);
+        on_files(move || dir::remove(&path)).await
+    }
+
+    /// Ends the uploads that have expired, but none to which a piece is being written, nor one that only a clock
+    /// that was wrong made old. Says how many. `age` is how long an upload is kept after its last piece.
+    pub async fn expire_partials(&self, age: Duration) -> Result<usize> {
+        let empty = age.min(EMPTY);
+        // What ends now began its age so long ago.
+        let (last_empty, last) = (self.ago(empty).await?, self.ago(age).await?);
+        let due = sql_scalar!(
+            "SELECT id FROM partials WHERE expires_at <= iif(received = 0, ?, ?)",
+            [later(last_empty, empty), later(last, age)]
+        );
+        let mut ended = 0;
+        for id in due.fetch_all(&self.readers).await? {
+            let path = self.dir().partial(id);
+            let lock = on_files(move || lock(&path)).await?;
+            // A piece may have come before the lock was taken.
+            let is_due = sql!(
+                "SELECT 1 FROM partials WHERE id = ? AND expires_at <= ?",
+                [id, Timestamp::now()]
+            )
+            .fetch_optional(&self.readers)
+            .await?
+            .is_some();
+            if is_due && !matches!(lock, Lock::Busy) {
+                self.end_partial(id).await?;
+                ended += 1;
+            }
+        }
+        Ok(ended)
+    }
+
+    /// Bytes of the disk that were promised and are not written: the next ones of uploads in pieces, masks
+    /// that are made of captures (twice, as they are scaled at the end), and of jobs what is not assembled.
+    pub async fn promised_bytes(&self) -> Result<u64> {
+        let bytes: f64 = sql_scalar!(
+            "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
+                     FROM partials WHERE result IS NULL)
+                  + (SELECT coalesce(sum(2 * prepared_bytes), 0)
+                     FROM calibration_requests JOIN tasks USING (calibration)
+                     WHERE tasks.state NOT IN (?1, 'failed'))
+                  + (SELECT coalesce(sum(disk_bytes * (
+                         SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
+                         FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
+                     FROM jobs WHERE finished_at IS NULL)",
+            [TaskState::Done, integer(FIRST_RESERVE)]
+        )
+        .fetch_one(&self.readers)
+        .await?;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a sum of bytes
+        Ok(bytes as u64)
+    }
+}
+
+fn after(age: Duration) -> Timestamp {
+    later(Timestamp::now(), age)
+}
+
+fn later(moment: Timestamp, age: Duration) -> Timestamp {
+    let age = i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2);
+    Timestamp(moment.0.saturating_add(age))
+}
+
+fn short(upload: &Partial, found: u64) -> StoreError {
+    StoreError::Short { id: upload.id, found, recorded: upload.received }
+}

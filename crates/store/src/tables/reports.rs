@@ -1,0 +1,48 @@
+//! Tables `calibration_reports` and `calibration_maps`: what is told of masks, and its pictures.
+
+use sqlx::SqliteConnection;
+use sqlx::types::Json;
+
+use crate::Store;
+use crate::error::Result;
+use crate::rows::{sql, sql_scalar};
+use engine::job::{CalibrationId, CalibrationReport};
+
+impl Store {
+    /// The report of a calibration; none if it is not made yet.
+    pub async fn report(&self, id: CalibrationId) -> Result<Option<CalibrationReport>> {
+        let report =
+            sql_scalar!("SELECT report FROM calibration_reports WHERE calibration = ?", [id]);
+        Ok(report.fetch_optional(&self.readers).await?.map(|Json(report)| report))
+    }
+
+    /// A picture of a report, as PNG; none if there is none of this name.
+    pub async fn map(&self, id: CalibrationId, name: &str) -> Result<Option<Vec<u8>>> {
+        let png = "SELECT png FROM calibration_maps WHERE calibration = ? AND name = ?";
+        Ok(sql_scalar!(png, [id, name]).fetch_optional(&self.readers).await?)
+    }
+}
+
+/// Writes a report with its pictures, which are PNGs by name.
+pub async fn insert(
+    connection: &mut SqliteConnection,
+    id: CalibrationId,
+    report: &CalibrationReport,
+    maps: Vec<(String, Vec<u8>)>,
+) -> Result<()> {
+    sql!(
+        "INSERT OR REPLACE INTO calibration_reports (calibration, report) VALUES (?, ?)",
+        [id, Json(report)]
+    )
+    .execute(&mut *connection)
+    .await?;
+    for (name, png) in maps {
+        sql!(
+            "INSERT OR REPLACE INTO calibration_maps (calibration, name, png) VALUES (?, ?, ?)",
+            [id, name, png]
+        )
+        .execute(&mut *connection)
+        .await?;
+    }
+    Ok(())
+}

@@ -1,0 +1,81 @@
+//! Table `result_files`: what a job has made.
+
+use std::path::PathBuf;
+
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use crate::error::{Result, StoreError};
+use crate::rows::{integer, sql};
+use crate::{Job, Store};
+use engine::job::{JobId, ResultFile};
+
+/// The snapshot of files that belong to the whole job.
+pub(crate) const WHOLE_JOB: i64 = -1;
+
+impl Store {
+    /// A result file of a snapshot (or, with none, of the whole job), and where it lies.
+    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet.
+    pub async fn result_file(
+        &self,
+        job: &Job,
+        snapshot: Option<u32>,
+        name: &str,
+    ) -> Result<(ResultFile, PathBuf)> {
+        let row = sql!(
+            "SELECT * FROM result_files WHERE job = ? AND snapshot = ? AND name = ?",
+            [job.id, snapshot.map_or(WHOLE_JOB, i64::from), name]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        let file = result_file(&row.ok_or_else(|| StoreError::missing("result file", name))?)?;
+        let folder = match snapshot {
+            Some(snapshot) => self.dir().snapshot_results(job.id, snapshot),
+            None => self.dir().results(job.id),
+        };
+        // The name is the one on record, which a worker wrote: not the one in the request.
+        let path = folder.join(&file.name);
+        Ok((file, path))
+    }
+
+    /// The result files of a snapshot (or, with none, of the whole job), by name.
+    pub async fn result_files(&self, job: &Job, snapshot: Option<u32>) -> Result<Vec<ResultFile>> {
+        let rows = sql!(
+            "SELECT * FROM result_files WHERE job = ? AND snapshot = ? ORDER BY name",
+            [job.id, snapshot.map_or(WHOLE_JOB, i64::from)]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        rows.iter().map(result_file).collect()
+    }
+}
+
+/// Replaces the list of files of a snapshot (or of the whole job).
+pub async fn record(
+    connection: &mut SqliteConnection,
+    job: JobId,
+    snapshot: Option<u32>,
+    files: &[ResultFile],
+) -> Result<()> {
+    let snapshot = snapshot.map_or(WHOLE_JOB, i64::from);
+    sql!("DELETE FROM result_files WHERE job = ? AND snapshot = ?", [job, snapshot])
+        .execute(&mut *connection)
+        .await?;
+    for file in files {
+        sql!(
+            "INSERT INTO result_files (job, snapshot, name, size, sha256) VALUES (?, ?, ?, ?, ?)",
+            [job, snapshot, &file.name, integer(file.size), file.sha256]
+        )
+        .execute(&mut *connection)
+        .await?;
+    }
+    Ok(())
+}
+
+fn result_file(row: &SqliteRow) -> Result<ResultFile> {
+    Ok(ResultFile {
+        name: row.try_get("name")?,
+        size: row.try_get("size")?,
+        sha256: row.try_get("sha256")?,
+    })
+}

@@ -1,0 +1,126 @@
+//! Table `workers`: which worker processes live.
+
+use std::time::Duration;
+
+use serde::Serialize;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{FromRow, Row, SqliteConnection};
+
+use crate::Store;
+use crate::error::Result;
+use crate::rows::{sql, sql_scalar};
+use engine::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
+
+#[derive(Debug, Clone, Serialize)]
+pub struct WorkerRow {
+    pub id: WorkerId,
+    pub pid: u32,
+    pub version: String,
+    #[serde(flatten)]
+    pub place: WorkerPlace,
+    pub started_at: Timestamp,
+    pub seen_at: Timestamp,
+    pub task: Option<WorkerTask>,
+}
+
+/// Where a worker is that came over the network; empty for one of this machine.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, FromRow)]
+pub struct WorkerPlace {
+    pub host: Option<String>,
+    pub pool: Option<String>,
+    /// Where it computes: cpu, or cuda:0.
+    pub device: Option<String>,
+}
+
+#[derive(Debug, Clone, Serialize, FromRow)]
+pub struct WorkerTask {
+    /// The job, or that of which it makes a movie; none for a calibration's.
+    pub job: Option<JobId>,
+    /// The calibration; none for a job's.
+    pub calibration: Option<CalibrationId>,
+    pub kind: String,
+    pub snapshot: Option<u32>,
+    pub tile: Option<u32>,
+    pub stage: Option<String>,
+}
+
+impl Store {
+    /// Records that a worker has started; it has the version of this program.
+    pub async fn worker_started(
+        &self,
+        id: WorkerId,
+        pid: u32,
+        WorkerPlace { host, pool, device }: &WorkerPlace,
+    ) -> Result<()> {
+        let now = Timestamp::now();
+        sql!(
+            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?)
+             ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
+            [id, pid, env!("CARGO_PKG_VERSION"), host, pool, device, now, now]
+        )
+        .execute(&self.writer)
+        .await?;
+        Ok(())
+    }
+
+    /// Records that a worker lives though it has no task; a heartbeat says the same of one that has.
+    pub async fn worker_seen(&self, id: WorkerId) -> Result<()> {
+        seen(&mut *self.writer.acquire().await?, id).await
+    }
+
+    /// The workers that gave a sign of life within `age`.
+    pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>> {
+        let rows = sql!(
+            "SELECT workers.id, pid, version, host, pool, device, started_at, seen_at,
+                 coalesce(job, movie) AS job, calibration, kind, snapshot, tile, stage
+             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
+             WHERE seen_at >= ? ORDER BY workers.id",
+            [TaskState::Running, since(age)]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        rows.iter().map(worker).collect()
+    }
+
+    /// The last sign of life of a worker; none if it is not on record.
+    pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>> {
+        let seen = sql_scalar!("SELECT seen_at FROM workers WHERE id = ?", [id]);
+        Ok(seen.fetch_optional(&self.readers).await?)
+    }
+
+    /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
+    pub async fn forget_workers(&self, age: Duration) -> Result<()> {
+        sql!("DELETE FROM workers WHERE seen_at < ?", [since(age)]).execute(&self.writer).await?;
+        Ok(())
+    }
+}
+
+pub async fn remove(connection: &mut SqliteConnection, id: WorkerId) -> Result<()> {
+    sql!("DELETE FROM workers WHERE id = ?", [id]).execute(connection).await?;
+    Ok(())
+}
+
+pub async fn seen(connection: &mut SqliteConnection, id: WorkerId) -> Result<()> {
+    sql!("UPDATE workers SET seen_at = ? WHERE id = ?", [Timestamp::now(), id])
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+fn since(age: Duration) -> i64 {
+    Timestamp::now().0 - i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2)
+}
+
+fn worker(row: &SqliteRow) -> Result<WorkerRow> {
+    let has_task = row.try_get::<Option<String>, _>("kind")?.is_some();
+    Ok(WorkerRow {
+        id: row.try_get("id")?,
+        pid: row.try_get("pid")?,
+        version: row.try_get("version")?,
+        place: WorkerPlace::from_row(row)?,
+        started_at: row.try_get("started_at")?,
+        seen_at: row.try_get("seen_at")?,
+        task: has_task.then(|| WorkerTask::from_row(row)).transpose()?,
+    })
+}

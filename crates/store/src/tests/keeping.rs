@@ -1,0 +1,99 @@
+//! What is listed, what is kept, and what goes.
+
+use std::io::Write;
+
+use super::Lab;
+use crate::{Inserted, JobFilter, NewModel, StoreError};
+use engine::job::{ModelFacts, ModelTrial, Timestamp};
+
+#[tokio::test]
+async fn a_key_makes_one_job() {
+    let lab = Lab::new().await;
+    let Inserted::New(first) = lab.add(0, Some("k"), b"a").await.unwrap() else { panic!() };
+    assert_eq!(lab.add(0, Some("k"), b"a").await.unwrap(), Inserted::Before(first));
+    let other = lab.add(0, Some("k"), b"b").await;
+    assert!(matches!(other, Err(StoreError::KeyReused { id, .. }) if id == first.to_string()));
+    assert_eq!(
+        lab.store
+            .jobs(Some(&engine::job::Lab::local()), &JobFilter::default(), 10)
+            .await
+            .unwrap()
+            .items
+            .len(),
+        1
+    );
+}
+
+#[tokio::test]
+async fn pages_join_without_gaps() {
+    let lab = Lab::new().await;
+    let mut ids = Vec::new();
+    for _ in 0..5 {
+        ids.push(lab.submit(0).await);
+    }
+    ids.reverse();
+    let mut filter = JobFilter::default();
+    let mut seen = Vec::new();
+    loop {
+        let page = lab.store.jobs(Some(&engine::job::Lab::local()), &filter, 2).await.unwrap();
+        seen.extend(page.items.iter().map(|job| job.id));
+        filter.after = seen.last().copied();
+        if !page.more {
+            break;
+        }
+    }
+    assert_eq!(seen, ids);
+}
+
+#[tokio::test]
+async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
+    let lab = Lab::new().await;
+    let job = lab.submit(0).await;
+    let calibration =
+        lab.store.job(&engine::job::Lab::local(), job).await.unwrap().spec.calibration;
+    let in_use = |result| matches!(result, Err(StoreError::InUse { users: 1, .. }));
+    assert!(in_use(lab.store.delete_calibration(&engine::job::Lab::local(), calibration).await));
+    assert!(in_use(
+        lab.store.delete_measurement(&engine::job::Lab::local(), lab.measurement).await
+    ));
+    let soon = Timestamp(Timestamp::now().0 + 1000);
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 0);
+    lab.store.cancel_job(&engine::job::Lab::local(), job).await.unwrap();
+    lab.store.delete_job(&engine::job::Lab::local(), job).await.unwrap();
+    lab.store.delete_measurement(&engine::job::Lab::local(), lab.measurement).await.unwrap();
+    lab.store.delete_calibration(&engine::job::Lab::local(), calibration).await.unwrap();
+    assert_eq!(lab.store.blob_totals().await.unwrap().0, 2, "uploads wait for their age");
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 2);
+    let left = walk(&lab.store.dir().blobs());
+    assert_eq!(left, Vec::<std::path::PathBuf>::new());
+}
+
+fn walk(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
+}
+
+#[tokio::test]
+async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
+    let lab = Lab::new().await;
+    let local = engine::job::Lab::local();
+    let mut writer = lab.store.blob_writer().unwrap();
+    writer.write_all(b"network").unwrap();
+    let (file, _) = lab.store.store_upload(&local, None, writer.finish().unwrap()).await.unwrap();
+    let calibration =
+        lab.store.measurement(&local, lab.measurement).await.unwrap().facts.calibration;
+    let trial = ModelTrial { height: 64, width: 96, cpu_seconds: 1.0, peak_rss_bytes: 1 << 20 };
+    let facts = ModelFacts { inputs: Vec::new(), outputs: Vec::new(), fixed_size: true, trial };
+    let new = NewModel { name: None, calibration, file: file.sha256, facts };
+    let id = lab.store.add_model(&local, new, None).await.unwrap().id();
+    let model = lab.store.model(&local, id).await.unwrap();
+    lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
+    let soon = Timestamp(Timestamp::now().0 + 1000);
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the data of the measurement");
+    assert!(lab.store.upload(&local, file.sha256).await.is_ok());
+    let refused = lab.store.delete_calibration(&local, calibration).await;
+    assert!(matches!(refused, Err(StoreError::InUse { by: "models", users: 1, .. })));
+    lab.store.delete_model(&local, model.id).await.unwrap();
+    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the network");
+    lab.store.delete_calibration(&local, calibration).await.unwrap();
+}

@@ -1,0 +1,111 @@
+//! Whose turn it is: labs beside one another, and the jobs of a lab.
+
+use super::{Lab, id};
+use crate::Entitlement;
+use engine::job::{Algorithm, JobId, TaskKind};
+
+fn named(name: &str) -> engine::job::Lab {
+    name.parse().unwrap()
+}
+
+impl Lab {
+    async fn submit_for(&self, lab: &str, priority: i32) -> JobId {
+        id(self.add_for(&named(lab), Algorithm::GapTv, priority, None, b"request").await.unwrap())
+    }
+
+    /// Does so many tasks, and says whose they were.
+    async fn turns(&self, tasks: usize) -> Vec<JobId> {
+        let mut jobs = Vec::new();
+        for _ in 0..tasks {
+            let Some(task) = self.claim().await else { break };
+            jobs.push(task.step().job);
+            self.work(&task).await;
+        }
+        jobs
+    }
+
+    /// Works off the queue, and says in which order the jobs ended.
+    async fn ends(&self) -> Vec<JobId> {
+        let mut ended = Vec::new();
+        while let Some(task) = self.claim().await {
+            if task.kind == TaskKind::Manifest {
+                ended.push(task.step().job);
+            }
+            self.work(&task).await;
+        }
+        ended
+    }
+}
+
+#[tokio::test]
+async fn a_lab_with_one_job_does_not_wait_for_all_jobs_of_another() {
+    let lab = Lab::new().await;
+    let mut first = Vec::new();
+    for _ in 0..6 {
+        first.push(lab.submit_for("first", 0).await);
+    }
+    lab.turns(3).await;
+    let second = lab.submit_for("second", 0).await;
+    let ended = lab.ends().await;
+    let place = |job| ended.iter().position(|ended| *ended == job).unwrap();
+    assert!(place(second) < place(first[2]), "{ended:?}");
+    let of_first: Vec<_> = ended.iter().copied().filter(|job| *job != second).collect();
+    assert_eq!(of_first, first, "a lab's own jobs end in their order");
+}
+
+#[tokio::test]
+async fn a_share_is_a_share_of_what_is_computed() {
+    let lab = Lab::new().await;
+    let to = Entitlement { share: Some(3.0), ..Entitlement::default() };
+    lab.store.entitle(&named("second"), to).await.unwrap();
+    let first = lab.submit_for("first", 0).await;
+    let second = lab.submit_for("second", 0).await;
+    // Until tiles alone are left, of which each lab has four that cost the same.
+    while lab.store.labs().await.unwrap().iter().any(|lab| lab.jobs > 0) {
+        let task = lab.claim().await.unwrap();
+        if matches!(task.kind, TaskKind::Tile { .. }) {
+            lab.store.give_back(&task.lease).await.unwrap();
+            break;
+        }
+        lab.work(&task).await;
+    }
+    sqlx::query("UPDATE labs SET start = 0, finish = 0").execute(&lab.store.writer).await.unwrap();
+    sqlx::query("UPDATE tasks SET state = 'done' WHERE kind <> 'tile'")
+        .execute(&lab.store.writer)
+        .await
+        .unwrap();
+    let turns = lab.turns(4).await;
+    let of = |job| turns.iter().filter(|turn| **turn == job).count();
+    assert_eq!((of(first), of(second)), (1, 3));
+}
+
+#[tokio::test]
+async fn who_wanted_nothing_is_owed_nothing() {
+    let lab = Lab::new().await;
+    for _ in 0..3 {
+        lab.submit_for("busy", 0).await;
+    }
+    lab.turns(15).await;
+    let late = [lab.submit_for("late", 0).await, lab.submit_for("late", 0).await];
+    let ended = lab.ends().await;
+    assert!(ended.iter().position(|job| *job == late[1]) > Some(1), "{ended:?}");
+}
+
+#[tokio::test]
+async fn begun_jobs_come_before_older_ones_that_have_not_begun() {
+    let lab = Lab::new().await;
+    let (old, young) = (lab.submit_for("lab", 0).await, lab.submit_for("lab", 0).await);
+    lab.store.cancel_job(&named("lab"), old).await.unwrap();
+    assert_eq!(lab.turns(1).await, [young]);
+    lab.store.retry_job(&named("lab"), old).await.unwrap();
+    assert_eq!(lab.ends().await, [young, old]);
+}
+
+#[tokio::test]
+async fn priority_comes_before_turns() {
+    let lab = Lab::new().await;
+    lab.submit_for("first", 0).await;
+    let urgent = lab.submit_for("second", 5).await;
+    let turns = lab.turns(10).await;
+    assert!(turns.iter().all(|job| *job == urgent), "{turns:?}");
+}

@@ -1,0 +1,78 @@
+//! Bringing a database up to date: never without a copy of it as it was, and never one that a newer
+//! version has changed.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{ConnectOptions, Connection};
+
+use super::DataDir;
+use super::dir::{self, on_files};
+use super::error::{Result, StoreError};
+use super::rows::sql;
+use engine::job::Timestamp;
+
+/// So many copies are kept.
+const KEPT: usize = 3;
+
+/// Copies a database that is older than this program, whose newest migration is `schema`, to
+/// `before-updates/`, and says where. Nothing is done if it is up to date, or if there is none.
+/// Errors: the database; the disk, which may be full.
+pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> {
+    let database = dir.database();
+    if !fs::metadata(&database).is_ok_and(|meta| meta.len() > 0) {
+        return Ok(None);
+    }
+    let options = SqliteConnectOptions::new().filename(&database).read_only(true);
+    let mut connection = options.connect().await?;
+    let tables = "SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'";
+    let ours: i64 = sqlx::query_scalar(tables).fetch_one(&mut connection).await?;
+    let found: Option<i64> = if ours == 0 {
+        None
+    } else {
+        let newest = "SELECT max(version) FROM _sqlx_migrations";
+        sqlx::query_scalar(newest).fetch_one(&mut connection).await?
+    };
+    let Some(found) = found.filter(|found| *found < schema) else {
+        connection.close().await?;
+        return Ok(None);
+    };
+    let folder = dir.before_updates();
+    fs::create_dir_all(&folder).map_err(StoreError::io("make the folder", &folder))?;
+    let copy = folder.join(format!("{}-schema-{found:04}.db", Timestamp::now().0));
+    sql!("VACUUM INTO ?", [copy.to_string_lossy().into_owned()]).execute(&mut connection).await?;
+    connection.close().await?;
+    let synced = copy.clone();
+    on_files(move || {
+        let file = File::open(&synced).map_err(StoreError::io("open", &synced))?;
+        file.sync_all().map_err(StoreError::io("write to the disk", &synced))?;
+        dir::sync_dir(&folder)?;
+        let mut copies = copies(&folder)?;
+        copies.sort();
+        let old = copies.len().saturating_sub(KEPT);
+        copies[..old].iter().try_for_each(|path| dir::remove(path))
+    })
+    .await?;
+    tracing::info!(from = found, to = schema, copy = %copy.display(), "the database is brought up to date");
+    Ok(Some(copy))
+}
+
+/// The last copy of a database that this program, whose newest migration is `schema`, can serve.
+pub(super) fn last_copy(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> {
+    let mut copies = copies(&dir.before_updates())?;
+    copies.retain(|path| schema_of(path).is_some_and(|found| found <= schema));
+    copies.sort();
+    Ok(copies.pop())
+}
+
+fn copies(folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut copies = if folder.is_dir() { dir::children(folder)? } else { Vec::new() };
+    copies.retain(|path| schema_of(path).is_some());
+    Ok(copies)
+}
+
+/// The newest migration of a copy, by its name.
+fn schema_of(path: &Path) -> Option<i64> {
+    path.file_stem()?.to_str()?.split_once("-schema-")?.1.parse().ok()
+}

@@ -1,0 +1,356 @@
+//! The store of the same machine, as a worker sees it.
+
+use std::ops::Range;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ndarray::ArrayView3;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+use tokio::sync::Mutex;
+
+use super::transport::{
+    Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
+};
+use engine::job::{Sha256, TaskKind, TaskProgress, WorkerId};
+use engine::pipeline::PipelineError;
+use engine::pipeline::arrays::Arrays;
+use engine::pipeline::blend::StoredTile;
+use engine::pipeline::manifest::{CameraRecord, Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
+use engine::pipeline::movie::MovieTask;
+use engine::pipeline::networks::{ModelFile, ModelRecord};
+use engine::pipeline::pilot::full_schedule;
+use engine::pipeline::records::{PilotRecord, PreparedRecord};
+use engine::pipeline::tile::TileInput;
+use formats::planar;
+use store::{
+    Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, MovieWork, Product, StagedBlob,
+    Store, StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
+};
+
+/// The store, and who works for it.
+#[derive(Debug, Clone)]
+pub struct Local {
+    store: Store,
+    worker: WorkerId,
+    claimant: Claimant<'static>,
+    /// None until it is first needed.
+    watcher: Arc<Mutex<Option<Watcher>>>,
+}
+
+impl Local {
+    /// For a worker of this name, which does all there is, or leaves the tiles to other machines.
+    pub fn new(store: Store, worker: WorkerId, tiles: bool) -> Self {
+        let claimant = if tiles { Claimant::Local } else { Claimant::WithoutTiles };
+        Self { store, worker, claimant, watcher: Arc::default() }
+    }
+
+    fn arrays(&self, masks: Sha256, snapshots: Sha256) -> Arrays {
+        Arrays { masks: (self.path(masks), masks), snapshots: (self.path(snapshots), snapshots) }
+    }
+
+    /// All that a task needs, at the attempt of this number.
+    fn input(&self, work: &Work, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
+        match work {
+            Work::Job(task) => self.step(task, kind, attempt),
+            Work::Calibration(task) => match &task.captures {
+                Some(captures) => Ok(TaskInput::Captures {
+                    name: task.name.clone(),
+                    files: captures.map(|upload| self.path(*upload)),
+                    scratch: self.store.staged_path().map_err(failed)?,
+                    masks: Box::new(self.store.blob_writer().map_err(failed)?),
+                }),
+                None => {
+                    let masks = task.masks.ok_or_else(|| not_possible(kind))?;
+                    Ok(TaskInput::Report(self.path(masks)))
+                }
+            },
+            Work::Movie(work) => {
+                let file = self.store.staged_path().map_err(failed)?;
+                Ok(TaskInput::Movie(Box::new(movie_task(work)?), file))
+            }
+        }
+    }
+
+    fn step(&self, task: &JobTask, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
+        let JobTask { job, spec, calibration, measurement, .. } = task;
+        let arrays = self.arrays(calibration.prepared, measurement.prepared);
+        let folder = || self.store.staged_dir().map_err(failed);
+        Ok(match kind {
+            TaskKind::Prepare => TaskInput::Prepare { arrays, snapshots: spec.snapshots },
+            TaskKind::Preview { snapshot } => TaskInput::Preview {
+                arrays,
+                shape: spec.shape,
+                snapshot,
+                white: white(task.prepared.as_ref())?,
+            },
+            TaskKind::Pilot => TaskInput::Pilot {
+                arrays,
+                snapshots: spec.snapshots,
+                white: white(task.prepared.as_ref())?,
+                schedule: spec.schedule.clone(),
+                runs: spec.sequence_plan().map_err(PipelineError::from)?,
+                mosaic: spec.shape.mosaic,
+            },
+            TaskKind::Tile { snapshot, tile, .. } => {
+                TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
+            }
+            TaskKind::Assemble { snapshot } => TaskInput::Assemble {
+                job: *job,
+                recipe: Box::new(recipe(task)?),
+                snapshot,
+                tiles: task
+                    .tiles
+                    .iter()
+                    .map(|tile| self.stored_tile(tile))
+                    .collect::<Result<_, _>>()?,
+                folder: folder()?,
+            },
+            TaskKind::Manifest => TaskInput::Manifest {
+                job: *job,
+                spec: Box::new(spec.clone()),
+                recipe: Box::new(recipe(task)?),
+                tasks: tasks(&task.records, attempt)?,
+                folder: folder()?,
+            },
+            TaskKind::Calibration | TaskKind::Movie { .. } => {
+                return Err(not_possible(kind).into());
+            }
+        })
+    }
+
+    /// What was made, as the store takes it. Blocks on the disk.
+    fn product(&self, output: Output) -> Result<Product, TransportError> {
+        Ok(match output {
+            Output::Record => Product::Record,
+            Output::TileCost(share) => Product::TileCost(share),
+            Output::Stack(frames) => Product::File(self.staged(frames.view())?),
+            Output::File(file) => Product::File(file.finish()?),
+            Output::Files(folder, files) => Product::Files(folder, files),
+            Output::Calibration(done) => Product::Calibration(done),
+        })
+    }
+
+    /// Frames \[B,h,w\] as a prepared array.
+    fn staged(&self, frames: ArrayView3<'_, f32>) -> Result<StagedBlob, TransportError> {
+        let (count, height, width) = frames.dim();
+        let mut writer = planar::writer(self.store.blob_writer()?, count, height, width)?;
+        frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
+        Ok(writer.finish()?.finish()?)
+    }
+
+    fn stored_tile(&self, stored: &TileResult) -> Result<StoredTile, PipelineError> {
+        let TileResult { run, tile, sha256, record } = stored;
+        let record = parsed("tile", record)?;
+        Ok(StoredTile { run: *run, tile: *tile, path: self.path(*sha256), sha256: *sha256, record })
+    }
+
+    fn path(&self, sha256: Sha256) -> std::path::PathBuf {
+        self.store.dir().blob(&sha256)
+    }
+}
+
+impl Transport for Local {
+    async fn started(&self) -> Result<(), TransportError> {
+        Ok(self
+            .store
+            .worker_started(self.worker, std::process::id(), &WorkerPlace::default())
+            .await?)
+    }
+
+    async fn seen(&self) -> Result<(), TransportError> {
+        Ok(self.store.worker_seen(self.worker).await?)
+    }
+
+    async fn idle(&self, time: Duration) {
+        let mut place = self.watcher.lock().await;
+        let changed = async {
+            let watcher = match &mut *place {
+                Some(watcher) => watcher,
+                none => none.insert(self.store.watcher()?),
+            };
+            watcher.changed(time).await
+        };
+        if let Err(error) = changed.await {
+            tracing::warn!(%error, "changes of the database can't be seen");
+            *place = None;
+            tokio::time::sleep(time).await;
+        }
+    }
+
+    async fn claim(&self) -> Result<Option<Claim>, TransportError> {
+        let task = self.store.claim_as(self.claimant, self.worker, LEASE).await?;
+        let Some(task) = task else { return Ok(None) };
+        let ClaimedTask { lease, kind, cost, work } = task;
+        let (id, name) = (lease.task, kind.into_str());
+        let span = match &work {
+            Work::Job(task) => {
+                tracing::info_span!("task", job = %task.job, kind = name, task = %id)
+            }
+            Work::Calibration(task) => {
+                tracing::info_span!("task", calibration = %task.calibration, kind = name, task = %id)
+            }
+            Work::Movie(work) => {
+                tracing::info_span!("task", job = %work.job, kind = name, task = %id)
+            }
+        };
+        let here = self.clone();
+        let input = move || here.input(&work, kind, lease.attempt);
+        let input = tokio::task::spawn_blocking(input).await?;
+        Ok(Some(Claim { lease, span, cost, input }))
+    }
+
+    async fn heartbeat(
+        &self,
+        lease: &Lease,
+        progress: TaskProgress,
+        history: Option<&str>,
+    ) -> Result<Heartbeat, TransportError> {
+        Ok(self.store.heartbeat(lease, progress, history).await?)
+    }
+
+    async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError> {
+        let Done { progress, record, output } = done;
+        let here = self.clone();
+        let product = tokio::task::spawn_blocking(move || here.product(output)).await??;
+        Ok(self.store.complete(lease, Completion { progress, record, product }).await?)
+    }
+
+    async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError> {
+        Ok(self.store.fail(lease, reason, retry).await?)
+    }
+
+    async fn postpone(&self, lease: &Lease, reason: &str) -> Result<(), TransportError> {
+        Ok(self.store.postpone(lease, reason).await?)
+    }
+
+    async fn give_back(&self, lease: &Lease) -> Result<(), TransportError> {
+        Ok(self.store.give_back(lease).await?)
+    }
+
+    async fn redo(&self, lease: &Lease, tiles: &[(u32, u32)]) -> Result<(), TransportError> {
+        Ok(self.store.redo_tiles(lease, tiles).await?)
+    }
+
+    fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError> {
+        let arrays = self.arrays(task.masks, task.measurement);
+        let input = arrays.window(task.snapshots.clone(), &task.tile.window(), task.white)?;
+        Ok(TileInput { pieces: task.pieces.clone(), ..input })
+    }
+
+    fn model(&self, sha256: Sha256) -> ModelFile {
+        ModelFile::new(self.path(sha256), sha256)
+    }
+}
+
+fn failed(error: StoreError) -> TaskError {
+    TaskError::Transport(error.into())
+}
+
+fn not_possible(kind: TaskKind) -> PipelineError {
+    let problem = format!("a {} has nothing to begin with", kind.into_str());
+    PipelineError::Record { what: "task", problem }
+}
+
+/// A record that this program wrote.
+fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, PipelineError> {
+    T::deserialize(record).map_err(PipelineError::record(what))
+}
+
+/// White level of the scene, as the prepare task recorded it.
+fn white(prepared: Option<&Value>) -> Result<f32, PipelineError> {
+    Ok(parsed::<PreparedRecord>("prepare task", prepared.unwrap_or(&Value::Null))?.white)
+}
+
+fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
+    let MovieWork { spec, measurement, prepared, arrays, .. } = work;
+    let facts = &measurement.facts;
+    let frames = spec.shape.frames;
+    let record = CameraRecord::new((facts.camera_fps, facts.exposure_s), 0, frames);
+    let exposure = record.and_then(|record| record.frame_exposure_s(frames));
+    Ok(MovieTask {
+        shape: spec.shape,
+        white: white(prepared.as_ref())?,
+        scene_fps: exposure.map(|seconds| 1.0 / seconds),
+        clips: arrays.clone(),
+    })
+}
+
+/// What the pilot found; none before it, and for a job without one.
+fn pilot(task: &JobTask) -> Result<Option<PilotRecord>, PipelineError> {
+    parsed("pilot", task.pilot.as_ref().unwrap_or(&Value::Null))
+}
+
+/// A tile of the run of a job that begins with this snapshot, from the plans and the records of the tasks
+/// before it.
+pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, PipelineError> {
+    let plan = task.spec.tile_plan()?;
+    let tile = plan.tile(index as usize).ok_or_else(|| PipelineError::Record {
+        what: "task",
+        problem: format!("tile {index} of a plan of {}", plan.len()),
+    })?;
+    let pilot = pilot(task)?;
+    let runs = task.spec.sequence_plan()?;
+    let begins = |run: &Range<usize>| run.start == first as usize;
+    let run = runs.runs().iter().position(begins).ok_or_else(|| PipelineError::Record {
+        what: "task",
+        problem: format!("no run begins with snapshot {first}"),
+    })?;
+    let start = runs.runs()[run].start;
+    let pieces = runs.pieces(&pilot.as_ref().map(PilotRecord::cuts).unwrap_or_default());
+    let own = pieces.into_iter().filter(|piece| piece.run == run).map(|piece| piece.snapshots);
+    Ok(TileTask {
+        masks: task.calibration.prepared,
+        measurement: task.measurement.prepared,
+        snapshots: first..first + runs.runs()[run].len() as u32,
+        pieces: own.map(|piece| piece.start - start..piece.end - start).collect(),
+        tile,
+        white: white(task.prepared.as_ref())?,
+        schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),
+        evidence: pilot.as_ref().and_then(|pilot| pilot.evidence.clone()),
+        model: task.spec.model.as_ref().map(|model| model.sha256),
+    })
+}
+
+fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
+    let (spec, calibration, measurement) =
+        (&task.spec, &task.calibration.facts, &task.measurement.facts);
+    let pilot = pilot(task)?;
+    Ok(Recipe {
+        program_version: VERSION,
+        algorithm: spec.algorithm,
+        schedule: full_schedule(&spec.schedule, pilot.as_ref()),
+        pilot,
+        shape: spec.shape,
+        inputs: Inputs {
+            masks_sha256: calibration.masks,
+            masks_axes: calibration.axes.clone(),
+            measurement_sha256: measurement.data,
+            measurement_axes: measurement.axes.clone(),
+        },
+        models: ModelRecord::of_job(spec),
+        scale: ScaleRecord {
+            masks_full_scale: calibration.full_scale,
+            measurement_full_scale: measurement.full_scale,
+            white: white(task.prepared.as_ref())?,
+        },
+        tile_plan: spec.tile_plan()?,
+        runs: spec.sequence_plan()?,
+        warnings: spec.warnings.clone(),
+        camera: (measurement.camera_fps, measurement.exposure_s),
+    })
+}
+
+/// What the other tasks of a job have left for its manifest, which `attempt` is to write.
+fn tasks(records: &[TaskRecord], attempt: u32) -> Result<JobTasks, PipelineError> {
+    let mut tasks =
+        JobTasks { snapshots: Vec::new(), seconds: Vec::new(), attempts: u64::from(attempt) };
+    for task in records {
+        tasks.seconds.push((task.kind, task.seconds));
+        tasks.attempts += u64::from(task.attempt);
+        if let TaskKind::Assemble { snapshot } = task.kind {
+            tasks.snapshots.push((snapshot, parsed("snapshot", &task.record)?));
+        }
+    }
+    Ok(tasks)
+}

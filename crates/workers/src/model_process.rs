@@ -1,0 +1,401 @@
+//! Networks of users, each in a process of its own (`sci-recon run-model`): native code works there on what a
+//! stranger has sent, so it sees the files of no lab, and its end is not that of the worker.
+//!
+//! From the worker come the length and the bytes of the ONNX file, then, for each run, the sides B, H and W, the
+//! measurement and the masks. Back comes a line of JSON, [`Answer`], and after [`Answer::Frames`] the frames.
+//! Numbers are as this machine has them.
+
+use std::ffi::OsString;
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::path::PathBuf;
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::Duration;
+
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
+use serde::{Deserialize, Serialize};
+
+use engine::job::Sha256;
+use engine::pipeline::PipelineError;
+use engine::pipeline::networks::{ModelFile, NetworkSource};
+use engine::pipeline::progress::Monitor;
+use engine::pipeline::usage::{cpu_seconds_of, kills_for_memory, peak_rss_of};
+use reconstruction::ReconError;
+use reconstruction::learned::{SnapshotNetwork, all_finite};
+
+/// Time between looks whether a run is still wanted, and at the memory that it takes.
+const LOOK: Duration = Duration::from_millis(100);
+/// Bytes of an answer's line that are read.
+const LINE: u64 = 1 << 16;
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Answer {
+    Loaded,
+    Frames,
+    Failed(String),
+}
+
+/// How such a process is started.
+#[derive(Debug, Clone)]
+pub struct ModelCommand {
+    /// This program.
+    pub program: PathBuf,
+    /// Its arguments.
+    pub arguments: Vec<OsString>,
+    /// The most memory that it may take, in bytes.
+    pub memory_bytes: Option<u64>,
+}
+
+/// The process of the network that was last asked for.
+pub(super) struct ModelProcesses {
+    command: ModelCommand,
+    running: Option<ModelProcess>,
+}
+
+impl ModelProcesses {
+    pub(super) fn new(command: ModelCommand) -> Self {
+        Self { command, running: None }
+    }
+
+    /// A process with this network, which is kept until another one is asked for, or none: memory is
+    /// planned for one thing at a time.
+    pub(super) fn only(
+        &mut self,
+        file: Option<&ModelFile>,
+        monitor: &Monitor,
+    ) -> Result<Option<&mut ModelProcess>, PipelineError> {
+        let warm = self.running.take();
+        let Some(file) = file else { return Ok(None) };
+        let warm = warm.filter(|process| process.model == file.sha256());
+        let process = match warm.and_then(ModelProcess::alive) {
+            Some(process) => process,
+            None => ModelProcess::start(&self.command, file, monitor)?,
+        };
+        Ok(Some(self.running.insert(process)))
+    }
+}
+
+/// A process with a loaded network. It is killed when this is dropped.
+pub(super) struct ModelProcess {
+    model: Sha256,
+    child: Child,
+    input: ChildStdin,
+    output: BufReader<ChildStdout>,
+    /// The most that it may take, and what was seen of it so far.
+    memory: (Option<u64>, u64),
+    /// Kills by the kernel for want of memory before it began.
+    kills: Option<u64>,
+    /// See [`Self::bill`].
+    billed: f64,
+}
+
+impl ModelProcess {
+    fn start(
+        command: &ModelCommand,
+        file: &ModelFile,
+        monitor: &Monitor,
+    ) -> Result<Self, PipelineError> {
+        let content = file.content()?;
+        let failed = |error: io::Error| {
+            ReconError::Runtime(format!("the process of a network can't be started: {error}"))
+        };
+        let mut child = Command::new(&command.program)
+            .args(&command.arguments)
+            // All that it needs has been told.
+            .env_remove("SCI_RECON_CONFIG")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(failed)?;
+        let pipes = child.stdin.take().zip(child.stdout.take());
+        let (input, output) = pipes.ok_or_else(|| failed(io::ErrorKind::BrokenPipe.into()))?;
+        let mut process = Self {
+            model: file.sha256(),
+            child,
+            input,
+            output: BufReader::new(output),
+            memory: (command.memory_bytes, 0),
+            kills: kills_for_memory(),
+            billed: 0.0,
+        };
+        process.ask(monitor, |input, output| {
+            input.write_all(&(content.len() as u64).to_ne_bytes())?;
+            input.write_all(&content)?;
+            answer(output)
+        })?;
+        Ok(process)
+    }
+
+    /// The same, unless it has ended.
+    fn alive(mut self) -> Option<Self> {
+        matches!(self.child.try_wait(), Ok(None)).then_some(self)
+    }
+
+    /// Processor time that it has used since this was last asked, in seconds, and its largest resident memory,
+    /// in bytes.
+    pub(super) fn bill(&mut self) -> (f64, u64) {
+        let process = self.child.id();
+        let now = cpu_seconds_of(process);
+        (now - std::mem::replace(&mut self.billed, now), peak_rss_of(process))
+    }
+
+    /// The network in it, whose runs end as soon as the monitor says so.
+    pub(super) fn watched<'a>(&'a mut self, monitor: &'a Monitor) -> impl SnapshotNetwork + 'a {
+        Watched { process: self, monitor }
+    }
+
+    /// Exchanges something with the process, and kills it if it is wanted no more.
+    fn ask<T>(
+        &mut self,
+        monitor: &Monitor,
+        exchange: impl FnOnce(
+            &mut ChildStdin,
+            &mut BufReader<ChildStdout>,
+        ) -> io::Result<Result<T, String>>,
+    ) -> Result<T, PipelineError> {
+        let Self { child, input, output, memory: (_, peak), .. } = self;
+        let (done, ended) = mpsc::channel::<()>();
+        let exchanged = std::thread::scope(|scope| {
+            scope.spawn(move || {
+                // Neither native code nor a pipe can be asked to stop.
+                while ended.recv_timeout(LOOK) == Err(RecvTimeoutError::Timeout) {
+                    *peak = peak_rss_of(child.id()).max(*peak);
+                    if monitor.stopped() {
+                        let _ = child.kill();
+                    }
+                }
+            });
+            let exchanged = exchange(input, output);
+            drop(done);
+            exchanged
+        });
+        monitor.check()?;
+        match exchanged {
+            Ok(Ok(value)) => Ok(value),
+            Ok(Err(why)) => Err(ReconError::Runtime(why).into()),
+            Err(error) => Err(ReconError::Runtime(self.death(&error)).into()),
+        }
+    }
+
+    /// Why it does not answer.
+    fn death(&mut self, error: &io::Error) -> String {
+        // One that has closed its pipes and lives is of no use.
+        let _ = self.child.kill();
+        let how = match self.child.wait() {
+            Ok(status) => status.to_string(),
+            Err(_) => error.to_string(),
+        };
+        let (limit, peak) = self.memory;
+        let starved = match kills_for_memory() > self.kills {
+            true => "; the machine had no memory left for it",
+            false => "",
+        };
+        let limit = limit.map_or_else(String::new, |limit| {
+            format!(" of the {} MiB that it may take", limit >> 20)
+        });
+        format!(
+            "the network ended the process that ran it ({how}){starved}; its memory was seen at {} \
+             MiB{limit}",
+            peak >> 20
+        )
+    }
+}
+
+impl Drop for ModelProcess {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+struct Watched<'a> {
+    process: &'a mut ModelProcess,
+    monitor: &'a Monitor,
+}
+
+impl SnapshotNetwork for Watched<'_> {
+    fn frames(
+        &mut self,
+        y: ArrayView2<'_, f32>,
+        masks: ArrayView3<'_, f32>,
+    ) -> Result<Array3<f32>, ReconError> {
+        let (frames, height, width) = masks.dim();
+        let ran = self.process.ask(self.monitor, |input, output| {
+            let sides = [frames, height, width].map(|side| side as u64);
+            input.write_all(bytemuck::cast_slice(&sides))?;
+            for values in [y.as_slice(), masks.as_slice()] {
+                let values = values.ok_or(io::ErrorKind::InvalidInput)?;
+                input.write_all(bytemuck::cast_slice(values))?;
+            }
+            if let Err(why) = answer(output)? {
+                return Ok(Err(why));
+            }
+            let mut made = Array3::zeros(masks.raw_dim());
+            if let Some(made) = made.as_slice_mut() {
+                output.read_exact(bytemuck::cast_slice_mut(made))?;
+            }
+            Ok(Ok(made))
+        });
+        let made = ran.map_err(|error| match error {
+            PipelineError::Stopped => ReconError::Cancelled,
+            other => ReconError::Runtime(other.to_string()),
+        })?;
+        // It is the word of a stranger's code.
+        all_finite(&made)?;
+        Ok(made)
+    }
+}
+
+/// Whether it went well, or why not.
+fn answer(output: &mut impl BufRead) -> io::Result<Result<(), String>> {
+    let mut line = String::new();
+    output.by_ref().take(LINE).read_line(&mut line)?;
+    match serde_json::from_str(&line) {
+        Ok(Answer::Loaded | Answer::Frames) => Ok(Ok(())),
+        Ok(Answer::Failed(why)) => Ok(Err(why)),
+        Err(error) => Err(io::Error::new(io::ErrorKind::InvalidData, error)),
+    }
+}
+
+/// The other side: answers on standard output what comes on standard input, until its end.
+/// Errors: standard output is closed.
+pub fn answer_worker(source: &NetworkSource) -> io::Result<()> {
+    let (sender, tasks) = mpsc::sync_channel(0);
+    // The end of the input, which a killed worker leaves, ends this process whatever the network is doing.
+    std::thread::spawn(move || {
+        let _ = read(&mut io::stdin().lock(), &sender);
+        std::process::exit(0);
+    });
+    let mut network = None;
+    let mut output = io::stdout().lock();
+    for task in tasks {
+        let (answer, frames) = match (task, &mut network) {
+            (Task::Load(content), network) => match source.end_to_end(&content) {
+                Ok(loaded) => {
+                    *network = Some(loaded);
+                    (Answer::Loaded, None)
+                }
+                Err(error) => (Answer::Failed(error.to_string()), None),
+            },
+            (Task::Run(y, masks), Some(network)) => match network.frames(y.view(), masks.view()) {
+                Ok(frames) => (Answer::Frames, Some(frames)),
+                Err(error) => (Answer::Failed(error.to_string()), None),
+            },
+            (Task::Run(..), None) => (Answer::Failed("no network is loaded".into()), None),
+        };
+        serde_json::to_writer(&mut output, &answer)?;
+        output.write_all(b"\n")?;
+        if let Some(frames) = frames.as_ref().and_then(|frames| frames.as_slice()) {
+            output.write_all(bytemuck::cast_slice(frames))?;
+        }
+        output.flush()?;
+    }
+    Ok(())
+}
+
+enum Task {
+    Load(Vec<u8>),
+    Run(Array2<f32>, Array3<f32>),
+}
+
+/// Reads what the worker sends, one thing after the other, for as long as it does.
+fn read(input: &mut impl Read, tasks: &mpsc::SyncSender<Task>) -> io::Result<()> {
+    let mut length = [0; 1];
+    input.read_exact(bytemuck::cast_slice_mut::<u64, u8>(&mut length))?;
+    let mut content = Vec::new();
+    input.by_ref().take(length[0]).read_to_end(&mut content)?;
+    let gone = |_| io::Error::from(io::ErrorKind::BrokenPipe);
+    tasks.send(Task::Load(content)).map_err(gone)?;
+    loop {
+        let mut sides = [0; 3];
+        input.read_exact(bytemuck::cast_slice_mut::<u64, u8>(&mut sides))?;
+        let [frames, height, width] = sides.map(|side| usize::try_from(side).unwrap_or(usize::MAX));
+        let mut y = Array2::zeros((height, width));
+        let mut masks = Array3::zeros((frames, height, width));
+        for values in [y.as_slice_mut(), masks.as_slice_mut()].into_iter().flatten() {
+            input.read_exact(bytemuck::cast_slice_mut::<f32, u8>(values))?;
+        }
+        tasks.send(Task::Run(y, masks)).map_err(gone)?;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use ndarray::{Array2, Array3};
+
+    use super::{ModelCommand, ModelProcesses};
+    use engine::pipeline::PipelineError;
+    use engine::pipeline::networks::ModelFile;
+    use engine::pipeline::progress::Monitor;
+    use reconstruction::ReconError;
+    use reconstruction::learned::SnapshotNetwork;
+
+    /// One run of "networks" that are shell scripts, which take the length and the 8 bytes of the file first.
+    fn run(script: &str, monitor: &Monitor) -> Result<Array3<f32>, PipelineError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("network.onnx");
+        std::fs::write(&path, "8 bytes.").unwrap();
+        let arguments = ["-c".into(), format!("head -c 16 >/dev/null; {script}").into()].into();
+        let memory_bytes = Some(512 << 20);
+        let command = ModelCommand { program: "sh".into(), arguments, memory_bytes };
+        let mut processes = ModelProcesses::new(command);
+        let file = ModelFile::open(&path).unwrap();
+        let process = processes.only(Some(&file), monitor)?.unwrap();
+        let masks = Array3::ones((2, 2, 2));
+        Ok(process.watched(monitor).frames(Array2::ones((2, 2)).view(), masks.view())?)
+    }
+
+    /// Sides, measurement and masks of a run.
+    const TAKEN: &str = r#"echo '"loaded"'; head -c 72 >/dev/null; "#;
+
+    #[test]
+    fn frames_come_back() {
+        let script = format!("{TAKEN} echo '\"frames\"'; head -c 32 /dev/zero; exec cat");
+        assert_eq!(run(&script, &Monitor::default()).unwrap(), Array3::<f32>::zeros((2, 2, 2)));
+    }
+
+    #[test]
+    fn whatever_it_answers_is_no_ones_but_its_own_fault() {
+        for (script, told) in [
+            ("exit 3".to_owned(), "exit status: 3"),
+            ("kill -ABRT $$".to_owned(), "SIGABRT"),
+            ("echo '{\"failed\":\"no network\"}'; exec cat".to_owned(), "no network"),
+            ("echo '{'; exec cat".to_owned(), "of the 512 MiB"),
+            ("head -c 100000 /dev/zero; exec cat".to_owned(), "ended the process"),
+            (format!("{TAKEN} kill -SEGV $$"), "SIGSEGV"),
+            (format!("{TAKEN} echo '\"frames\"'; head -c 31 /dev/zero"), "exit status: 0"),
+            (
+                format!(
+                    "{TAKEN} echo '\"frames\"'; head -c 32 /dev/zero | tr '\\0' '\\377'; exec cat"
+                ),
+                "finite",
+            ),
+        ] {
+            let error = run(&script, &Monitor::default()).unwrap_err().to_string();
+            assert!(error.contains(told), "{script}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_run_ends_when_it_is_wanted_no_more() {
+        for script in ["exec sleep 60".to_owned(), format!("{TAKEN} exec sleep 60")] {
+            let (monitor, start) = (Monitor::default(), Instant::now());
+            let ended = std::thread::scope(|scope| {
+                scope.spawn(|| {
+                    std::thread::sleep(Duration::from_millis(300));
+                    monitor.stop();
+                });
+                run(&script, &monitor)
+            });
+            assert!(matches!(
+                ended,
+                Err(PipelineError::Stopped | PipelineError::Recon(ReconError::Cancelled))
+            ));
+            assert!(start.elapsed() < Duration::from_secs(30));
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! Files in a stream, in chunks that fit into a message. The first chunk comes last: it marks a whole
+//! file. What was received is believed only if it has the hash that was promised.
+
+use async_nats::jetstream::stream::DirectGetErrorKind;
+use bytes::Bytes;
+use futures_util::{StreamExt, TryStreamExt, stream};
+
+use super::connection::{ClusterError, Connection};
+use super::message::Input;
+use super::names;
+use engine::job::Sha256;
+
+/// Bytes of a chunk: below the default limit of a message, with room for its headers.
+const CHUNK: usize = 512 * 1024;
+/// Chunks under way at a time.
+const AT_ONCE: usize = 4;
+
+/// Why a file is not to be had.
+#[derive(Debug, thiserror::Error)]
+pub enum BlobError {
+    /// A chunk is not there, or not yet.
+    #[error("a chunk is missing")]
+    Missing,
+    /// The bytes are others.
+    #[error("its bytes are not those that were sent")]
+    Damaged,
+    /// The stream can't be read.
+    #[error("{0}")]
+    Failed(String),
+}
+
+impl Connection {
+    /// Puts a file under `prefix`, a subject of a stream.
+    ///
+    /// # Errors
+    /// If the stream takes no more, or has no quorum.
+    pub(super) async fn put(&self, prefix: &str, bytes: Bytes) -> Result<(), ClusterError> {
+        let count = chunks(bytes.len());
+        let rest = stream::iter((1..count).map(|n| self.put_chunk(prefix, &bytes, n)));
+        rest.buffer_unordered(AT_ONCE).try_collect::<()>().await?;
+        self.put_chunk(prefix, &bytes, 0).await
+    }
+
+    async fn put_chunk(&self, prefix: &str, bytes: &Bytes, n: usize) -> Result<(), ClusterError> {
+        let chunk = bytes.slice(n * CHUNK..bytes.len().min((n + 1) * CHUNK));
+        let sent = self.context.publish(format!("{prefix}.{n}"), chunk).await;
+        let stored = sent.map_err(ClusterError::nats("put a file"))?.await;
+        stored.map(|_| ()).map_err(ClusterError::nats("put a file"))
+    }
+
+    /// Gets the file under `prefix` out of a stream.
+    ///
+    /// # Errors
+    /// See [`BlobError`].
+    pub(super) async fn get(
+        &self,
+        stream: &str,
+        prefix: &str,
+        wanted: Input,
+    ) -> Result<Vec<u8>, BlobError> {
+        let size = usize::try_from(wanted.bytes).map_err(|_| BlobError::Damaged)?;
+        // Memory grows with what arrives, not with what was promised.
+        let mut bytes = Vec::from(self.get_chunk(stream, format!("{prefix}.0")).await?);
+        let rest = stream::iter(1..chunks(size));
+        let mut rest =
+            rest.map(|n| self.get_chunk(stream, format!("{prefix}.{n}"))).buffered(AT_ONCE);
+        while let Some(chunk) = rest.next().await {
+            bytes.extend_from_slice(&chunk?);
+            if bytes.len() > size {
+                return Err(BlobError::Damaged);
+            }
+        }
+        drop(rest);
+        let hashed = tokio::task::spawn_blocking(move || (Sha256::of(&bytes), bytes)).await;
+        let (found, bytes) = hashed.map_err(|error| BlobError::Failed(error.to_string()))?;
+        if found == wanted.sha256 { Ok(bytes) } else { Err(BlobError::Damaged) }
+    }
+
+    async fn get_chunk(&self, stream: &str, subject: String) -> Result<Bytes, BlobError> {
+        let found = self.context.get_stream_no_info(stream).await;
+        let found = found.map_err(|error| BlobError::Failed(error.to_string()))?;
+        let message = found.direct_get_last_for_subject(subject).await;
+        message.map(|message| message.payload).map_err(|error| match error.kind() {
+            DirectGetErrorKind::NotFound => BlobError::Missing,
+            _ => BlobError::Failed(error.to_string()),
+        })
+    }
+
+    /// Removes all messages of a stream whose subjects match.
+    ///
+    /// # Errors
+    /// If the server refuses, or has no quorum.
+    pub(super) async fn purge(&self, stream: &str, subjects: String) -> Result<(), ClusterError> {
+        let failed = ClusterError::nats("purge a stream");
+        let found = self.context.get_stream_no_info(stream).await;
+        let found = found.map_err(ClusterError::nats("find a stream"))?;
+        let purged = found.purge().filter(subjects).await;
+        purged.map(|_| ()).map_err(failed)
+    }
+
+    /// Removes a message of a tile; that it is gone already is no error.
+    pub(super) async fn drop_task(&self, seq: i64) {
+        if let Ok(stream) = self.context.get_stream_no_info(names::TASKS).await
+            && let Err(error) = stream.delete_message(seq.cast_unsigned()).await
+        {
+            tracing::debug!(%error, seq, "a message is not there to be removed");
+        }
+    }
+}
+
+fn chunks(bytes: usize) -> usize {
+    bytes.div_ceil(CHUNK).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{CHUNK, chunks};
+
+    #[test]
+    fn every_file_has_a_first_chunk() {
+        assert_eq!([0, 1, CHUNK, CHUNK + 1].map(chunks), [1, 1, 1, 2]);
+    }
+}

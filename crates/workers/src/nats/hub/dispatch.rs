@@ -1,0 +1,262 @@
+//! Hands tiles out: claims them through the store, cuts their windows, puts what is absent, publishes.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_nats::jetstream::message::PublishMessage;
+use bytes::Bytes;
+use tokio::sync::Semaphore;
+
+use super::core::{Core, lock};
+use super::figures;
+use crate::local::tile_task;
+use crate::nats::arrays;
+use crate::nats::connection::ClusterError;
+use crate::nats::message::{Input, TaskMessage, Tell};
+use crate::nats::names;
+use crate::transport::TileTask;
+use engine::job::{Pool, Sha256, TaskKind, without_paths};
+use engine::pipeline::PipelineError;
+use engine::pipeline::arrays::window;
+use formats::planar::Reader;
+use formats::{FormatError, Limits};
+use store::{Claimant, ClaimedTask, MessagePlace, RemoteTask, StoreError, Work};
+
+/// Time between looks for tiles, and for jobs that are wanted no more.
+const TICK: Duration = Duration::from_millis(200);
+/// Tiles whose windows are cut and put at a time.
+const AT_ONCE: usize = 4;
+/// Pause after the store or the message server has failed.
+const TROUBLE: Duration = Duration::from_secs(2);
+
+/// Why a tile could not be sent.
+#[derive(Debug, thiserror::Error)]
+enum SendError {
+    /// The tile's own fault.
+    #[error(transparent)]
+    Tile(#[from] PipelineError),
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+impl From<FormatError> for SendError {
+    fn from(error: FormatError) -> Self {
+        Self::Tile(error.into())
+    }
+}
+
+impl Core {
+    /// Hands tiles out for as long as this is awaited.
+    pub async fn dispatch(self: Arc<Self>) {
+        let permits = Arc::new(Semaphore::new(AT_ONCE));
+        loop {
+            if let Err(error) = self.call_off().await {
+                tracing::error!(%error, "cancelled tiles can't be called off");
+            }
+            loop {
+                let Ok(permit) = permits.clone().acquire_owned().await else { return };
+                match self.next().await {
+                    Ok(Some((pool, task))) => {
+                        let hub = self.clone();
+                        tokio::spawn(async move {
+                            hub.send(&pool, task).await;
+                            drop(permit);
+                        });
+                    }
+                    Ok(None) => break,
+                    Err(error) => {
+                        tracing::error!(%error, "no tile can be claimed");
+                        tokio::time::sleep(TROUBLE).await;
+                        break;
+                    }
+                }
+            }
+            tokio::select! {
+                () = self.more.notified() => {}
+                () = tokio::time::sleep(TICK) => {}
+            }
+        }
+    }
+
+    /// The next tile, and the pool that has most room for it; none if there is no tile, or no pool with
+    /// room: two tiles for each worker may be out.
+    async fn next(&self) -> Result<Option<(Pool, ClaimedTask)>, StoreError> {
+        let pools = lock(&self.presence).pools();
+        if pools.values().all(|(workers, _)| *workers == 0) {
+            return Ok(None);
+        }
+        let out = self.store.remote_counts().await?;
+        let room = |(pool, (workers, _)): (Pool, (usize, _))| {
+            let out = out.get(pool.as_str()).map_or(0, |count| *count as usize);
+            let room = (2 * workers).saturating_sub(out);
+            (room > 0).then_some((room, pool))
+        };
+        let Some((_, pool)) = pools.into_iter().filter_map(room).max() else { return Ok(None) };
+        let claimed =
+            self.store.claim_as(Claimant::Pool(pool.as_str()), self.id, Duration::ZERO).await?;
+        Ok(claimed.map(|task| (pool, task)))
+    }
+
+    /// Sends a tile to a pool, and does not give up while the tile is the hub's.
+    pub async fn send(&self, pool: &Pool, claimed: ClaimedTask) {
+        let lease = claimed.lease;
+        if !lock(&self.sending).insert(lease.task) {
+            return;
+        }
+        if let Work::Job(task) = &claimed.work {
+            lock(&self.jobs).insert(task.job);
+        }
+        while let Err(error) = self.try_send(pool, &claimed).await {
+            tracing::warn!(%error, task = %lease.task, "a tile can't be sent");
+            if let SendError::Tile(error) = &error {
+                let reason = without_paths(&error.to_string());
+                match self.store.fail(&lease, &reason, error.is_retryable()).await {
+                    Ok(()) => break,
+                    Err(error) => tracing::error!(%error, "the failure is not recorded"),
+                }
+            }
+            tokio::time::sleep(TROUBLE).await;
+            let found = self.store.remote_task(lease.task).await;
+            if !found.is_ok_and(|found| found.is_some_and(|found| found.attempt == lease.attempt)) {
+                break;
+            }
+        }
+        lock(&self.sending).remove(&lease.task);
+    }
+
+    async fn try_send(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<(), SendError> {
+        let (lease, message) = (claimed.lease, self.prepare(pool, claimed).await?);
+        let text = serde_json::to_vec(&message).map_err(PipelineError::record("tile"))?;
+        let id = format!("{}.{}", lease.task, lease.attempt);
+        let message = PublishMessage::build().message_id(id).payload(text.into());
+        let message = message.outbound_message(names::task(pool));
+        let failed = ClusterError::nats("publish a tile");
+        let sent = self
+            .connection
+            .context
+            .publish_with_headers(
+                message.subject,
+                message.headers.unwrap_or_default(),
+                message.payload,
+            )
+            .await;
+        let stored = sent.map_err(&failed)?.await.map_err(ClusterError::nats("publish a tile"))?;
+        let stream = lock(&self.stream).clone();
+        let place = MessagePlace { stream, seq: stored.sequence.cast_signed() };
+        self.store.remote_published(&lease, &place).await?;
+        Ok(())
+    }
+
+    /// Puts all that a tile needs, as far as it is absent.
+    async fn prepare(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<TaskMessage, SendError> {
+        let wrong = || PipelineError::Record { what: "task", problem: "it is no tile".into() };
+        let Work::Job(job) = &claimed.work else { return Err(wrong().into()) };
+        let TaskKind::Tile { snapshot, tile, .. } = claimed.kind else {
+            return Err(wrong().into());
+        };
+        let tile = tile_task(job, snapshot, tile)?;
+        let masks = match self.window(tile.masks, tile.tile) {
+            Some(known) if self.is_put(pool, known.sha256) => known,
+            _ => {
+                let input = self.put_input(pool, self.cut(&tile, Part::Masks).await?).await?;
+                self.note_window(tile.masks, tile.tile, input);
+                input
+            }
+        };
+        let snapshots = self.put_input(pool, self.cut(&tile, Part::Snapshots).await?).await?;
+        self.note_snapshots(claimed.lease.task, pool, snapshots.sha256);
+        let model = match tile.model {
+            Some(sha256) => Some(self.put_model(pool, sha256).await?),
+            None => None,
+        };
+        let (task, attempt) = (claimed.lease.task, claimed.lease.attempt);
+        let (job, cost) = (job.job, claimed.cost);
+        Ok(TaskMessage { task, attempt, job, cost, tile, masks, snapshots, model })
+    }
+
+    /// A window of a prepared array, as a file.
+    async fn cut(&self, task: &TileTask, part: Part) -> Result<Vec<u8>, PipelineError> {
+        let sha256 = if part == Part::Masks { task.masks } else { task.measurement };
+        let (path, task) = (self.store.dir().blob(&sha256), task.clone());
+        let cut = tokio::task::spawn_blocking(move || {
+            let array = Reader::open(&path, &Limits::default())?;
+            let frames = match part {
+                Part::Masks => 0..array.info().frames,
+                Part::Snapshots => task.snapshots.start as usize..task.snapshots.end as usize,
+            };
+            arrays::to_bytes(window(&array, frames, &task.tile.window())?.view())
+        });
+        Ok(cut.await.map_err(|_| PipelineError::Thread)??)
+    }
+
+    async fn put_model(&self, pool: &Pool, sha256: Sha256) -> Result<Input, SendError> {
+        let path = self.store.dir().blob(&sha256);
+        let read = tokio::fs::read(path).await;
+        let failed = |source| FormatError::Io { action: "read the network's file", source };
+        self.put_input(pool, read.map_err(failed)?).await
+    }
+
+    /// Puts a file into the stream of inputs, unless it is there.
+    async fn put_input(&self, pool: &Pool, bytes: Vec<u8>) -> Result<Input, SendError> {
+        let hashed = tokio::task::spawn_blocking(move || (Sha256::of(&bytes), bytes)).await;
+        let (sha256, bytes) = hashed.map_err(|_| PipelineError::Thread)?;
+        let size = bytes.len();
+        if !self.is_put(pool, sha256) {
+            self.connection.put(&names::input(pool, sha256), Bytes::from(bytes)).await?;
+            figures::bytes("out", size);
+            self.note_put(pool, sha256);
+        }
+        Ok(Input { sha256, bytes: size as u64 })
+    }
+
+    /// Puts an input again that a worker can't find.
+    pub async fn put_again(&self, remote: &RemoteTask, pool: &Pool, sha256: Sha256) {
+        self.forget_put(pool, sha256);
+        let again = async {
+            let claimed = self.store.remote_work(remote).await?;
+            self.prepare(pool, &claimed).await
+        };
+        match again.await {
+            Ok(_) => tracing::info!(%sha256, "an input that a worker could not find is put again"),
+            Err(error) => tracing::warn!(%error, "an input can't be put again"),
+        }
+    }
+
+    /// Parts with the tiles of jobs that are not wanted any more: tells their workers, and takes those
+    /// back that no living worker has.
+    async fn call_off(&self) -> Result<(), StoreError> {
+        let jobs: Vec<_> = lock(&self.jobs).iter().copied().collect();
+        let unwanted = self.store.unwanted_jobs(&jobs).await?;
+        if unwanted.is_empty() {
+            return Ok(());
+        }
+        let mut left = false;
+        for remote in self.store.remote_tasks().await?.into_iter().filter(|remote| !remote.wanted) {
+            let Ok(pool) = remote.pool.parse::<Pool>() else { continue };
+            left = true;
+            if remote.delivery > 0 && lock(&self.presence).lives(remote.worker) {
+                let (task, attempt) = (remote.task, remote.attempt);
+                self.tell(&pool, remote.worker, Tell::Cancel { task, attempt }).await;
+            } else if !lock(&self.sending).contains(&remote.task) {
+                self.store.give_back(&remote.lease()).await?;
+                if let Some(place) = &remote.place {
+                    self.connection.drop_task(place.seq).await;
+                }
+                self.clear(&pool, remote.task).await;
+            }
+        }
+        if !left {
+            lock(&self.jobs).retain(|job| !unwanted.contains(job));
+        }
+        Ok(())
+    }
+}
+
+/// Which array a window is cut from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Part {
+    Masks,
+    Snapshots,
+}

@@ -1,0 +1,200 @@
+//! What workers ask and tell without a stream: hello, begin, signs of life, inputs that are missing.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_nats::{Message, Subscriber};
+use futures_util::StreamExt;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::core::{Core, lock};
+use super::figures;
+use crate::nats::connection::ClusterError;
+use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Tell, Want};
+use crate::nats::names;
+use engine::job::Pool;
+use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
+
+/// Time between two transactions for what workers tell.
+const FLUSH: Duration = Duration::from_secs(1);
+/// Requests that are dealt with at a time.
+const AT_ONCE: usize = 64;
+
+impl Core {
+    /// Listens to what workers ask.
+    ///
+    /// # Errors
+    /// If the message server does not let it.
+    pub async fn listen(&self, what: &str) -> Result<Subscriber, ClusterError> {
+        let subscribed = self.connection.client.subscribe(format!("sci.v1.{what}.*")).await;
+        subscribed.map_err(ClusterError::nats("listen to workers"))
+    }
+
+    pub async fn answer_hellos(self: Arc<Self>, asked: Subscriber) {
+        each(asked, |pool, hello: Hello, message| {
+            let hub = self.clone();
+            async move {
+                if let Some(answer) = hub.hello(&pool, hello).await {
+                    hub.reply(&message, &answer).await;
+                }
+            }
+        })
+        .await;
+    }
+
+    pub async fn answer_begins(self: Arc<Self>, asked: Subscriber) {
+        each(asked, |pool, begin: Begin, message| {
+            let hub = self.clone();
+            async move {
+                match hub.begin(&pool, begin).await {
+                    Ok(answer) => hub.reply(&message, &answer).await,
+                    // The worker goes on without an answer.
+                    Err(error) => tracing::error!(%error, "a worker that begins is not answered"),
+                }
+            }
+        })
+        .await;
+    }
+
+    pub async fn answer_wants(self: Arc<Self>, asked: Subscriber) {
+        each(asked, |pool, want: Want, _| {
+            let hub = self.clone();
+            async move {
+                match hub.store.remote_task(want.task).await {
+                    Ok(Some(remote)) if remote.pool == pool.as_str() => {
+                        hub.put_again(&remote, &pool, want.sha256).await;
+                    }
+                    Ok(_) => {}
+                    Err(error) => tracing::error!(%error, "what a worker wants can't be looked up"),
+                }
+            }
+        })
+        .await;
+    }
+
+    pub async fn hear_beats(self: Arc<Self>, told: Subscriber) {
+        each(told, |pool, beat: Beat, _| {
+            let hub = self.clone();
+            async move {
+                if beat.leaves {
+                    let known = lock(&hub.presence).leave(beat.worker, &pool);
+                    if known && let Err(error) = hub.store.remote_worker_left(beat.worker).await {
+                        tracing::error!(%error, "the end of a worker is not recorded");
+                    }
+                } else if !lock(&hub.presence).sign(beat.worker, &pool, beat.tile) {
+                    hub.tell(&pool, beat.worker, Tell::Introduce).await;
+                }
+            }
+        })
+        .await;
+    }
+
+    /// Records what workers have told, once a second.
+    pub async fn record_beats(self: Arc<Self>) {
+        loop {
+            tokio::time::sleep(FLUSH).await;
+            if let Err(error) = self.flush().await {
+                tracing::error!(%error, "what workers tell is not recorded");
+            }
+        }
+    }
+
+    async fn flush(&self) -> Result<(), StoreError> {
+        let (seen, tiles) = lock(&self.presence).news();
+        if seen.is_empty() {
+            return Ok(());
+        }
+        let beats: Vec<RemoteBeat> = tiles
+            .iter()
+            .map(|(_, pool, tile)| RemoteBeat {
+                pool: pool.to_string(),
+                task: tile.task,
+                attempt: tile.attempt,
+                progress: tile.progress,
+                history: tile.history.clone(),
+            })
+            .collect();
+        let answers = self.store.remote_beats(&beats, &seen).await?;
+        for ((worker, pool, tile), answer) in tiles.iter().zip(answers) {
+            let (task, attempt) = (tile.task, tile.attempt);
+            match answer {
+                Heartbeat::Continue => {}
+                Heartbeat::Cancelled => {
+                    self.tell(pool, *worker, Tell::Cancel { task, attempt }).await
+                }
+                Heartbeat::Lost => self.tell(pool, *worker, Tell::Lost { task, attempt }).await,
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes a worker in; none if that has failed and it should ask again.
+    async fn hello(&self, pool: &Pool, hello: Hello) -> Option<HelloAnswer> {
+        let Hello { worker, host, pid, device, program } = hello;
+        if let Some(reason) = self.program.refusal(&program) {
+            tracing::warn!(%worker, host, reason, "a worker is refused");
+            return Some(HelloAnswer::Refused(reason));
+        }
+        if let Err(error) = self.connection.make_pool(pool, self.ack_wait).await {
+            tracing::error!(%error, "a pool can't be made");
+            return None;
+        }
+        let place = WorkerPlace {
+            host: Some(host.clone()),
+            pool: Some(pool.to_string()),
+            device: Some(device),
+        };
+        if let Err(error) = self.store.worker_started(worker, pid, &place).await {
+            tracing::error!(%error, "a worker can't be recorded");
+            return None;
+        }
+        lock(&self.presence).join(worker, pool);
+        tracing::info!(%worker, host, %pool, "a worker has come");
+        self.more.notify_one();
+        let ack_wait_ms = u64::try_from(self.ack_wait.as_millis()).unwrap_or(u64::MAX);
+        Some(HelloAnswer::Welcome { ack_wait_ms })
+    }
+
+    async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, StoreError> {
+        let Begin { task, attempt, seq, delivery, worker } = begin;
+        let task = (task, pool.as_str());
+        let begun = self.store.remote_begin(task, (attempt, seq), delivery, worker).await?;
+        Ok(match begun {
+            Begun::Go(attempt, redelivered) => {
+                lock(&self.presence).begin(worker, task.0);
+                figures::redelivered(u64::from(redelivered));
+                BeginAnswer::Go(attempt)
+            }
+            Begun::Over => BeginAnswer::Over,
+            Begun::Lost => BeginAnswer::Lost,
+        })
+    }
+
+    async fn reply(&self, message: &Message, answer: &impl Serialize) {
+        let Some(to) = &message.reply else { return };
+        if let Err(error) = self.connection.say(to.to_string(), answer).await {
+            tracing::warn!(%error, "a worker can't be answered");
+        }
+    }
+}
+
+/// Deals with all that comes, several at a time; what can't be read is left.
+async fn each<T, F>(told: Subscriber, deal: impl Fn(Pool, T, Message) -> F)
+where
+    T: DeserializeOwned,
+    F: Future<Output = ()>,
+{
+    let read = told.filter_map(|message| async move {
+        let pool = names::pool_of(&message.subject)?;
+        match serde_json::from_slice(&message.payload) {
+            Ok(read) => Some((pool, read, message)),
+            Err(error) => {
+                tracing::warn!(%error, subject = %message.subject, "a worker says what can't be read");
+                None
+            }
+        }
+    });
+    read.for_each_concurrent(AT_ONCE, |(pool, read, message)| deal(pool, read, message)).await;
+}

@@ -1,0 +1,139 @@
+//! The streams and their consumers.
+
+use std::time::Duration;
+
+use async_nats::jetstream::ErrorCode;
+use async_nats::jetstream::consumer::pull::Config as Consumer;
+use async_nats::jetstream::consumer::{AckPolicy, PullConsumer};
+use async_nats::jetstream::context::CreateStreamErrorKind;
+use async_nats::jetstream::stream::{Config, DiscardPolicy, RetentionPolicy, StorageType};
+
+use super::connection::{ClusterError, Connection};
+use super::names;
+use engine::job::Pool;
+
+/// Copies of each message, where the message server is a cluster.
+const REPLICAS: usize = 3;
+/// Messages that may be out for a consumer, and requests for them.
+const AT_ONCE: i64 = 16_384;
+/// An event that was not dealt with is delivered to the hub again after so long.
+const EVENT_WAIT: Duration = Duration::from_secs(30);
+const HOUR: Duration = Duration::from_secs(3600);
+
+fn streams() -> [Config; 4] {
+    let stream = |name: &str, subject: &str| Config {
+        name: name.into(),
+        subjects: vec![subject.into()],
+        storage: StorageType::File,
+        discard: DiscardPolicy::New,
+        num_replicas: 1,
+        ..Config::default()
+    };
+    let queue = |name, subject| Config {
+        retention: RetentionPolicy::WorkQueue,
+        max_messages: 65_536,
+        max_message_size: 512 * 1024,
+        duplicate_window: Duration::from_secs(600),
+        ..stream(name, subject)
+    };
+    let files = |name, subject, max_age| Config {
+        max_messages_per_subject: 1,
+        allow_direct: true,
+        max_age,
+        ..stream(name, subject)
+    };
+    [
+        queue(names::TASKS, "sci.v1.task.*"),
+        queue(names::EVENTS, "sci.v1.event.*"),
+        files(names::INPUTS, "sci.v1.in.>", 24 * HOUR),
+        files(names::OUTPUTS, "sci.v1.out.>", 6 * HOUR),
+    ]
+}
+
+impl Connection {
+    /// Makes the streams that are missing, and the consumer of events; says when that of tiles was made.
+    ///
+    /// # Errors
+    /// If the server refuses, or has no quorum.
+    pub(super) async fn make_streams(&self) -> Result<String, ClusterError> {
+        for config in streams() {
+            if self.context.get_stream(&config.name).await.is_err() {
+                self.make_stream(config).await?;
+            }
+        }
+        let config = Consumer {
+            durable_name: Some(names::HUB.into()),
+            ack_policy: AckPolicy::Explicit,
+            ack_wait: EVENT_WAIT,
+            max_ack_pending: AT_ONCE,
+            ..Consumer::default()
+        };
+        let made = self.context.create_consumer_on_stream(config, names::EVENTS).await;
+        made.map_err(ClusterError::nats("make the consumer of events"))?;
+        let tasks = self.context.get_stream(names::TASKS).await;
+        let tasks = tasks.map_err(ClusterError::nats("find the stream of tiles"))?;
+        Ok(tasks.cached_info().created.to_string())
+    }
+
+    async fn make_stream(&self, config: Config) -> Result<(), ClusterError> {
+        let copies = Config { num_replicas: REPLICAS, ..config.clone() };
+        let made = match self.context.create_stream(copies).await {
+            Err(error) => match error.kind() {
+                // One server alone keeps one copy. That a part of a cluster is down is an error.
+                CreateStreamErrorKind::JetStream(error)
+                    if error.error_code() == ErrorCode::STREAM_REPLICAS_NOT_SUPPORTED =>
+                {
+                    self.context.create_stream(config).await
+                }
+                _ => Err(error),
+            },
+            made => made,
+        };
+        made.map(|_| ()).map_err(ClusterError::nats("make a stream"))
+    }
+
+    /// Makes the consumer of a pool, of which each worker pulls.
+    ///
+    /// # Errors
+    /// If the server refuses, or has no quorum.
+    pub(super) async fn make_pool(
+        &self,
+        pool: &Pool,
+        ack_wait: Duration,
+    ) -> Result<(), ClusterError> {
+        let config = Consumer {
+            durable_name: Some(pool.to_string()),
+            filter_subject: names::task(pool),
+            ack_policy: AckPolicy::Explicit,
+            ack_wait,
+            max_ack_pending: AT_ONCE,
+            max_waiting: AT_ONCE,
+            ..Consumer::default()
+        };
+        let made = self.context.create_consumer_on_stream(config, names::TASKS).await;
+        made.map(|_| ()).map_err(ClusterError::nats("make the consumer of a pool"))
+    }
+
+    /// The consumer of a pool.
+    ///
+    /// # Errors
+    /// If there is none, or the credential has no right to it.
+    pub(super) async fn pool(&self, pool: &Pool) -> Result<PullConsumer, ClusterError> {
+        let found = self.context.get_consumer_from_stream(pool.as_str(), names::TASKS).await;
+        found.map_err(ClusterError::nats("find the consumer of the pool"))
+    }
+
+    /// Removes a consumer, which is made anew by the next sweep at the latest; who pulls of it sees none for
+    /// that long.
+    pub(super) async fn drop_consumer(&self, stream: &str, consumer: &str) {
+        if let Err(error) = self.context.delete_consumer_from_stream(consumer, stream).await {
+            tracing::warn!(%error, stream, consumer, "a consumer can't be removed");
+        }
+    }
+
+    /// The consumer of events.
+    pub(super) async fn events(&self) -> Result<PullConsumer, ClusterError> {
+        let found = self.context.get_consumer_from_stream(names::HUB, names::EVENTS).await;
+        found.map_err(ClusterError::nats("find the consumer of events"))
+    }
+}

@@ -1,0 +1,152 @@
+//! `tables.json`: all rows that were ever made in a folder, each with all that it depends on.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use engine::job::{Algorithm, RunSpec, Schedule, TileSpec};
+use engine::pipeline::networks::ModelRecord;
+use engine::pipeline::records::JointRecord;
+use sci_recon::cli::CliError;
+use serde::{Deserialize, Serialize};
+
+/// Name and version of this form of record.
+const SCHEMA: &str = "sci-recon/bench-tables/1";
+
+const FILE: &str = "tables.json";
+
+/// What all rows of one command share.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Setting {
+    pub pattern: String,
+    /// Standard deviation of the noise of the measurement on the scale of 255 grey values.
+    pub noise_sigma: f32,
+    pub seed: u64,
+}
+
+/// All that a row depends on: a row with the same key need not be computed again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Key {
+    pub program_version: String,
+    pub clip: String,
+    /// How many snapshots of the clip there are.
+    #[serde(default = "one")]
+    pub snapshots: usize,
+    /// How they are reconstructed together.
+    #[serde(default)]
+    pub run: RunSpec,
+    pub algorithm: Algorithm,
+    pub scale: usize,
+    pub compression_ratio: usize,
+    #[serde(flatten)]
+    pub setting: Setting,
+    /// SHA-256 of masks, measurement and true frames, one after the other, as little-endian f32.
+    pub inputs_sha256: String,
+    pub schedule: Schedule,
+    pub tile: TileSpec,
+    pub models: Vec<ModelRecord>,
+    /// Execution provider of the networks; none without one.
+    pub provider: Option<String>,
+}
+
+/// A clip, an algorithm, and what came of them. A PSNR is in dB, the mean over the frames of the
+/// snapshot, and none where it is infinite.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    #[serde(flatten)]
+    pub key: Key,
+    pub psnr_db: Option<f64>,
+    pub ssim: f64,
+    pub psnr_db_by_frame: Vec<Option<f64>>,
+    /// From the centre to the rim.
+    pub psnr_db_by_zone: Vec<ZoneRecord>,
+    pub cpu_seconds: f64,
+    pub seconds: f64,
+    /// Most of any tile.
+    pub denoiser_passes: usize,
+    /// White level of the scene, as it was estimated.
+    pub white: f32,
+    pub stop_reason: String,
+    /// Whether snapshots were found to belong together.
+    #[serde(default)]
+    pub joints: Vec<JointRecord>,
+}
+
+/// Rows of before there were sequences.
+fn one() -> usize {
+    1
+}
+
+/// A ring around the centre.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ZoneRecord {
+    /// Its outer radius in pixels; none for the corners.
+    pub outer_radius: Option<f64>,
+    pub psnr_db: Option<f64>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct File {
+    schema: String,
+    rows: Vec<Row>,
+}
+
+pub struct Records {
+    folder: PathBuf,
+    file: File,
+}
+
+impl Records {
+    /// Makes the folder, or reads what an earlier command left there.
+    pub fn open(folder: &Path) -> Result<Self, CliError> {
+        fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
+        let path = folder.join(FILE);
+        let file = match fs::read(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+                File { schema: SCHEMA.into(), rows: Vec::new() }
+            }
+            Err(error) => return Err(CliError::file("read", &path, &error)),
+            Ok(text) => parse(&text).map_err(|problem| {
+                CliError::Input(format!(
+                    "{} is not what this version writes: {problem}; move it away or name another \
+                     --out",
+                    path.display()
+                ))
+            })?,
+        };
+        Ok(Self { folder: folder.to_owned(), file })
+    }
+
+    pub fn find(&self, key: &Key) -> Option<&Row> {
+        self.file.rows.iter().find(|row| row.key == *key)
+    }
+
+    /// Adds a row and writes the file, so that an interruption costs nothing that was made.
+    pub fn add(&mut self, row: Row) -> Result<Row, CliError> {
+        self.file.rows.push(row.clone());
+        let text = serde_json::to_string_pretty(&self.file)
+            .map_err(|error| CliError::Failure(format!("{FILE}: {error}")))?;
+        self.write(FILE, &(text + "\n"))?;
+        Ok(row)
+    }
+
+    /// Writes a file of the folder: the old one stays until the new one is whole.
+    pub fn write(&self, name: &str, text: &str) -> Result<(), CliError> {
+        let path = self.folder.join(name);
+        let write = || -> std::io::Result<()> {
+            let mut file = tempfile::NamedTempFile::new_in(&self.folder)?;
+            file.write_all(text.as_bytes())?;
+            file.persist(&path)?;
+            Ok(())
+        };
+        write().map_err(|error| CliError::file("write", &path, &error))
+    }
+}
+
+fn parse(text: &[u8]) -> Result<File, String> {
+    let file: File = serde_json::from_slice(text).map_err(|error| error.to_string())?;
+    if file.schema != SCHEMA {
+        return Err(format!("its schema is {:?}, not {SCHEMA:?}", file.schema));
+    }
+    Ok(file)
+}
