@@ -4,7 +4,7 @@
 //! and from frame to frame, how far the priors have moved them since total variation, what the denoiser's own first
 //! layers see in them, how well the masks can tell frames apart, and the [`super::signs`] of pixels
 //! that were held out. Block by block the expected error follows from these by a small network that was fitted to
-//! simulated snapshots of many scenes; `docs/benchmarks.md` says how well it does on others.
+//! simulated snapshots of many scenes; `docs/BENCHMARKS.md` states how well it does on others.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

@@ -38,9 +38,8 @@ const CHANCE: f64 = 1.5;
 /// iterations on, is given up then.
 const CLEAR: f64 = 2.0;
 
-/// Below this correlation of their changes along time, frames that were shrunk much and those that were not
-/// have no motion in common: what changed was not in the scene. Of 224 simulated scenes
-/// (`docs/experiments.md`) 27 of 33 at rest are below it, and 8 of 191 others.
+/// Correlation of the temporal changes under weak and under strong shrinkage. Below this value the scene counts as
+/// static. Swept on 224 simulated scenes (`research/NOTEBOOK.md`): 27 of 33 static ones and 8 of 191 others are below.
 const MOTION: f32 = 0.45;
 
 /// Side in pixels of the squares over which a scene without texture and motion is even.

@@ -293,7 +293,7 @@ const HIGH_CONTRAST: f32 = 0.125;
 /// With the default's 0.55 the best static variance is 0.07 at a contrast of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06,
 /// 0.3 at 0.084, 0.25 to 0.3 from there to 0.17, and 0.3 to 0.4 at 0.25, where optics blur binary masks or let light
 /// through closed pixels; behind independent binary ones (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from
-/// Cr 16 on (docs/experiments.md).
+/// Cr 16 on (`research/NOTEBOOK.md`).
 fn static_share(contrast: f32, frames: usize) -> f32 {
     let count = frames as f32;
     let many = (10.0 / count).sqrt();

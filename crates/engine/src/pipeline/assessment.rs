@@ -233,7 +233,7 @@ fn reasons(
 }
 
 /// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up
-/// to 5.3, motion by 10 as 7 to 14 (`docs/benchmarks.md`).
+/// to 5.3, motion by 10 as 7 to 14 (`research/NOTEBOOK.md`).
 const FAST: f32 = 6.0;
 
 fn too_fast(motion: f32) -> Option<Finding> {
