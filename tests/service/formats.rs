@@ -138,7 +138,10 @@ async fn every_row_of_the_tables_holds() {
     let (accepted, refused) = (rows("## Supported input formats"), rows("## Convert other files"));
     let told: BTreeSet<&str> = accepted.iter().chain(&refused).map(|(row, _)| &**row).collect();
     let written: BTreeSet<&str> = files.iter().map(|file| &*file.row).collect();
-    assert_eq!(told, written, "rows of docs/DATA.md (left) differ from tests/judges/written_files.py (right)");
+    assert_eq!(
+        told, written,
+        "rows of docs/DATA.md (left) differ from tests/judges/written_files.py (right)"
+    );
     for file in &files {
         let (path, asked) = (judge.folder.path().join(&file.file), file.asked());
         if accepted.iter().any(|(row, _)| *row == file.row) {

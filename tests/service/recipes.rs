@@ -13,8 +13,11 @@ fn recipes(document: &str, port: u16, folder: &Path) -> Vec<String> {
     let here = folder.to_str().unwrap();
     let ours = blocks.map(|block| {
         let block = block.replace("127.0.0.1:8080", &format!("127.0.0.1:{port}"));
+        let block = block.replace("/tmp/", &format!("{here}/"));
         // The default takes half a minute.
-        block.replace("/tmp/", &format!("{here}/")).replace("pnp-tv-fastdvdnet", "gap-tv")
+        block
+            .replace("pnp-tv-fastdvdnet", "gap-tv")
+            .replace("sci-recon submit ", "sci-recon submit --algorithm gap-tv ")
     });
     ours.collect()
 }
