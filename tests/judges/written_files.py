@@ -1,4 +1,4 @@
-"""Makes files of every kind that `docs/formats.md` lists, with the writers that labs use, into FOLDER.
+"""Makes files of every kind that `docs/DATA.md` lists, with the writers that labs use, into FOLDER.
 
 `index.json` there says of each file to which row of the tables it belongs, what is asked of it, and what it holds: masks
 [4, 48, 64] of 0 and 1, or snapshots [2, 48, 64] from 0 to 250.
@@ -98,14 +98,14 @@ def accepted():
         pages = [Image.fromarray(page) for page in EIGHT]
         pages[0].save(path(row, "a.tif"), save_all=True, append_images=pages[1:], compression=compression)
     imageio.imwrite(path(row, "a.tif"), EIGHT, is_batch=True, photometric="minisblack")
-    row = "ImageJ stack, above 4 GB too"
+    row = "ImageJ stack, also above 4 GB"
     tifffile.imwrite(path(row, "a.tif"), EIGHT, imagej=True)
     tifffile.imwrite(path(row, "a.tif"), MASKS.astype("f4"), imagej=True, truncate=True)
     row = "PNG"
     Image.fromarray(MASKS[0].astype(bool)).save(path(row, "a.png", frames=1))
     Image.fromarray(EIGHT[0]).save(path(row, "a.png", frames=1))
     imageio.imwrite(path(row, "a.png", frames=1), (MASKS[0] * 65535).astype("u2"))
-    row = "ZIP of pictures"
+    row = "ZIP of images"
     numbered = [(f"shot_{k + 8}.png", png(frame)) for k, frame in enumerate(EIGHT)]
     zipped(path(row, "a.zip"), numbered[::-1])
     zipped(path(row, "a.zip"), numbered, zipfile.ZIP_DEFLATED)
@@ -115,7 +115,7 @@ def accepted():
         tifffile.imwrite(file, frame, photometric="minisblack")
         tiffs.append((f"run 3/{k:04}.tif", file.getvalue()))
     zipped(path(row, "a.zip"), tiffs, zipfile.ZIP_DEFLATED)
-    row = "tar of pictures"
+    row = "tar of images"
     for form in [tarfile.PAX_FORMAT, tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT]:
         with tarfile.open(path(row, "a.tar"), "w", format=form) as archive:
             for name, content in numbered:
@@ -152,9 +152,9 @@ def accepted():
 
 def refused():
     colours = np.repeat(EIGHT[0][..., None], 3, axis=2)
-    row = "masks whose axes may be in several orders"
+    row = "masks with several possible axis orders"
     np.save(path(row, "in.npy", reason="axes_ambiguous"), np.moveaxis(MASKS, 0, -1).astype("f4"))
-    row = "npy with axes of length 1 beside those of frames"
+    row = "npy with extra axes of length 1"
     np.save(path(row, "in.npy"), MASKS[:, None].astype("f4"))
     row = "npy of objects (a pickle)"
     frames = np.empty(4, object)
@@ -162,25 +162,25 @@ def refused():
     np.save(path(row, "in.npy"), frames, allow_pickle=True)
     row = "npy of complex numbers"
     np.save(path(row, "in.npy"), MASKS.astype("c8"))
-    row = "npz without an array of that name"
+    row = "npz without the expected array name"
     np.savez(path(row, "in.npz", reason="missing_array", again={"name": "a"}), a=MASKS, b=SNAPSHOTS)
-    row = "a colour PNG, or one with transparency or 2 or 4 bits"
+    row = "PNG with colour, transparency, or 2 or 4 bits"
     Image.fromarray(colours).save(path(row, "in.png", frames=1))
     Image.fromarray(colours).convert("LA").save(path(row, "in.png", frames=1))
     Image.fromarray(EIGHT[0]).quantize(2).save(path(row, "in.png", frames=1))
-    row = "an animated PNG"
+    row = "animated PNG"
     pages = [Image.fromarray(frame) for frame in EIGHT]
     pages[0].save(path(row, "in.png"), save_all=True, append_images=pages[1:])
-    row = "a colour TIFF"
+    row = "colour TIFF"
     tifffile.imwrite(path(row, "in.tif", frames=1), colours, photometric="rgb")
-    row = "a TIFF of other numbers"
+    row = "TIFF with another sample type"
     for code in ["<u4", "<i2", "<f2"]:
         tifffile.imwrite(path(row, "in.tif"), MASKS.astype(code), photometric="minisblack")
-    row = "a TIFF in which 0 is white"
+    row = "TIFF in which 0 is white"
     tifffile.imwrite(path(row, "in.tif"), 255 - EIGHT, photometric="miniswhite")
-    row = "a TIFF packed in another way"
+    row = "TIFF with another compression"
     pages[0].save(path(row, "in.tif"), save_all=True, append_images=pages[1:], compression="zstd")
-    row = "TIFF pages of several sizes"
+    row = "TIFF with pages of several sizes"
     with tifffile.TiffWriter(path(row, "in.tif")) as file:
         for frame in MASKS.astype("f4"):
             file.write(frame, photometric="minisblack", contiguous=False)
@@ -188,66 +188,66 @@ def refused():
     row = "EXR"
     parts = [OpenEXR.Part({}, {"Y": frame.astype("f4")}, str(k)) for k, frame in enumerate(MASKS)]
     OpenEXR.File(parts).write(str(path(row, "in.exr")))
-    row = "a GIF or BMP"
+    row = "GIF or BMP"
     pages[0].save(path(row, "in.gif"), save_all=True, append_images=pages[1:])
     Image.fromarray(EIGHT[0]).save(path(row, "in.gif", frames=1), "bmp")
-    row = "a JPEG"
+    row = "JPEG"
     pages[0].save(path(row, "in.jpg"))
     row = "gzip"
     place = path(row, "in.gz")
     with gzip.open(place, "wb") as file:
         np.save(file, MASKS.astype("f4"))
-    row = "a ZIP of pictures of which some are missing, or of other files too"
+    row = "ZIP with missing numbers or other files"
     some = [(f"shot_{k}.png", png(frame)) for k, frame in zip([1, 2, 4, 5], EIGHT)]
     zipped(path(row, "in.zip"), some)
     zipped(path(row, "in.zip"), [*some, ("read me.txt", b"text")])
-    row = "a tar of these"
+    row = "tar with missing numbers or other files"
     with tarfile.open(path(row, "in.tar"), "w") as archive:
         for name, content in some:
             member = tarfile.TarInfo(name)
             member.size = len(content)
             archive.addfile(member, io.BytesIO(content))
-    row = "a ZIP packed in another way"
+    row = "ZIP with another compression"
     numbered = [(f"shot_{k}.png", png(frame)) for k, frame in enumerate(EIGHT)]
     zipped(path(row, "in.zip"), numbered, zipfile.ZIP_BZIP2)
     zipped(path(row, "in.zip"), numbered, zipfile.ZIP_LZMA)
     mask = np.moveaxis(MASKS, 0, -1).astype("f8")
-    row = "a sparse matrix in a `.mat`"
+    row = "`.mat` with a sparse matrix"
     scipy.io.savemat(path(row, "in.mat", frames=1), {"mask": scipy.sparse.csc_matrix(MASKS[0].astype("f8"))})
-    row = "complex numbers in a `.mat`"
+    row = "`.mat` with complex numbers"
     scipy.io.savemat(path(row, "in.mat"), {"mask": mask.astype("c16")})
-    row = "a cell array in a `.mat`"
+    row = "`.mat` with a cell array"
     cells = np.empty((1, 4), object)
     cells[0] = [frame.astype("f8") for frame in MASKS]
     scipy.io.savemat(path(row, "in.mat"), {"mask": cells})
-    row = "a struct in a `.mat`"
+    row = "`.mat` with a struct"
     scipy.io.savemat(path(row, "in.mat"), {"mask": {"data": mask, "date": "today"}})
-    row = "more than three axes in a `.mat`"
+    row = "`.mat` with more than three axes"
     scipy.io.savemat(path(row, "in.mat"), {"mask": mask.reshape(48, 64, 2, 2, order="F")})
     scipy.io.savemat(path(row, "in.mat"), {"mask": mask[:, :, None]})
-    row = "a cell array in a `.mat` of level 7.3"
+    row = "`.mat` 7.3 with a cell array"
     with level73(path(row, "in.mat")) as file:
         cells = [file.create_dataset(f"#refs#/{k}", data=frame.astype("f8").T).ref for k, frame in enumerate(MASKS)]
         dataset = file.create_dataset("mask", data=np.array(cells, h5py.ref_dtype).reshape(4, 1))
         dataset.attrs["MATLAB_class"] = np.bytes_("cell")
-    row = "a struct in a `.mat` of level 7.3"
+    row = "`.mat` 7.3 with a struct"
     with level73(path(row, "in.mat")) as file:
         file.create_dataset("mask/data", data=mask.T).attrs["MATLAB_class"] = np.bytes_("double")
         file["mask"].attrs["MATLAB_class"] = np.bytes_("struct")
-    row = "more than three axes in a `.mat` of level 7.3"
+    row = "`.mat` 7.3 with more than three axes"
     matlab73(path(row, "in.mat"), mask=(mask.reshape(48, 64, 2, 2, order="F"), "double"))
-    row = "more than three axes in HDF5"
+    row = "HDF5 with more than three axes"
     with h5py.File(path(row, "in.h5"), "w") as file:
         file["mask"] = MASKS.reshape(2, 2, 48, 64)
-    row = "a MATLAB file of level 4 (`save -v4`)"
+    row = "`.mat` level 4 (`save -v4`)"
     scipy.io.savemat(path(row, "in.mat", frames=1), {"mask": MASKS[0].astype("f8")}, format="4")
-    row = "HDF5 packed by a filter of its own (LZF, szip)"
+    row = "HDF5 with another filter (LZF, szip)"
     with h5py.File(path(row, "in.h5"), "w") as file:
         file.create_dataset("mask", data=MASKS, chunks=(1, 48, 64), compression="lzf")
-    row = "records or complex numbers in HDF5"
+    row = "HDF5 with records or complex numbers"
     with h5py.File(path(row, "in.h5"), "w") as file:
         file["mask"] = MASKS.astype("c8")
-    row = "integers of which nobody has said which number means 1"
+    row = "integers without a stated full scale"
     np.save(path(row, "in.npy", measurement=True, reason="invalid_full_scale", again={"full_scale": 250}), SNAPSHOTS.astype("<i4"))
 
 

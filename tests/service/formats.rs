@@ -1,4 +1,4 @@
-//! The tables of `docs/formats.md`, row by row, with files of the writers that labs use.
+//! Holds the tables of `docs/DATA.md` row by row to files from the programs that labs use.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ type Row = (String, Option<String>);
 
 /// The rows of the first table below this heading.
 fn rows(heading: &str) -> Vec<Row> {
-    let text = std::fs::read_to_string("docs/formats.md").unwrap();
+    let text = std::fs::read_to_string("docs/DATA.md").unwrap();
     let (_, below) = text.split_once(heading).unwrap();
     let lines = below.lines().skip_while(|line| !line.starts_with("| ---")).skip(1);
     let row = |line: &str| {
@@ -135,10 +135,13 @@ fn run(command: &mut Command) {
 #[tokio::test]
 async fn every_row_of_the_tables_holds() {
     let Some((judge, files)) = Judge::new().await else { return };
-    let (accepted, refused) = (rows("## In: masks"), rows("## What is refused"));
+    let (accepted, refused) = (rows("## Supported input formats"), rows("## Convert other files"));
     let told: BTreeSet<&str> = accepted.iter().chain(&refused).map(|(row, _)| &**row).collect();
     let written: BTreeSet<&str> = files.iter().map(|file| &*file.row).collect();
-    assert_eq!(told, written, "the rows of docs/formats.md, and of tests/judges/written_files.py");
+    assert_eq!(
+        told, written,
+        "rows of docs/DATA.md (left) differ from tests/judges/written_files.py (right)"
+    );
     for file in &files {
         let (path, asked) = (judge.folder.path().join(&file.file), file.asked());
         if accepted.iter().any(|(row, _)| *row == file.row) {

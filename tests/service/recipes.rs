@@ -13,8 +13,11 @@ fn recipes(document: &str, port: u16, folder: &Path) -> Vec<String> {
     let here = folder.to_str().unwrap();
     let ours = blocks.map(|block| {
         let block = block.replace("127.0.0.1:8080", &format!("127.0.0.1:{port}"));
+        let block = block.replace("/tmp/", &format!("{here}/"));
         // The default takes half a minute.
-        block.replace("/tmp/", &format!("{here}/")).replace("pnp-tv-fastdvdnet", "gap-tv")
+        block
+            .replace("pnp-tv-fastdvdnet", "gap-tv")
+            .replace("sci-recon submit ", "sci-recon submit --algorithm gap-tv ")
     });
     ours.collect()
 }
@@ -56,14 +59,20 @@ fn pasted(documents: &[&str], least: usize) -> String {
 }
 
 #[test]
-fn the_job_of_the_readme_and_the_calibration_that_follows_it_succeed() {
-    let told = pasted(&["README.md", "docs/calibration.md"], 8);
+fn jobs_by_command_and_by_curl_and_a_calibration_from_captures_succeed() {
+    let told = pasted(&["README.md", "docs/HTTP.md", "docs/DATA.md"], 6);
     assert!(told.is_empty() || told.contains("succeeded") && told.contains("ready"), "{told}");
     assert!(told.is_empty() || told.contains("\"grade\": \"good\""), "{told}");
 }
 
 #[test]
+fn the_commands_for_lab_machines_and_offline_work() {
+    let told = pasted(&["README.md", "docs/CLI.md"], 7);
+    assert!(told.is_empty() || told.contains("succeeded") && told.contains("stack.tif"), "{told}");
+}
+
+#[test]
 fn the_recipes_of_operations_work_in_their_order() {
-    let told = pasted(&["docs/operations.md"], 7);
+    let told = pasted(&["docs/OPERATIONS.md"], 7);
     assert!(told.is_empty() || told.contains("succeeded"), "{told}");
 }

@@ -248,8 +248,9 @@ async fn the_python_of_the_documentation_uploads_a_file() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("masks.npy");
     std::fs::write(&file, b"0123456789").unwrap();
-    let document = std::fs::read_to_string("docs/uploads.md").unwrap();
-    let (_, after) = document.split_once("```python\n").unwrap();
+    let document = std::fs::read_to_string("docs/DATA.md").unwrap();
+    let (_, section) = document.split_once("## Upload large files over a bad network").unwrap();
+    let (_, after) = section.split_once("```python\n").unwrap();
     let (recipe, _) = after.split_once("```").unwrap();
     let call = "import sys\nprint(upload(*sys.argv[1:]))";
     let mut command = tokio::process::Command::new(&python);

@@ -14,14 +14,14 @@ pub enum StoreError {
     Migrate(#[from] sqlx::migrate::MigrateError),
     #[error(
         "the database can't be brought up to date: {error}. Its copy from before is {copy}; the version \
-         before serves it (docs/operations.md, upgrade and rollback)",
+         before serves it (docs/OPERATIONS.md, section Update and roll back)",
         copy = copy.display()
     )]
     Upgrade { error: sqlx::migrate::MigrateError, copy: PathBuf },
     #[error(
         "{folder}: the database was brought up to date by version {by} (schema {found}); this is version \
          {own} (schema {schema}). Nothing was changed. To go on, start that version again, or go back{copy} \
-         (docs/operations.md, upgrade and rollback)",
+         (docs/OPERATIONS.md, section Update and roll back)",
         folder = folder.display(),
         own = env!("CARGO_PKG_VERSION"),
         copy = copy.as_ref().map_or(String::new(), |path| format!(" to {}", path.display()))

@@ -1,5 +1,7 @@
 //! `/v1/uploads`: uploads in pieces, by tus 1.0 (core, creation, checksum, expiration, termination).
-//! `docs/uploads.md` says why this is a module of our own.
+//!
+//! `tus-protocol` 0.1 leaves storage, state, locks and hooks to the caller. Here the offset, the quotas and the
+//! disk reservation share one database, so all four would be this code again; the protocol is four handlers.
 
 mod append;
 pub mod headers;

@@ -1,4 +1,4 @@
-//! What a new user does: the commands of docs/cluster.md, word for word, with the server in one network
+//! What a new user does: the commands of docs/CLUSTER.md, word for word, with the server in one network
 //! namespace, and the worker, as another user, in another.
 
 use std::path::{Path, PathBuf};
@@ -11,10 +11,10 @@ use super::nodes;
 use super::{job, local};
 use crate::samples::Scene;
 
-/// The commands under "From one machine to three": those of the server's machine, and of another one.
+/// The commands under "Run workers on another PC": those of the server's machine, and of another one.
 fn recipe() -> [String; 2] {
-    let text = std::fs::read_to_string("docs/cluster.md").unwrap();
-    let (_, text) = text.split_once("## From one machine to three").unwrap();
+    let text = std::fs::read_to_string("docs/CLUSTER.md").unwrap();
+    let (_, text) = text.split_once("## Run workers on another PC").unwrap();
     let mut blocks = text.split("```sh\n").skip(1).map(|rest| rest.split("```").next().unwrap());
     std::array::from_fn(|_| blocks.next().unwrap().to_owned())
 }
