@@ -34,6 +34,7 @@ mod quality;
 mod reports;
 mod results;
 mod resumption;
+mod revocation;
 mod router;
 mod running;
 mod samples;
@@ -43,6 +44,7 @@ mod system;
 mod tiles;
 pub mod tus;
 mod upload;
+mod write_deadline;
 
 pub use app::App;
 pub use listen::listen;

@@ -106,8 +106,9 @@ pub fn router(app: App) -> Router {
     let hosts: Arc<[String]> = app.settings.hosts.clone().into();
     let mut router = Router::new();
     for route in routes() {
+        let (store, revocations) = (app.store.clone(), app.revocations.clone());
         let guard =
-            from_fn_with_state((app.store.clone(), hosts.clone(), route.rule), access::guard);
+            from_fn_with_state((store, hosts.clone(), revocations, route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let handlers = handlers.route_layer(guard);

@@ -7,6 +7,7 @@ use reqwest::{Body, Method};
 use serde_json::{Value, json};
 
 use crate::app::TestApp;
+use crate::downloads::ask_beside_slow_readers;
 use crate::samples::{Scene, npy_header};
 
 fn setting(name: &str, default: u64) -> u64 {
@@ -77,6 +78,26 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
                "requests": times.len(), "errors": errors, "p50_ms": percentile(&times, 50.0),
                "p99_ms": p99, "max_ms": percentile(&times, 100.0),
                "peak_memory_mib": app.peak_memory()})
+    );
+    assert!(ok);
+}
+
+#[tokio::test]
+#[ignore = "minutes; run by make load"]
+async fn two_hundred_slow_clients_download_while_another_lab_asks() {
+    const CLIENTS: usize = 200;
+    let seconds = setting("SCI_RECON_LOAD_SLOW_SECONDS", 120);
+    let answers = ask_beside_slow_readers(CLIENTS, Duration::from_secs(seconds)).await;
+    let errors = answers.iter().filter(|(status, _)| *status != 200).count();
+    let mut times: Vec<Duration> = answers.into_iter().map(|(_, took)| took).collect();
+    times.sort();
+    let p99 = percentile(&times, 99.0);
+    let ok = p99 < 100.0 && errors == 0 && times.len() as u64 > 10 * seconds;
+    println!(
+        "{}",
+        json!({"target": "load_slow_downloads", "ok": ok, "clients": CLIENTS, "seconds": seconds,
+               "requests": times.len(), "errors": errors, "p50_ms": percentile(&times, 50.0),
+               "p99_ms": p99, "max_ms": percentile(&times, 100.0)})
     );
     assert!(ok);
 }
