@@ -1,13 +1,17 @@
-//! Downloads by slow clients.
+//! Downloads that are slow: by their clients, or by the disk.
 
-use std::time::{Duration, Instant};
+use std::path::Path;
+use std::time::{Duration, Instant, SystemTime};
 
 use futures_util::future::join_all;
 use reqwest::{Method, StatusCode};
+use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 
 use crate::app::TestApp;
+use crate::crashes::Shim;
+use crate::samples::Scene;
 
 /// The time between two reads of a client.
 const STEP: Duration = Duration::from_millis(100);
@@ -180,4 +184,82 @@ async fn an_answer_ends_with_the_session_and_with_the_open_service() {
     ends(signed_in).await;
     let more = tokio::time::timeout(Duration::from_secs(4), other.chunk()).await;
     assert!(more.is_err(), "the token itself is good");
+}
+
+/// Makes all stored files look as if they had been changed, so that their hashes are not known.
+pub fn touch_all(folder: &Path) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            touch_all(&path);
+        } else {
+            let file = std::fs::File::options().write(true).open(path).unwrap();
+            file.set_modified(SystemTime::now()).unwrap();
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_file_on_a_slow_disk_is_read_once_and_however_long_it_takes() {
+    // Files of 48 kB and more take 6 s.
+    const RATE: &str = "8000";
+    let shim = Shim::build();
+    let slow = shim.file("slow");
+    let faults = [("FAULT_SLOW", slow.to_str().unwrap()), ("FAULT_RATE", RATE)];
+    let arguments = ["--workers", "1", "--request-seconds", "3", "--scrub-bytes", "0"];
+    let app = shim.service(&arguments, &faults).await;
+    let (calibration, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let job = app.submit(&body).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let upload = app.upload(vec![7; 48_000]).await;
+    let masks = app.upload(Scene::SMALL.masks()).await;
+    let head = async |path: &str| {
+        let start = Instant::now();
+        let answer = app.request(Method::HEAD, path).send().await.unwrap();
+        assert_eq!(answer.status(), 200, "{path}");
+        start.elapsed().as_secs_f64()
+    };
+    std::fs::write(&slow, []).unwrap();
+    let content = format!("/v1/blobs/{upload}/content");
+    let took = head(&content).await;
+    assert!(took < 3.0, "the hash is known from the upload: {took} s");
+    let forget = || {
+        touch_all(&app.data().join("blobs"));
+        touch_all(&app.data().join("results"));
+    };
+    // The read continues after its client has left.
+    forget();
+    let impatient = app.request(Method::GET, &content).timeout(Duration::from_millis(500));
+    assert!(impatient.send().await.unwrap_err().is_timeout());
+    tokio::time::sleep(Duration::from_secs(7)).await;
+    let took = head(&content).await;
+    assert!(took < 3.0, "the file is read again: {took} s");
+    // Every route that reads a file to its end before the first byte.
+    forget();
+    let snapshot = format!("/v1/jobs/{job}/snapshots/0");
+    let paths = [
+        content,
+        format!("/v1/blobs/{masks}/pictures/frame-1"),
+        format!("/v1/calibrations/{calibration}/pictures/mask-1"),
+        format!("/v1/measurements/{measurement}/pictures/snapshot-1"),
+        format!("/v1/measurements/{measurement}/pictures/snapshot-1/spread"),
+        format!("/v1/jobs/{job}/manifest.json"),
+        format!("/v1/jobs/{job}/results.zip"),
+        format!("/v1/jobs/{job}/sequence/frames.npy"),
+        format!("/v1/jobs/{job}/sequence/stack.tif"),
+        format!("/v1/jobs/{job}/sequence/frames.zarr/c/5/0/0"),
+        format!("{snapshot}/manifest.json"),
+        format!("{snapshot}/stack.exr"),
+        format!("{snapshot}/stack.tif"),
+        format!("{snapshot}/frames.npy"),
+        format!("{snapshot}/frames/1.exr"),
+        format!("{snapshot}/frames/1.png"),
+        format!("{snapshot}/frames.zarr/c/0/0/0"),
+        format!("{snapshot}/pictures/frame-1"),
+        format!("{snapshot}/pictures/residual"),
+    ];
+    let times = join_all(paths.iter().map(|path| head(path))).await;
+    let longest = times.iter().fold(0.0, |longest: f64, took| longest.max(*took));
+    assert!(longest > 3.0, "the disk is not slow: {longest} s");
 }
