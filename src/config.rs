@@ -97,6 +97,27 @@ pub struct ServeArguments {
     )]
     pub upload_bytes_per_second: u64,
 
+    /// Seconds after which a client is disconnected that receives an answer more slowly than
+    /// --download-bytes-per-second. It can request the rest with a range.
+    #[arg(
+        long,
+        env = "SCI_RECON_DOWNLOAD_STALL_SECONDS",
+        value_name = "SECONDS",
+        default_value_t = 60,
+        value_parser = clap::value_parser!(u64).range(1..)
+    )]
+    pub download_stall_seconds: u64,
+
+    /// Lowest rate at which a client may receive an answer, in bytes per second, averaged over
+    /// --download-stall-seconds; 0: no limit.
+    #[arg(
+        long,
+        env = "SCI_RECON_DOWNLOAD_BYTES_PER_SECOND",
+        value_name = "BYTES",
+        default_value_t = 1000
+    )]
+    pub download_bytes_per_second: u64,
+
     /// Seconds that an answer may take (other than uploads, checks of uploads, and downloads).
     #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
     pub request_seconds: u64,
@@ -356,6 +377,11 @@ impl ServeArguments {
     #[must_use]
     pub fn upload_idle(&self) -> Duration {
         Duration::from_secs(self.upload_idle_seconds)
+    }
+
+    #[must_use]
+    pub fn download_stall(&self) -> Duration {
+        Duration::from_secs(self.download_stall_seconds)
     }
 
     /// How long an upload is kept that nothing refers to, or that is not complete.

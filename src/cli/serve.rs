@@ -117,7 +117,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     app.resume_checks().await?;
     let service = router(app);
     tokio::select! {
-        () = listen(listener, service, stopped(stop.clone())) => {}
+        () = listen(listener, service, settings, stopped(stop.clone())) => {}
         () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
     }
     // 6. The end: workers of this machine give their tasks back; those of others go on.

@@ -4,7 +4,6 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::body::{Body, HttpBody};
 use axum::extract::{FromRequestParts, Request, State};
@@ -19,6 +18,7 @@ use headers::{Cookie, HeaderMapExt};
 use rustix::system::uname;
 
 use super::error::{ApiError, Code, Result};
+use super::revocation::{Grant, Revocations};
 use engine::job::{Lab, Role, Secret, Timestamp, TokenId};
 use store::{Store, Token};
 
@@ -26,9 +26,6 @@ use store::{Store, Token};
 pub(super) const SESSION: &str = "sci_recon_session";
 /// What changes something by a session has this header: a page of another site can't set it.
 const CHANGES: &str = "x-requested-with";
-
-/// Time between two looks at whether an answer that goes on may go on.
-const LOOK: Duration = Duration::from_secs(3);
 
 /// Who may use a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -112,6 +109,14 @@ impl Access {
         Self { lab, role, all_labs, across: false, token, max_bytes, expires_at, session }
     }
 
+    fn grant(&self) -> Grant {
+        match (&self.session, self.token) {
+            (Some(session), _) => Grant::Session(session.clone()),
+            (None, Some(token)) => Grant::Token(token),
+            (None, None) => Grant::Open,
+        }
+    }
+
     /// The lab whose data are to be shown; none for those of all labs.
     pub(super) fn shown(&self) -> Option<&Lab> {
         (!self.across).then_some(&self.lab)
@@ -130,7 +135,7 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
 /// Lets a request pass if its token may do what it wants. What is answered bit by bit ends when the token
 /// does.
 pub(super) async fn guard(
-    State((store, hosts, rule)): State<(Store, Arc<[String]>, Rule)>,
+    State((store, hosts, revocations, rule)): State<(Store, Arc<[String]>, Revocations, Rule)>,
     mut request: Request,
     next: Next,
 ) -> Response {
@@ -145,7 +150,7 @@ pub(super) async fn guard(
             }
             response.map(|body| {
                 let parts = body.into_data_stream();
-                Body::from_stream(parts.take_until(end_of_access(store, access)))
+                Body::from_stream(parts.take_until(revocations.end_of(access.grant())))
             })
         }
         Err(refusal) => refusal.into_response(),
@@ -249,25 +254,6 @@ fn without_lab(uri: &Uri) -> (Option<String>, Uri) {
     let rest: Vec<_> = pairs().filter(|pair| !pair.starts_with("lab=")).collect();
     let rest = format!("{}?{}", uri.path(), rest.join("&"));
     (Some(lab), rest.parse().unwrap_or_else(|_| uri.clone()))
-}
-
-/// Waits until a token, or the session that stands for it, opens nothing any more; without a token, until the
-/// service is not open any more.
-async fn end_of_access(store: Store, access: Access) {
-    loop {
-        tokio::time::sleep(LOOK).await;
-        let holds = match (&access.session, access.token) {
-            (Some(session), _) => {
-                store.token_of_session(session).await.map(|token| token.is_some())
-            }
-            (None, Some(token)) => store.token_holds(token).await,
-            (None, None) => store.is_open().await,
-        };
-        // A failing database shows in every other answer, too.
-        if matches!(holds, Ok(false)) {
-            return;
-        }
-    }
 }
 
 fn text<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {

@@ -12,6 +12,7 @@ use super::events::Events;
 use super::metrics::Metrics;
 use super::model_check::Checker;
 use super::rendering::Pictures;
+use super::revocation::Revocations;
 use super::running::Checks;
 use super::shares::Turns;
 use crate::config::ServeArguments;
@@ -46,6 +47,7 @@ pub struct Services {
     pub(super) checker: Checker,
     pub(super) metrics: Metrics,
     pub(super) events: Events,
+    pub(super) revocations: Revocations,
     pub(super) pictures: Pictures,
     /// Why no tile can leave this machine, where tiles should.
     pub(super) cluster: Option<watch::Receiver<Option<String>>>,
@@ -69,6 +71,7 @@ impl App {
     ) -> Self {
         Self(Arc::new(Services {
             events: Events::start(store.clone(), closing.clone()),
+            revocations: Revocations::start(store.clone()),
             pictures: Pictures::new(),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },

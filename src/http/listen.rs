@@ -1,4 +1,4 @@
-//! The connections: how many there may be, and how long they may be silent.
+//! The connections: how many there may be, how long they may be silent, and how slow.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -11,18 +11,32 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
 use hyper_util::service::TowerToHyperService;
 use rustix::process::{Resource, getrlimit, setrlimit};
+use socket2::SockRef;
 use tokio::net::{TcpListener, TcpStream};
+
+use super::write_deadline::{LeastRate, WriteDeadline};
+use crate::config::ServeArguments;
 
 /// A connection that sends no whole head of a request for so long is closed, the first one and between
 /// two requests.
 const SILENCE: Duration = Duration::from_secs(30);
 /// Connections of one address, such as that of a proxy or of a lab behind one; more are closed at once.
 const MOST_OF_AN_ADDRESS: usize = 2048;
+/// Unsent bytes of a connection that the kernel takes from us. With megabytes, as is the kernel's default, it would take
+/// nothing for minutes from a connection with a slow client, as from one that stands still.
+const UNSENT_BYTES: u32 = 64 * 1024;
 /// Files that are kept for what is no connection.
 const OTHER_FILES: u64 = 256;
 
 /// Answers at all connections, until `stop`; then lets requests that have begun come to their end.
-pub async fn listen(listener: TcpListener, router: Router, stop: impl Future<Output = ()>) {
+pub async fn listen(
+    listener: TcpListener,
+    router: Router,
+    settings: &ServeArguments,
+    stop: impl Future<Output = ()>,
+) {
+    let (rate, time) = (settings.download_bytes_per_second, settings.download_stall());
+    let least = LeastRate { bytes: rate.saturating_mul(time.as_secs()), time };
     let places = Places::new(raise_file_limit());
     let service = TowerToHyperService::new(router);
     let mut http = http1::Builder::new();
@@ -47,7 +61,7 @@ pub async fn listen(listener: TcpListener, router: Router, stop: impl Future<Out
             tracing::warn!(%address, "too many connections");
             continue;
         };
-        let connection = graceful.watch(http.serve_connection(io(stream), service.clone()));
+        let connection = graceful.watch(http.serve_connection(io(stream, least), service.clone()));
         tokio::spawn(async move {
             if let Err(error) = connection.await {
                 tracing::debug!(%error, "a connection broke");
@@ -59,10 +73,12 @@ pub async fn listen(listener: TcpListener, router: Router, stop: impl Future<Out
     graceful.shutdown().await;
 }
 
-fn io(stream: TcpStream) -> TokioIo<TcpStream> {
+fn io(stream: TcpStream, least: LeastRate) -> TokioIo<WriteDeadline<TcpStream>> {
     // Small answers go at once; a stream for which that can't be had works as well.
     let _ = stream.set_nodelay(true);
-    TokioIo::new(stream)
+    // Without it, slow clients are broken off that are faster than they need to be.
+    let _ = SockRef::from(&stream).set_tcp_notsent_lowat(UNSENT_BYTES);
+    TokioIo::new(WriteDeadline::new(stream, least))
 }
 
 /// Allows as many open files as the system does, and says how many those are.

@@ -35,6 +35,7 @@ mod rendering;
 mod reports;
 mod results;
 mod resumption;
+mod revocation;
 mod router;
 mod running;
 mod samples;
@@ -44,6 +45,7 @@ mod system;
 mod tiles;
 pub mod tus;
 mod upload;
+mod write_deadline;
 
 pub use app::App;
 pub use listen::listen;

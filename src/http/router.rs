@@ -33,8 +33,8 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/labs/{lab}").get(labs::show).patch(labs::change).only(Rule::AllLabs),
         R::at("/v1/blobs").get(blobs::list).post(blobs::create).uploads(),
         R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).delete(blobs::delete).uploads(),
-        R::at("/v1/blobs/{sha256}/content").get(blobs::content),
-        R::at("/v1/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>),
+        R::at("/v1/blobs/{sha256}/content").get(blobs::content).slow(),
+        R::at("/v1/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>).slow(),
         R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
@@ -53,38 +53,38 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}").get(jobs::show).patch(jobs::change).delete(jobs::delete),
         R::at("/v1/jobs/{job}/cancel").post(jobs::cancel),
         R::at("/v1/jobs/{job}/retry").post(jobs::retry),
-        R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest),
+        R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}").get(results::snapshot),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::file),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(exports::exr),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::file),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/mosaic.npy").get(results::file),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/error.npy").get(results::file),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.tif").get(exports::tiff),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/movie.mp4").get(exports::movie),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::file).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(exports::exr).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::file).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/mosaic.npy").get(results::file).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/error.npy").get(results::file).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.tif").get(exports::tiff).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/movie.mp4").get(exports::movie).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/zarr.json").get(exports::zarr),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0").get(exports::chunk),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0/0").get(exports::chunk),
-        R::at("/v1/jobs/{job}/sequence/stack.tif").get(exports::tiff),
-        R::at("/v1/jobs/{job}/sequence/movie.mp4").get(exports::movie),
-        R::at("/v1/jobs/{job}/sequence/frames.npy").get(exports::array),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0").get(exports::chunk).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0/0").get(exports::chunk).slow(),
+        R::at("/v1/jobs/{job}/sequence/stack.tif").get(exports::tiff).slow(),
+        R::at("/v1/jobs/{job}/sequence/movie.mp4").get(exports::movie).slow(),
+        R::at("/v1/jobs/{job}/sequence/frames.npy").get(exports::array).slow(),
         R::at("/v1/jobs/{job}/sequence/frames.zarr/zarr.json").get(exports::zarr),
-        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0").get(exports::chunk),
-        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0/0").get(exports::chunk),
-        R::at("/v1/jobs/{job}/results.zip").get(exports::archive),
+        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0").get(exports::chunk).slow(),
+        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0/0").get(exports::chunk).slow(),
+        R::at("/v1/jobs/{job}/results.zip").get(exports::archive).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).slow(),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).slow(),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>).slow(),
+        R::at("/v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).slow(),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).slow(),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>).slow(),
+        R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).slow(),
         R::at("/v1/events").get(events::listen).slow(),
         R::at("/v1/system").get(system::show).only(Rule::Admin),
         R::at("/").get(dashboard::page).only(Rule::Public),
@@ -106,8 +106,9 @@ pub fn router(app: App) -> Router {
     let hosts: Arc<[String]> = app.settings.hosts.clone().into();
     let mut router = Router::new();
     for route in routes() {
+        let (store, revocations) = (app.store.clone(), app.revocations.clone());
         let guard =
-            from_fn_with_state((app.store.clone(), hosts.clone(), route.rule), access::guard);
+            from_fn_with_state((store, hosts.clone(), revocations, route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let handlers = handlers.route_layer(guard);
@@ -195,8 +196,8 @@ impl Route {
         self
     }
 
-    /// Without a limit on the time of the answer: the check of a large file takes minutes, and
-    /// events never end.
+    /// Without a limit on the time of the answer: the check of a large file takes minutes, so does reading it whole
+    /// before it is handed out, and events never end.
     fn slow(mut self) -> Self {
         self.slow = true;
         self

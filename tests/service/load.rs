@@ -7,6 +7,8 @@ use reqwest::{Body, Method};
 use serde_json::{Value, json};
 
 use crate::app::TestApp;
+use crate::crashes::Shim;
+use crate::downloads::{ask_beside_slow_readers, touch_all};
 use crate::samples::{Scene, npy_header};
 
 fn setting(name: &str, default: u64) -> u64 {
@@ -82,6 +84,26 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
 }
 
 #[tokio::test]
+#[ignore = "minutes; run by make load"]
+async fn two_hundred_slow_clients_download_while_another_lab_asks() {
+    const CLIENTS: usize = 200;
+    let seconds = setting("SCI_RECON_LOAD_SLOW_SECONDS", 120);
+    let answers = ask_beside_slow_readers(CLIENTS, Duration::from_secs(seconds)).await;
+    let errors = answers.iter().filter(|(status, _)| *status != 200).count();
+    let mut times: Vec<Duration> = answers.into_iter().map(|(_, took)| took).collect();
+    times.sort();
+    let p99 = percentile(&times, 99.0);
+    let ok = p99 < 100.0 && errors == 0 && times.len() as u64 > 10 * seconds;
+    println!(
+        "{}",
+        json!({"target": "load_slow_downloads", "ok": ok, "clients": CLIENTS, "seconds": seconds,
+               "requests": times.len(), "errors": errors, "p50_ms": percentile(&times, 50.0),
+               "p99_ms": p99, "max_ms": percentile(&times, 100.0)})
+    );
+    assert!(ok);
+}
+
+#[tokio::test]
 #[ignore = "gigabytes; run by make load"]
 async fn large_uploads_at_once_take_little_memory() {
     const SIDE: usize = 2240;
@@ -116,6 +138,53 @@ async fn large_uploads_at_once_take_little_memory() {
         "{}",
         json!({"target": "load_uploads", "ok": ok, "uploads": uploads, "bytes_each": size,
                "stored": stored, "seconds": seconds, "peak_memory_mib": peak})
+    );
+    assert!(ok);
+}
+
+#[tokio::test]
+#[ignore = "gigabytes; run by make load"]
+async fn a_large_file_comes_from_a_slow_disk() {
+    const PIECE: usize = 1 << 20;
+    const BYTES_PER_SECOND: u64 = 100_000_000;
+    let size = setting("SCI_RECON_LOAD_FILE_BYTES", 4 << 30).next_multiple_of(PIECE as u64);
+    let (shim, rate) = (Shim::build(), BYTES_PER_SECOND.to_string());
+    let slow = shim.file("slow");
+    let faults = [("FAULT_SLOW", slow.to_str().unwrap()), ("FAULT_RATE", &rate)];
+    let app = shim.service(&["--workers", "0", "--scrub-bytes", "0"], &faults).await;
+    let piece = Bytes::from(vec![0x5au8; PIECE]);
+    let pieces = (0..size / PIECE as u64).map(move |_| Ok::<_, std::io::Error>(piece.clone()));
+    let body = Body::wrap_stream(futures_util::stream::iter(pieces));
+    let request = app.request(Method::POST, "/v1/blobs").header("content-length", size).body(body);
+    let sent = app.send(request).await.expect(201).json();
+    let path = format!("/v1/blobs/{}/content", sent["sha256"].as_str().unwrap());
+    std::fs::write(&slow, []).unwrap();
+    let mut first_byte = Vec::new();
+    let mut first = async || {
+        let start = Instant::now();
+        let answer = app.request(Method::GET, &path).send().await.unwrap();
+        first_byte.push(start.elapsed().as_secs_f64());
+        answer
+    };
+    // Known from the upload; not known; read a moment ago.
+    let mut answers = vec![first().await];
+    touch_all(&app.data().join("blobs"));
+    answers.push(first().await);
+    answers.push(first().await);
+    let good = answers.iter().filter(|answer| answer.status() == 200).count();
+    let mut last = answers.pop().unwrap();
+    drop(answers);
+    let (start, mut bytes) = (Instant::now(), 0);
+    while let Ok(Some(chunk)) = last.chunk().await {
+        bytes += chunk.len() as u64;
+    }
+    let ok = good == 3 && bytes == size && first_byte[0] < 1.0 && first_byte[2] < 1.0;
+    println!(
+        "{}",
+        json!({"target": "load_large_file", "ok": ok, "bytes": size, "good": good,
+               "disk_bytes_per_second": BYTES_PER_SECOND, "seconds_to_first_byte": first_byte,
+               "seconds_to_last_byte": start.elapsed().as_secs_f64(),
+               "peak_memory_mib": app.peak_memory()})
     );
     assert!(ok);
 }

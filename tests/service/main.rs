@@ -23,6 +23,7 @@ mod crashes;
 mod damage;
 mod dashboard;
 mod deep;
+mod downloads;
 mod exports;
 mod faults;
 mod formats;

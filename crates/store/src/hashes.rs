@@ -4,18 +4,24 @@ use std::fs::{File, Metadata};
 use std::io::Read;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
+use std::sync::Arc;
 
 use flate2::Crc;
 use quick_cache::sync::Cache;
 use sha2::Digest;
+use tokio::sync::Semaphore;
 
 use super::error::{Result, StoreError};
+use super::on_files;
 use engine::job::Sha256;
 
 /// Files of which the hash is remembered.
 const REMEMBERED: usize = 65_536;
 /// Bytes that are read at a time.
-const PIECE: usize = 256 * 1024;
+const SLICE: usize = 1 << 20;
+/// Slices that are read at the same time for those who wait: files take turns, so that a small one is soon done beside
+/// large ones.
+const SLICES_AT_ONCE: usize = 4;
 
 /// A file as it was when it was hashed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -59,14 +65,80 @@ impl Digester {
     }
 }
 
-/// Digests of files that were read.
+/// Digests of files that were written or read.
 #[derive(Debug)]
-pub(super) struct Hashes(pub(super) Cache<Identity, Digests>);
+pub(super) struct Hashes {
+    known: Cache<Identity, Digests>,
+    turns: Semaphore,
+}
 
 impl Default for Hashes {
     fn default() -> Self {
-        Self(Cache::new(REMEMBERED))
+        Self { known: Cache::new(REMEMBERED), turns: Semaphore::new(SLICES_AT_ONCE) }
     }
+}
+
+impl Hashes {
+    /// Remembers the digests of a file.
+    pub(super) fn remember(&self, file: Identity, digests: Digests) {
+        self.known.insert(file, digests);
+    }
+
+    /// The digests of an open file. It is read once for all who ask, and to its end even if none of them waits any
+    /// longer.
+    pub(super) async fn of(self: &Arc<Self>, file: &File, meta: &Metadata) -> Result<Digests> {
+        let identity = Identity::of(meta);
+        if let Some(known) = self.known.get(&identity) {
+            return Ok(known);
+        }
+        let again = file.try_clone().map_err(unreadable())?;
+        let hashes = self.clone();
+        let reading = tokio::spawn(async move {
+            let read = hashes.read(Hashing::new(again));
+            hashes.known.get_or_insert_async(&identity, read).await
+        });
+        reading.await.map_err(|_| StoreError::Interrupted)?
+    }
+
+    async fn read(&self, mut file: Hashing) -> Result<Digests> {
+        loop {
+            let _turn = self.turns.acquire().await.map_err(|_| StoreError::Interrupted)?;
+            let (read, count) = file.advance().await?;
+            if count == 0 {
+                return Ok(read.digester.finish());
+            }
+            file = read;
+        }
+    }
+}
+
+/// A file that is hashed slice by slice, so that it can be broken off between two of them.
+#[derive(Debug)]
+pub(super) struct Hashing {
+    pub(super) file: File,
+    pub(super) digester: Digester,
+    slice: Vec<u8>,
+}
+
+impl Hashing {
+    pub(super) fn new(file: File) -> Self {
+        Self { file, digester: Digester::default(), slice: Vec::new() }
+    }
+
+    /// Reads the next slice. Gives its bytes, 0 at the end of the file.
+    pub(super) async fn advance(mut self) -> Result<(Self, usize)> {
+        on_files(move || {
+            self.slice.resize(SLICE, 0);
+            let count = self.file.read(&mut self.slice).map_err(unreadable())?;
+            self.digester.update(&self.slice[..count]);
+            Ok((self, count))
+        })
+        .await
+    }
+}
+
+fn unreadable() -> impl FnOnce(std::io::Error) -> StoreError {
+    StoreError::io("read", Path::new("a stored file"))
 }
 
 /// Opens a file; none if there is none.
@@ -81,17 +153,11 @@ pub(super) fn open(path: &Path) -> Result<Option<(File, Metadata)>> {
 
 /// The digests of the bytes that are left to read.
 pub(super) fn digest(mut file: File) -> Result<Digests> {
-    let failed = StoreError::io("read", Path::new("a stored file"));
-    let read = |file: &mut File, digester: &mut Digester| -> std::io::Result<()> {
-        let mut buffer = vec![0; PIECE];
-        loop {
-            match file.read(&mut buffer)? {
-                0 => return Ok(()),
-                count => digester.update(&buffer[..count]),
-            }
+    let (mut digester, mut slice) = (Digester::default(), vec![0; SLICE]);
+    loop {
+        match file.read(&mut slice).map_err(unreadable())? {
+            0 => return Ok(digester.finish()),
+            count => digester.update(&slice[..count]),
         }
-    };
-    let mut digester = Digester::default();
-    read(&mut file, &mut digester).map_err(failed)?;
-    Ok(digester.finish())
+    }
 }

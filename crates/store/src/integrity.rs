@@ -1,25 +1,23 @@
 //! Whether stored files have the bytes on record: asked before a file is handed out, and by a slow look at
 //! all of them in between.
 //!
-//! A file is read whole the first time that it is asked for. What was found holds until the file changes
-//! (its inode, size or time), or until the slow look finds that the disk has changed it by itself.
+//! A file is read whole the first time that it is asked for, unless this process has written it. What was found holds
+//! until the file changes (its inode, size or time), or until the slow look finds that the disk has changed it.
 
 use std::fs::File;
-use std::io::{Read, Seek};
+use std::io::Seek;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::fs::{Advice, fadvise};
 
 use super::error::{Result, StoreError};
-use super::hashes::{Digester, Digests, Identity, digest, open};
+use super::hashes::{Digests, Hashing, Identity, digest, open};
 use super::records::{self, Place, Record};
 use super::rows::{sql, sql_scalar};
 use super::{DataDir, Job, Store, on_files};
 use engine::job::{ResultFile, Sha256, Timestamp};
 
-/// Bytes that the slow look reads at a time.
-const SLICE: usize = 1 << 20;
 /// Time from the begin of a slow look to that of the next.
 const ROUND: Duration = Duration::from_secs(86_400);
 /// Pause of the slow look when the database or the disk has failed, or when it is done.
@@ -88,12 +86,7 @@ impl Store {
         let path = record.path(self.dir());
         let opened = on_files(move || open(&path)).await?;
         let Some((mut file, meta)) = opened else { return Err(self.damaged(record).await) };
-        let hashing = async {
-            let again = file.try_clone().map_err(StoreError::io("open", self.dir().root()))?;
-            let hashed = on_files(move || digest(again)).await?;
-            Ok::<_, StoreError>(hashed)
-        };
-        let found = self.hashes.0.get_or_insert_async(&Identity::of(&meta), hashing).await?;
+        let found = self.hashes.of(&file, &meta).await?;
         if found.sha256 != record.sha256 {
             return Err(self.damaged(record).await);
         }
@@ -254,7 +247,7 @@ impl Store {
             None => None,
             Some((file, meta)) => {
                 let digests = read_slowly(file, rate).await?;
-                self.hashes.0.insert(Identity::of(&meta), digests);
+                self.hashes.remember(Identity::of(&meta), digests);
                 Some(digests.sha256)
             }
         };
@@ -281,28 +274,18 @@ fn result_record(job: &Job, snapshot: Option<u32>, file: &ResultFile) -> Record 
 async fn read_slowly(file: File, rate: u64) -> Result<Digests> {
     // Advice alone: where it is not taken, what the kernel remembers is hashed.
     let _ = fadvise(&file, 0, None, Advice::DontNeed);
-    let mut state = (file, Digester::default());
+    let mut hashing = Hashing::new(file);
     loop {
-        let (next, count) = on_files(move || {
-            let (mut file, mut digester) = state;
-            let mut buffer = vec![0; SLICE];
-            let count = file
-                .read(&mut buffer)
-                .map_err(StoreError::io("read", Path::new("a stored file")))?;
-            digester.update(&buffer[..count]);
-            Ok(((file, digester), count))
-        })
-        .await?;
-        state = next;
+        let (read, count) = hashing.advance().await?;
+        hashing = read;
         if count == 0 {
             break;
         }
         #[allow(clippy::cast_precision_loss)] // a pause
         tokio::time::sleep(Duration::from_secs_f64(count as f64 / rate.max(1) as f64)).await;
     }
-    let (file, digester) = state;
-    let _ = fadvise(&file, 0, None, Advice::DontNeed);
-    Ok(digester.finish())
+    let _ = fadvise(&hashing.file, 0, None, Advice::DontNeed);
+    Ok(hashing.digester.finish())
 }
 
 impl Record {

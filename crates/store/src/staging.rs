@@ -9,11 +9,11 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use sha2::Digest;
 use uuid::Uuid;
 
 use super::Store;
 use super::error::{Result, StoreError};
+use super::hashes::{Digester, Digests, Identity, digest};
 use super::locked::LockedFile;
 use super::{dir, on_files};
 use engine::job::{ResultFile, Sha256};
@@ -56,7 +56,7 @@ impl Store {
         let file = File::options().write(true).open(path);
         let file = file.map_err(StoreError::io("open", path))?;
         let file = BufWriter::with_capacity(256 * 1024, file);
-        Ok(BlobWriter { file, temporary: staged.0, hasher: sha2::Sha256::new(), size: 0 })
+        Ok(BlobWriter { file, temporary: staged.0, digester: Digester::default(), size: 0 })
     }
 
     /// A new empty file for a writer that wants a path. Blocks on the disk.
@@ -118,7 +118,7 @@ impl Store {
 pub struct BlobWriter {
     temporary: Temporary,
     file: BufWriter<File>,
-    hasher: sha2::Sha256,
+    digester: Digester,
     size: u64,
 }
 
@@ -131,15 +131,15 @@ impl BlobWriter {
     pub fn finish(mut self) -> Result<StagedBlob> {
         let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
         synced.map_err(StoreError::io("write to the disk", &self.temporary.path))?;
-        let sha256 = Sha256::new(self.hasher.finalize().into());
-        Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
+        let digests = self.digester.finish();
+        Ok(StagedBlob { temporary: self.temporary, digests, size: self.size })
     }
 }
 
 impl Write for BlobWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let count = self.file.write(bytes)?;
-        self.hasher.update(&bytes[..count]);
+        self.digester.update(&bytes[..count]);
         self.size += count as u64;
         Ok(count)
     }
@@ -162,10 +162,10 @@ impl StagedPath {
     /// Reads the file back to hash it, and brings it to the disk.
     pub fn finish(self) -> Result<StagedBlob> {
         let path = &self.0.path;
-        let mut file = File::open(path).map_err(StoreError::io("open", path))?;
-        let (sha256, size) = Sha256::of_reader(&mut file).map_err(StoreError::io("read", path))?;
+        let file = File::open(path).map_err(StoreError::io("open", path))?;
+        let size = file.metadata().map_err(StoreError::io("read", path))?.len();
         file.sync_all().map_err(StoreError::io("write to the disk", path))?;
-        Ok(StagedBlob { temporary: self.0, sha256, size })
+        Ok(StagedBlob { temporary: self.0, digests: digest(file)?, size })
     }
 }
 
@@ -173,13 +173,17 @@ impl StagedPath {
 #[derive(Debug)]
 pub struct StagedBlob {
     temporary: Temporary,
-    sha256: Sha256,
+    digests: Digests,
     size: u64,
 }
 
 impl StagedBlob {
     pub fn sha256(&self) -> Sha256 {
-        self.sha256
+        self.digests.sha256
+    }
+
+    pub(super) fn digests(&self) -> Digests {
+        self.digests
     }
 
     pub fn size(&self) -> u64 {
@@ -191,8 +195,8 @@ impl StagedBlob {
         &self.temporary.path
     }
 
-    /// Moves the file to its place. The writer's lock of the database must be held.
-    pub(super) fn put(mut self, place: &Path) -> Result<()> {
+    /// Moves the file to its place, and gives its identity there. The writer's lock of the database must be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<Identity> {
         if let Some(folder) = place.parent() {
             dir::make_dir_durably(folder)?;
         }
@@ -207,7 +211,7 @@ impl StagedBlob {
         // Two names of one file stay two: it was stored before, by an attempt that a crash ended.
         dir::remove(&self.temporary.path)?;
         self.temporary.moved = true;
-        Ok(())
+        Ok(Identity::of(&fs::metadata(place).map_err(StoreError::io("read", place))?))
     }
 }
 

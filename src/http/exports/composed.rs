@@ -194,8 +194,15 @@ impl Composed {
                 open(app, &job, piece).await?;
             }
             let (app, job) = (app.clone(), Arc::new(job));
-            let streams = stream::iter(wanted)
-                .then(move |(part, skip, take)| part.read(app.clone(), job.clone(), skip, take));
+            let streams = stream::iter(wanted).then(move |(part, skip, take)| {
+                let (app, job) = (app.clone(), job.clone());
+                async move {
+                    // Runs as a separate task: nobody polls the body while the client is slow, and an unpolled
+                    // query keeps its connection.
+                    let read = tokio::spawn(part.read(app, job, skip, take));
+                    read.await.unwrap_or_else(|error| Err(io::Error::other(error)))
+                }
+            });
             Ok::<_, ApiError>(Body::from_stream(streams.try_flatten()))
         };
         download.answer(read, request).await

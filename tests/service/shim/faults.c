@@ -6,6 +6,7 @@
  *                next writes of the process fail for want of space
  * FAULT_TOKEN    a file of one byte; the process that sets it to 1 has the fault, so that there is one
  * FAULT_FULL     a file; as long as it is there, nothing can be written
+ * FAULT_SLOW     a file; as long as it is there, regular files are read at FAULT_RATE bytes a second
  * FAULT_CLOCK    a file of 8 bytes, seconds that the wall clock is off
  */
 #define _GNU_SOURCE
@@ -26,7 +27,8 @@
 static long at = -1;
 static int kind_full, kind_stop, failing;
 static atomic_long count;
-static const char *full;
+static const char *full, *slow;
+static double rate = 1e6;
 static volatile char *token;
 static volatile long long *skew;
 
@@ -51,6 +53,8 @@ __attribute__((constructor)) static void begin(void) {
         close(file);
     }
     full = getenv("FAULT_FULL");
+    slow = getenv("FAULT_SLOW");
+    if (getenv("FAULT_RATE")) rate = atof(getenv("FAULT_RATE"));
     kind_full = kind && strcmp(kind, "full") == 0;
     kind_stop = kind && strcmp(kind, "stop") == 0;
     if (number && program && meant(program)) at = atol(number);
@@ -82,6 +86,16 @@ static int fault(int writes) {
 #define REAL(name) __typeof__(&name) real = (__typeof__(&name))dlsym(RTLD_NEXT, #name)
 #define FAIL do { errno = ENOSPC; return -1; } while (0)
 
+ssize_t read(int file, void *bytes, size_t size) {
+    REAL(read);
+    ssize_t count = real(file, bytes, size);
+    if (count > 0 && slow && access(slow, F_OK) == 0 && regular(file)) {
+        double seconds = (double)count / rate;
+        struct timespec pause = {(time_t)seconds, (long)((seconds - (time_t)seconds) * 1e9)};
+        nanosleep(&pause, NULL);
+    }
+    return count;
+}
 ssize_t write(int file, const void *bytes, size_t size) {
     REAL(write);
     if (regular(file) && fault(1)) FAIL;

@@ -74,7 +74,7 @@ fn no_role(text: &str) -> InvalidText {
 }
 
 /// A token or session as its holder has it. It shows itself to nobody who only prints it for debugging.
-#[derive(Clone, PartialEq, Eq)]
+#[derive(Clone, PartialEq, Eq, Hash)]
 pub struct Secret(String);
 
 /// With this, a token that was left lying about is known for what it is.

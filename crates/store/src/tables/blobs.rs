@@ -159,8 +159,9 @@ impl Store {
         origin: Origin,
     ) -> Result<()> {
         let (sha256, size) = (staged.sha256(), staged.size());
-        let place = self.dir().blob(&sha256);
-        on_files(move || staged.put(&place)).await?;
+        let (place, digests) = (self.dir().blob(&sha256), staged.digests());
+        let identity = on_files(move || staged.put(&place)).await?;
+        self.hashes.remember(identity, digests);
         let now = Timestamp::now();
         sql!(
             "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)
