@@ -19,8 +19,9 @@ test: runtime judges $(TRAINING)/.stamp ## all tests
 	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test
 	$(TRAINING)/bin/python training/test_pipeline.py
 
-deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
-	$(JUDGES)/bin/python tests/judges/deploy.py .
+deploy-check: judges runtime ## the samples under deploy/ and docker/ against the validators of those who read them
+	$(CARGO) build --quiet
+	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
 
 client-check: judges ## the client for Python: types, lint
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \

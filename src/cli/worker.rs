@@ -32,7 +32,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     }
     // What the driver of a GPU opens is its own affair.
     let confined = !settings.engine.unconfined && settings.engine.device == "cpu";
-    if let Some(data) = settings.data.as_deref().filter(|_| confined) {
+    if let Some(data) = settings.data_folder().filter(|_| confined) {
         let library = folders_of(settings.engine.onnxruntime.as_deref());
         let readable: Vec<&Path> = library.iter().map(PathBuf::as_path).collect();
         if let Err(why) = confine_worker(&readable, &[data]) {
@@ -99,8 +99,7 @@ async fn work(
         remote.leave().await;
         return Ok(ended?);
     }
-    let store =
-        Store::open(settings.data.as_deref().unwrap_or(Path::new("")), Purpose::Use).await?;
+    let store = Store::open(settings.data_folder().unwrap_or(Path::new("")), Purpose::Use).await?;
     let local = Local::new(store.clone(), id, !settings.without_tiles);
     let ended = Worker::new(local, network, model, stall, stop).run().await;
     store.close().await;

@@ -1,12 +1,13 @@
 """Holds the samples under deploy/ and docker/ to the validators of those who read them.
 
-Usage: deploy.py ROOT. Says what was not checked because its program is not here; ends with 1 and the reasons
-if anything is wrong.
+Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Says what was not checked because its program is
+not here; ends with 1 and the reasons if anything is wrong.
 """
 
 import json
 import os
 import pathlib
+import re
 import shutil
 import subprocess
 import sys
@@ -14,8 +15,13 @@ import tempfile
 
 import kubernetes_validate
 import yaml
+from docker.utils.build import exclude_paths
+
+from image import services
 
 VERSION = "1.31"
+# An image name that no sample has: kustomize must put it everywhere.
+IMAGE = {"newName": "registry.example/sci-recon", "newTag": "1.2.3"}
 
 
 def run(*command, **options):
@@ -27,7 +33,7 @@ def kubernetes(root, wrong):
     folder = root / "deploy/kubernetes"
     documents = []
     for file in sorted(folder.glob("*.yaml")):
-        if file.name != "kustomization.yaml":
+        if file.name not in ("kustomization.yaml", "name-references.yaml"):
             documents += [(file.name, each) for each in yaml.safe_load_all(file.read_text())]
     listed = yaml.safe_load((folder / "kustomization.yaml").read_text())["resources"]
     if sorted(listed) != sorted({name for name, _ in documents}):
@@ -43,45 +49,216 @@ def kubernetes(root, wrong):
             wrong.append(f"{name}: {document['kind']}: {error.message}")
 
 
-def kustomize(root, wrong):
+def make_keys(program, folder, *nodes):
+    """What docs/cluster.md has its readers write into `cluster` below a folder."""
+    options = [word for node in nodes for word in ("--node", node)]
+    for line in [
+        ["init", "--no-tls", *options, "--store", "/data", "--nats-version", "2.12"],
+        ["worker", "create", "--pool", "default", "--out", "cluster/default.creds"],
+    ]:
+        subprocess.run([program, "cluster", *line], cwd=folder, check=True, capture_output=True)
+
+
+def kustomize(root, wrong, program):
     if not shutil.which("kubectl"):
         return "kubectl"
     with tempfile.TemporaryDirectory() as copy:
         folder = pathlib.Path(copy) / "kubernetes"
-        shutil.copytree(root / "deploy/kubernetes", folder)
-        (folder / "cluster").mkdir(exist_ok=True)
-        for name in [*(f"nats-server-{n}.conf" for n in (1, 2, 3)), "hub.creds", "default.creds"]:
-            (folder / "cluster" / name).write_text("x")
-        status, told = run("kubectl", "kustomize", str(folder))
+        shutil.copytree(root / "deploy/kubernetes", folder, ignore=shutil.ignore_patterns("cluster"))
+        make_keys(program, folder, *(f"nats-{n}.nats" for n in range(3)))
+        file = folder / "kustomization.yaml"
+        text = yaml.safe_load(file.read_text())
+        text["images"] = [{**image, **IMAGE} for image in text["images"]]
+        file.write_text(yaml.safe_dump(text))
+        status, said = run("kubectl", "kustomize", str(folder))
     if status:
-        wrong.append(f"kubectl kustomize: {told}")
+        wrong.append(f"kubectl kustomize: {said}")
         return None
-    kinds = [each["kind"] for each in yaml.safe_load_all(told)]
+    documents = list(yaml.safe_load_all(said))
+    kinds = [each["kind"] for each in documents]
     if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
         wrong.append(f"kubectl kustomize makes {kinds}")
+    wrong += [f"kubectl kustomize: {reason}" for reason in unresolved(documents)]
     return None
 
 
+def templates(documents):
+    """Name and template of all pods that these objects make, with the object."""
+    for document in documents:
+        spec = document.get("spec", {})
+        template = spec.get("jobTargetRef", spec).get("template")
+        if template:
+            yield document["metadata"]["name"], document, template
+
+
+def unresolved(documents):
+    """References among these objects that lead nowhere."""
+    named = {}
+    for document in documents:
+        named.setdefault(document["kind"], {})[document["metadata"]["name"]] = document
+    services, secrets, [namespace] = named["Service"], named["Secret"], named["Namespace"]
+    labels = []
+    for name, document, template in templates(documents):
+        spec, pod = document["spec"], template["spec"]
+        containers = [*pod.get("initContainers", []), *pod["containers"]]
+        ports = [port for container in containers for port in container.get("ports", [])]
+        labels.append((template["metadata"]["labels"], ports))
+        if document["metadata"].get("namespace") != namespace:
+            yield f"{name} is in the namespace {document['metadata'].get('namespace')}"
+        if document["kind"] == "StatefulSet":
+            if spec["serviceName"] not in services:
+                yield f"{name} names the service {spec['serviceName']}"
+            if not spec["selector"]["matchLabels"].items() <= template["metadata"]["labels"].items():
+                yield f"{name} selects other pods than its own"
+        claims = {claim["metadata"]["name"]: {} for claim in spec.get("volumeClaimTemplates", [])}
+        volumes = {**claims, **{volume["name"]: volume for volume in pod.get("volumes", [])}}
+        for volume in volumes.values():
+            secret = volume.get("secret", {}).get("secretName")
+            if secret and secret not in secrets:
+                yield f"{name} names the secret {secret}; there are {sorted(secrets)}"
+        for container in containers:
+            yield from unresolved_in(container, name, spec, volumes, secrets)
+        probes = [container[kind]["httpGet"] for container in containers for kind in container if kind.endswith("Probe")]
+        for probe in probes:
+            if probe["port"] not in [port["name"] for port in ports]:
+                yield f"a probe of {name} asks the port {probe['port']}"
+    for name, service in services.items():
+        chosen = [ports for label, ports in labels if service["spec"]["selector"].items() <= label.items()]
+        if len(chosen) != 1:
+            yield f"the service {name} selects {len(chosen)} kinds of pods"
+        for port in service["spec"]["ports"] if chosen else []:
+            target = port.get("targetPort", port["port"])
+            if not any(target in (each["name"], each["containerPort"]) for each in chosen[0]):
+                yield f"the service {name} leads to the port {target}"
+    for name, job in named["ScaledJob"].items():
+        for trigger in job["spec"]["triggers"]:
+            host, port = trigger["metadata"]["natsServerMonitoringEndpoint"].split(":")
+            service = next((each for each in services if host == f"{each}.{namespace}.svc.cluster.local"), None)
+            if not service or int(port) not in [each["port"] for each in services[service]["spec"]["ports"]]:
+                yield f"a trigger of {name} asks {host}:{port}"
+
+
+def unresolved_in(container, name, spec, volumes, secrets):
+    image = container["image"]
+    if image != f"{IMAGE['newName']}:{IMAGE['newTag']}" and not image.startswith("nats:"):
+        yield f"{name} runs the image {image}"
+    mounts = {mount["mountPath"]: volumes.get(mount["name"]) for mount in container.get("volumeMounts", [])}
+    for place, volume in mounts.items():
+        if volume is None:
+            yield f"{name} mounts at {place} what it does not declare"
+    # The files that its command line names, with what a shell makes of them in each pod.
+    for line in command_lines(container, name, spec.get("replicas", 1)):
+        for word in line:
+            place, _, file = word.rpartition("/")
+            secret = (mounts.get(place) or {}).get("secret", {}).get("secretName")
+            if secret in secrets and file not in secrets[secret]["data"]:
+                yield f"{name} reads {word}; the secret has {sorted(secrets[secret]['data'])}"
+            if word.startswith("/etc/") and secret is None:
+                yield f"{name} reads {word}, which no secret brings"
+
+
+def command_lines(container, name, replicas):
+    """The words of a container's command; behind `sh -c` those of the program that the shell ends as."""
+    command = [*container.get("command", []), *container.get("args", [])]
+    if command[:2] != ["/bin/sh", "-c"]:
+        return [command]
+    lines = []
+    for n in range(replicas):
+        with tempfile.TemporaryDirectory() as folder:
+            stand_in = pathlib.Path(folder, "nats-server")
+            stand_in.write_text("#!/bin/sh\nprintf '%s\\n' \"$@\"\n")
+            stand_in.chmod(0o755)
+            environment = {"PATH": f"{folder}:/usr/bin:/bin", "HOSTNAME": f"{name}-{n}"}
+            lines.append(run(*command, env=environment)[1].splitlines())
+    return lines
+
+
+def context(root, wrong, program):
+    """What a build of the image sees: all files of the repository, and nothing that was made in the checkout."""
+    files = subprocess.run(["git", "-C", root, "ls-files", "-z"], capture_output=True, text=True, check=True).stdout
+    files = {name for name in files.split("\0") if (root / name).is_file()}
+    with tempfile.TemporaryDirectory() as copy:
+        for name in files:
+            place = pathlib.Path(copy, name)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, place)
+        for folder in [".", "docker", "deploy/kubernetes"]:
+            make_keys(program, pathlib.Path(copy, folder), "nats-0.nats", "nats-1.nats")
+            shutil.copy2(pathlib.Path(copy, folder, "cluster/default.creds"), pathlib.Path(copy, folder))
+        keys = pathlib.Path(copy, "elsewhere")
+        subprocess.run([program, "cluster", "init", "--keys", keys], check=True, capture_output=True)
+        for name in ["target/x", "runtime/x", "data/sci-recon.db", "tests/e2e/node_modules/x", ".git/x", "dist/x",
+                     ".venv/x", "clients/python/.venv/x", "tests/__pycache__/x.pyc"]:
+            pathlib.Path(copy, name).parent.mkdir(parents=True, exist_ok=True)
+            pathlib.Path(copy, name).write_text("x")
+        patterns = [line.strip() for line in (root / ".dockerignore").read_text().splitlines()]
+        patterns = [pattern for pattern in patterns if pattern and not pattern.startswith("#")]
+        seen = {name for name in exclude_paths(copy, patterns) if pathlib.Path(copy, name).is_file()}
+    if seen - files:
+        wrong.append(f".dockerignore leaves in the context: {sorted(seen - files)}")
+    if files - seen:
+        wrong.append(f".dockerignore takes out of the context: {sorted(files - seen)}")
+
+
 def compose(root, wrong):
+    listed = services(root)
+    built = [service.get("image") for service in listed.values() if "build" in service]
+    if len(built) != 1 or built[0] is None:
+        wrong.append(f"docker/cluster.yaml builds {built}: server and worker must run one image, built once")
+    for name, service in listed.items():
+        made_here = service.get("image") in built
+        if made_here != ("build" in service or service.get("pull_policy") == "never"):
+            wrong.append(f"docker/cluster.yaml: {name} has {service.get('image')}, which is {'' if made_here else 'not '}built")
+    if not {"sci-recon", "nats"} <= set(listed["worker"]["depends_on"]):
+        wrong.append("docker/cluster.yaml: another service makes the worker's image")
     if not shutil.which("docker-compose"):
         return "docker-compose"
     files = ["-f", str(root / "docker/compose.yaml"), "-f", str(root / "docker/cluster.yaml")]
-    status, told = run("docker-compose", *files, "config")
+    status, said = run("docker-compose", *files, "config")
     if status:
-        wrong.append(f"docker-compose config: {told}")
+        wrong.append(f"docker-compose config: {said}")
+    return None
+
+
+def image(root, wrong, program):
+    """The containers of the samples, started without Docker."""
+    nats_server = shutil.which("nats-server", path=os.environ["PATH"] + ":/usr/sbin")
+    namespaces = ["unshare", "--mount", "--net", "--pid", "--fork", "--kill-child", "--mount-proc"]
+    if not nats_server or run(*namespaces, "true")[0]:
+        return "containers (nats-server, and root with namespaces)"
+    script = root / "tests/judges/image.py"
+    status, said = run(*namespaces, sys.executable, script, root, program)
+    if status:
+        wrong.append(f"docker/Dockerfile: {said}")
     return None
 
 
 def systemd(root, wrong):
     if not shutil.which("systemd-analyze"):
         return "systemd-analyze"
-    for unit in (root / "deploy/systemd").glob("*.service"):
-        _, told = run("systemd-analyze", "verify", str(unit))
+    for unit in sorted((root / "deploy/systemd").glob("*.service")):
+        # With its drop-ins.
+        _, said = run("systemd-analyze", "verify", str(unit))
         # The program is not installed where this runs.
-        told = [line for line in told.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
-        if told:
-            wrong.append(f"{unit.name}: {told}")
+        said = [line for line in said.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
+        if said:
+            wrong.append(f"{unit.name}: {said}")
+        texts = [file.read_text() for file in [unit, *unit.parent.glob(f"{unit.name}.d/*.conf")]]
+        wrong += [f"{unit.name}: {reason}" for reason in unreadable("\n".join(texts))]
     return None
+
+
+def unreadable(text):
+    """Credentials that a unit's user can't read, since systemd does not hand them to it."""
+    lines = [line for line in text.splitlines() if "=" in line]
+    loaded = [line.removeprefix("LoadCredential=").split(":")[0] for line in lines if line.startswith("LoadCredential=")]
+    for name in re.findall(r"%d/([\w.-]+)", text):
+        if name not in loaded:
+            yield f"no LoadCredential= is named {name}"
+    for line in lines:
+        path = re.search(r"/\S*\.creds", line)
+        if path and not line.startswith("LoadCredential="):
+            yield f"DynamicUser= can't read {path.group()}: {line}"
 
 
 def nginx(root, wrong):
@@ -146,10 +323,13 @@ def words(text):
 
 
 def main():
-    root, wrong = pathlib.Path(sys.argv[1]), []
+    root, program, wrong = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]).resolve(), []
     kubernetes(root, wrong)
     figures(root, wrong)
-    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd, nginx, caddy, promtool)) if name]
+    context(root, wrong, program)
+    absent = [check(root, wrong, program) for check in (kustomize, image)]
+    absent += [check(root, wrong) for check in (compose, systemd, nginx, caddy, promtool)]
+    absent = [name for name in absent if name]
     if absent:
         print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
     for reason in wrong:
