@@ -48,6 +48,7 @@ fn squares(values: &Array2<f64>) -> f64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)] // lists of ranges, some of one
 mod tests {
     use std::convert::Infallible;
 

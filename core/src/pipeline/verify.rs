@@ -12,7 +12,7 @@ use crate::formats::{FormatError, Limits};
 use crate::recon::ReconError;
 use crate::recon::sensing::SensingOperator;
 
-/// Largest frame value, in units of the white level and of what one projection makes of the measurement.
+/// Largest frame value, in units of the white level or of the largest value after one projection.
 ///
 /// The first projection of GAP returns `C y / (H H^T)`. Later ones correct it by less, but the accelerated residual
 /// may wind up, and networks overshoot: the largest value seen is 9 times the white level. The margin of 100 keeps
@@ -122,6 +122,7 @@ pub fn relative_difference(one: &Path, other: &Path, white: f32) -> Result<f64, 
 }
 
 #[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)] // lists of ranges, some of one
 mod tests {
     use std::fs::File;
     use std::path::PathBuf;
@@ -134,7 +135,7 @@ mod tests {
     use crate::pipeline::tile::{TileInput, reconstruct_tile};
     use crate::recon::schedule::Schedule;
 
-    /// Two snapshots, of which the second alone is solved, and its frames.
+    /// A run of two snapshots whose second one is solved, its frames, and their residual.
     fn solved() -> (TileInput, Array3<f32>, f32) {
         let masks = iid_masks(4, 32, 24, 1).unwrap();
         let truth = Array3::from_shape_fn((4, 32, 24), |(k, i, j)| {
@@ -142,7 +143,7 @@ mod tests {
         });
         let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0)) * 3.0;
         let y = concatenate![Axis(0), y, y];
-        let input = TileInput { masks, y, white: 2.4, pieces: Vec::from([1..2]) };
+        let input = TileInput { masks, y, white: 2.4, pieces: vec![1..2] };
         let schedule = Schedule::gap_tv();
         let outcome = reconstruct_tile(input.clone(), &schedule, &mut (), &mut ()).unwrap();
         (input, outcome.frames, outcome.residual)
