@@ -204,6 +204,12 @@ pub struct ClusterArguments {
     #[arg(long, env = "SCI_RECON_ACK_WAIT", value_name = "SECONDS", default_value_t = 30,
           value_parser = clap::value_parser!(u64).range(2..=3600))]
     pub ack_wait: u64,
+
+    /// Share of the tiles that a second worker on another machine computes, too, and whose results are compared; 0
+    /// for none, 1 for all.
+    #[arg(long, env = "SCI_RECON_VERIFY_FRACTION", value_name = "SHARE", default_value_t = 0.002,
+          value_parser = fraction)]
+    pub verify_fraction: f64,
 }
 
 /// How a worker on another machine gets its tiles.
@@ -323,6 +329,13 @@ pub struct EngineArguments {
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse().ok().filter(|seconds| *seconds > 0.0 && *seconds <= 86_400.0);
     seconds.ok_or_else(|| format!("{text:?} is no number of seconds above 0 and up to 86400"))
+}
+
+/// A share from 0 to 1.
+#[cfg(feature = "nats")]
+fn fraction(text: &str) -> Result<f64, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| format!("{text:?} is no share from 0 to 1"))
 }
 
 /// Reads a number of bytes: `1000000`, `10GB` (powers of 1000) or `8GiB` (of 1024).

@@ -20,7 +20,9 @@ use crate::config::{ConfigError, ServeArguments, WorkerArguments};
 use crate::http::{App, Metrics, listen, router};
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
-use workers::nats::{Access, ClusterError, Credential, Hub, Program, describe_metrics};
+use workers::nats::{
+    Access, ClusterError, Credential, Hub, HubSettings, Program, describe_metrics,
+};
 
 /// How long open requests may take to end at a shutdown.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -171,7 +173,7 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
 /// Begins to hand tiles out to other machines, if that is wanted.
 #[cfg(feature = "nats")]
 async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>, ServeError> {
-    let ClusterArguments { nats, ack_wait } = &settings.cluster;
+    let ClusterArguments { nats, ack_wait, verify_fraction } = &settings.cluster;
     if !nats.is_wanted() {
         store.disown_remote().await?;
         return Ok(None);
@@ -180,8 +182,12 @@ async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>
     let credential = nats.nats_creds.as_deref().map(Credential::read).transpose()?;
     let access =
         Access::new(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")?;
-    let program = Program::of(VERSION);
-    Ok(Some(Hub::start(store.clone(), access, program, Duration::from_secs(*ack_wait))))
+    let settings = HubSettings {
+        program: Program::of(VERSION),
+        ack_wait: Duration::from_secs(*ack_wait),
+        verify_fraction: *verify_fraction,
+    };
+    Ok(Some(Hub::start(store.clone(), access, settings)))
 }
 
 /// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.

@@ -145,7 +145,7 @@ const DEFAULT_TV_UPDATES: usize = 4;
 /// The most stages of a schedule.
 const MAX_STAGES: usize = 32;
 /// The most iterations of a schedule; with more, a job would look hung.
-const MAX_ITERATIONS: usize = 10_000;
+pub const MAX_ITERATIONS: usize = 10_000;
 /// Cost of a projection with its update, CPU-nanoseconds per voxel (see [`Prior::cost`]).
 const PROJECTION_NS: f64 = 0.7;
 

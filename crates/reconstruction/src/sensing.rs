@@ -101,6 +101,12 @@ impl SensingOperator {
         self.gram.view()
     }
 
+    /// Largest factor from a measured value to a frame's value in a projection that starts from frames of 0.
+    pub fn largest_gain(&self) -> f32 {
+        let pixels = self.gram.iter().zip(&self.inverse_gram);
+        pixels.map(|(gram, inverse)| gram.sqrt() * inverse).fold(0.0, f32::max)
+    }
+
     /// The share of the masks' energy that changes from frame to frame: 0 where all masks are alike, about 1/2 where
     /// each opens half of its pixels by chance.
     fn contrast(&self) -> f32 {

@@ -331,7 +331,7 @@ impl Nats {
     pub async fn state(&self) -> String {
         let client = self.client().await;
         let mut said = String::new();
-        for (stream, consumer) in [("SCI_TASKS", "test"), ("SCI_EVENTS", "hub")] {
+        for (stream, consumer) in [("SCI_TASKS", "test"), ("SCI_EVENTS", "hub-test")] {
             for subject in [
                 format!("$JS.API.STREAM.INFO.{stream}"),
                 format!("$JS.API.CONSUMER.INFO.{stream}.{consumer}"),

@@ -142,6 +142,8 @@ impl Ground {
             &nats.url(),
             "--ack-wait",
             &plan.ack_wait.to_string(),
+            "--verify-fraction",
+            "0.1",
         ])
         .await;
         let credential = nats.credential("test");

@@ -68,7 +68,7 @@ impl Crowd {
         let mut events = client.subscribe("sci.v1.event.test").await.unwrap();
         client.flush().await.unwrap();
         let mut model = worker(nats, &[]);
-        let (_, measurement) = app.scene(&Scene::SMALL).await;
+        let (_, measurement) = app.scene(&scene(4)).await;
         let job = app.submit(&with_iterations(&measurement, 1)).await;
         let read = |message: async_nats::Message| -> Value {
             serde_json::from_slice(&message.payload).unwrap()
@@ -178,7 +178,7 @@ impl Simulated {
             self.crowd.pauses.lock().unwrap().push(free.elapsed());
         }
         let masks = self.input(&task["masks"]).await;
-        self.input(&task["snapshots"]).await;
+        let snapshots = self.input(&task["snapshots"]).await;
         let start = Instant::now();
         let (mut told, mut kept) = (start, start);
         let length = *self.crowd.length.lock().unwrap();
@@ -198,8 +198,9 @@ impl Simulated {
         }
         let (id, worker) = (task["task"].as_str().unwrap(), &self.id);
         let subject = format!("sci.v1.out.test.{id}.{attempt}.{worker}.0");
-        self.stored(subject, masks).await;
         let mut end = self.crowd.end.clone();
+        end["record"]["residual"] = json!(residual(&masks, &masks, &snapshots));
+        self.stored(subject, masks).await;
         end["frames"] = task["masks"].clone();
         end["history"] = Value::Null;
         let event = json!({"task": id, "attempt": attempt, "worker": worker, "end": {"done": end}});
@@ -223,6 +224,21 @@ impl Simulated {
         let stream = self.context.get_stream_no_info("SCI_IN").await.unwrap();
         self.in_time(|| stream.direct_get_last_for_subject(subject.clone())).await.payload
     }
+}
+
+/// Relative residual of frames against the snapshot of a tile; all are prepared arrays.
+pub fn residual(masks: &[u8], frames: &[u8], snapshot: &[u8]) -> f32 {
+    let values = |array: &[u8]| -> Vec<f64> {
+        let samples = array[32..].chunks_exact(4);
+        samples.map(|four| f64::from(f32::from_le_bytes(four.try_into().unwrap()))).collect()
+    };
+    let (masks, frames, y) = (values(masks), values(frames), values(snapshot));
+    let mut rest = y.clone();
+    for (k, (c, x)) in masks.iter().zip(&frames).enumerate() {
+        rest[k % y.len()] -= c * x;
+    }
+    let norm = |values: &[f64]| values.iter().map(|value| value * value).sum::<f64>().sqrt();
+    (norm(&rest) / norm(&y)) as f32
 }
 
 /// A scene with at least so many tiles of 24 pixels.

@@ -61,6 +61,24 @@ impl TileAssessment {
         Some(Self { size: (rows, columns), levels, motion, unfamiliar })
     }
 
+    /// True if it has a block structure that `frames` frames of `height` x `width` pixels can have.
+    pub fn fits(&self, frames: usize, (height, width): (usize, usize)) -> bool {
+        let size = blocks(height, width);
+        let fastest = (height + width) as f32;
+        self.size == size
+            && self.levels.len() == frames * size.0 * size.1
+            && (0.0..=fastest).contains(&self.motion)
+    }
+
+    /// True if two assessments of equal frames agree to within 1 dB in each block, which allows for rounding on
+    /// different processors.
+    pub fn agrees_with(&self, other: &Self) -> bool {
+        let near = |(a, b): (&u8, &u8)| f32::from(a.abs_diff(*b)) <= STEPS;
+        self.size == other.size
+            && self.levels.len() == other.levels.len()
+            && self.levels.iter().zip(&other.levels).all(near)
+    }
+
     fn is_dark(&self) -> bool {
         self.levels.iter().all(|level| *level == DARK)
     }
@@ -286,6 +304,19 @@ mod tests {
     }
 
     /// A tile of 2 frames of 32x32 pixels with this level in dB.
+    #[test]
+    fn an_assessment_fits_the_frames_that_it_is_of() {
+        let one = tile(30);
+        let (rows, columns) = (2 * super::BLOCK, 2 * super::BLOCK);
+        let frames = one.levels.len() / 4;
+        assert!(one.fits(frames, (rows, columns)));
+        assert!(!one.fits(frames + 1, (rows, columns)) && !one.fits(frames, (rows, columns + 1)));
+        for motion in [f32::NAN, f32::INFINITY, -1.0, 1e30] {
+            assert!(!TileAssessment { motion, ..one.clone() }.fits(frames, (rows, columns)));
+        }
+        assert!(one.agrees_with(&tile(31)) && !one.agrees_with(&tile(32)));
+    }
+
     fn tile(decibels: u8) -> TileAssessment {
         let (levels, motion) = (vec![4 * decibels; 8], 4.0);
         TileAssessment { size: (2, 2), levels, motion, unfamiliar: false }

@@ -15,10 +15,12 @@ pub mod preview;
 pub mod progress;
 pub mod quality;
 pub mod records;
+pub mod residual;
 pub mod scale;
 pub mod sequence;
 pub mod tile;
 pub mod usage;
+pub mod verify;
 pub mod write;
 
 pub use error::PipelineError;

@@ -218,6 +218,15 @@ impl History {
     }
 }
 
+/// True if a text could come from [`Monitor::news`] after at most `iterations` iterations.
+pub fn is_history(text: &str, iterations: usize) -> bool {
+    type Row = (usize, Option<f64>, Option<f64>, Option<f64>);
+    let rows = serde_json::from_str::<Vec<Row>>(text);
+    rows.is_ok_and(|rows| {
+        rows.len() <= POINTS + 1 && rows.iter().all(|(iteration, ..)| *iteration <= iterations)
+    })
+}
+
 /// Four digits are more than a plot shows.
 fn rounded(value: f32) -> Value {
     let text = format!("{value:.3e}");
@@ -227,7 +236,7 @@ fn rounded(value: f32) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use super::{History, POINTS, ShareDone, stage};
+    use super::{History, POINTS, ShareDone, is_history, stage};
     use reconstruction::prior::SIGMA;
     use reconstruction::prior::registry::PRIORS;
     use reconstruction::schedule::Schedule;
@@ -259,6 +268,21 @@ mod tests {
         assert_eq!(points[0], serde_json::json!([1, 1.0, null, null]));
         assert_eq!(points[1], serde_json::json!([2, 0.5, null, 0.1]));
         assert_eq!(points[2], serde_json::json!([3, 0.3333, null, null]));
+    }
+
+    #[test]
+    fn only_what_a_history_writes_is_one() {
+        for iterations in [0, 3, POINTS, 9999] {
+            let text = Value::from(after(iterations)).to_string();
+            assert!(is_history(&text, iterations), "{text}");
+            assert!(iterations == 0 || !is_history(&text, iterations - 1));
+        }
+        let long = Value::from_iter(vec![serde_json::json!([1, 0.1, 0.1, 0.1]); POINTS + 2]);
+        let more =
+            ["", "{}", "[1]", "[[1,2]]", "[[-1,0,0,0]]", "[[1,0,0,\"x\"]]", "[[1,1e999,0,0]]"];
+        for text in more.map(str::to_owned).into_iter().chain([long.to_string()]) {
+            assert!(!is_history(&text, 10_000), "{text}");
+        }
     }
 
     #[test]

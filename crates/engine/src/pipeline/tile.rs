@@ -4,14 +4,14 @@ use std::ops::Range;
 
 use ndarray::{Array3, Array4, ArrayView3, Axis, s};
 
-use reconstruction::ReconError;
+use super::residual::residual;
 use reconstruction::assessment::Model;
 use reconstruction::learned::SnapshotNetwork;
-use reconstruction::pilot;
 use reconstruction::prior::Networks;
 use reconstruction::schedule::Schedule;
 use reconstruction::sensing::SensingOperator;
 use reconstruction::solver::{self, Observer, Outcome, StopReason};
+use reconstruction::{ReconError, pilot};
 
 /// What a tile is made of: arrays alone, wherever they come from.
 #[derive(Debug, Clone)]
@@ -57,6 +57,13 @@ impl TileInput {
         Ok(Some((op, self.y / self.white)))
     }
 
+    /// Makes every snapshot a piece.
+    #[must_use]
+    pub fn snapshot_by_snapshot(self) -> Self {
+        let pieces = (0..self.y.dim().0).map(|snapshot| snapshot..snapshot + 1).collect();
+        Self { pieces, ..self }
+    }
+
     /// Has the pieces of the tile solved on the unit scale, one after the other, and multiplies the frames
     /// by the white level again. `solve` is told which share of all the work a piece is. A tile without
     /// light has frames of 0 and no iterations.
@@ -65,7 +72,7 @@ impl TileInput {
         F: FnMut(&SensingOperator, ArrayView3<'_, f32>, Range<f64>) -> Result<Outcome, ReconError>,
     {
         let ((frames, height, width), white) = (self.masks.dim(), self.white);
-        let pieces = self.pieces.clone();
+        let (pieces, measured) = (self.pieces.clone(), self.y.clone());
         let mut whole = Outcome {
             frames: Array3::zeros((self.y.dim().0 * frames, height, width)),
             tv_iterations: 0,
@@ -79,7 +86,7 @@ impl TileInput {
         let all: usize = pieces.iter().map(Range::len).sum();
         let share = |snapshots: usize| snapshots as f64 / all as f64;
         let mut done = 0;
-        for piece in pieces {
+        for piece in pieces.iter().cloned() {
             op = op.over(piece.len())?;
             let part = share(done)..share(done + piece.len());
             done += piece.len();
@@ -98,12 +105,13 @@ impl TileInput {
             }
             whole.tv_iterations = whole.tv_iterations.max(outcome.tv_iterations);
             whole.denoiser_passes = whole.denoiser_passes.max(outcome.denoiser_passes);
-            whole.residual = whole.residual.max(outcome.residual);
             if outcome.stop_reason == StopReason::MaxIterations {
                 whole.stop_reason = StopReason::MaxIterations;
             }
         }
         whole.frames *= white;
+        let frame = |k| Ok::<_, ReconError>(whole.frames.index_axis(Axis(0), k).to_owned());
+        whole.residual = residual(op.masks(), measured.view(), &pieces, frame)?;
         Ok(whole)
     }
 }
@@ -147,25 +155,18 @@ pub fn run_network(
     input: TileInput,
     network: &mut dyn SnapshotNetwork,
 ) -> Result<Outcome, ReconError> {
-    let pieces = (0..input.y.dim().0).map(|snapshot| snapshot..snapshot + 1).collect();
-    TileInput { pieces, ..input }.solved(|op, y, _| {
-        let frames = network.frames(y.index_axis(Axis(0), 0), op.masks())?;
-        let rest = &y - &op.forward(frames.view())?;
-        let norm = squares(y).max(f64::MIN_POSITIVE);
+    input.snapshot_by_snapshot().solved(|op, y, _| {
         Ok(Outcome {
             features: None,
             evidence: None,
-            frames,
+            frames: network.frames(y.index_axis(Axis(0), 0), op.masks())?,
             tv_iterations: 0,
             denoiser_passes: 1,
-            residual: (squares(rest.view()) / norm).sqrt() as f32,
+            // `solved` computes the residual of the whole tile.
+            residual: 0.0,
             stop_reason: StopReason::MaxIterations,
         })
     })
-}
-
-fn squares(values: ArrayView3<'_, f32>) -> f64 {
-    values.iter().map(|&value| f64::from(value) * f64::from(value)).sum()
 }
 
 #[cfg(test)]

@@ -38,6 +38,8 @@ pub struct RemoteTask {
     pub delivery: u32,
     /// Who has it; before that, who handed it out.
     pub worker: WorkerId,
+    /// When that attempt began.
+    pub started_at: Timestamp,
     /// False once its job is cancelled or has failed.
     pub wanted: bool,
 }
@@ -75,6 +77,7 @@ pub enum Begun {
 pub struct RemoteBeat {
     pub task: TaskId,
     pub attempt: u32,
+    pub worker: WorkerId,
     /// The pool of the worker that tells it.
     pub pool: String,
     pub progress: TaskProgress,
@@ -84,7 +87,8 @@ pub struct RemoteBeat {
 
 const ROWS: &str =
     "SELECT task, pool, r.attempt AS message, stream, seq, delivery, t.job, t.attempt,
-    t.worker, j.state AS job_state
+    t.worker, j.state AS job_state,
+    (SELECT started_at FROM attempts a WHERE a.task = r.task AND a.attempt = t.attempt) AS started_at
     FROM remote_tasks r JOIN tasks t ON t.id = task JOIN jobs j ON j.id = t.job";
 
 impl FromRow<'_, SqliteRow> for RemoteTask {
@@ -102,6 +106,7 @@ impl FromRow<'_, SqliteRow> for RemoteTask {
             },
             delivery: row.try_get("delivery")?,
             worker: row.try_get("worker")?,
+            started_at: row.try_get("started_at")?,
             wanted: is_wanted(row.try_get("job_state")?),
         })
     }
@@ -242,12 +247,14 @@ impl Store {
         .execute(&mut *transaction)
         .await?;
         let mut answers = Vec::with_capacity(beats.len());
-        for RemoteBeat { task, attempt, pool, progress, history } in beats {
+        for RemoteBeat { task, attempt, worker, pool, progress, history } in beats {
             let row = sql!(
                 "UPDATE tasks SET stage = ?, iterations = ?, passes = ?, fraction = ?,
                      history = coalesce(?, history)
                  WHERE id = ? AND attempt = ? AND state = ?
-                   AND EXISTS (SELECT 1 FROM remote_tasks WHERE task = id AND pool = ?)
+                   -- A worker that began while the server was down is not on record.
+                   AND EXISTS (SELECT 1 FROM remote_tasks WHERE task = id AND pool = ?
+                                   AND (delivery = 0 OR tasks.worker = ?))
                  RETURNING (SELECT state FROM jobs WHERE id = tasks.job) AS job_state",
                 [
                     progress.stage,
@@ -258,7 +265,8 @@ impl Store {
                     task,
                     attempt,
                     TaskState::Running,
-                    pool
+                    pool,
+                    worker
                 ]
             )
             .fetch_optional(&mut *transaction)

@@ -1,9 +1,11 @@
 //! Files in a stream, in chunks that fit into a message. The first chunk comes last: it marks a whole
 //! file. What was received is believed only if it has the hash that was promised.
 
+use std::pin::pin;
+
 use async_nats::jetstream::stream::DirectGetErrorKind;
 use bytes::Bytes;
-use futures_util::{StreamExt, TryStreamExt, stream};
+use futures_util::{Stream, StreamExt, TryStreamExt, stream};
 
 use super::connection::{ClusterError, Connection};
 use super::message::Input;
@@ -58,22 +60,33 @@ impl Connection {
         prefix: &str,
         wanted: Input,
     ) -> Result<Vec<u8>, BlobError> {
-        let size = usize::try_from(wanted.bytes).map_err(|_| BlobError::Damaged)?;
         // Memory grows with what arrives, not with what was promised.
-        let mut bytes = Vec::from(self.get_chunk(stream, format!("{prefix}.0")).await?);
-        let rest = stream::iter(1..chunks(size));
-        let mut rest =
-            rest.map(|n| self.get_chunk(stream, format!("{prefix}.{n}"))).buffered(AT_ONCE);
-        while let Some(chunk) = rest.next().await {
-            bytes.extend_from_slice(&chunk?);
-            if bytes.len() > size {
-                return Err(BlobError::Damaged);
-            }
+        let mut bytes = Vec::new();
+        let mut chunks = pin!(self.chunks(stream, prefix, wanted.bytes, 0));
+        while let Some(chunk) = chunks.try_next().await? {
+            bytes.extend_from_slice(&chunk);
         }
-        drop(rest);
         let hashed = tokio::task::spawn_blocking(move || (Sha256::of(&bytes), bytes)).await;
         let (found, bytes) = hashed.map_err(|error| BlobError::Failed(error.to_string()))?;
         if found == wanted.sha256 { Ok(bytes) } else { Err(BlobError::Damaged) }
+    }
+
+    /// Gets the chunks of a file in their order, from number `first` on; `bytes` is the size of the file. A chunk
+    /// whose length does not match its place in the file is [`BlobError::Damaged`]. The caller checks the hash.
+    pub(super) fn chunks(
+        &self,
+        stream: &str,
+        prefix: &str,
+        bytes: u64,
+        first: u64,
+    ) -> impl Stream<Item = Result<Bytes, BlobError>> {
+        let size = CHUNK as u64;
+        let chunks = stream::iter(first..bytes.div_ceil(size).max(1)).map(move |n| async move {
+            let chunk = self.get_chunk(stream, format!("{prefix}.{n}")).await?;
+            let fits = chunk.len() as u64 == size.min(bytes - n * size);
+            if fits { Ok(chunk) } else { Err(BlobError::Damaged) }
+        });
+        chunks.buffered(AT_ONCE)
     }
 
     async fn get_chunk(&self, stream: &str, subject: String) -> Result<Bytes, BlobError> {

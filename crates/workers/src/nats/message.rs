@@ -50,6 +50,11 @@ pub struct Event {
     pub task: TaskId,
     pub attempt: u32,
     pub worker: WorkerId,
+    /// The message that the worker has, and its delivery, for a hub that did not hear the worker begin.
+    #[serde(default)]
+    pub seq: i64,
+    #[serde(default)]
+    pub delivery: u32,
     pub end: End,
 }
 
@@ -99,6 +104,8 @@ pub enum BeginAnswer {
     Over,
     /// Another worker has the message.
     Lost,
+    /// The tile is computed a second time, by another worker than the first time.
+    Another,
 }
 
 /// A worker's sign of life.

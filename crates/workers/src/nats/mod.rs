@@ -9,8 +9,8 @@
 //! inputs and publishes a message. A worker pulls the message, tells that it begins, gets the inputs
 //! from its cache or the stream, computes, puts the frames into the stream of outputs, publishes an
 //! event, and only then acknowledges the message: if it dies before, the message is delivered again.
-//! The hub fetches the frames, checks their hash and completes the task in the store, which accepts
-//! one report of each attempt.
+//! The hub fetches the frames, checks hash, values and residual, and completes the task in the store, which
+//! accepts one report of each attempt. A sample of tiles is computed twice, by two workers.
 
 mod arrays;
 mod authority;
@@ -29,6 +29,6 @@ pub use authority::{Authority, HUB as HUB_CREDENTIAL, Issued};
 pub use check::Check;
 pub use configuration::{Node, ServerVersion};
 pub use connection::{Access, ClusterError, Credential};
-pub use hub::{Hub, describe_metrics};
+pub use hub::{Hub, HubSettings, describe_metrics};
 pub use message::Program;
 pub use remote::{Remote, RemoteSettings};

@@ -9,9 +9,6 @@ pub const EVENTS: &str = "SCI_EVENTS";
 pub const INPUTS: &str = "SCI_IN";
 pub const OUTPUTS: &str = "SCI_OUT";
 
-/// The hub's consumer of events.
-pub const HUB: &str = "hub";
-
 /// Where the messages of tiles go. Its one consumer is named after the pool.
 pub fn task(pool: &Pool) -> String {
     format!("sci.v1.task.{pool}")
@@ -20,6 +17,11 @@ pub fn task(pool: &Pool) -> String {
 /// Where workers tell how tiles ended.
 pub fn event(pool: &Pool) -> String {
     format!("sci.v1.event.{pool}")
+}
+
+/// The hub's consumer of a pool's events. Each pool has one: what holds up the events of one pool holds up no other.
+pub fn events(pool: &Pool) -> String {
+    format!("hub-{pool}")
 }
 
 /// What workers ask or tell the hub, without a stream.

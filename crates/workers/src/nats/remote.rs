@@ -18,7 +18,6 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tokio_util::sync::CancellationToken;
 
-use super::arrays;
 use super::blobs::BlobError;
 use super::cache::Cache;
 use super::connection::{Access, ClusterError, Connection, Credential};
@@ -26,9 +25,9 @@ use super::message::{
     Beat, Begin, BeginAnswer, End, Event, Hello, HelloAnswer, Input, Program, TaskMessage, Tell,
     TileBeat, Want,
 };
-use super::names;
+use super::{arrays, names};
 use crate::transport::{Claim, Done, Output, TaskInput, TileTask, Transport, TransportError};
-use engine::job::{Pool, Sha256, TaskId, TaskProgress, WorkerId};
+use engine::job::{Pool, Sha256, TaskProgress, WorkerId};
 use engine::pipeline::PipelineError;
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::tile::TileInput;
@@ -45,6 +44,9 @@ const BEGIN: Duration = Duration::from_secs(1);
 const SIGN: Duration = Duration::from_secs(5);
 /// Time between two looks for an input that is missing.
 const LOOK: Duration = Duration::from_millis(500);
+/// Milliseconds after which a tile is offered again that another worker is to compute. By chance, because
+/// two idle workers may get each other's refused tiles in turn for ever.
+const ANOTHER: std::ops::Range<u64> = 200..2000;
 /// How long the end of a tile is tried to be told, and how long once the worker is to end.
 const TELL: (Duration, Duration) = (Duration::from_secs(600), Duration::from_secs(3));
 
@@ -296,17 +298,17 @@ impl Remote {
         self.note_hand(None);
     }
 
-    /// Notes what is in hand, a task's attempt and its message, for the process after this one.
-    fn note_hand(&self, held: Option<(TaskId, u32, &Message)>) {
+    /// Notes what is in hand, a tile that begins and its message, for the process after this one.
+    fn note_hand(&self, held: Option<(&Begin, &Message)>) {
         let Some(path) = &self.0.hand else { return };
         let noted = match held {
             None => match std::fs::remove_file(path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
                 _ => Ok(()),
             },
-            Some((task, attempt, message)) => {
+            Some((&Begin { task, attempt, seq, delivery, worker }, message)) => {
                 let end = End::Died { how: String::new(), fault: false };
-                let event = Event { task, attempt, worker: self.0.hello.worker, end };
+                let event = Event { task, attempt, worker, seq, delivery, end };
                 let acknowledge = message.reply.as_ref().map_or("", |to| to.as_str()).to_owned();
                 let text = serde_json::to_vec(&Hand { event, acknowledge });
                 text.map_err(io::Error::other).and_then(|text| std::fs::write(path, text))
@@ -318,7 +320,8 @@ impl Remote {
     }
 
     fn hold(&self, held: Option<Arc<Held>>) {
-        self.note_hand(held.as_ref().map(|held| (held.task.task, held.attempt, &held.message)));
+        let begin = held.as_ref().map(|held| Begin { attempt: held.attempt, ..held.begin });
+        self.note_hand(begin.as_ref().zip(held.as_ref().map(|held| &held.message)));
         let mut place = lock(&self.0.held);
         if place.0.is_some() || held.is_some() {
             *place = (held, Instant::now());
@@ -362,11 +365,17 @@ impl Remote {
         let worker = self.0.hello.worker;
         let begin = Begin { task: task.task, attempt: task.attempt, seq, delivery, worker };
         // Before the hub counts on this process: nobody else would know that it died with the message.
-        self.note_hand(Some((task.task, task.attempt, &message)));
+        self.note_hand(Some((&begin, &message)));
         let attempt = match self.ask(&begin).await {
             Some(BeginAnswer::Go(attempt)) => attempt,
             Some(BeginAnswer::Lost) => {
                 self.note_hand(None);
+                return Ok(None);
+            }
+            Some(BeginAnswer::Another) => {
+                self.note_hand(None);
+                let pause = Duration::from_millis(rand::random_range(ANOTHER));
+                message.ack_with(AckKind::Nak(Some(pause))).await?;
                 return Ok(None);
             }
             Some(BeginAnswer::Over) => {
@@ -431,7 +440,7 @@ impl Remote {
         }
         match self.ask(&held.begin).await {
             Some(BeginAnswer::Go(_) | BeginAnswer::Over) => Standing::Mine,
-            Some(BeginAnswer::Lost) => Standing::Anothers,
+            Some(BeginAnswer::Lost | BeginAnswer::Another) => Standing::Anothers,
             None => Standing::Unsure,
         }
     }
@@ -444,7 +453,9 @@ impl Remote {
             self.hold(None);
             return Ok(Heartbeat::Lost);
         }
-        let event = Event { task: lease.task, attempt: lease.attempt, worker: lease.worker, end };
+        let Begin { seq, delivery, .. } = held.begin;
+        let Lease { task, attempt, worker, .. } = *lease;
+        let event = Event { task, attempt, worker, seq, delivery, end };
         self.publish(&event).await?;
         if standing == Standing::Mine {
             let let_go = self.persist(|| async {

@@ -8,6 +8,8 @@ use async_nats::jetstream::consumer::{AckPolicy, PullConsumer};
 use async_nats::jetstream::context::CreateStreamErrorKind;
 use async_nats::jetstream::stream::{Config, DiscardPolicy, RetentionPolicy, StorageType};
 
+use futures_util::TryStreamExt;
+
 use super::connection::{ClusterError, Connection};
 use super::names;
 use engine::job::Pool;
@@ -17,7 +19,7 @@ const REPLICAS: usize = 3;
 /// Messages that may be out for a consumer, and requests for them.
 const AT_ONCE: i64 = 16_384;
 /// An event that was not dealt with is delivered to the hub again after so long.
-const EVENT_WAIT: Duration = Duration::from_secs(30);
+pub(super) const EVENT_WAIT: Duration = Duration::from_secs(30);
 const HOUR: Duration = Duration::from_secs(3600);
 
 fn streams() -> [Config; 4] {
@@ -51,7 +53,7 @@ fn streams() -> [Config; 4] {
 }
 
 impl Connection {
-    /// Makes the streams that are missing, and the consumer of events; says when that of tiles was made.
+    /// Makes the streams that are missing; says when that of tiles was made.
     ///
     /// # Errors
     /// If the server refuses, or has no quorum.
@@ -61,15 +63,6 @@ impl Connection {
                 self.make_stream(config).await?;
             }
         }
-        let config = Consumer {
-            durable_name: Some(names::HUB.into()),
-            ack_policy: AckPolicy::Explicit,
-            ack_wait: EVENT_WAIT,
-            max_ack_pending: AT_ONCE,
-            ..Consumer::default()
-        };
-        let made = self.context.create_consumer_on_stream(config, names::EVENTS).await;
-        made.map_err(ClusterError::nats("make the consumer of events"))?;
         let tasks = self.context.get_stream(names::TASKS).await;
         let tasks = tasks.map_err(ClusterError::nats("find the stream of tiles"))?;
         Ok(tasks.cached_info().created.to_string())
@@ -131,9 +124,33 @@ impl Connection {
         }
     }
 
-    /// The consumer of events.
-    pub(super) async fn events(&self) -> Result<PullConsumer, ClusterError> {
-        let found = self.context.get_consumer_from_stream(names::HUB, names::EVENTS).await;
-        found.map_err(ClusterError::nats("find the consumer of events"))
+    /// The pools with events that wait.
+    ///
+    /// # Errors
+    /// If the server refuses, or has no quorum.
+    pub(super) async fn pools_with_events(&self) -> Result<Vec<Pool>, ClusterError> {
+        let failed = || ClusterError::nats("look at the subjects of events");
+        let stream = self.context.get_stream_no_info(names::EVENTS).await;
+        let stream = stream.map_err(ClusterError::nats("find the stream of events"))?;
+        let subjects = stream.info_with_subjects("sci.v1.event.*").await.map_err(failed())?;
+        let subjects: Vec<(String, usize)> = subjects.try_collect().await.map_err(failed())?;
+        Ok(subjects.iter().filter_map(|(subject, _)| names::pool_of(subject)).collect())
+    }
+
+    /// The consumer of a pool's events, which is made if it is missing.
+    ///
+    /// # Errors
+    /// If the server refuses, or has no quorum.
+    pub(super) async fn events(&self, pool: &Pool) -> Result<PullConsumer, ClusterError> {
+        let config = Consumer {
+            durable_name: Some(names::events(pool)),
+            filter_subject: names::event(pool),
+            ack_policy: AckPolicy::Explicit,
+            ack_wait: EVENT_WAIT,
+            max_ack_pending: AT_ONCE,
+            ..Consumer::default()
+        };
+        let made = self.context.create_consumer_on_stream(config, names::EVENTS).await;
+        made.map_err(ClusterError::nats("make the consumer of a pool's events"))
     }
 }

@@ -4,9 +4,10 @@ use std::collections::{HashMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::Notify;
+use tokio::sync::{Notify, Semaphore};
 
 use super::presence::Presence;
+use super::replays::Replays;
 use crate::nats::connection::Connection;
 use crate::nats::message::{Input, Program, Tell};
 use crate::nats::names;
@@ -18,6 +19,11 @@ use store::Store;
 const WINDOWS: usize = 65_536;
 /// An input that was put longer ago may have grown too old for the stream.
 const FRESH: Duration = Duration::from_secs(12 * 3600);
+
+/// Tiles whose frames are checked at a time.
+const VERIFIED_AT_ONCE: usize = 2;
+/// Inputs that are put again at a time.
+const PUT_AGAIN_AT_ONCE: usize = 2;
 
 /// A message that is there and is not delivered.
 #[derive(Debug, Clone, Copy)]
@@ -40,6 +46,12 @@ pub struct Core {
     /// Called when there may be more to hand out.
     pub more: Notify,
     pub presence: Mutex<Presence>,
+    /// Results that wait for a second one.
+    pub replays: Mutex<Replays>,
+    pub verifying: Semaphore,
+    /// Tiles whose inputs are put again, and their turns.
+    pub wanted: Mutex<HashSet<TaskId>>,
+    pub putting_again: Semaphore,
     /// Tiles on their way out, and the jobs of those that are out.
     pub sending: Mutex<HashSet<TaskId>>,
     pub jobs: Mutex<HashSet<JobId>>,
@@ -58,7 +70,13 @@ pub struct Core {
 }
 
 impl Core {
-    pub fn new(store: Store, connection: Connection, program: Program, ack_wait: Duration) -> Self {
+    /// The hub of a server, with the share of tiles that are computed twice.
+    pub fn new(
+        store: Store,
+        connection: Connection,
+        (program, ack_wait): (Program, Duration),
+        verify_fraction: f64,
+    ) -> Self {
         Self {
             store,
             connection,
@@ -67,6 +85,10 @@ impl Core {
             ack_wait,
             more: Notify::new(),
             presence: Mutex::default(),
+            replays: Mutex::new(Replays::new(verify_fraction)),
+            verifying: Semaphore::new(VERIFIED_AT_ONCE),
+            wanted: Mutex::default(),
+            putting_again: Semaphore::new(PUT_AGAIN_AT_ONCE),
             sending: Mutex::default(),
             jobs: Mutex::default(),
             stream: Mutex::default(),

@@ -14,7 +14,19 @@ pub fn describe() {
     );
     describe_counter!(
         "sci_recon_cluster_refused_total",
-        "Reports that came too late, or a second time."
+        "Reports that came too late, a second time, from another worker, or in no readable form."
+    );
+    describe_counter!(
+        "sci_recon_cluster_rejected_total",
+        "Results of workers that were rejected: impossible values, a wrong residual, or another worker disagrees."
+    );
+    describe_counter!(
+        "sci_recon_cluster_replayed_total",
+        "Tiles that two workers have computed and whose results were compared."
+    );
+    describe_counter!(
+        "sci_recon_cluster_mismatched_total",
+        "Tiles about which two workers disagree."
     );
     describe_counter!(
         "sci_recon_cluster_repaired_total",
@@ -32,6 +44,9 @@ pub fn describe() {
     );
     redelivered(0);
     refused(0);
+    rejected(0);
+    replayed(0);
+    mismatched(0);
     repaired(0);
     bytes("out", 0);
     bytes("in", 0);
@@ -44,6 +59,18 @@ pub fn redelivered(count: u64) {
 
 pub fn refused(count: u64) {
     counter!("sci_recon_cluster_refused_total").increment(count);
+}
+
+pub fn rejected(count: u64) {
+    counter!("sci_recon_cluster_rejected_total").increment(count);
+}
+
+pub fn replayed(count: u64) {
+    counter!("sci_recon_cluster_replayed_total").increment(count);
+}
+
+pub fn mismatched(count: u64) {
+    counter!("sci_recon_cluster_mismatched_total").increment(count);
 }
 
 pub fn repaired(count: u64) {

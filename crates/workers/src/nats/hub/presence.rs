@@ -85,6 +85,13 @@ impl Presence {
         sign.is_some_and(|sign| sign.holds == Some(task) && sign.at.elapsed() < SILENCE)
     }
 
+    /// True if a pool has another living worker.
+    pub fn has_another(&self, pool: &Pool, worker: WorkerId) -> bool {
+        let mut others =
+            self.workers.iter().filter(|(id, sign)| **id != worker && sign.pool == *pool);
+        others.any(|(_, sign)| sign.at.elapsed() < SILENCE)
+    }
+
     /// Whether a living worker of a pool waits for a tile.
     pub fn waits(&self, pool: &Pool) -> bool {
         let waits = |sign: &Sign| sign.pool == *pool && sign.holds.is_none();

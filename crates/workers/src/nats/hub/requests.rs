@@ -9,18 +9,24 @@ use futures_util::StreamExt;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use super::accept::is_possible;
 use super::core::{Core, lock};
+use super::error::EventError;
 use super::figures;
 use crate::nats::connection::ClusterError;
-use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Tell, Want};
+use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Tell, TileBeat, Want};
 use crate::nats::names;
 use engine::job::Pool;
+use engine::pipeline::progress::is_history;
+use reconstruction::schedule::MAX_ITERATIONS;
 use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
 
 /// Time between two transactions for what workers tell.
 const FLUSH: Duration = Duration::from_secs(1);
 /// Requests that are dealt with at a time.
 const AT_ONCE: usize = 64;
+/// Longest name of a host or a device, in bytes.
+const NAME: usize = 255;
 
 impl Core {
     /// Listens to what workers ask.
@@ -64,7 +70,14 @@ impl Core {
             async move {
                 match hub.store.remote_task(want.task).await {
                     Ok(Some(remote)) if remote.pool == pool.as_str() => {
-                        hub.put_again(&remote, &pool, want.sha256).await;
+                        // Once at a time, however often a worker asks.
+                        if !lock(&hub.wanted).insert(want.task) {
+                            return;
+                        }
+                        if let Ok(_turn) = hub.putting_again.acquire().await {
+                            hub.put_again(&remote, &pool, want.sha256).await;
+                        }
+                        lock(&hub.wanted).remove(&want.task);
                     }
                     Ok(_) => {}
                     Err(error) => tracing::error!(%error, "what a worker wants can't be looked up"),
@@ -83,7 +96,7 @@ impl Core {
                     if known && let Err(error) = hub.store.remote_worker_left(beat.worker).await {
                         tracing::error!(%error, "the end of a worker is not recorded");
                     }
-                } else if !lock(&hub.presence).sign(beat.worker, &pool, beat.tile) {
+                } else if !lock(&hub.presence).sign(beat.worker, &pool, possible(beat.tile)) {
                     hub.tell(&pool, beat.worker, Tell::Introduce).await;
                 }
             }
@@ -108,7 +121,8 @@ impl Core {
         }
         let beats: Vec<RemoteBeat> = tiles
             .iter()
-            .map(|(_, pool, tile)| RemoteBeat {
+            .map(|(worker, pool, tile)| RemoteBeat {
+                worker: *worker,
                 pool: pool.to_string(),
                 task: tile.task,
                 attempt: tile.attempt,
@@ -133,6 +147,11 @@ impl Core {
     /// Takes a worker in; none if that has failed and it should ask again.
     async fn hello(&self, pool: &Pool, hello: Hello) -> Option<HelloAnswer> {
         let Hello { worker, host, pid, device, program } = hello;
+        let is_name =
+            |name: &String| name.len() <= NAME && !name.chars().any(|c: char| c.is_control());
+        if !is_name(&host) || !is_name(&device) {
+            return Some(HelloAnswer::Refused("the name of its host or device is too long".into()));
+        }
         if let Some(reason) = self.program.refusal(&program) {
             tracing::warn!(%worker, host, reason, "a worker is refused");
             return Some(HelloAnswer::Refused(reason));
@@ -157,8 +176,12 @@ impl Core {
         Some(HelloAnswer::Welcome { ack_wait_ms })
     }
 
-    async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, StoreError> {
+    /// Gives a worker the right to an attempt, if the tile may be its.
+    pub async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, EventError> {
         let Begin { task, attempt, seq, delivery, worker } = begin;
+        if self.leaves_to_another(pool, task, worker).await? {
+            return Ok(BeginAnswer::Another);
+        }
         let task = (task, pool.as_str());
         let begun = self.store.remote_begin(task, (attempt, seq), delivery, worker).await?;
         Ok(match begun {
@@ -178,6 +201,13 @@ impl Core {
             tracing::warn!(%error, "a worker can't be answered");
         }
     }
+}
+
+/// Drops a beat's tile if its progress is impossible, and its history if that can't be read.
+fn possible(tile: Option<TileBeat>) -> Option<TileBeat> {
+    let mut tile = tile.filter(|tile| is_possible(&tile.progress))?;
+    tile.history = tile.history.filter(|history| is_history(history, MAX_ITERATIONS));
+    Some(tile)
 }
 
 /// Deals with all that comes, several at a time; what can't be read is left.

@@ -16,6 +16,17 @@ const PAUSES: (Duration, Duration) = (Duration::from_secs(1), Duration::from_sec
 /// Time between looks at the connection.
 const LOOK: Duration = Duration::from_secs(1);
 
+/// How the hub treats workers.
+#[derive(Debug, Clone)]
+pub struct HubSettings {
+    /// The program that workers must be.
+    pub program: Program,
+    /// A message is delivered again when its worker was silent for so long.
+    pub ack_wait: Duration,
+    /// Share of the tiles that a second worker computes, too, on \[0,1\].
+    pub verify_fraction: f64,
+}
+
 /// The hub, which runs until this is dropped. Tiles that are out stay out, and are known to the next
 /// server by the store.
 #[derive(Debug)]
@@ -25,13 +36,12 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// Starts to hand tiles out to workers that are `program`, as soon as the message server answers. A
-    /// message is delivered again when its worker was silent for `ack_wait`.
+    /// Starts to hand tiles out to workers, as soon as the message server answers.
     #[must_use]
-    pub fn start(store: Store, access: Access, program: Program, ack_wait: Duration) -> Self {
+    pub fn start(store: Store, access: Access, settings: HubSettings) -> Self {
         let mut running = JoinSet::new();
         let (tell, trouble) = watch::channel(Some("there is no connection to NATS yet".to_owned()));
-        running.spawn(run(store, access, (program, ack_wait), tell));
+        running.spawn(run(store, access, settings, tell));
         Self { _running: running, trouble }
     }
 
@@ -45,11 +55,13 @@ impl Hub {
 async fn run(
     store: Store,
     access: Access,
-    (program, ack_wait): (Program, Duration),
+    settings: HubSettings,
     tell: watch::Sender<Option<String>>,
 ) {
     let connection = persist(&tell, || access.connect()).await;
-    let core = Arc::new(Core::new(store, connection.clone(), program, ack_wait));
+    let HubSettings { program, ack_wait, verify_fraction } = settings;
+    let core = Core::new(store, connection.clone(), (program, ack_wait), verify_fraction);
+    let core = Arc::new(core);
     persist(&tell, || core.find_streams()).await;
     let mut parts = persist(&tell, || parts(&core)).await;
     tracing::info!("handing tiles out to other machines");

@@ -1,9 +1,11 @@
 //! Compares what is out by the store's account with what the message server has, and mends the
 //! difference. It is the answer to every message that is lost, and to a lost disk of the message server.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+
+use futures_util::future::join_all;
 
 use super::core::{Core, Undelivered, lock};
 use super::figures;
@@ -66,10 +68,12 @@ impl Core {
     async fn sweep_once(self: &Arc<Self>, start: Instant) -> Result<(), SweepError> {
         // 1. What a lost disk of the message server takes with it.
         self.find_streams().await?;
-        let pools = lock(&self.presence).pools();
-        for pool in pools.keys() {
+        let known = self.pools().await;
+        for pool in &known {
             self.connection.make_pool(pool, self.ack_wait).await?;
         }
+        let pools = lock(&self.presence).pools();
+        lock(&self.replays).drop_old();
         // 2. What should be out; before the streams are looked at.
         let out = self.store.remote_tasks().await?;
         lock(&self.jobs).extend(out.iter().map(|remote| remote.job));
@@ -77,7 +81,7 @@ impl Core {
         // still out when all that was reported before is dealt with, is lost.
         let messages = self.messages().await?;
         let reported = self.reported().await?;
-        let mut missing = Vec::new();
+        let mut missing: BTreeMap<Pool, Vec<&RemoteTask>> = BTreeMap::new();
         for remote in &out {
             let Ok(pool) = remote.pool.parse::<Pool>() else { continue };
             let held = self.is_held(remote);
@@ -97,7 +101,9 @@ impl Core {
                     let (hub, pool) = (self.clone(), pool);
                     tokio::spawn(async move { hub.send(&pool, claimed).await });
                 }
-                Some(place) if !there(place) && !held => missing.push(remote),
+                Some(place) if !there(place) && !held => {
+                    missing.entry(pool).or_default().push(remote);
+                }
                 Some(place) if empty && !held => {
                     self.connection.drop_task(place.seq).await;
                     self.mend(remote, "its pool has no worker any more").await?;
@@ -105,28 +111,37 @@ impl Core {
                 Some(_) => {}
             }
         }
-        if !missing.is_empty() && self.is_dealt_with(reported).await? {
-            for remote in missing {
-                self.mend(remote, "its message was lost").await?;
+        // One pool's events hold up the tiles of no other.
+        let mended = missing.iter().map(|(pool, missing)| async move {
+            if self.is_dealt_with(pool, reported).await? {
+                for remote in missing {
+                    self.mend(remote, "its message was lost").await?;
+                }
             }
-        }
+            Ok::<_, SweepError>(())
+        });
+        join_all(mended).await.into_iter().collect::<Result<(), _>>()?;
         self.deliver(&out).await?;
         self.drop_strays(messages).await?;
         // 4. When nothing is out, nothing needs the files.
         if out.is_empty() && lock(&self.sending).is_empty() {
             self.empty_files().await?;
-            self.empty_events(reported).await?;
+            self.empty_events(&known, reported).await?;
         }
         Ok(())
     }
 
     /// Removes events up to this one when nothing is out and no more of them are to come: those that a killed
     /// message server has again.
-    async fn empty_events(&self, last: u64) -> Result<(), ClusterError> {
+    async fn empty_events(&self, pools: &[Pool], last: u64) -> Result<(), ClusterError> {
         let stream = self.connection.context.get_stream(names::EVENTS).await;
         let stream = stream.map_err(ClusterError::nats("find the stream of events"))?;
         let there = stream.cached_info().state.messages;
-        if there > 0 && self.is_dealt_with(last).await? {
+        if there == 0 {
+            return Ok(());
+        }
+        let dealt = join_all(pools.iter().map(|pool| self.is_dealt_with(pool, last))).await;
+        if dealt.into_iter().collect::<Result<Vec<_>, _>>()?.iter().all(|dealt| *dealt) {
             let purged = stream.purge().sequence(last + 1).await;
             let purged = purged.map_err(ClusterError::nats("empty the stream of events"))?.purged;
             if purged > 0 {
@@ -144,7 +159,11 @@ impl Core {
         {
             let mut undelivered = lock(&self.undelivered);
             let before = std::mem::take(&mut *undelivered);
-            for remote in out.iter().filter(|remote| !self.is_held(remote)) {
+            // A tile that its first worker leaves to another may wait for long.
+            let replayed =
+                |remote: &RemoteTask| lock(&self.replays).first_worker(remote.task).is_some();
+            let waiting = out.iter().filter(|remote| !self.is_held(remote) && !replayed(remote));
+            for remote in waiting {
                 let (Some(place), Ok(pool)) = (&remote.place, remote.pool.parse::<Pool>()) else {
                     continue;
                 };
@@ -238,11 +257,11 @@ impl Core {
         Ok(stream.cached_info().state.last_sequence)
     }
 
-    /// Waits until all events up to this number are dealt with; false if that takes long.
-    async fn is_dealt_with(&self, last: u64) -> Result<bool, ClusterError> {
+    /// Waits until all events of a pool up to this number are dealt with; false if that takes long.
+    async fn is_dealt_with(&self, pool: &Pool, last: u64) -> Result<bool, ClusterError> {
         let (start, mut first) = (Instant::now(), None);
         loop {
-            let consumer = self.connection.events().await?;
+            let consumer = self.connection.events(pool).await?;
             let info = consumer.cached_info();
             let none_left = info.num_pending == 0 && info.num_ack_pending == 0;
             let floor = info.ack_floor.stream_sequence;
@@ -251,8 +270,8 @@ impl Core {
             }
             if start.elapsed() > TICK {
                 if floor == *first.get_or_insert(floor) {
-                    tracing::warn!("events are not delivered: their consumer is made anew");
-                    self.connection.drop_consumer(names::EVENTS, names::HUB).await;
+                    tracing::warn!(%pool, "events are not delivered: their consumer is made anew");
+                    self.connection.drop_consumer(names::EVENTS, &names::events(pool)).await;
                 }
                 return Ok(false);
             }

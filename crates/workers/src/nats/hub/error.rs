@@ -1,0 +1,33 @@
+//! Why what a worker says is left for later.
+
+use crate::nats::connection::ClusterError;
+use engine::pipeline::PipelineError;
+use store::StoreError;
+
+/// Why an event is left for later.
+#[derive(Debug, thiserror::Error)]
+pub enum EventError {
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error("the frames can't be written: {0}")]
+    Write(#[from] std::io::Error),
+    #[error("a thread ended unexpectedly")]
+    Thread(#[from] tokio::task::JoinError),
+    #[error("the frames can't be fetched: {0}")]
+    Fetch(String),
+    #[error("the tile's own arrays can't be read: {0}")]
+    Tile(#[from] PipelineError),
+}
+
+impl EventError {
+    /// True if the event may be the cause; false if a disk or a message server has failed.
+    pub fn is_of_event(&self) -> bool {
+        match self {
+            Self::Store(error) => !error.is_disk_full(),
+            Self::Thread(_) | Self::Tile(_) => true,
+            Self::Cluster(_) | Self::Write(_) | Self::Fetch(_) => false,
+        }
+    }
+}
