@@ -92,7 +92,8 @@ def kustomize(root, wrong, program):
     return None
 
 
-# What the Pod Security Standard "restricted" allows (kubernetes.io/docs/concepts/security/pod-security-standards).
+# Kinds of volumes in the Pod Security Standard "restricted"
+# (kubernetes.io/docs/concepts/security/pod-security-standards).
 VOLUMES = {"configMap", "csi", "downwardAPI", "emptyDir", "ephemeral", "persistentVolumeClaim", "projected", "secret"}
 
 

@@ -5,14 +5,14 @@ use std::io;
 
 use rustls::Error as TlsError;
 
-/// What to do about a failed connection, if trying again can't help: a certificate that is not trusted, a server that
-/// does not speak TLS, a host that does not exist.
+/// The remedy for a failed connection that no further try mends: an untrusted certificate, a port without TLS, an
+/// unknown host. None for all other failures.
 pub(super) fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
     if let Some(error) = error.downcast_ref::<TlsError>() {
-        return of_tls(error);
+        return tls_remedy(error);
     }
     if let Some(error) = error.downcast_ref::<io::Error>() {
-        if let Some(remedy) = of_lookup(error) {
+        if let Some(remedy) = lookup_remedy(error) {
             return Some(remedy);
         }
         if let Some(remedy) = error.get_ref().and_then(|inner| remedy(inner)) {
@@ -22,7 +22,7 @@ pub(super) fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
     error.source().and_then(remedy)
 }
 
-fn of_tls(error: &TlsError) -> Option<&'static str> {
+fn tls_remedy(error: &TlsError) -> Option<&'static str> {
     match error {
         TlsError::InvalidCertificate(_) => Some(
             "the certificate of the service is not trusted; name the certificate of its authority (PEM) in \
@@ -37,7 +37,7 @@ fn of_tls(error: &TlsError) -> Option<&'static str> {
 }
 
 /// The standard library gives the resolver's answer as text only.
-fn of_lookup(error: &io::Error) -> Option<&'static str> {
+fn lookup_remedy(error: &io::Error) -> Option<&'static str> {
     let text = error.to_string();
     let unknown =
         text.starts_with("failed to lookup address") && !text.contains("Temporary failure");
