@@ -4,14 +4,20 @@ Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Says what 
 not here; ends with 1 and the reasons if anything is wrong.
 """
 
+import contextlib
 import json
 import os
 import pathlib
 import re
 import shutil
+import socket
+import ssl
 import subprocess
 import sys
 import tempfile
+import time
+import urllib.error
+import urllib.request
 
 import kubernetes_validate
 import yaml
@@ -261,23 +267,72 @@ def unreadable(text):
             yield f"DynamicUser= can't read {path.group()}: {line}"
 
 
-def nginx(root, wrong):
-    program = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin")
-    if not program or not shutil.which("openssl"):
+def nginx(root, wrong, program):
+    server = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin")
+    if not server or not shutil.which("openssl"):
         return "nginx"
-    with tempfile.TemporaryDirectory() as folder:
-        key, certificate = f"{folder}/key.pem", f"{folder}/cert.pem"
+    with tempfile.TemporaryDirectory() as folder, served(program, folder) as url:
+        key, certificate, port = f"{folder}/key.pem", f"{folder}/cert.pem", free_port()
         run("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate,
             "-days", "1", "-subj", "/CN=bench.example")
         site = (root / "deploy/nginx/sci-recon.conf").read_text()
-        site = site.replace("/etc/ssl/bench.example.pem", certificate)
-        site = site.replace("/etc/ssl/private/bench.example.key", key)
+        for place, ours in [("/etc/ssl/bench.example.pem", certificate), ("/etc/ssl/private/bench.example.key", key),
+                            ("listen 443 ", f"listen 127.0.0.1:{port} "), ("127.0.0.1:8080;", url.removeprefix("http://") + ";")]:
+            if place not in site:
+                wrong.append(f"deploy/nginx/sci-recon.conf does not name {place}")
+            site = site.replace(place, ours)
         whole = pathlib.Path(folder, "nginx.conf")
-        whole.write_text(f"pid {folder}/pid; error_log {folder}/log; events {{}} http {{ {site} }}")
-        status, told = run(program, "-t", "-q", "-c", str(whole))
+        whole.write_text(f"daemon off; pid {folder}/pid; error_log {folder}/log; events {{}} "
+                         f"http {{ access_log off; {site} }}")
+        status, said = run(server, "-t", "-q", "-c", str(whole))
         if status:
-            wrong.append(f"nginx -t: {told}")
+            wrong.append(f"nginx -t: {said}")
+            return None
+        proxy = subprocess.Popen([server, "-c", str(whole)])
+        try:
+            for path in ["/v1/jobs", "/sci/v1/jobs"]:
+                own = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", f"https://bench.example:{port}")
+                other = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", "https://other.example")
+                if own == "foreign_site" or other != "foreign_site":
+                    wrong.append(f"behind nginx at {path} a page of the service gets {own}, one of another {other}")
+        finally:
+            proxy.terminate()
+            proxy.wait()
     return None
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+@contextlib.contextmanager
+def served(program, folder):
+    """A service without tokens that is reached as bench.example; its address."""
+    line = [program, "serve", "--data", f"{folder}/data", "--listen", "127.0.0.1:0", "--workers", "0", "--host", "bench.example"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        try:
+            yield json.loads(server.stdout.readline())["url"]
+        finally:
+            server.terminate()
+
+
+def refusal(url, host, origin):
+    """The code of the problem with which a change is refused that a page of `origin` sends."""
+    request = urllib.request.Request(url, b"{}", {"Host": host, "Origin": origin, "Content-Type": "application/json"})
+    context = ssl._create_unverified_context()
+    start = time.monotonic()
+    while True:
+        try:
+            urllib.request.urlopen(request, timeout=20, context=context).close()
+            return None
+        except urllib.error.HTTPError as error:
+            return json.load(error)["code"]
+        except urllib.error.URLError:
+            # It is still starting.
+            if time.monotonic() - start > 10:
+                raise
+            time.sleep(0.1)
 
 
 def caddy(root, wrong):
@@ -327,8 +382,8 @@ def main():
     kubernetes(root, wrong)
     figures(root, wrong)
     context(root, wrong, program)
-    absent = [check(root, wrong, program) for check in (kustomize, image)]
-    absent += [check(root, wrong) for check in (compose, systemd, nginx, caddy, promtool)]
+    absent = [check(root, wrong, program) for check in (kustomize, image, nginx)]
+    absent += [check(root, wrong) for check in (compose, systemd, caddy, promtool)]
     absent = [name for name in absent if name]
     if absent:
         print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
