@@ -275,7 +275,8 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
 
-    /// How much workers stand back for others (0 to 19), so that the API answers at full load.
+    /// How much workers stand back for others (0 to 19), so that the API answers at full load. They never raise the
+    /// priority that they are started with.
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,

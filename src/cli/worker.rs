@@ -139,10 +139,15 @@ fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     ModelCommand { program, arguments, memory_bytes: *memory_bytes }
 }
 
-/// Lowers the priority of this process, and so of all its threads.
+/// Lowers the priority of this process, and so of all its threads. A lower one stays: only root may raise it.
 fn stand_back(nice: i32) -> Result<()> {
-    rustix::process::setpriority_process(None, nice)
-        .map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
+    let failed = |error: rustix::io::Errno| {
+        CliError::Failure(format!("the priority can't be lowered: {error}"))
+    };
+    if rustix::process::getpriority_process(None).map_err(failed)? >= nice {
+        return Ok(());
+    }
+    rustix::process::setpriority_process(None, nice).map_err(failed)
 }
 
 /// Waits for a reason to stop, and tells it on.

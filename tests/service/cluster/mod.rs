@@ -147,6 +147,29 @@ async fn settings_of_one_process_are_not_taken_for_those_of_another() {
 }
 
 #[tokio::test]
+async fn a_worker_keeps_a_lower_priority_than_its_own() {
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "5").await;
+    let url = nats.url();
+    let line = ["--nats", url.as_str(), "--pool", "test"];
+    // Somebody other than root may not raise it. What `nice` adds, it adds to that of the test.
+    let own = rustix::process::getpriority_process(None).unwrap();
+    for added in [15, 5] {
+        let started = added.to_string();
+        let expected = (own + added).clamp(10, 19).to_string();
+        let mut worker = RemoteWorker::within(&["nice", "-n", &started], &line);
+        until("the worker comes in", || async { workers(&app).await.len() == 1 }).await;
+        let stat = format!("/proc/{}/stat", worker.inner().unwrap().as_raw_nonzero());
+        let stat = std::fs::read_to_string(stat).unwrap();
+        let (_, fields) = stat.rsplit_once(") ").unwrap();
+        assert_eq!(fields.split(' ').nth(16), Some(&*expected), "{stat}");
+        worker.process.signal(Signal::TERM);
+        assert_eq!(worker.process.ended(Duration::from_secs(5)), Some(0));
+        until("the worker is gone", || async { workers(&app).await.is_empty() }).await;
+    }
+}
+
+#[tokio::test]
 async fn a_worker_that_is_killed_in_a_tile_costs_one_attempt() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
