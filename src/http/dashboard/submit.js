@@ -213,7 +213,7 @@ function measurementStep(form, changed, signal) {
     form.measurement = null;
     put(verdict);
     // Try the file that was dropped for another calibration with this one.
-    if (form.calibration && last) make(last, scaled).catch((error) => put(verdict, problem(error)));
+    if (form.calibration && last) make(last, known).catch((error) => put(verdict, problem(error)));
     changed();
   };
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
