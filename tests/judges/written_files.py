@@ -36,7 +36,7 @@ def path(row, file, **asked):
     place.parent.mkdir()
     # Pictures have no axes to tell; other arrays are told as they usually are, or as `told` says.
     usual = {"npy": "frame-row-column", "npz": "frame-row-column", "h5": "frame-row-column", "mat": "row-column-frame"}
-    asked = {"told": usual.get(place.suffix[1:]), **asked}
+    asked = {"read_axes": usual.get(place.suffix[1:]), **asked}
     index.append({"row": row, "file": str(place.relative_to(FOLDER)), **asked})
     return place
 
@@ -81,8 +81,8 @@ def accepted():
     snapshots = {"measurement": True, "full_scale": 250}
     np.save(path(row, "a.npy", **snapshots), SNAPSHOTS.astype("<u2"))
     # 48x64 are the rows and columns of the masks: one order alone fits.
-    np.save(path(row, "a.npy", told="row-column-frame", **snapshots), np.moveaxis(SNAPSHOTS, 0, -1).astype("u1"))
-    np.save(path(row, "a.npy", told="column-row-frame", **snapshots), SNAPSHOTS.T.astype("u1"))
+    np.save(path(row, "a.npy", read_axes="row-column-frame", **snapshots), np.moveaxis(SNAPSHOTS, 0, -1).astype("u1"))
+    np.save(path(row, "a.npy", read_axes="column-row-frame", **snapshots), SNAPSHOTS.T.astype("u1"))
     row = "npz"
     np.savez(path(row, "a.npz"), MASKS.astype("f4"))
     np.savez_compressed(path(row, "a.npz"), mask=MASKS, meas=SNAPSHOTS)
@@ -129,7 +129,7 @@ def accepted():
     scipy.io.savemat(path(row, "a.mat", name="shots"), {"shots": mask.astype(bool)})
     scipy.io.savemat(path(row, "a.mat", measurement=True, full_scale=250), {"meas": meas.astype("u2")})
     # At most 64 masks, no sensor of 4 rows: the frames can only come first.
-    scipy.io.savemat(path(row, "a.mat", told="frame-row-column"), {"mask": MASKS.astype("u1")})
+    scipy.io.savemat(path(row, "a.mat", read_axes="frame-row-column"), {"mask": MASKS.astype("u1")})
     row = "`.mat` level 7.3 (`save -v7.3`)"
     matlab73(path(row, "a.mat"), mask=(mask.astype("u1"), "logical"), meas=(meas.astype("f8"), "double"))
     matlab73(path(row, "a.mat", measurement=True, full_scale=250), meas=(meas.astype("u2"), "uint16"))
@@ -144,9 +144,9 @@ def accepted():
     # MATLAB's h5write of [row, column, frame]: the sizes in reverse, and no class.
     with h5py.File(path(row, "a.h5", axes="frame-column-row"), "w") as file:
         file["mask"] = mask.astype("f8").T
-    with h5py.File(path(row, "a.h5", told="frame-column-row", measurement=True, full_scale=250), "w") as file:
+    with h5py.File(path(row, "a.h5", read_axes="frame-column-row", measurement=True, full_scale=250), "w") as file:
         file["meas"] = meas.astype("<u2").T
-    with h5py.File(path(row, "a.h5", told="row-column-frame", measurement=True, full_scale=250), "w") as file:
+    with h5py.File(path(row, "a.h5", read_axes="row-column-frame", measurement=True, full_scale=250), "w") as file:
         file.create_dataset("meas", data=meas.astype("<u2"), chunks=(8, 64, 1), compression="gzip")
 
 
