@@ -134,6 +134,8 @@ def paragraphs(lines):
                 fence = None
             continue
         item = re.match(r"\s*(?:[-*+]|\d+[.)])\s+|#+\s+|>\s?", line)
+        entry = re.match(r"\s*[\w$'/.()\[\],=<>-]+ {2,}(?=\S)", line)  # of a table of options
+        item = item or entry
         if not stripped or item or stripped.startswith("|") or OFF in line:
             if current:
                 yield Passage(current)
@@ -452,7 +454,7 @@ def name_findings(path, source):
             if BAD_WORD.intersection(words) or BAD_NAME.match(match[1]) or len(words) > longest:
                 yield number, "name", match[0]
         if line.strip():
-            test = "test]" in line or (test and line.lstrip().startswith("#["))
+            test = bool(re.search(r"#\[(\w+::)?test\b", line)) or (test and line.lstrip().startswith("#["))
 
 
 def check(path, source):

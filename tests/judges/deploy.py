@@ -1,7 +1,7 @@
-"""Holds the samples under deploy/ and docker/ to the validators of those who read them.
+"""Validates the samples under deploy/ and docker/ with the programs that read them.
 
-Usage: deploy.py ROOT. Says what was not checked because its program is not here; ends with 1 and the reasons
-if anything is wrong.
+Usage: deploy.py ROOT. Names the validators that are not installed. Exits with 1 and the reasons if a sample
+is invalid.
 """
 
 import json
@@ -34,7 +34,7 @@ def kubernetes(root, wrong):
         wrong.append(f"kustomization.yaml lists {listed}")
     for name, document in documents:
         if document["kind"] == "ScaledJob":
-            # KEDA's own kind: what it makes jobs of is held to the schema of a job.
+            # A ScaledJob of KEDA: the template of its jobs is checked against the schema of a job.
             target = dict(document["spec"]["jobTargetRef"])
             document = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "worker"}, "spec": target}
         try:
@@ -77,7 +77,7 @@ def systemd(root, wrong):
         return "systemd-analyze"
     for unit in (root / "deploy/systemd").glob("*.service"):
         _, told = run("systemd-analyze", "verify", str(unit))
-        # The program is not installed where this runs.
+        # The program's path does not exist on the machine of the test.
         told = [line for line in told.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
         if told:
             wrong.append(f"{unit.name}: {told}")
@@ -137,7 +137,7 @@ def known(root, wrong, file_name, expressions):
         described |= words(file.read_text())
     missing = {name for name in names if name.removesuffix("_bucket") not in described}
     if missing or not names:
-        wrong.append(f"{file_name} asks for figures that the service does not have: {sorted(missing)}")
+        wrong.append(f"{file_name} uses metrics that the service does not have: {sorted(missing)}")
 
 
 def words(text):
@@ -151,7 +151,7 @@ def main():
     figures(root, wrong)
     absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd, nginx, caddy, promtool)) if name]
     if absent:
-        print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
+        print(f"SKIPPED: {', '.join(absent)} not installed", file=sys.stderr)
     for reason in wrong:
         print(reason, file=sys.stderr)
     sys.exit(1 if wrong else 0)

@@ -175,14 +175,14 @@ async fn the_documented_commands_work_between_two_machines() {
     let other = tempfile::tempdir().unwrap();
     std::fs::copy(&credential, other.path().join("default.creds")).unwrap();
     for path in [other.path().to_owned(), other.path().join("default.creds")] {
-        std::os::unix::fs::chown(path, Some(nodes::NOBODY), Some(nodes::NOBODY)).unwrap();
+        std::os::unix::fs::chown(path, Some(nodes::UNPRIVILEGED_UID), Some(nodes::UNPRIVILEGED_UID)).unwrap();
     }
     let script = other.path().join("recipe.sh");
     std::fs::write(&script, format!("set -e\n{worker}")).unwrap();
     let line = format!(
         "mount -t tmpfs -o mode=1777 tmpfs /var/tmp && \
          exec setpriv --reuid {0} --regid {0} --clear-groups sh {1}",
-        nodes::NOBODY,
+        nodes::UNPRIVILEGED_UID,
         script.display()
     );
     let log = std::fs::File::create(other.path().join("log")).unwrap();

@@ -378,7 +378,7 @@ pub fn program() -> &'static Path {
 }
 
 /// A user without rights to any file.
-pub const NOBODY: u32 = 65_534;
+pub const UNPRIVILEGED_UID: u32 = 65_534;
 
 /// A worker in an empty folder with a cleared environment, under another user if the test runs as
 /// root.
@@ -399,7 +399,7 @@ impl RemoteWorker {
         let own = tempfile::NamedTempFile::new().unwrap();
         std::fs::copy(credential, own.path()).unwrap();
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(own.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+            std::os::unix::fs::chown(own.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).unwrap();
         }
         let path = own.path().to_str().unwrap().to_owned();
         let mut worker = Self::within(&[], &[&["--nats-creds", path.as_str()], arguments].concat());
@@ -429,8 +429,8 @@ impl RemoteWorker {
             command.env("ORT_DYLIB_PATH", library);
         }
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(folder.path(), Some(NOBODY), Some(NOBODY)).unwrap();
-            command.uid(NOBODY).gid(NOBODY);
+            std::os::unix::fs::chown(folder.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).unwrap();
+            command.uid(UNPRIVILEGED_UID).gid(UNPRIVILEGED_UID);
         }
         let process = Process(command.spawn().unwrap());
         Self { process, folder, log, credential: None }
