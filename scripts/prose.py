@@ -118,11 +118,22 @@ class Passage:
 # Markdown, which is also what a comment holds.
 
 
-def paragraphs(lines):
-    """Splits lines of Markdown into passages; fenced and indented code is left out."""
-    fence, current = None, []
+def paragraphs(lines, base=None):
+    """Splits lines of Markdown with this indentation into passages; fenced and indented code is left out."""
+    fence, current, code = None, [], False
+    if base is None:
+        base = min((len(line) - len(line.lstrip()) for _, line in lines if line.strip()), default=0)
+    after_blank = True
     for number, line in lines:
         stripped = line.strip()
+        deep = bool(stripped) and len(line) - len(line.lstrip()) >= base + 4
+        code = deep and (after_blank or code) or (code and not stripped)
+        after_blank = not stripped
+        if code and fence is None and stripped:
+            if current:
+                yield Passage(current)
+                current = []
+            continue
         opener = re.match(r"(```+|~~~+)", stripped)
         if opener or fence:
             if current:
@@ -300,6 +311,11 @@ def continued(number, text):
         yield passage
 
 
+def node_indent(node):
+    """Indentation of a docstring."""
+    return node.body[0].col_offset
+
+
 def python(source):
     comments, strings = [], []
     lines = iter(source.splitlines(keepends=True))
@@ -316,7 +332,8 @@ def python(source):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and ast.get_docstring(node, clean=False):
             value = node.body[0].value
             documented.add(id(value))
-            strings += paragraphs([(value.lineno + i, text) for i, text in enumerate(value.value.split("\n"))])
+            text = value.value.split("\n")
+            strings += paragraphs([(value.lineno + i, line) for i, line in enumerate(text)], base=node_indent(node))
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             parts = []
@@ -567,7 +584,8 @@ EXAMPLES = [
     ("a.js", "/** Asks for the scale.\n * Who asks is told of it.\n */\n", ["opening"]),
     ("a.py", '"""Runs a command.\n\nOf the outputs, one is kept.\n"""\n', ["opening"]),
     ("a.py", 'fail(f"{name} is told of {error} as need be")\n', ["phrase"]),
-    ("a.md", "Of the tiles, 3 are done.\n\n    indented\n", ["opening"]),
+    ("a.md", "Of the tiles, 3 are done.\n\n    whose what is told of it\n", ["opening"]),
+    ("a.py", '"""Runs it.\n\n    whose what is told of it\n"""\n', []),
     ("a.md", "| Name | Effect |\n| --- | --- |\n| a | Whether it is read |\n", ["opening"]),
     ("a.md", "Is what is left of it read?\n", ["phrase"]),
     ("a.md", " ".join(["word"] * (LONGEST_SENTENCE + 1)) + ".\n", ["long sentence"]),

@@ -5,7 +5,7 @@
 //! paths name; re-exports are followed. Test code does not count, nor do the lines in which a
 //! folder's `mod.rs` lists its children (`mod x;`, `pub use x::Y;`).
 
-#![allow(clippy::unwrap_used)] // helpers of tests
+#![allow(clippy::unwrap_used)] // tests may panic
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;

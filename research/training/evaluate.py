@@ -7,7 +7,6 @@ clip after TV and after the deep passes.
 """
 import argparse
 import json
-import os
 
 import numpy as np
 import torch

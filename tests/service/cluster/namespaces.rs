@@ -175,7 +175,12 @@ async fn the_documented_commands_work_between_two_machines() {
     let other = tempfile::tempdir().unwrap();
     std::fs::copy(&credential, other.path().join("default.creds")).unwrap();
     for path in [other.path().to_owned(), other.path().join("default.creds")] {
-        std::os::unix::fs::chown(path, Some(nodes::UNPRIVILEGED_UID), Some(nodes::UNPRIVILEGED_UID)).unwrap();
+        std::os::unix::fs::chown(
+            path,
+            Some(nodes::UNPRIVILEGED_UID),
+            Some(nodes::UNPRIVILEGED_UID),
+        )
+        .unwrap();
     }
     let script = other.path().join("recipe.sh");
     std::fs::write(&script, format!("set -e\n{worker}")).unwrap();

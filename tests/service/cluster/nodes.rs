@@ -399,7 +399,8 @@ impl RemoteWorker {
         let own = tempfile::NamedTempFile::new().unwrap();
         std::fs::copy(credential, own.path()).unwrap();
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(own.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).unwrap();
+            std::os::unix::fs::chown(own.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID))
+                .unwrap();
         }
         let path = own.path().to_str().unwrap().to_owned();
         let mut worker = Self::within(&[], &[&["--nats-creds", path.as_str()], arguments].concat());
@@ -429,7 +430,8 @@ impl RemoteWorker {
             command.env("ORT_DYLIB_PATH", library);
         }
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(folder.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID)).unwrap();
+            std::os::unix::fs::chown(folder.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID))
+                .unwrap();
             command.uid(UNPRIVILEGED_UID).gid(UNPRIVILEGED_UID);
         }
         let process = Process(command.spawn().unwrap());
