@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-latency bench-peers bench-scale eval-models eval-loop eval-wrong-inputs evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -175,6 +175,12 @@ fmt:
 
 lint:
 	$(CARGO) clippy --workspace --all-targets -- -D warnings
+
+# Findings per 1,000 words of the whole repository. Lower it when the rate falls; the aim is 1.0.
+PROSE_RATE ?= 14.3
+prose: ## check comments, texts and names against the style rules; BASE=commit lists the findings in changed lines
+	$(PYTHON) scripts/prose.py --self-test
+	$(PYTHON) scripts/prose.py $(if $(BASE),--changed $(BASE),--folders --at-most $(PROSE_RATE))
 
 docs:
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --workspace --no-deps --document-private-items
