@@ -159,16 +159,16 @@ async fn the_documented_commands_work_between_two_machines() {
     let mut shell = machines.shell(0, &format!("set -e\n{server}\nwait"));
     shell.current_dir(&home).env("HOME", &home).stderr(log.try_clone().unwrap()).stdout(log);
     machines.started.push(shell.spawn().unwrap());
-    let log = || std::fs::read_to_string(machines.folder.path().join("server.log")).unwrap();
+    let server_log = || std::fs::read_to_string(machines.folder.path().join("server.log")).unwrap();
     let credential = home.join("default.creds");
-    wait("the credential exists", || credential.exists(), &log);
+    wait("the credential exists", || credential.exists(), &server_log);
     wait(
         "the server answers",
         || machines.curl("-f http://127.0.0.1:8080/livez").status.success(),
-        &log,
+        &server_log,
     );
     let ready = || machines.api("/readyz", None);
-    wait("the server has connected to NATS", || ready()["ready"] == true, &log);
+    wait("the server has connected to NATS", || ready()["ready"] == true, &server_log);
 
     // The other machine has a copy of the program and the credential, another user's rights, and
     // other folders.
@@ -194,7 +194,7 @@ async fn the_documented_commands_work_between_two_machines() {
     let mut shell = machines.shell(1, &line);
     shell.current_dir(other.path()).stderr(log.try_clone().unwrap()).stdout(log);
     machines.started.push(shell.spawn().unwrap());
-    let heard = || std::fs::read_to_string(other.path().join("log")).unwrap() + &log();
+    let heard = || std::fs::read_to_string(other.path().join("log")).unwrap() + &server_log();
     let there = || {
         let system = machines.api("/v1/system", None);
         system["workers"].as_array().unwrap().iter().any(|worker| worker["pool"] == "default")
