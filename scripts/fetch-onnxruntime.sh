@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Put libonnxruntime.so into runtime/ (or the folder given), taken from the pinned PyPI wheel.
+# Install libonnxruntime.so from the pinned PyPI wheel into runtime/ or another folder.
 #
 #   scripts/fetch-onnxruntime.sh [--gpu] [FOLDER]
 #
-# The wheel's hash is checked by pip. A stamp makes a second run a no-op.
+# pip checks the wheel's hash. A stamp file makes a second run a no-op.
 set -euo pipefail
 package=onnxruntime
 version=1.31.1
@@ -36,7 +36,7 @@ source, folder = sys.argv[1:]
 with zipfile.ZipFile(glob.glob(source + "/*.whl")[0]) as wheel:
     for name in wheel.namelist():
         base = os.path.basename(name)
-        # The loader's name has no version; the providers of the GPU wheel keep theirs.
+        # The loader's file name has no version; the providers of the GPU wheel keep their names.
         if name.startswith("onnxruntime/capi/lib") and ".so" in base:
             target = re.sub(r"^(libonnxruntime\.so).*", r"\1", base)
             with wheel.open(name) as data, open(os.path.join(folder, target), "wb") as out:

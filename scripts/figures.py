@@ -1,4 +1,4 @@
-"""Runs a command and ends with one JSON line: the figures that it has printed, and whether all is well.
+"""Runs a command, and ends with one JSON line: the figures that it printed, and whether it succeeded.
 
 Usage: figures.py NAME COMMAND... Figures are lines of JSON objects with a field `target`.
 """
@@ -14,7 +14,7 @@ def main():
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, errors="replace")
     for line in process.stdout:
         print(line, end="", flush=True)
-        # The test runner may have left its own text at the start of the line.
+        # The line may start with output of the test runner.
         at = line.find('{"')
         try:
             figures = json.loads(line[at:]) if at >= 0 else {}

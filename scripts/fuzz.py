@@ -1,6 +1,6 @@
-"""Runs every fuzz target for some seconds of CPU; each must end without a finding.
+"""Runs every fuzz target for some seconds of CPU; none may find an error.
 
-Usage: fuzz.py SECONDS [TARGET...]. Needs cargo-fuzz. Prints one JSON line at its end.
+Usage: fuzz.py SECONDS [TARGET...]. Needs cargo-fuzz. The last line is JSON.
 """
 
 import json
@@ -16,7 +16,7 @@ def main():
     seconds = int(sys.argv[1])
     known = sorted(path.stem for path in pathlib.Path("fuzz/fuzz_targets").glob("*.rs"))
     known.remove("file")
-    # Stable Rust has no sanitizer, and safe Rust little need of one.
+    # Stable Rust has no sanitizer, and safe Rust hardly needs one.
     subprocess.run(["cargo", "fuzz", "build", "-s", "none"], check=True)
     report = {target: fuzz(target, seconds) for target in sys.argv[2:] or known}
     good = all(row["clean"] for row in report.values())
@@ -27,11 +27,11 @@ def main():
 
 def fuzz(target, seconds):
     """Runs a target until it has used its CPU seconds, however busy the machine is."""
-    # Files in the corpus are for reading: what is found goes to a folder of its own.
+    # The corpus in the repository is not changed: new inputs go to another folder.
     found = pathlib.Path("fuzz/target/corpus", target)
     found.mkdir(parents=True, exist_ok=True)
     command = ["cargo", "fuzz", "run", "-s", "none", target, str(found), f"fuzz/corpus/{target}", "--"]
-    # The timeout is of the clock, and the machine may be busy.
+    # The timeout is in wall-clock time, and the machine may be busy.
     command += ["-max_len=8192", "-rss_limit_mb=1024", "-timeout=60"]
     runs, used, clean = 0, 0.0, True
     while clean and used < seconds:
@@ -48,7 +48,7 @@ def fuzz(target, seconds):
 
 
 def cpu_seconds():
-    """CPU seconds of all children that have ended."""
+    """CPU seconds of all ended children."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Put the program, stripped, with all that belongs to it below a folder.
+# Install the stripped program and all files that belong to it below a folder.
 #
 #   scripts/install.sh PROGRAM FOLDER PREFIX
 #
-# PREFIX is where FOLDER will be in the end, for the paths in the systemd unit.
+# PREFIX is the final location of FOLDER, for the paths in the systemd unit.
 set -euo pipefail
 program=$1 folder=$2 prefix=$3
 root=$(cd "$(dirname "$0")/.." && pwd)
@@ -14,10 +14,10 @@ install -d "$folder/bin" "$folder/lib/sci-recon" "$folder/lib/systemd/system" "$
   "$share/sci-recon" "$share/doc/sci-recon"
 install -m 755 "$program" "$folder/bin/sci-recon"
 strip "$folder/bin/sci-recon"
-# The program looks for it here, from where it stands itself.
+# The program looks for the library relative to its location.
 install -m 644 "$root"/runtime/libonnxruntime*.so "$folder/lib/sci-recon/"
 install -m 644 "$root"/runtime/onnxruntime-* "$root/LICENSE" "$share/doc/sci-recon/"
-# The program carries its networks; these are for training and for `--models`.
+# The program includes its networks; these files are for training and for `--models`.
 cp -R "$root/models" "$root/docs/schedule.schema.json" "$share/sci-recon/"
 for unit in "$root"/deploy/systemd/*.service "$root"/deploy/systemd/*.timer; do
   sed "s|/usr/local/bin/|$prefix/bin/|" "$unit" >"$folder/lib/systemd/system/$(basename "$unit")"

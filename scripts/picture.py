@@ -1,10 +1,10 @@
-"""Lays images side by side in one grey PNG: the picture of the README.
+"""Joins images side by side in one grey PNG, such as the image of the README.
 
 Usage: picture.py OUT.png FRAME FILE.npy [FILE.npy ...]
 
-Each file holds float32, [H,W] or [frames,H,W], of which frame FRAME (from 0) is shown. Values from 0 to
-1 become black to white; a measurement, which exceeds 1, is divided by its largest value. The README's
-picture is made of the demo's clip, without a server:
+Each file holds float32, [H,W] or [frames,H,W]; frame FRAME (from 0) is shown. Values from 0 to 1 become black
+to white; a measurement, which exceeds 1, is divided by its largest value. The README's image shows the demo
+clip, computed without a server:
 
     sci-recon simulate --frames demo/clip --compression-ratio 8 --seed 1 --out sim
     for algorithm in gap-tv pnp-tv-fastdvdnet; do

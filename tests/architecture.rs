@@ -1,11 +1,11 @@
-//! Holds what Cargo can't: no circles of imports between files or folders of a crate, and libraries that only some
-//! files may name.
+//! Rules that Cargo does not enforce: no circular imports between files or folders of a crate, and
+//! libraries that only some files may name.
 //!
 //! The sources are parsed. A file depends on the files that define what its `use` lines and its
 //! paths name; re-exports are followed. Test code does not count, nor do the lines in which a
 //! folder's `mod.rs` lists its children (`mod x;`, `pub use x::Y;`).
 
-#![allow(clippy::unwrap_used)] // helpers of tests
+#![allow(clippy::unwrap_used)] // tests may panic
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use syn::visit::Visit;
 
-/// The folders of the crates' sources.
+/// Source folders of the crates.
 const SOURCES: [&str; 7] = [
     "src",
     "crates/formats/src",
@@ -33,7 +33,7 @@ const OWNERS: &[(&str, &[&str])] = &[
     ("crate::http", &["src/http/", "src/cli/serve.rs"]),
 ];
 
-/// Folders that know arrays and no files.
+/// Folders that must not access files.
 const WITHOUT_FILES: (&[&str], &[&str], &[&str]) = (
     &["crates/reconstruction/src/", "crates/optics/src/"],
     &["std::fs", "std::path"],
@@ -43,18 +43,18 @@ const WITHOUT_FILES: (&[&str], &[&str], &[&str]) = (
 /// A module's path from the crate's root.
 type Module = Vec<String>;
 
-/// What a file of the sources says of itself and of others.
+/// The imports and exports of a source file.
 #[derive(Default)]
 struct File {
     place: String,
-    /// Whether it is a folder's own file, which lists children.
+    /// True for a folder's `mod.rs`, which lists children.
     is_folder: bool,
     children: BTreeSet<String>,
-    /// What it imports: the name here, and the path it stands for.
+    /// Imports: the local name, and the path that it stands for.
     imports: BTreeMap<String, Vec<String>>,
-    /// Paths of ours that it depends on.
+    /// Paths of this crate that the file depends on.
     uses: BTreeSet<Vec<String>>,
-    /// All other paths that it names, such as `std::fs::File`.
+    /// All other paths that the file names, such as `std::fs`.
     foreign: BTreeSet<String>,
 }
 
@@ -117,8 +117,8 @@ impl Reader {
             self.file.foreign.insert(path.join("::"));
             return;
         };
-        let of_child = absolute.len() > self.module.len() && absolute.starts_with(&self.module);
-        if !(public && of_child && self.file.is_folder) {
+        let names_child = absolute.len() > self.module.len() && absolute.starts_with(&self.module);
+        if !(public && names_child && self.file.is_folder) {
             self.file.uses.insert(absolute.clone());
         }
         self.file.imports.insert(shown, absolute);
@@ -190,7 +190,7 @@ fn read(text: &str, module: Module, place: &str, is_folder: bool) -> File {
     reader.file
 }
 
-/// All files of one crate, and none that holds nothing but tests.
+/// All files of one crate, except those that contain only tests.
 fn read_crate(folder: &str) -> BTreeMap<Module, File> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut paths = Vec::new();
@@ -216,7 +216,7 @@ fn read_crate(folder: &str) -> BTreeMap<Module, File> {
     files
 }
 
-/// The module whose file defines what a path from the root names.
+/// The module whose file defines the item of a path from the root.
 fn definer(files: &BTreeMap<Module, File>, path: &[String], depth: usize) -> Option<Module> {
     let mut module = Module::new();
     for (index, word) in path.iter().enumerate() {
@@ -254,7 +254,7 @@ fn ahead(edges: &BTreeMap<Module, BTreeSet<Module>>, from: &Module) -> BTreeSet<
     seen
 }
 
-/// Sets of files each of which depends on all others of its set.
+/// Sets of files in which each file depends on all others.
 fn circles(edges: &BTreeMap<Module, BTreeSet<Module>>) -> BTreeSet<BTreeSet<Module>> {
     let reached: BTreeMap<&Module, BTreeSet<Module>> =
         edges.keys().map(|module| (module, ahead(edges, module))).collect();
@@ -318,7 +318,7 @@ fn no_folders_depend_on_each_other_in_a_circle() {
 }
 
 #[test]
-fn crates_are_known_where_they_belong() {
+fn restricted_crates_are_named_only_by_their_owners() {
     let starts = |path: &str, root: &str| {
         path.strip_prefix(root).is_some_and(|rest| rest.is_empty() || rest.starts_with("::"))
     };
@@ -326,8 +326,8 @@ fn crates_are_known_where_they_belong() {
     let crates = SOURCES.map(read_crate);
     for file in crates.iter().flat_map(BTreeMap::values) {
         let named = |root: &str| {
-            let of_ours = file.uses.iter().map(|path| format!("crate::{}", path.join("::")));
-            file.foreign.iter().cloned().chain(of_ours).any(|path| starts(&path, root))
+            let internal = file.uses.iter().map(|path| format!("crate::{}", path.join("::")));
+            file.foreign.iter().cloned().chain(internal).any(|path| starts(&path, root))
         };
         let within = |places: &[&str]| places.iter().any(|place| file.place.starts_with(place));
         for (root, owners) in OWNERS {
@@ -346,7 +346,7 @@ fn crates_are_known_where_they_belong() {
 }
 
 #[test]
-fn the_check_sees_what_it_should() {
+fn the_check_detects_circles() {
     let module = |path: &str| path.split("::").map(str::to_owned).collect::<Module>();
     let file = |path: &str, text: &str, is_folder| {
         (module(path), read(text, module(path), path, is_folder))
@@ -354,7 +354,7 @@ fn the_check_sees_what_it_should() {
     let files = BTreeMap::from([
         (Module::new(), read("mod a;", Module::new(), "lib", true)),
         file("a", "mod b; mod c; mod d; pub use b::Thing;", true),
-        // By a name that the folder exports, and by a path inside an expression.
+        // An import through the folder's exports, and a path inside an expression.
         file("a::b", "fn f() { super::c::g(); } pub struct Thing;", false),
         file("a::c", "use crate::a::{Thing, d::{self, h}};", false),
         file("a::d", "use std::fs; #[cfg(test)] mod tests { use super::super::c; }", false),

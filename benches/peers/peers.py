@@ -1,12 +1,14 @@
-"""CPU seconds of sci-recon beside the usual Python way, in one run, each on one thread.
+"""CPU seconds of sci-recon, compared with the usual Python libraries in one run, each on one thread.
 
     python peers.py SCI_RECON_BINARY [--short]
 
-The Python way is GAP in numpy with scikit-image's total variation, and FFDNet and FastDVDNet in PyTorch as they were published: frame by
-frame, so that FastDVDNet runs four blocks a frame. Both sides get the same masks and measurement in float32 and do the same number of
-iterations. The cost of one iteration or pass is the difference of two runs, which leaves out starting, reading and writing; content does
-not change the time, so these frames are random. Then a whole job, the demo's clip: our default beside the stages of it that the Python way
-has, with the same weights, and a pass of BM4D beside one of our nonlocal prior. Prints tables and ends with all figures as one JSON line.
+The Python side is GAP in numpy with scikit-image's total variation, and FFDNet and FastDVDNet in PyTorch as
+published: frame by frame, so that FastDVDNet runs four blocks per frame. Both sides get the same float32
+masks and measurement, and run the same number of iterations. The cost of an iteration or pass is the
+difference of two runs, without start, input and output. Content does not affect the time, so these frames are
+random. Then a whole job on the demo clip: our default algorithm, compared with those of its stages that exist
+in Python, with the same weights; and a pass of BM4D, compared with one of our nonlocal prior. Prints tables;
+the last line is JSON with all figures.
 """
 import os
 
@@ -47,7 +49,7 @@ def snapshot(frames, size):
 
 # ---------------------------------------------------------------- the Python way
 def gap(masks, y, v, denoise, iterations):
-    """Accelerated GAP from the frames `v` on, with `denoise(v, iteration)` for a prior."""
+    """Accelerated GAP from the frames `v`, with `denoise(v, iteration)` as prior."""
     gram = (masks * masks).sum(0)
     gram[gram == 0] = 1   # dead pixels
     y1 = np.zeros_like(y)
@@ -59,7 +61,7 @@ def gap(masks, y, v, denoise, iterations):
 
 
 def total_variation(v, _):
-    """Of each frame."""
+    """Total variation of each frame."""
     return np.stack([denoise_tv_chambolle(frame, weight=TV_WEIGHT, eps=0, max_num_iter=DUAL_UPDATES + 1) for frame in v])
 
 
@@ -68,7 +70,7 @@ def gap_tv(masks, y, iterations):
 
 
 def pnp_tv_fastdvdnet(masks, y, net, stages):
-    """The stages of total variation, then those of the network with levels that fall evenly."""
+    """The stages of total variation, then those of the network with evenly falling levels."""
     v = np.zeros_like(masks)
     for stage in stages:
         levels = np.linspace(*stage['sigma'], stage['iterations'], dtype=np.float32) if stage.get('sigma') else None
@@ -131,7 +133,8 @@ def psnr(frames, truth):
 
 # ---------------------------------------------------------------- a whole job
 def whole_job(binary, size=256, frames=8):
-    """Rows (what, CPU seconds, PSNR): the default and its parts, ours and the Python way, on the demo's clip behind random squares."""
+    """Rows (name, CPU seconds, PSNR): the default and its parts, ours and in Python, on the demo clip behind
+    random squares."""
     root = pathlib.Path(__file__).resolve().parents[2]
     clip = np.stack([imageio.imread(path) for path in sorted(root.glob('demo/clip/frame_*.png'))[:frames]])
     top, left = ((extent - size) // 2 for extent in clip.shape[1:])
@@ -173,7 +176,8 @@ def whole_job(binary, size=256, frames=8):
 
 
 def least(measure, few, many, repeats):
-    """CPU seconds of one iteration: the difference of two runs, each the least of a few (a busy machine only adds)."""
+    """CPU seconds of one iteration: the difference of two runs, each the minimum of several, because a busy
+    machine only adds time."""
     runs = {n: min(measure(n) for _ in range(repeats)) for n in (few, many)}
     return (runs[many] - runs[few]) / (many - few)
 

@@ -1,10 +1,10 @@
-"""How long a small job takes through the real service: from its POST to the last byte of its result.
+"""Duration of a small job through the real service, from its POST to the last byte of its result.
 
     python latency.py SCI_RECON_BINARY [--size 64] [--frames 8] [--algorithm gap-tv] [--jobs 50]
 
-A lab that adjusts its optics waits for each such job. Each job is of a snapshot of its own (a repeated one would be answered at once with
-the result that stands), on one connection: POST of the job, GET of its end (`wait`), GET of the frames as one EXR file. Ends
-with one JSON line: milliseconds, median and the slowest tenth, of each part.
+A lab waits for each such job while it adjusts the optics. Each job has another snapshot, because a repeated
+job would return the existing result. One connection is used: POST of the job, GET of its end (`?wait=`), GET
+of the frames as one EXR file. The last line is JSON: milliseconds of each part, median and slowest tenth.
 """
 import argparse
 import http.client
@@ -22,7 +22,7 @@ from service import Service
 
 
 def scene(rng, frames, size):
-    """Frames [B,size,size], uint8: a smooth random picture that moves by two pixels a frame."""
+    """Frames [B,size,size], uint8: a smooth random image that moves by two pixels per frame."""
     waves = rng.uniform(.05, .4, (6, 2))
     y, x = np.mgrid[:size, :size]
     return np.stack([127 + 20 * sum(np.sin(u * y + v * (x + 2 * k)) for u, v in waves) for k in range(frames)]).clip(0, 255).astype(np.uint8)

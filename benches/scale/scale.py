@@ -2,9 +2,10 @@
 
     python scale.py SCI_RECON_BINARY IMAGE [--size 3200] [--frames 10] [--snapshots 1] [--algorithm gap-tv] [--device cuda:0] ...
 
-IMAGE, panned by a few pixels a frame, is the scene; masks and snapshots are simulated (random squares). Everything then goes over HTTP:
-upload, calibration, measurement, job, download. Prints what happens and ends with one JSON line: seconds by stage, the greatest resident
-memory of the server and of each worker (VmHWM), the first remaining time that was promised beside the true one, disk and quality.
+IMAGE, panned by a few pixels per frame, is the scene; masks and snapshots are simulated (random squares). All requests
+use HTTP: upload, calibration, measurement, job, download. Prints its progress. The last line is JSON: seconds by stage,
+peak resident memory of the server and of each worker (VmHWM), the first estimate of the remaining time and the true one,
+disk and quality.
 """
 import argparse
 import json
@@ -22,7 +23,7 @@ from skimage import io, transform
 
 
 def pan(image, frames, size, step=(3, 5)):
-    """Frames [B,size,size], uint8: a window that moves over the gray image, which is enlarged if it is too small."""
+    """Frames [B,size,size], uint8: a window that moves over the grey image, which is enlarged if necessary."""
     need = [size + frames * s for s in step]
     gray = image[..., :3].mean(-1) if image.ndim == 3 else image.astype(float)
     factor = max(1, *(n / extent for n, extent in zip(need, gray.shape)))
@@ -45,14 +46,14 @@ def main():
     p.add_argument('image')
     p.add_argument('--size', type=int, default=3200)
     p.add_argument('--frames', type=int, default=10)
-    p.add_argument('--snapshots', type=int, default=1, help='that follow one another, and are reconstructed together')
+    p.add_argument('--snapshots', type=int, default=1, help='consecutive snapshots, reconstructed jointly')
     p.add_argument('--algorithm', default='gap-tv')
     p.add_argument('--schedule', help='a schedule as JSON [default: the algorithm\'s own]')
     p.add_argument('--workers', type=int, default=2)
     p.add_argument('--tile', type=int, help='tile size [default: the service\'s]')
     p.add_argument('--overlap', type=int, default=32)
     p.add_argument('--device', help='for example cuda:0 [default: the CPU]')
-    p.add_argument('--folder', help='where the files go and stay [default: a folder that is removed]')
+    p.add_argument('--folder', help='folder for the files, which are kept [default: a temporary folder]')
     a = p.parse_args()
     folder = pathlib.Path(a.folder or tempfile.mkdtemp(prefix='sci-recon-scale-'))
     folder.mkdir(parents=True, exist_ok=True)

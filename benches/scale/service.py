@@ -1,4 +1,4 @@
-"""A service of its own, spoken to over HTTP."""
+"""A service in a new folder, used over HTTP."""
 import json
 import os
 import pathlib
@@ -35,7 +35,7 @@ class Service:
             return self.call('POST', '/v1/blobs', file, headers)['sha256']
 
     def look(self):
-        """Greatest resident memory so far, by process."""
+        """Peak resident memory so far, by process."""
         children = pathlib.Path(f'/proc/{self.process.pid}/task').glob('*/children')
         workers = ' '.join(path.read_text() for path in children).split()
         for name, pid in [('server', self.process.pid), *((f'worker {pid}', pid) for pid in workers)]:

@@ -2,24 +2,24 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %SCI_RECON  Reconstructs video from a snapshot compressive measurement with a sci-recon service.
 %
 %   FRAMES = SCI_RECON(MASKS, MEASUREMENT) sends MASKS [H,W,B] on [0,1] and MEASUREMENT [H,W], or [H,W,S] for a
-%   sequence of snapshots, waits for the job, and gives FRAMES [H,W,B], or [H,W,B,S], single. The measurement is the
-%   sum of the masked frames: where all masks are open it goes up to B.
+%   sequence of snapshots, waits for the job, and returns FRAMES [H,W,B], or [H,W,B,S], single. The measurement is the
+%   sum of the masked frames: its values reach B where all masks are open.
 %
-%   [FRAMES, JOB] = ... also gives the job as the service describes it.
+%   [FRAMES, JOB] = ... also returns the service's description of the job.
 %
 %   SCI_RECON(..., NAME, VALUE, ...):
 %     'url'         address of the service   (default: environment SCI_RECON_URL, or http://127.0.0.1:8080)
 %     'token'       access token             (default: environment SCI_RECON_TOKEN)
 %     'algorithm'   'pnp-tv-fastdvdnet' (default), 'gap-tv', 'gap-tv3d', ...
 %     'full_scale'  the number in MEASUREMENT that means 1 (default 1; never guessed)
-%     'masks_full_scale'  the same of MASKS
+%     'masks_full_scale'  the number in MASKS that means 1
 %     'mosaic'      'rggb', 'bggr', 'grbg' or 'gbrg' for a colour sensor: FRAMES are [H,W,3,B], or [H,W,3,B,S], then
 %     'camera_fps', 'exposure_s', 'label'   kept with the measurement and the job
-%     'schedule'    a struct, instead of the algorithm's own schedule
-%     'quiet'       true: no lines of progress
+%     'schedule'    a struct that replaces the algorithm's default schedule
+%     'quiet'       true: print no progress
 %
-%   Uploads go on where they were after a cut, downloads too. Errors have the service's code as identifier, such as
-%   sci_recon:invalid_content. Needs curl on the path, as Windows 10, macOS and Linux have it; MATLAB R2016b or
+%   Uploads and downloads resume after a lost connection. Errors have the service's code as identifier, such as
+%   sci_recon:invalid_content. Needs curl on the path, which Windows 10, macOS and Linux include, and MATLAB R2016b or
 %   Octave 7.
 %
 %   Example:
@@ -68,7 +68,7 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 
   frames = [];
   for s = job.snapshots.first + (0:job.snapshots.count - 1)
-    % Frames of colours have an axis more.
+    % Colour frames have one more axis.
     frames = cat(4 + ~isempty(o.mosaic), frames, download(o, sprintf('/v1/jobs/%s/snapshots/%d', job.id, s)));
   end
 end
@@ -91,7 +91,7 @@ function o = options(flags)
 end
 
 function body = given(body)
-  % Leaves out what was not stated.
+  % Removes options without a value.
   for name = fieldnames(body)'
     if isempty(body.(name{1}))
       body = rmfield(body, name{1});
@@ -100,7 +100,7 @@ function body = given(body)
 end
 
 function record = ready(o, path, record)
-  % Waits while the service prepares what it was sent.
+  % Waits until the service has checked a calibration or measurement.
   while isfield(record, 'state') && strcmp(record.state, 'preparing')
     pause(0.5);
     record = request(o, 'GET', [path record.id], []);
@@ -124,8 +124,8 @@ function one = element(list, k)
 end
 
 function record = request(o, method, path, body)
-  % One request with a body of JSON; again after a cut or while the service is busy. The key makes the second
-  % sending of a request harmless.
+  % Sends a JSON request, and repeats it after a lost connection or while the service is busy. The key makes
+  % repeated requests harmless.
   files = {tempname(), tempname()};
   clean = onCleanup(@() remove(files));
   extra = '';
@@ -164,7 +164,7 @@ function refuse(o, status, file, what)
 end
 
 function hash = upload(o, values)
-  % Sends an array by tus 1.0, in pieces, going on where it was after a cut.
+  % Uploads an array with tus 1.0 in pieces, and resumes after a lost connection.
   file = tempname();
   answer = tempname();
   clean = onCleanup(@() remove({file, answer, [file '.piece'], [file '.head']}));
@@ -228,7 +228,7 @@ function status = append(o, file, offset, piece, location, answer)
 end
 
 function frames = download(o, path)
-  % The frames of a snapshot, [H,W,B] or [H,W,3,B]; the download goes on where it was after a cut.
+  % Downloads the frames of a snapshot, [H,W,B] or [H,W,3,B], and resumes after a lost connection.
   file = tempname();
   clean = onCleanup(@() remove({file}));
   for attempt = 1:12
@@ -245,8 +245,8 @@ function frames = download(o, path)
 end
 
 function status = curl(o, flags, path)
-  % The status of HTTP, or 0 where the answer did not come to its end. The token goes by a file, because other
-  % users of the machine can see command lines.
+  % Returns the HTTP status, or 0 if the answer was interrupted. The token is passed in a file, because other users
+  % of the machine can see command lines.
   config = tempname();
   clean = onCleanup(@() remove({config}));
   lines = '';
@@ -277,7 +277,7 @@ function value = header(file, name)
 end
 
 function write_npy(file, values)
-  % [H,W,B] becomes [B,H,W] in C order, which has the same order of bytes as [W,H,B] in MATLAB.
+  % [H,W,B] becomes [B,H,W] in C order, which has the same byte order as [W,H,B] in MATLAB.
   if islogical(values)
     type = '|b1'; class_name = 'uint8';
   else

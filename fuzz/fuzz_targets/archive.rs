@@ -5,7 +5,7 @@ mod file;
 use formats::mat::SceneArray;
 use formats::{Axes, Expected, Wanted, open_array, open_stack};
 
-// Both kinds of archives, with arrays and with pictures: the corpus has one of each.
+// The corpus has both kinds of archives, with arrays and with images.
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     file::with_file(bytes, |path| {
         if let Ok(mut reader) = open_stack(path, &file::LIMITS) {

@@ -1,10 +1,11 @@
-"""Wrong inputs, each through the real service, beside good ones: are they flagged, and is no good one?
+"""Test whether wrong inputs are flagged, and correct ones are not, through the real service.
 
     python wrong_inputs.py SCI_RECON_BINARY --data DATA [--good 60] [--scenes 6] [--algorithm gap-tv] [--side 256]
 
-DATA has photographs in photos/train and photos/val. A camera moves over them, by at most 4 pixels a frame, behind all kinds of masks, Cr 6 to 24,
-with noise of 0 to 10; dark frames are given. A result is flagged if its assessment has a finding about the input, is graded `bad` though its
-PSNR is above 22 dB, or is predicted 3 dB below that of the right input. Ends with one JSON line.
+DATA has photographs in photos/train and photos/val. A camera moves over them by at most 4 pixels per frame, behind
+masks of every kind, Cr 6 to 24, with noise of 0 to 10 and given dark frames. A result is flagged if its assessment has
+a finding about the input, is graded `bad` though its PSNR is above 22 dB, or is predicted 3 dB below that of the
+correct input. The last line of the output is JSON.
 """
 import argparse
 import glob
@@ -25,16 +26,16 @@ from service import Service  # noqa: E402
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
 RATIOS = 6, 8, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
-# What a camera adds to each value, as a share of the mean, and what its brightest pixel is of the largest number.
+# Offset that the camera adds, as a share of the mean, and the brightest pixel as a share of the largest number.
 DARK, HEADROOM = .1, .8
-# A finding that tells of the scene, not of a wrong input.
-OF_THE_SCENE = {'uneven_error'}
+# Findings about the scene, not about wrong inputs.
+SCENE_FINDINGS = {'uneven_error'}
 FALL = 3.0      # dB
-BAD = 22.0      # dB, as the program has it
+BAD = 22.0      # dB, as in the program
 
 
 def panned(photo, frames, side, step, scale):
-    """Frames [frames,side,side] on [0,1] of a camera that moves by so many pixels a frame over a gray photograph."""
+    """Frames [frames,side,side] on [0,1] of a camera that moves by `step` pixels per frame over a grey photograph."""
     scale = max(scale, (side + 2) / min(photo.shape))
     photo = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
     middle = np.array(photo.shape[::-1]) / 2 - side / 2
@@ -51,8 +52,8 @@ class Lab:
         return self.service.upload(self.folder / 'one.npy')
 
     def job(self, masks, y, dark=None, full=65535 * HEADROOM, stated=1):
-        """The assessment of a job and its frames: numbers of 16 bits, where `full` means the largest value of `y`, and the full scale is
-        stated as so many times the true one."""
+        """Assessment and frames of a job with 16-bit numbers, where `full` stands for the largest value of `y`, and the
+        stated full scale is `stated` times the true one."""
         scale = full / y.max()
         counts = lambda values: self.send((values * scale).round().clip(0, 65535).astype(np.uint16))
         calibration = self.service.call('POST', '/v1/calibrations', {'masks': self.send(masks.astype(np.float32))})['id']
@@ -69,7 +70,7 @@ class Lab:
 
 
 def wrongs(masks, other, clean, dark, fast):
-    """Name and arguments of the job of each wrong input; `fast` is the measurement of a fast motion."""
+    """Name and job arguments of each wrong input; `fast` is the measurement of a fast motion."""
     gains = np.tile([[.7, 1.], [1., .8]], [extent // 2 for extent in clean.shape])
     y = clean + dark
     yield 'foreign masks', dict(masks=other, y=y, dark=dark)
@@ -88,8 +89,8 @@ def psnr(found, truth):
 
 
 def flags(assessment, right=None, true=None):
-    """Why an assessment is a warning; the prediction counts where what the right input has is known."""
-    found = [reason['code'] for reason in assessment['reasons'] if reason['code'] not in OF_THE_SCENE]
+    """Reasons for which an assessment is a warning. The prediction counts only if that of the correct input is known."""
+    found = [reason['code'] for reason in assessment['reasons'] if reason['code'] not in SCENE_FINDINGS]
     if right is not None and assessment['psnr_db'] <= right['psnr_db'] - FALL:
         found.append('prediction')
     if assessment['grade'] == 'bad' and (true is None or true > BAD):
@@ -102,7 +103,7 @@ def main():
     p.add_argument('binary')
     p.add_argument('--data', required=True)
     p.add_argument('--good', type=int, default=60)
-    p.add_argument('--scenes', type=int, default=6, help='scenes of which each wrong input is made')
+    p.add_argument('--scenes', type=int, default=6, help='scenes for each wrong input')
     p.add_argument('--algorithm', default='gap-tv')
     p.add_argument('--side', type=int, default=256)
     a = p.parse_args()

@@ -1,12 +1,12 @@
-"""How good frames behind a Bayer mosaic are, beside the same scenes in grey.
+"""Quality of frames behind a Bayer mosaic, compared with the same scenes in grey.
 
 usage: colour.py PROGRAM FOLDER
 
-Photographs that come with scikit-image (astronaut, coffee, chelsea) are panned by 3.3 columns and 1.7 rows a frame: clips of
-8 frames of 256x256 pixels, in colour and in grey (the mean of the three). Both are measured through random-squares masks and
-through independent ones, and reconstructed by gap-tv and by the default. Behind a mosaic each colour is reconstructed at half the
-size, so the same is done with every second pixel of every second row of the grey clip. Prints a table of PSNR in dB, in colour over
-all samples of red, green and blue.
+Photographs from scikit-image (astronaut, coffee, chelsea) are panned by 3.3 columns and 1.7 rows per frame: clips of 8
+frames of 256x256 pixels, in colour and in grey (mean of the three channels). Both are measured through random-squares
+masks and through independent ones, and reconstructed by gap-tv and by the default. Behind a mosaic each colour is
+reconstructed at half the size, so the grey clip is also reconstructed from every second pixel of every second row.
+Prints a table of PSNR in dB; in colour it covers all samples of red, green and blue.
 
 Needs the PyPI packages scikit-image and scipy.
 """

@@ -1,13 +1,13 @@
-"""Fit what the program predicts of its own results without a truth: the expected error of blocks and the PSNR of a snapshot.
+"""Fit the quality model, which predicts the error of blocks and the PSNR of a snapshot without true frames.
 
     python assessment.py make --binary sci-recon-experiments --data DATA [--more FOLDER] --out FOLDER
     python assessment.py fit --out FOLDER... [--write ../../crates/reconstruction/src/assessment.json]
 
-`make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels (photographs that a camera moves over, half of
-them with parts that move by themselves, and clips; all kinds of masks, half of them blurred or with light through closed
-pixels, Cr 6 to 24, noise 0 to 10) and has them reconstructed. It goes on where it was stopped, and what it has made so far is a mixture of all. `fit` fits small networks to
-all cases, and tells how they do on scenes that were left out (no scene is in two folds). The scenes of `eval_loop.py`, which judges them,
-are in no fit.
+`make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels and has them reconstructed. The scenes are
+photographs below a moving camera, half of them with independently moving parts, and clips. Masks are of every kind,
+half of them blurred or with light through closed pixels; Cr is 6 to 24, noise 0 to 10. An interrupted run can be
+continued, and at any time its cases are a mixture of all kinds. `fit` fits small networks to all cases, and reports
+their error by cross-validation over scenes. The scenes of `eval_loop.py`, which judges the networks, are in no fit.
 """
 import argparse
 import copy
@@ -24,30 +24,32 @@ from torch import nn
 
 import eval_loop
 
-SIDES, LONGEST, BLOCK = (128, 256, 256), 24, 16      # the last as the program has it
+SIDES, LONGEST, BLOCK = (128, 256, 256), 24, 16      # BLOCK as in the program
 PATTERNS = eval_loop.FOLLOWING[0]
 RATIOS = 6, 8, 10, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
-# Pixels a frame. At rest and fast most: there the pilot shrinks most of what changes, and has to be told right from wrong.
+# Pixels per frame. Static and fast scenes are frequent, because there the pilot removes most temporal changes, rightly
+# or wrongly.
 SPEEDS = 0, 0, 0, .3, 1, 2, 4, 7, 7, 7
 ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
-# The models of results: of which algorithm, and whether changes along time were shrunk by more than SHRUNK, as the program has it.
+# Quality models: name -> (algorithm, whether temporal changes were shrunk by more than SHRUNK), as in the program.
 MODELS = {'gap-tv': ('gap-tv', False), 'pnp-tv-fastdvdnet': ('pnp-tv-fastdvdnet', False), 'pnp-tv-fastdvdnet, shrunk': ('pnp-tv-fastdvdnet', True)}
 SHRUNK = 1.0
-FEATURES, CHANNELS = 26, 128    # as the program has them, those of its encoder after the others
-MOVES, DOUBT, LEAST = 3.0, .3, .1  # as the program has them: see `apart`
-FARTHEST = 3.0      # as the program has it
-CONTRAST, GRADIENT = 11, 12     # which features are of the masks
-APERTURE_CONTRAST, APERTURE_SHARPNESS = (-1.6, -1.0), .28   # as the program has them
+# The next five lines repeat constants of crates/reconstruction/src/assessment.rs.
+FEATURES, CHANNELS = 26, 128    # features of a block, then channels of the encoder
+MOTION_DB, MOTION_WIDTH_DB, MIN_SHARE = 3.0, .3, .1     # see `first_run_estimate`
+MAX_DEVIATION = 3.0             # largest scaled input
+CONTRAST, GRADIENT = 11, 12     # indices of the features of the masks
+APERTURE_CONTRAST, APERTURE_SHARPNESS = (-1.6, -1.0), .28
 BEST = eval_loop.BEST
-SPARE = 10.0        # dB above it up to which the fit follows
-COMPONENTS = 64     # of what the encoder sees
-NEAR = eval_loop.NEAR   # misses much larger than this weigh no more than one another in the fit
-LEAST_CASES = 5     # that an interval is fitted to
-AT_ONCE = 64        # blocks of a case that a step sees, in all its frames
-WHOLE = slice(14, 17)  # which features are of the whole frame
-JOINED = .6         # share of cases that a step sees with a part of another one
-LIKE = 6.0          # dB: pictures whose white levels are as near may be parts of one
+MARGIN = 10.0       # dB above BEST up to which the fit follows the true PSNR
+COMPONENTS = 64     # principal components of the encoder's features
+TOLERANCE = eval_loop.TOLERANCE   # dB; the weight of larger misses saturates in the fit
+MIN_CASES = 5       # cases below BEST that an interval needs in each half
+BLOCKS_PER_STEP = 64  # blocks of a case in a training step, each in all frames
+WHOLE = slice(14, 17)  # features of the whole frame
+JOINED = .6         # share of cases that are joined to a part of another case
+WHITE_TOLERANCE = 6.0  # dB between the white levels of two cases that may be joined
 
 
 # ---------------------------------------------------------------- scenes
@@ -59,8 +61,8 @@ def grey(file, smaller, least):
 
 
 def parts(rng, others, wide):
-    """What moves by itself before the photograph, as (part, its shape, place, step a frame): nothing, a large part of another photograph, or many small
-    ones that cover one another, rectangles and ellipses."""
+    """Parts that move independently, as (image, mask, position, step per frame): none, one large part of another
+    photograph, or many small rectangles and ellipses that cover one another."""
     kind = rng.random()
     sides = [[int(rng.integers(wide // 5, wide * 9 // 20))] * 2] if kind < .25 else \
         [rng.integers(8, wide // 4, 2).tolist() for _ in range(rng.integers(3, 3 + wide // 14))] if kind < .5 else []
@@ -76,7 +78,7 @@ def parts(rng, others, wide):
 
 
 def panned(rng, file, others, wide):
-    """A camera that moves over a photograph, perhaps with parts of others that move by themselves."""
+    """A camera that moves over a photograph, perhaps with parts of other photographs that move independently."""
     photo = grey(file, rng.choice([.2, .3, .45, .7]), wide + 40)
     angle, speed, turn, light = rng.uniform(0, 2 * np.pi), rng.choice(SPEEDS), rng.choice([0, 0, .5]), rng.choice([1, 1, .6, .3])
     centre = [extent * (.5 + rng.uniform(-.2, .2)) for extent in photo.shape[::-1]]
@@ -103,8 +105,8 @@ def cropped(rng, clip, wide):
 
 
 def softness(rng, pattern):
-    """What a lens blurs masks by (pixels, standard deviation) and the light that closed pixels let through, of half of the cases. Blurred further, those
-    of the hybrid aperture tell nothing of the changes."""
+    """Blur of the masks by a lens (standard deviation in pixels) and the light that closed pixels let through, for half
+    of the cases. With more blur, masks of the hybrid aperture carry no information on temporal changes."""
     if rng.random() < .5:
         return 0, 0
     most = 1.3 if pattern == 'iid' else .7
@@ -157,7 +159,7 @@ def make(a):
 
 # ---------------------------------------------------------------- networks
 class Case:
-    """What is seen of a snapshot, and its true error."""
+    """The features of a reconstructed snapshot, and its true error."""
 
     def __init__(self, folder, algorithm):
         path = f'{folder}/{algorithm}/{os.path.basename(folder)}'
@@ -165,7 +167,7 @@ class Case:
             about = json.load(f)
         with open(f'{folder}/scene.json') as f:
             self.scene, self.source = json.load(f), os.path.dirname(folder)
-        # [features and the true error, frame, block]; what is not known counts as in the mean, as the program has it.
+        # [features and the true error, frame, block]; an unknown feature has the mean value, as in the program.
         seen = np.load(path + '.npy').astype(np.float32)
         self.psnr, self.frames, self.side = about['psnr_db'], seen.shape[1], round(seen.shape[2] ** .5)
         self.white = 20 * np.log10(about['white'])
@@ -173,12 +175,12 @@ class Case:
         both = lambda rows: (values(rows[:FEATURES]), values(rows[FEATURES:]).half())
         one = FEATURES + CHANNELS if len(seen) > FEATURES + 1 else FEATURES
         self.features, self.encoded = both(seen[:one])
-        # Of a stage that was run twice.
+        # The first run of a stage that was run twice.
         self.first = self.distance = None
         if len(seen) > one + 1:
             self.first, self.distance = both(seen[one:2 * one]), 10 ** values(seen[2 * one:2 * one + 1])[:, 0]
-        self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + SPARE) / 10))))
-        self.told_by(about['evidence'])
+        self.error = torch.from_numpy(np.log10(seen[-1].reshape(-1).clip(10 ** (-(BEST + MARGIN) / 10))))
+        self.set_evidence(about['evidence'])
         self.first_evidence = about['evidence'].get('first')
         self.masks, self.noise = about['setting']['pattern'], about['setting']['noise_sigma']
         self.pattern, *softened = self.masks.split(', ')
@@ -191,7 +193,7 @@ class Case:
         stages = about['pilot']['stages'] if about.get('pilot') else []
         self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
 
-    def told_by(self, evidence):
+    def set_evidence(self, evidence):
         self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)
         self.piece = torch.tensor(evidence['features'], dtype=torch.float32)
 
@@ -199,26 +201,28 @@ class Case:
         """The frames of the first run of a stage that was run twice, as a case without a true error."""
         case = copy.copy(self)
         case.features, case.encoded = self.first
-        case.told_by(self.first_evidence)
+        case.set_evidence(self.first_evidence)
         return case
 
-    def apart(self, of_first):
-        """Of the decimal logarithms of the errors of the first run's frames: the share of them, and the errors of the result if it is all.
+    def first_run_estimate(self, first_errors):
+        """Combine both runs of a stage, from `first_errors`, the decimal logarithms of the predicted errors of the
+        first run. Returns the weight of this estimate, and the estimated errors of the result.
 
-        What was shrunk away in the second run was error where the scene is at rest. Then the frames of both are as far from each other as those of the
-        first from the truth. Where it was motion, those of the first are further from the truth, by what both have wrong."""
-        error = 10 ** of_first
-        left = torch.log10(torch.maximum(error - self.distance, LEAST * error))
-        more = 10 * torch.log10(error.mean() / self.distance.mean())
-        return torch.sigmoid((more - MOVES) / DOUBT), left
+        If the scene is static, the second run has removed only errors. The distance of both results then equals the
+        error of the first one. If it has removed motion, the first result is further from the truth, by the error that
+        both share."""
+        error = 10 ** first_errors
+        result = torch.log10(torch.maximum(error - self.distance, MIN_SHARE * error))
+        excess = 10 * torch.log10(error.mean() / self.distance.mean())
+        return torch.sigmoid((excess - MOTION_DB) / MOTION_WIDTH_DB), result
 
     def psnr_of(self, errors):
-        """Of the decimal logarithms of the errors of blocks, as many of each frame."""
+        """PSNR from the decimal logarithms of the errors of blocks, with equally many blocks in each frame."""
         return (-10 * torch.log10((10 ** errors).reshape(self.frames, -1).mean(1))).mean() - self.white
 
 
 def encoder():
-    """The SHA-256 of the encoder that the program carries: a prediction is fitted to what that one sees, and to no other."""
+    """SHA-256 of the encoder in the program: a model is fitted to the features of this encoder only."""
     with open(os.path.join(eval_loop.HERE, '../../models/fastdvdnet-gray-encoder/model.onnx'), 'rb') as f:
         return hashlib.sha256(f.read()).hexdigest()
 
@@ -228,20 +232,20 @@ def scaling(values, least):
 
 
 def scaled(values, by):
-    return ((values - by[0]) / by[1]).clamp(-FARTHEST, FARTHEST)
+    return ((values - by[0]) / by[1]).clamp(-MAX_DEVIATION, MAX_DEVIATION)
 
 
 class Model:
-    """The mean of some networks of two inner layers, all fitted to the same cases, each from weights of its own."""
+    """Mean of several networks with two hidden layers, fitted to the same cases from different initial weights."""
 
     def __init__(self, cases, a, start=None, first=None):
-        """Fitted to cases, from the record of a model on if there is one; `first` is the model of the first run of stages that are run twice."""
+        """Fit to cases, starting from the record of a model if one is given; `first` is the model of first runs."""
         self.first = first
         if start:
             self.scale_as(start)
         else:
             self.scale(cases)
-        inputs, firsts, others = [self.inputs(case).half() for case in cases], [self.by_first(case) for case in cases], self.alike(cases)
+        inputs, firsts, others = [self.inputs(case).half() for case in cases], [self.first_run_estimate(case) for case in cases], self.partners(cases)
         self.networks = []
         for seed, known in enumerate(start['networks'] if start else [None] * a.networks):
             torch.manual_seed(seed)
@@ -252,7 +256,7 @@ class Model:
 
     @classmethod
     def read(cls, record, first=None):
-        """That of a record."""
+        """The model of a record."""
         model = cls.__new__(cls)
         model.first = first
         model.scale_as(record)
@@ -272,14 +276,15 @@ class Model:
 
     @staticmethod
     def principal(seen):
-        """The mean, and the weights of the principal components, each of which then varies by 1."""
+        """The mean, and the weights of the principal components, scaled to unit variance."""
         mean, scale = scaling(seen, 1e-3)
         values, axes = torch.linalg.eigh(torch.cov(((seen - mean) / scale).T))
         values, axes = values.flip(0)[:COMPONENTS], axes.flip(1)[:, :COMPONENTS]
         return mean, (axes / values.sqrt()).T / scale
 
     def inputs(self, case):
-        """Of each block what is seen of it, of the blocks around it, of these in all frames, what the piece tells, and what the encoder sees."""
+        """Inputs of each block: its features, those of the blocks around it, their mean over the frames, those of the
+        piece, and those of the encoder."""
         features = scaled(case.features, self.features)
         frames = features.reshape(case.frames, case.side, case.side, -1).permute(0, 3, 1, 2)
         around = nn.functional.avg_pool2d(frames, 3, 1, 1, count_include_pad=False)
@@ -289,7 +294,7 @@ class Model:
         all_of = [features, around, always, rest.expand(len(features), -1)]
         if self.encoding:
             mean, components = self.encoding
-            all_of.append(((case.encoded.float() - mean) @ components.T).clamp(-FARTHEST, FARTHEST))
+            all_of.append(((case.encoded.float() - mean) @ components.T).clamp(-MAX_DEVIATION, MAX_DEVIATION))
         return torch.cat(all_of, 1)
 
     @staticmethod
@@ -301,31 +306,34 @@ class Model:
                 layer.bias.copy_(torch.tensor(known['bias']))
         return network
 
-    def by_first(self, case):
-        """What the first run tells of a case: see `Case.apart`."""
+    def first_run_estimate(self, case):
+        """Estimate from the first run of a case: see `Case.first_run_estimate`."""
         if case.first is None or self.first is None:
             return torch.tensor(0.), torch.zeros_like(case.error)
-        return case.apart(self.first.errors(case.first_run()))
+        return case.first_run_estimate(self.first.errors(case.first_run()))
 
     def joined(self, one, other, share):
-        """Inputs [frame, block, input] of a picture that has such a share of the other's blocks, and its piece among those of the first."""
+        """Inputs [frame, block, input] of an image that contains a share of the other's blocks, and the piece of the
+        first one."""
         rest = slice(3 * FEATURES, 3 * FEATURES + FEATURES + len(self.signs[0]))
         other[:, :, rest] = one[:, :1, rest]
         mean, scale = (values[WHOLE] for values in self.features)
         energy = lambda of: 10 ** (of[:, 0, WHOLE] * scale + mean)
         whole = scaled(torch.log10((1 - share) * energy(one) + share * energy(other)), (mean, scale))
         both = torch.cat([one, other], 1)
-        for kind, values in enumerate((whole, whole, whole.mean(0, keepdim=True))):     # of the block, around it, in all frames
+        for kind, values in enumerate((whole, whole, whole.mean(0, keepdim=True))):     # the block, its neighbourhood, all frames
             both[:, :, kind * FEATURES + WHOLE.start:kind * FEATURES + WHOLE.stop] = values[:, None]
         return both
 
-    def alike(self, cases):
-        """Of each case the places of those that may be joined to it; none where first runs tell of a case: they tell of all of it."""
-        like = lambda one, other: (one.masks, one.frames, one.noise) == (other.masks, other.frames, other.noise) and abs(one.white - other.white) < LIKE
+    def partners(self, cases):
+        """Indices of the cases that may be joined to each case; none if first runs are used, because they concern whole
+        images."""
+        like = lambda one, other: (one.masks, one.frames, one.noise) == (other.masks, other.frames, other.noise) and abs(one.white - other.white) < WHITE_TOLERANCE
         return [[] if self.first else [place for place, other in enumerate(cases) if other is not case and like(case, other)] for case in cases]
 
     def fitted(self, network, cases, inputs, firsts, others, a):
-        """A network, fitted to cases by their inputs, by what first runs tell of them, and joined to others that are alike."""
+        """Fit a network to cases from their inputs and the estimates of first runs, with some cases joined to similar
+        ones."""
         count = inputs[0].shape[1]
         optimiser = torch.optim.AdamW(network.parameters(), a.rate, weight_decay=.05)
         batches = torch.arange(len(cases)).split(8)
@@ -335,30 +343,30 @@ class Model:
             for batch in batches:
                 drawn, seen, errors, by_first = [cases[index] for index in order[batch].tolist()], [], [], []
                 for index, case in zip(order[batch].tolist(), drawn):
-                    blocks = torch.randperm(case.side ** 2)[:AT_ONCE]
+                    blocks = torch.randperm(case.side ** 2)[:BLOCKS_PER_STEP]
                     of = lambda index, values, blocks: values.reshape(cases[index].frames, cases[index].side ** 2, -1)[:, blocks].float()
                     if others[index] and torch.rand(()) < JOINED:
-                        # In small pictures the piece is half of all; in large ones it is not, and the rest is unlike it.
-                        other, part = others[index][int(torch.randint(len(others[index]), ()))], int(AT_ONCE * torch.empty(()).uniform_(.2, .9))
+                        # In small images the piece covers half of the area; in large ones less, and the rest differs from it.
+                        other, part = others[index][int(torch.randint(len(others[index]), ()))], int(BLOCKS_PER_STEP * torch.empty(()).uniform_(.2, .9))
                         blocks, there = blocks[part:], torch.randperm(cases[other].side ** 2)[:part]
-                        given = self.joined(of(index, inputs[index], blocks), of(other, inputs[other], there), part / AT_ONCE)
+                        given = self.joined(of(index, inputs[index], blocks), of(other, inputs[other], there), part / BLOCKS_PER_STEP)
                         error = torch.cat([of(index, case.error, blocks), of(other, cases[other].error, there)], 1)
-                        left = torch.zeros_like(error)
+                        estimate = torch.zeros_like(error)
                     else:
-                        given, error, left = (of(index, values, blocks) for values in (inputs[index], case.error, firsts[index][1]))
-                    # All cases of a fit are a little alike, and those to come are not.
+                        given, error, estimate = (of(index, values, blocks) for values in (inputs[index], case.error, firsts[index][1]))
+                    # The cases of a fit resemble each other more than future cases do, so common noise is added.
                     seen.append(given.flatten(0, 1) + .1 * torch.randn(1, count))
                     errors.append(error.flatten())
-                    by_first.append((firsts[index][0], left.flatten()))
+                    by_first.append((firsts[index][0], estimate.flatten()))
                 seen = torch.cat(seen)
-                told = network(seen + .05 * torch.randn_like(seen))[:, 0].split([len(of_case) for of_case in errors])
+                predictions = network(seen + .05 * torch.randn_like(seen))[:, 0].split([len(of_case) for of_case in errors])
                 loss = 0
-                for case, told, error, (share, left) in zip(drawn, told, errors, by_first):
-                    told = share * left + (1 - share) * told
-                    wanted = case.psnr_of(error).clamp(max=BEST + SPARE)
-                    # What can't be told would outweigh what can (Welsch's loss).
-                    off = case.psnr_of(told) - wanted
-                    loss = loss + ((told - error) ** 2).mean() + 1.5 * (1 - torch.exp(-.5 * (off / NEAR) ** 2))
+                for case, predicted, error, (share, estimate) in zip(drawn, predictions, errors, by_first):
+                    predicted = share * estimate + (1 - share) * predicted
+                    wanted = case.psnr_of(error).clamp(max=BEST + MARGIN)
+                    # Welsch's loss, because unpredictable cases would outweigh the others.
+                    off = case.psnr_of(predicted) - wanted
+                    loss = loss + ((predicted - error) ** 2).mean() + 1.5 * (1 - torch.exp(-.5 * (off / TOLERANCE) ** 2))
                 optimiser.zero_grad()
                 (loss / len(batch)).backward()
                 optimiser.step()
@@ -369,8 +377,8 @@ class Model:
         """Decimal logarithms of the errors of the blocks."""
         with torch.no_grad():
             inputs = self.inputs(case)
-            share, left = self.by_first(case)
-            return share * left + (1 - share) * torch.stack([network(inputs)[:, 0] for network in self.networks]).mean(0)
+            share, estimate = self.first_run_estimate(case)
+            return share * estimate + (1 - share) * torch.stack([network(inputs)[:, 0] for network in self.networks]).mean(0)
 
     def __call__(self, case):
         """Errors of the blocks, and the PSNR."""
@@ -378,7 +386,7 @@ class Model:
         return errors.numpy(), float(case.psnr_of(errors))
 
     def move(self, by):
-        """Moves what is told of the PSNR by so many dB."""
+        """Shift the predicted PSNR by `by` dB."""
         with torch.no_grad():
             for network in self.networks:
                 network[-1].bias -= by / 10
@@ -392,13 +400,15 @@ class Model:
         return {'features': by(self.features), 'signs': by(self.signs), 'encoding': encoding, 'networks': [layers(network) for network in self.networks]}
 
 
-def settle(true, told, half, as_told, outside):
-    """Of cases in two halves what is added to all that is told of them, and the interval; of each what is then missed, and whether it is in the interval.
+def settle(true, predicted, half, unshifted, outside):
+    """Offset of all predictions, and their interval, from cases in two halves. Also returns the remaining error of each
+    case, and whether it is in the interval.
 
-    Errors of blocks are told too even, so their mean is too small: what is told is moved to the median, and of each half by that of the other half,
-    whose interval it has. Nothing is moved if they are taken as they are told. Outside that interval is such a share of them at either end."""
-    median = lambda chosen: 0 if as_told else np.median((true - told)[chosen & (told < BEST)])
-    wrong = true - (told + np.where(half == 0, median(half == 1), median(half == 0))).clip(max=BEST)
+    Predicted errors of blocks are too even, so their mean is too small. Predictions are therefore shifted to the median
+    error; each half uses the offset and interval of the other half. With `unshifted`, nothing is shifted. A share of
+    `outside` of the cases lies beyond either end of the interval."""
+    median = lambda chosen: 0 if unshifted else np.median((true - predicted)[chosen & (predicted < BEST)])
+    wrong = true - (predicted + np.where(half == 0, median(half == 1), median(half == 0))).clip(max=BEST)
     ends = lambda chosen: np.quantile(wrong[chosen], [outside, 1 - outside])
     inside = np.zeros(len(true), bool)
     for k in (0, 1):
@@ -424,7 +434,7 @@ def fit(a):
         cases = [case for case in cases if case.shrunk == shrunk and case.scene not in judged]
         if not cases:
             raise SystemExit(f"{', '.join(a.out)} has no cases for the model of {name}")
-        # Those that were shrunk are few: their model may go on from that of the others.
+        # Strongly shrunk cases are few, so their model can start from that of the other cases.
         known = start and start.get(name, start[algorithm])
         others = models.get(algorithm) or (start and start[algorithm])
         if shrunk and not others:
@@ -432,26 +442,26 @@ def fit(a):
         first = Model.read(others) if shrunk else None
         names = sorted({case.scene for case in cases})
         fold = {name: index % a.folds for index, name in enumerate(np.random.default_rng(1).permutation(names))}
-        told, spread = np.zeros(len(cases)), []
-        # Of what no model was fitted to all may be told by the same.
+        predicted, spread = np.zeros(len(cases)), []
+        # With --epochs 0, no model was fitted to these cases, so one model predicts all of them.
         made = lambda of: Model(of, a, known, first) if a.epochs else Model.read(known, first)
         for k in range(a.folds):
             model = made([case for case in cases if fold[case.scene] != k])
             for index, case in enumerate(cases):
                 if fold[case.scene] == k:
-                    errors, told[index] = model(case)
+                    errors, predicted[index] = model(case)
                     spread.append(np.corrcoef(errors, case.error)[0, 1])
         true, half = np.array([min(case.psnr, BEST) for case in cases]), np.array([fold[case.scene] % 2 for case in cases])
         unfamiliar = np.array([case.unfamiliar for case in cases])
         wrong, inside, settled = np.zeros(len(cases)), np.zeros(len(cases), bool), []
-        # A little wider than four of five cases of the fit: other scenes are worse.
+        # A little wider than four of five cases of the fit, because other scenes have larger errors.
         outside = .08 if a.epochs else .1
         for of, moved in ((~unfamiliar, a.epochs and not first), (unfamiliar, True)):
-            if any(sum(of & (half == k) & (told < BEST)) < LEAST_CASES for k in (0, 1)):
-                raise SystemExit(f'{name}: an interval wants {LEAST_CASES} cases below {BEST:.0f} dB in each half of the scenes, behind masks that predictions are uncertain behind and behind '
-                                 f'others; of {len(cases)} cases {sum(unfamiliar)} are behind the former: make more')
-            # What first runs leave is mostly better than BEST, and its median says nothing.
-            *by_all, wrong[of], inside[of] = settle(true[of], told[of], half[of], not moved, outside)
+            if any(sum(of & (half == k) & (predicted < BEST)) < MIN_CASES for k in (0, 1)):
+                raise SystemExit(f'{name}: an interval needs {MIN_CASES} cases below {BEST:.0f} dB in each half of the scenes, both behind unfamiliar masks and '
+                                 f'behind others; {sum(unfamiliar)} of {len(cases)} cases are behind unfamiliar masks: make more')
+            # Estimates from first runs are mostly better than BEST, so their median carries no information.
+            *by_all, wrong[of], inside[of] = settle(true[of], predicted[of], half[of], not moved, outside)
             settled.append(by_all)
         (by, interval), (by_unfamiliar, of_unfamiliar) = settled
         everywhere = np.ones(len(cases), bool)
@@ -464,8 +474,8 @@ def fit(a):
         for kind, of in kinds.items():
             if np.any(of):
                 found = eval_loop.accuracy(wrong[of], inside[of])
-                print(f"  {kind}: {found['snapshots']} cases, {found['mean_db']} dB in the mean, 80 % within {found['four_of_five_db']}, "
-                      f"{found['near_percent']} % within {NEAR}, {found['inside_percent']} % in the interval")
+                print(f"  {kind}: {found['snapshots']} cases, {found['mean_db']} dB on average, 80 % within {found['four_of_five_db']}, "
+                      f"{found['near_percent']} % within {TOLERANCE}, {found['inside_percent']} % in the interval")
         model = made(cases)
         model.move(by)
         rounded = lambda values: [round(float(value), 2) for value in values]
@@ -484,15 +494,15 @@ def main():
     p.add_argument('--more', help='a folder of further photographs (.jpg, .png) and clips (.npy, [frame, row, column] of uint8)')
     p.add_argument('--out', nargs='+', default=['assessment-output'], help='the folder of the cases; `fit` takes several')
     p.add_argument('--write', help='the file of the models')
-    p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, where several make them')
-    p.add_argument('--side', type=int, help='of the pictures; a mixture where it is left out')
-    p.add_argument('--epochs', type=int, default=24, help='0 leaves the models of --start as they are, and fits their intervals to cases that they have not seen')
-    p.add_argument('--start', help='a file of models to go on from, where the cases are few')
-    p.add_argument('--rate', type=float, default=5e-3, help='the highest rate of learning; less to go on from a model')
-    p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this one alone')
-    p.add_argument('--model', choices=MODELS, help='fit this one alone')
-    p.add_argument('--folds', type=int, default=5, help='as many parts are left out, one after the other')
-    p.add_argument('--networks', type=int, default=3, help='whose mean is taken; with --start as many as the file has')
+    p.add_argument('--part', default='0/1', help='K/N: every Nth case from the Kth on, to divide the work')
+    p.add_argument('--side', type=int, help='side of the images in pixels [default: a mixture]')
+    p.add_argument('--epochs', type=int, default=24, help='0 keeps the models of --start, and fits only their intervals, to cases that they have not seen')
+    p.add_argument('--start', help='a file of models to start from, if there are few cases')
+    p.add_argument('--rate', type=float, default=5e-3, help='the highest learning rate; use a lower one with --start')
+    p.add_argument('--algorithm', choices=ALGORITHMS, help='make cases of this algorithm only')
+    p.add_argument('--model', choices=MODELS, help='fit this model only')
+    p.add_argument('--folds', type=int, default=5, help='folds of the cross-validation')
+    p.add_argument('--networks', type=int, default=3, help='networks that are averaged; with --start, as many as the file has')
     a = p.parse_args()
     {'make': make, 'fit': fit}[a.what](a)
 

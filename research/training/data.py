@@ -22,7 +22,7 @@ class Footage:
 
     def __init__(self, root, split, seed, video=.5):
         self.random = np.random.default_rng(seed)
-        self.lights = split == 'train'   # what judges stays on [0,1], and as it was
+        self.lights = split == 'train'   # validation footage stays on [0,1] and unchanged
         self.photos = [gray(p) for p in sorted(glob.glob(f'{root}/photos/{split}/*.jpg'))]
         self.clips = []
         cuts = self.cuts(f'{root}/INDEX.tsv')
@@ -42,14 +42,14 @@ class Footage:
                     for row in csv.DictReader(f, delimiter='\t')}
 
     def window(self, image, size, tries):
-        """A crop of the last two axes: the one of highest contrast among a few, since flat sky teaches nothing."""
+        """A crop of the last two axes: the one with the highest contrast among a few, because flat sky teaches nothing."""
         def pick():
             y, x = (int(self.random.integers(0, extent - size + 1)) for extent in image.shape[-2:])
             return image[..., y:y + size, x:x + size]
         return np.asarray(max((pick() for _ in range(tries)), key=np.std), np.float32) / 255
 
     def footage(self, size, count):
-        """Consecutive frames of one shot, at one to three times its speed; None where the drawn shot is too short."""
+        """Consecutive frames of one shot, at one to three times its speed; None if the drawn shot is too short."""
         frames, cuts = self.clips[self.random.choice(len(self.clips), p=self.weight)]
         step = int(self.random.integers(1, 4))
         span = (count - 1) * step + 1
@@ -77,7 +77,7 @@ class Footage:
             yield m
 
     def photograph(self, size, count):
-        """A photograph under motion; in front of it up to two patches of other photographs move on their own."""
+        """A photograph under motion, with up to two independently moving patches of other photographs in front of it."""
         r, source = self.random, 2 * size
         def warp(image, m):
             return cv2.warpAffine(image, m, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT)
@@ -100,10 +100,10 @@ class Footage:
         if r.random() < .5: x = x[:, :, ::-1]
         if r.random() < .5: x = x.transpose(0, 2, 1)
         if r.random() < .5: x = x[::-1]
-        if r.random() < .3:   # exposure: another level, in a part of the cases drifting over the clip
+        if r.random() < .3:   # exposure: another level, which in some cases drifts over the clip
             gain = r.uniform(.6, 1.1) * np.linspace(1, r.uniform(.85, 1.15) if r.random() < .3 else 1, len(x))
             x = np.clip(x * gain[:, None, None], 0, 1)
-        if self.lights and r.random() < .25:   # lights far above the white, which the program takes from the bulk of the measurement
+        if self.lights and r.random() < .25:   # lights far above the white level, which the program estimates from the bulk of the measurement
             x = x + r.uniform(1, 6) * np.maximum(x - r.uniform(.4, .9), 0)
         return np.ascontiguousarray(x, np.float32)
 

@@ -1,9 +1,9 @@
-"""Write the encoder of an exported FastDVDnet, by which results are assessed: the encoding half of its first stage.
+"""Write the encoder for the quality model: the encoding half of the first stage of an exported FastDVDnet.
 
     python encoder.py ../../models/fastdvdnet-gray ../../models/fastdvdnet-gray-encoder
 
-What its deepest layers give, 128 channels at a quarter of the sides, is averaged over blocks of 16x16 pixels, and the logarithm is taken. Nothing is
-trained.
+The 128 channels of its deepest layers, at a quarter of the image's sides, are averaged over blocks of 16x16 pixels, and
+the logarithm is taken. Nothing is trained.
 """
 import argparse
 import hashlib
@@ -14,7 +14,7 @@ import onnx
 
 import export
 
-CELLS = 4       # of the deepest layers, to a side of a block
+CELLS = 4       # pixels of the deepest layers per side of a block
 FLOOR = .02     # about a twentieth of the mean
 
 
@@ -27,7 +27,7 @@ def write(source, path):
     encoded = g.add('Log', g.add('Add', mean, g.constant(np.array(FLOOR, np.float32))))
     g.save(path, encoded, ('frames_and_two', 'frames'), 'The encoding half of the first stage.', ('encoded', block.d1[-2].out_channels, 'rows', 'columns'))
     network = onnx.load(path)
-    with open(os.path.join(source, export.STAGES[0]), 'rb') as f:   # so that weights and an encoder of other weights are not taken for a pair
+    with open(os.path.join(source, export.STAGES[0]), 'rb') as f:   # a mark by which weights are recognised that do not belong to this encoder
         onnx.helper.set_model_props(network, {'source_sha256': hashlib.sha256(f.read()).hexdigest()})
     onnx.save(network, path)
 

@@ -1,10 +1,12 @@
-"""Judge the product in its loop: the released program on snapshots whose truth is known, with networks trained in different ways.
+"""Judge the released program in its loop, on snapshots with known true frames and with networks trained in different
+ways.
 
     python eval_loop.py --binary ../../target/release/sci-recon --data DATA --scenes SCENES --white white.pt [--full] [--json]
 
-`make eval-loop` does that. Each row is one `sci-recon simulate` (or a scene with its own masks) and one `sci-recon reconstruct` on one thread. Schedules
-and hashes of models come from the program's own manifest. Rows that were computed before are taken from the output folder: the key is everything
-that a row depends on, the source of solver and optics included.
+`make eval-loop` runs it. Each row is one `sci-recon simulate` (or a scene with its own masks) and one `sci-recon
+reconstruct` on one thread. Schedules and hashes of models come from the program's manifest. Rows computed earlier are
+taken from the output folder: the key contains everything that a row depends on, including the sources of solver and
+optics.
 """
 import argparse
 import concurrent.futures
@@ -31,35 +33,35 @@ TV, FFDNET, WHITE, LOOP, INT8, TWICE, DEFAULT, FIXED = ALGORITHMS = (
     'fastdvdnet, in the loop, passes doubled', 'pnp-tv-fastdvdnet', 'pnp-tv-fastdvdnet, without a pilot')
 
 
-TURNS = (TV,), (DEFAULT, FIXED), (WHITE, LOOP), (INT8,), (TWICE,), (FFDNET,)   # the order of the work: what tells most comes first
-NETWORKS = TV, FFDNET, WHITE, LOOP, INT8, TWICE, DEFAULT   # on the settings of the networks
-PLANS = TV, INT8, FIXED, DEFAULT                    # on the cases of the schedules; INT8 is the default up to its nonlocal stage
+TURNS = (TV,), (DEFAULT, FIXED), (WHITE, LOOP), (INT8,), (TWICE,), (FFDNET,)   # order of the work: the most informative first
+NETWORKS = TV, FFDNET, WHITE, LOOP, INT8, TWICE, DEFAULT   # compared on the settings of the networks
+PLANS = TV, INT8, FIXED, DEFAULT                    # compared on the cases of the schedules; INT8 is the default up to its nonlocal stage
 LOST = 0.1          # dB; a case that loses more counts as lost
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One snapshot: a square clip and what is done to it."""
+    """One snapshot: a square clip and its settings."""
     scene: str
     masks: str          # 'own' or a --pattern of `sci-recon simulate`
     cr: int
-    sigma: int = 0      # noise of the measurement, of 255
+    sigma: int = 0      # noise of the measurement, on the scale of 255
     size: int = 256
     snapshot: int = 0   # for own masks
     twice: bool = dataclasses.field(default=False, compare=False)   # also with the passes doubled
-    half: str = dataclasses.field(default='', compare=False)        # of the cases: 'tuning', or 'held out'
-    blur: float = 0     # of the masks by a lens: standard deviation, pixels
-    leak: float = 0     # light that closed pixels of the masks let through, of that of open ones
+    half: str = dataclasses.field(default='', compare=False)        # 'tuning' or 'held out'
+    blur: float = 0     # blur of the masks by a lens: standard deviation in pixels
+    leak: float = 0     # transmission of closed mask pixels, relative to open ones
 
     def __str__(self):
         return f'{self.scene} {self.size}' + (f' snapshot {self.snapshot}' if self.masks == 'own' else '')
 
     def kind(self):
-        """Of the masks."""
+        """Kind of masks, with blur and leak."""
         return self.masks + (f', blur {self.blur}' if self.blur else '') + (f', leak {self.leak}' if self.leak else '')
 
 
-# Each kind of masks, compression ratio and noise; the most telling first.
+# Each kind of masks, compression ratio and noise; the most informative first.
 DEFAULT_SETTINGS = (
     Setting('traffic', 'own', 8, twice=True),
     Setting('street', 'random-squares', 10, twice=True),
@@ -75,7 +77,7 @@ DEFAULT_SETTINGS = (
     Setting('traffic', 'rotating-circle', 30),
 )
 
-# What schedules are judged on: clips of all kinds behind all kinds of masks. Those held out have no part in any choice of a constant.
+# Cases that judge schedules: clips and masks of all kinds. No constant was chosen with the held-out ones.
 CASE_SIZE = 128
 CASES = {
     'tuning': (
@@ -96,17 +98,18 @@ CASES = {
 }
 
 
-# The scenes held out behind masks as optics make them: blurred by so many pixels, with so much light through closed ones.
+# Held-out scenes behind masks as real optics make them: (blur in pixels, share of light through closed pixels).
 SOFTENED = (
     ('chamomile', 'iid', 8, 0, .6, 0), ('chamomile', 'random-squares', 10, 0, .5, 0), ('city', 'iid', 8, 5, .5, .1), ('city', 'iid', 10, 0, .7, 0),
     ('city', 'rotating-circle', 8, 0, .5, 0), ('flower', 'iid', 24, 0, .6, .1), ('flower', 'iid', 8, 5, 0, .3), ('flower', 'rotating-circle', 12, 5, 0, .2),
     ('lighthouse', 'iid', 6, 0, .7, 0), ('portrait', 'iid', 12, 0, .5, .1), ('still', 'iid', 16, 5, .8, 0), ('gratings', 'iid', 10, 0, .6, .1))
 
 
-# What predictions are judged on besides: the same scenes, larger, each with the masks, the ratio and the noise that follow its own here.
+# Additional cases that judge predictions: the same scenes, larger. Masks, ratio and noise of each case follow its own
+# ones in these lists.
 FOLLOWING = ('iid', 'random-squares', 'rotating-circle'), (6, 8, 10, 12, 16, 20, 24, 30), (0, 5, 10)
-NEAR = 1.5          # dB; a prediction that is further off counts as wrong
-BEST = 40.0         # dB; the program does not tell apart what is better
+TOLERANCE = 1.5          # dB; a prediction with a larger error counts as wrong
+BEST = 40.0         # dB; the program does not distinguish higher values
 
 
 def cases():
@@ -118,7 +121,7 @@ def softened():
 
 
 def following(lengths):
-    """The cases of CASES anew, as FOLLOWING has it; `lengths` are those of the clips."""
+    """The cases of CASES with the next settings of FOLLOWING; `lengths` are those of the clips."""
     for case in cases():
         masks, cr, sigma = (values[(values.index(own) + 1) % len(values)] for values, own in zip(FOLLOWING, (case.masks, case.cr, case.sigma)))
         yield Setting(case.scene, masks, cr if cr <= lengths[case.scene] else FOLLOWING[1][0], sigma)
@@ -143,7 +146,7 @@ def pictures(folder):
 
 
 def seen(photo, centre, turned, size):
-    """What a camera above a photograph sees, at `centre` (x, y) and turned by so many degrees."""
+    """The view of a camera above a photograph, at `centre` (x, y) and rotated by `turned` degrees."""
     matrix = cv2.getRotationMatrix2D(centre, turned, 1)
     matrix[:, 2] += size / 2 - np.array(centre)
     return cv2.warpAffine(photo, matrix, (size, size), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
@@ -161,13 +164,13 @@ def panned(file, scale, step, light=1.0, turn=0.0, count=24, size=CASE_SIZE):
 
 
 def drawn(frame, count=24, size=CASE_SIZE):
-    """A clip by its formula `frame(k, i, j, size)`, in grey values."""
+    """A clip from the formula `frame`, in grey values."""
     i, j = np.mgrid[:size, :size].astype(np.float32)
     return np.stack([frame(k, i, j, size) for k in range(count)]).clip(0, 255).round().astype(np.uint8)
 
 
 def shapes(k, i, j, size):
-    """Discs of all sizes that cross each other before a slope."""
+    """Discs of all sizes that cross each other in front of a slope."""
     grey = 60 + 80 * i / size
     for n in range(6):
         row, column = (size * (0.15 + 0.15 * n) + (n - 2.5) * 1.2 * k) % size, (size * (0.8 - 0.12 * n) + (2.5 - n) * 1.7 * k + 13 * n) % size
@@ -181,7 +184,7 @@ def gratings(k, i, j, size):
     return 128 + 50 * np.sin(2 * np.pi * np.where(i < size / 2, upper, lower))
 
 
-# Smooth and nearly still, fine and still, fine stripes, fast, dark, turning, without any motion.
+# Smooth and almost static; fine and static; fine stripes; fast; dark; rotating; without any motion.
 PANNED = {
     'sunset': ('budgie-backgrounds__budgie_beacon-street-sunset', 0.25, (0.3, 0.1)),
     'chamomile': ('gh-BuddiesOfBudgie__fragrant-chamomile', 0.25, (0.4, 0.5)),
@@ -197,12 +200,12 @@ FILMED = {'flower': 'gh-mdn__flower', 'bird': 'gh-intel__asl_bird'}
 
 
 def judged():
-    """What scenes are made of, as footage and cases name it: predictions are fitted to none of it."""
+    """Names of the footage and cases that judge predictions; no prediction is fitted to them."""
     return {'traffic', 'street', 'city', *FILMED.values()} | {f'{photo}.jpg' for photo, *_ in PANNED.values()}
 
 
 def filmed(a):
-    """Name -> frames [count,H,W], uint8, of clips. None of them was trained on."""
+    """Name -> frames [count,H,W], uint8, of clips. No network was trained on them."""
     for path in (a.traffic, a.street):
         if not os.path.isfile(path):
             raise SystemExit(f'there is no scene {path}: --scenes (make: SCENES=folder) names the folder of the scenes')
@@ -216,7 +219,7 @@ def filmed(a):
 
 
 def made(a, size):
-    """The same of photographs that a camera moves over, and of drawn clips, [count,size,size]."""
+    """Photographs below a moving camera, and drawn clips, as [count,size,size] by name."""
     return {'shapes': drawn(shapes, size=size), 'gratings': drawn(gratings, size=size)} | {
         name: panned(os.path.join(a.data, f'photos/val/{photo}.jpg'), *how, size=size) for name, (photo, *how) in PANNED.items()}
 
@@ -238,7 +241,7 @@ class Program:
         return done.stdout
 
     def simulate(self, frames, setting, folder):
-        """Files of one snapshot of these frames, as arguments of `reconstruct`."""
+        """Files of one simulated snapshot of these frames, as arguments of `reconstruct`."""
         clip = os.path.join(folder, 'clip.npy')
         np.save(clip, frames)
         self.run('simulate', '--frames', clip, '--compression-ratio', setting.cr, '--pattern', setting.masks, '--blur', setting.blur, '--leak', setting.leak, '--seed', SEED,
@@ -250,7 +253,7 @@ class Program:
         return json.loads(self.run('schedule', '--algorithm', algorithm))
 
     def models(self, arguments, frames):
-        """The models that `reconstruct` uses with these arguments, as the manifest of a small snapshot tells them."""
+        """The models that `reconstruct` uses with these arguments, from the manifest of a small snapshot."""
         with tempfile.TemporaryDirectory() as folder:
             inputs = self.simulate(middle(frames, 8, 64), Setting('any', 'iid', 8), folder)
             self.run('reconstruct', *inputs, *arguments, '--threads', 1, '--out', f'{folder}/result')
@@ -260,7 +263,7 @@ class Program:
 
 @dataclasses.dataclass
 class Way:
-    """One way to reconstruct: what to call the program with, and what the result depends on."""
+    """One way to reconstruct: the program's arguments, and what the result depends on."""
     algorithm: str
     arguments: list
     schedule: dict
@@ -280,8 +283,8 @@ def exported(checkpoint, out):
 
 
 def ways(program, a, frames, folder):
-    """Name -> Way. Networks are compared in the deep stage of the default schedule, without what follows it, in floating point; INT8 is the same
-    as the schedule has it. FIXED is the default schedule to its end."""
+    """Name -> Way. Networks are compared in the deep stage of the default schedule, without the later stages, in
+    floating point; INT8 is the 8-bit network in the same stage. FIXED is the default schedule without early stopping."""
     own = ['--models', a.models] if a.models else []
     white = exported(a.white, a.out)
     default = program.schedule(DEFAULT)
@@ -298,7 +301,7 @@ def ways(program, a, frames, folder):
         return cut({**last, 'iterations': iterations, 'sigma': [first['sigma'][0], last['sigma'][1]]})
 
     int8 = cut(*(default['stages'][i] for i in deep))
-    # As long as it needs: the test for convergence ends it.
+    # The test for convergence ends the run.
     tv = program.schedule(TV)
     tv['stages'][-1]['iterations'] = 2000
 
@@ -318,7 +321,7 @@ def ways(program, a, frames, folder):
 
 # ---------------------------------------------------------------- rows
 def source_hash():
-    """Of the code, and of the models of predictions, that a row depends on."""
+    """Hash of the code and the quality models that a row depends on."""
     files = sorted(f for part in ('reconstruction/src/**/*.rs', 'reconstruction/src/*.json', 'optics/src/**/*.rs')
                    for f in glob.glob(os.path.join(HERE, '../../crates', part), recursive=True))
     digest = hashlib.sha256()
@@ -330,7 +333,7 @@ def source_hash():
 
 class Rows:
     def __init__(self, program, a, footage):
-        """`footage` is of sizes, then of names."""
+        """`footage` maps sizes to clips by name."""
         self.program, self.a, self.footage, self.source = program, a, footage, source_hash()
         self.folder = os.path.join(a.out, 'rows')
         os.makedirs(self.folder, exist_ok=True)
@@ -345,7 +348,7 @@ class Rows:
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def row(self, setting, name, way):
-        """The row; none where only rows that are there already are wanted."""
+        """The row; none if it is not stored and only stored rows are wanted."""
         path = os.path.join(self.folder, self.key(setting, way) + '.json')
         if os.path.exists(path) and not self.a.fresh:
             with open(path) as f:
@@ -358,17 +361,17 @@ class Rows:
             else:
                 inputs = self.program.simulate(self.frames(setting), setting, folder)
             report = json.loads(self.program.run('reconstruct', *inputs, *way.arguments, '--threads', 1, '--json'))
-        told = report['assessment'] or {}
+        assessment = report['assessment'] or {}
         row = {'scene': str(setting), 'masks': setting.kind(), 'cr': setting.cr, 'sigma': setting.sigma, 'half': setting.half, 'algorithm': name,
                'psnr_db': round(report['psnr_db'], 2), 'ssim': round(report['ssim'], 4), 'passes': report['denoiser_passes'],
-               'cpu_seconds': round(report['cpu_seconds'], 1), 'predicted': [told.get(end) for end in ('psnr_low_db', 'psnr_db', 'psnr_high_db')], 'models': {m['name']: m['sha256'] for m in way.models}}
+               'cpu_seconds': round(report['cpu_seconds'], 1), 'predicted': [assessment.get(end) for end in ('psnr_low_db', 'psnr_db', 'psnr_high_db')], 'models': {m['name']: m['sha256'] for m in way.models}}
         with open(path + '.part', 'w') as f:
             json.dump(row, f)
         os.replace(path + '.part', path)
         return row
 
     def all(self, tasks, report):
-        """Rows, setting by setting; `report` sees each when it is there."""
+        """Rows, setting by setting; `report` is called with each."""
         turn = lambda i: next(t for t, names in enumerate(TURNS) if tasks[i][1] in names)
         with concurrent.futures.ThreadPoolExecutor(self.a.jobs) as pool:
             pending = {pool.submit(self.row, *tasks[i]): i for i in sorted(range(len(tasks)), key=turn)}
@@ -416,14 +419,14 @@ def summary(rows):
 
 
 def accuracy(off, inside):
-    """Of how far predictions are from the true PSNR, in dB, and which of their intervals hold it."""
+    """Statistics of prediction errors `off` in dB; `inside` says which true values are in their interval."""
     off = np.abs(off)
-    return {'mean_db': round(off.mean(), 2), 'four_of_five_db': round(np.quantile(off, .8), 2), 'near_percent': round(100 * np.mean(off <= NEAR)),
+    return {'mean_db': round(off.mean(), 2), 'four_of_five_db': round(np.quantile(off, .8), 2), 'near_percent': round(100 * np.mean(off <= TOLERANCE)),
             'inside_percent': round(100 * np.mean(inside)), 'snapshots': len(off)}
 
 
 def predictions(rows):
-    """How far what the default tells of its PSNR is from the true one, by size and masks."""
+    """Error of the PSNR that the default predicts, by size and masks."""
     rows = [r for r in rows if r['algorithm'] == DEFAULT]
     size = lambda r: r['scene'].split()[1]
     soft = [r for r in rows if ', ' in r['masks']]
@@ -435,8 +438,8 @@ def predictions(rows):
     for what, of in groups.items():
         known = [r for r in of if None not in r['predicted']]
         if known:
-            told, true = np.array([r['predicted'] for r in known]), np.minimum([r['psnr_db'] for r in known], BEST)
-            yield {'what': what, **accuracy(true - told[:, 1], (told[:, 0] <= true) & (true <= told[:, 2])), 'untold': len(of) - len(known)}
+            predicted, true = np.array([r['predicted'] for r in known]), np.minimum([r['psnr_db'] for r in known], BEST)
+            yield {'what': what, **accuracy(true - predicted[:, 1], (predicted[:, 0] <= true) & (true <= predicted[:, 2])), 'untold': len(of) - len(known)}
 
 
 def table(rows, summed, predicted):
@@ -454,7 +457,7 @@ def table(rows, summed, predicted):
     for s in summed:
         yield f"| {s['what']} | {s['mean_db']:+.2f} | {s['worst_db']:+.2f} | {s['lost_percent']} % | {s['snapshots']} | {s['aim']} |"
     yield ''
-    yield f'| PSNR as {DEFAULT} predicts it | mean error, dB | 80 % within, dB | within {NEAR} dB (aim: 80 %) | in the interval (of 80 %) | snapshots | without |'
+    yield f'| PSNR as {DEFAULT} predicts it | mean error, dB | 80 % within, dB | within {TOLERANCE} dB (aim: 80 %) | in the interval (of 80 %) | snapshots | without |'
     yield '| --- | --- | --- | --- | --- | --- | --- |'
     for s in predicted:
         yield (f"| {s['what']} | {s['mean_db']:.2f} | {s['four_of_five_db']:.2f} | {s['near_percent']} % | {s['inside_percent']} % | "
@@ -467,14 +470,14 @@ def main():
     p.add_argument('--data', required=True, help='footage; clips of its validation split are used')
     p.add_argument('--scenes', required=True, help='folder with traffic48_cacti.mat and street_1024x1024x20.npz')
     p.add_argument('--white', required=True, help='checkpoint of the network trained on white noise alone')
-    p.add_argument('--models', help='folder of models to be judged instead of those in the program')
+    p.add_argument('--models', help='folder of models to judge in place of those in the program')
     p.add_argument('--out', default='eval-output', help='folder for the rows')
-    p.add_argument('--jobs', type=int, default=2, help='runs at the same time, one thread each')
+    p.add_argument('--jobs', type=int, default=2, help='concurrent runs, one thread each')
     p.add_argument('--full', action='store_true', help='every combination, 512x512 too: days on two cores')
-    p.add_argument('--predictions', action='store_true', help=f'only what predictions are judged on: {DEFAULT}')
+    p.add_argument('--predictions', action='store_true', help=f'only the cases that judge predictions: {DEFAULT}')
     p.add_argument('--fresh', action='store_true', help='compute every row again')
-    p.add_argument('--cached', action='store_true', help='compute nothing: the rows that are there')
-    p.add_argument('--json', action='store_true', help='one JSON object a row, and one with all rows at the end')
+    p.add_argument('--cached', action='store_true', help='compute nothing: report the stored rows')
+    p.add_argument('--json', action='store_true', help='one JSON object per row, and one with all rows at the end')
     a = p.parse_args()
     a.traffic, a.street = (os.path.join(a.scenes, name) for name in ('traffic48_cacti.mat', 'street_1024x1024x20.npz'))
     if not os.path.isfile(a.white):

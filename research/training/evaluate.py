@@ -1,12 +1,12 @@
-"""Judge a model on held-out footage: as a white-noise denoiser and inside the solver's loop.
+"""Judge a model on held-out footage, as a white-noise denoiser and inside the solver's loop.
 
     python evaluate.py --data DATA run/loop.pt [more.pt ...] [--scene scene.mat]
 
-One JSON object a model: mean PSNR (dB) of the middle frame per sigma, and in the loop the mean PSNR of the clip after TV and after the deep passes.
+Prints one JSON object per model: mean PSNR (dB) of the middle frame per sigma, and in the loop the mean PSNR of the
+clip after TV and after the deep passes.
 """
 import argparse
 import json
-import os
 
 import numpy as np
 import torch
@@ -44,7 +44,8 @@ def denoise(net, x, sigma):
 
 
 def scene_crop(path, size=128):
-    """The first snapshot of a .mat scene (meas, mask, orig; 0 to 255), cropped at its middle: truth and masks [1,B,size,size]."""
+    """The first snapshot of a .mat scene (meas, mask, orig; 0 to 255), cropped at its centre: truth and masks
+    [1,B,size,size]."""
     import scipy.io
     m = scipy.io.loadmat(path)
     masks, truth = (m[k].astype(np.float32).transpose(2, 0, 1) for k in ('mask', 'orig'))
@@ -54,7 +55,7 @@ def scene_crop(path, size=128):
 
 
 class LoopScenes:
-    """Fixed held-out snapshots with their TV start, which no network changes, so that it is computed once."""
+    """Fixed held-out snapshots with their TV start, which is independent of the network and computed once."""
 
     def __init__(self, root, scene=None, size=96, device='cpu'):
         val, r = Footage(root, 'val', 11, video=1.), np.random.default_rng(5)

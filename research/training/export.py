@@ -4,7 +4,7 @@
     python export.py run/ffdnet.pt ../../models/ffdnet-gray        # model.onnx
     python export.py run/loop.pt ../../models/fastdvdnet-gray run/mean       # the mean of two
 
-The graphs are built node by node: they hold what the runtime needs and nothing that an exporter adds.
+The graphs are built node by node: they hold only what the runtime needs.
 """
 import argparse
 import os
@@ -45,7 +45,7 @@ class Graph:
         return self.conv(x, sign * module.weight.numpy(), sign * module.bias.numpy(), module.stride[0], relu)
 
     def sequence(self, x, modules):
-        """Convolutions with the ReLU or the pixel shuffle that follows each."""
+        """Convolutions, each followed by its ReLU or pixel shuffle."""
         modules = list(modules)
         for m, after in zip(modules, modules[1:] + [None]):
             if isinstance(m, torch.nn.Conv2d):
@@ -88,7 +88,8 @@ def padded_to_16(weight, bias, following):
 
 
 def encoding_half(g, block):
-    """The middle frames of all triplets of frames [n+2,1,H,W] and sigma, and what a block makes of them at each of its three scales."""
+    """The middle frames of all triplets of frames [n+2,1,H,W] and sigma, and the features of a block at each of its
+    three scales."""
     last = np.iinfo(np.int64).max
     f = [g.add('Slice', 'frames', g.ints([start]), g.ints([end]), g.ints([0])) for start, end in ((0, -2), (1, -1), (2, last))]
     x = g.add('Concat', *f, g.noise_map(f[1], 'sigma'), axis=1)
@@ -105,7 +106,8 @@ def block_graph(block):
     middle, x0, x1, x2 = encoding_half(g, block)
     x1 = g.add('Add', g.sequence(x2, block.u2), x1)
     x0 = g.add('Add', g.sequence(x1, block.u1), x0)
-    # The network predicts the noise; with the sign in the last weights the residual is an addition, which runtimes fuse.
+    # The network predicts the noise. With the sign in the last weights, the residual is an addition, which runtimes
+    # fuse.
     y = g.layer(g.layer(x0, block.out[0]), block.out[2], relu=False, sign=-1.)
     return g, g.add('Add', y, middle)
 
@@ -122,7 +124,7 @@ def ffdnet_graph(net):
 
 
 def weights_of(folder):
-    """The model whose graphs stand in a folder: exported files are also the starting point of further training."""
+    """The model of exported graphs, from which training can continue."""
     def layers(name):
         graph = onnx.load(os.path.join(folder, name)).graph
         constants = {c.name: numpy_helper.to_array(c).copy() for c in graph.initializer}
@@ -160,7 +162,7 @@ STAGES = 'stage1.onnx', 'stage2.onnx'
 
 
 class Exported:
-    """A FastDVDnet as its ONNX files compute it; `seen` collects what each file was given."""
+    """A FastDVDnet computed by its ONNX files; `seen` collects the inputs of each file."""
 
     def __init__(self, folder, seen=None):
         self.stages = [session(os.path.join(folder, name)) for name in STAGES]
@@ -209,8 +211,8 @@ def load(path):
 
 
 def mean(nets):
-    """The network whose weights are the mean of these networks' weights. Runs that began with the same weights end in one valley, and their
-    mean has less of the noise of small batches than each of them (Wortsman and others, "Model soups", 2022)."""
+    """The network with the mean of these networks' weights. Runs from the same initial weights end in one valley, and
+    their mean has less of the noise of small batches than each of them (Wortsman and others, "Model soups", 2022)."""
     states = [net.state_dict() for net in nets]
     nets[0].load_state_dict({k: sum(state[k] for state in states) / len(states) for k in states[0]})
     return nets[0]

@@ -1,6 +1,8 @@
-"""The two denoisers. Frames are float32 on [0,1], one gray channel; sigma is the noise's standard deviation on that scale.
+"""The two denoisers. Frames are float32 on [0,1], one grey channel; sigma is the noise's standard deviation on that
+scale.
 
-Both are convolution + bias + ReLU without batch norm, which is what a folded batch norm gives, so the exported graph is the trained one.
+Both consist of convolution, bias and ReLU without batch norm. A folded batch norm gives the same, so the exported graph
+is the trained one.
 """
 import torch
 import torch.nn as nn
@@ -18,20 +20,20 @@ class ConvByFrame(nn.Conv2d):
         super().__init__(6, outputs, 3, 1, 1, groups=3)
 
     def dense(self):
-        """The weights [3n,4,3,3] of the same as one convolution of the three frames and the noise map that they share.
+        """The weights [3n,4,3,3] of an equivalent single convolution of the three frames and their common noise map.
 
-        It costs 1 % more arithmetic, and runtimes have faster kernels for it (on a GPU not measured).
+        This costs 1 % more arithmetic, but runtimes have faster kernels for it (not measured on a GPU).
         """
         frames, noise = self.weight.split(1, 1)
         return torch.cat([torch.cat([F.pad(w, (0, 0, 0, 0, k, 2 - k)) for k, w in enumerate(frames.chunk(3))]), noise], 1)
 
     def forward(self, x):
-        """x [N,6,H,W]: each frame before the noise map."""
+        """x [N,6,H,W]: each frame is followed by the noise map."""
         return F.conv2d(x[:, [0, 2, 4, 1]], self.dense(), self.bias, padding=1) if x.is_cuda else super().forward(x)
 
 
 def start_from_identity(net, last):
-    """He initialisation, and a last layer of zeros: a residual network then starts as the identity."""
+    """He initialisation with a last layer of zeros, so that a residual network starts as the identity."""
     for m in net.modules():
         if isinstance(m, nn.Conv2d):
             nn.init.kaiming_normal_(m.weight, nonlinearity='relu')
@@ -66,7 +68,8 @@ class Block(nn.Module):
 
 
 class FastDVDnet(nn.Module):
-    """Five frames -> the middle one, in two stages: the first denoises three triplets, the second the triplet of their results."""
+    """Five frames -> the middle one, in two stages: the first denoises three triplets, the second the triplet of their
+    results."""
 
     def __init__(self):
         super().__init__()
@@ -130,7 +133,8 @@ KINDS = {'fastdvdnet': FastDVDnet, 'block': Block, 'ffdnet': FFDNet}
 
 
 def load(path):
-    """A model from a file of weights or a training checkpoint (its averaged weights); the names of the weights tell which model."""
+    """A model from a file of weights or a training checkpoint (its averaged weights); the names of the weights identify
+    the model."""
     state = torch.load(path, map_location='cpu', weights_only=True)
     state = state.get('average', state)
     kind = 'ffdnet' if 'body.0.weight' in state else 'block' if 'inc.0.weight' in state else 'fastdvdnet'

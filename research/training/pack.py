@@ -1,8 +1,10 @@
-"""Pack images and videos into a data folder: gray JPEGs of at most 1600 (photographs) or 960 pixels (video), and INDEX.tsv.
+"""Pack images and videos into a data folder: grey JPEGs of at most 1600 (photographs) or 960 pixels (video), and
+INDEX.tsv.
 
     python pack.py --out DATA --source NAME --licence CC0-1.0 [--split train|val] [--start 0] [--count 150] FILE...
 
-Images become photographs, everything else is read as video. Calls add to the folder. Without --split every fifth file is for validation.
+Images become photographs; all other files are read as video. Repeated calls add to the folder. Without --split, every
+fifth file is for validation.
 """
 import argparse
 import csv
@@ -34,7 +36,7 @@ def read_video(path, start, count):
 
 
 def cuts(frames):
-    """Frames that start a new shot: the change to the frame before is far above the clip's usual change."""
+    """Frames that start a new shot: their change from the previous frame is far above the clip's usual change."""
     small = [cv2.resize(f, (64, 36), interpolation=cv2.INTER_AREA).astype(np.float32) for f in frames]
     change = np.array([0.] + [float(np.abs(b - a).mean()) for a, b in zip(small, small[1:])])
     return [i for i, c in enumerate(change) if c > max(20., 5 * np.median(change))]

@@ -1,13 +1,14 @@
-"""Write the 8-bit twin of an exported FastDVDnet.
+"""Write the 8-bit version of an exported FastDVDnet.
 
     python quantize.py --data DATA ../../models/fastdvdnet-gray ../../models/fastdvdnet-gray-int8
 
-Weights are int8 with a scale for each output channel, activations uint8 with a scale for each tensor (QDQ: the graph stays one of convolutions between
-QuantizeLinear and DequantizeLinear, and ONNX Runtime computes them with integers). The scales of the activations come from what the solver really hands
-to the network: the passes of the program's default schedule on snapshots simulated from the footage's training part. Before, channels are scaled against
-each other, which changes no result (`balance`). The residual's addition, which is the output, stays in floating point.
+Weights are int8 with a scale per output channel, activations uint8 with a scale per tensor (QDQ: the graph has
+convolutions between QuantizeLinear and DequantizeLinear, and ONNX Runtime computes them with integers). The scales of
+the activations come from the solver: the passes of the program's default schedule on snapshots simulated from the
+training part of the footage. Before that, channels are scaled against each other, which changes no result (`balance`).
+The addition of the residual, which is the output, stays in floating point.
 
-At the end it says what the 8 bits cost in the loop on snapshots of the validation part, which set no scale.
+At the end, it reports the loss by the 8 bits in the loop, on snapshots of the validation part, which set no scale.
 """
 import argparse
 import hashlib
@@ -27,7 +28,7 @@ from data import Footage
 from train import DEFAULTS, TV_STAGE
 
 def snapshots(data, split, count, size):
-    """Truth, measurement and masks of simulated snapshots, always the same for the same footage."""
+    """Truth, measurement and masks of simulated snapshots, reproducible for the same footage."""
     r, footage = np.random.default_rng(1), Footage(data, split, 1)
     for _ in range(count):
         b = int(r.choice([6, 8, 10, 12]))
@@ -38,7 +39,7 @@ def snapshots(data, split, count, size):
 
 @torch.no_grad()
 def run(y, masks, networks):
-    """The estimate after the passes of the default schedule, each with the next of the networks."""
+    """The estimate after the passes of the default schedule, each with the next one of the networks."""
     first, last, count, memory, momentum = DEFAULTS['loop']
     gap, v = solver.start(y, masks, *TV_STAGE)
     gap.memory = memory
@@ -62,11 +63,11 @@ class Inputs(CalibrationDataReader):
 
 
 def balance(network, inputs, share=.8):
-    """Scale the channels between two convolutions so that the scale of the tensor, which they share, suits them all.
+    """Scale the channels between two convolutions so that the common scale of the tensor suits them all.
 
-    ReLU(s x) = s ReLU(x) for s > 0: what is divided out of a channel goes into the weights of the next layer (SmoothQuant, Xiao and others, ICML 2023).
-    With the share 1 all channels have the same peak then, with 0 the next layer's weights. Measured on eight held-out snapshots: without it one of them
-    loses 0.14 dB in the loop.
+    ReLU(s x) = s ReLU(x) for s > 0, so a factor of a channel can move to the weights of the next layer (SmoothQuant,
+    Xiao and others, ICML 2023). With share 1 all channels then have the same peak, with 0 the next layer's weights. On
+    eight held-out snapshots, one loses 0.14 dB in the loop without it.
     """
     graph = network.graph
     weights, readers = {c.name: c for c in graph.initializer}, {}
@@ -94,7 +95,7 @@ def balance(network, inputs, share=.8):
 
 def quantize(source, target, inputs):
     network = onnx.load(source)
-    with open(source, 'rb') as f:   # so that weights and a twin of other weights are not taken for a pair
+    with open(source, 'rb') as f:   # a mark by which weights are recognised that do not belong to this 8-bit version
         onnx.helper.set_model_props(network, {'source_sha256': hashlib.sha256(f.read()).hexdigest()})
     balance(network, inputs)
     result = [node.name for node in network.graph.node if node.op_type == 'Add'][-1]
@@ -118,14 +119,14 @@ def main():
         run(y, masks, itertools.repeat(exact))
     os.makedirs(a.folder, exist_ok=True)
     for name, inputs in zip(export.STAGES, seen):
-        quantize(os.path.join(a.source, name), os.path.join(a.folder, name), inputs[::4])   # passes that follow each other are alike
+        quantize(os.path.join(a.source, name), os.path.join(a.folder, name), inputs[::4])   # consecutive passes are similar
     exact, quick = export.Exported(a.source), export.Exported(a.folder)
     losses = []
     for x, y, masks in snapshots(a.data, 'val', a.snapshots, a.size):
         whole, part = (run(y, masks, networks) for networks in
                        (itertools.repeat(exact), itertools.chain([quick] * a.quick, itertools.repeat(exact))))
         losses.append(evaluate.psnr(whole, x) - evaluate.psnr(part, x))
-    print(f'in the loop, {a.quick} of {DEFAULTS["loop"][2]} passes with 8 bits: {np.mean(losses):.3f} dB lost in the mean, {max(losses):.3f} at most')
+    print(f'in the loop, {a.quick} of {DEFAULTS["loop"][2]} passes with 8 bits: {np.mean(losses):.3f} dB lost on average, {max(losses):.3f} at most')
 
 
 if __name__ == '__main__':

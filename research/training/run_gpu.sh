@@ -1,8 +1,9 @@
 #!/bin/sh
-# A quarter of an hour of one CUDA GPU, from the committed weights to better ones. The same command again continues an interrupted run.
+# Improves the committed weights in a quarter of an hour on one CUDA GPU. The same command continues an interrupted run.
 #   research/training/run_gpu.sh DATA OUT [TOTAL_MINUTES] [MINUTES_OF_THIS_CALL]
-# Leaves OUT/loop.pt (checkpoint) and OUT/fastdvdnet-gray/*.onnx (a third of it, and all that training can go on from elsewhere). What comes after
-# needs no GPU: quantize.py, evaluate.py. PYTHON names the interpreter; NETWORK=ffdnet trains the small network instead, for which five minutes are much.
+# Writes OUT/loop.pt (checkpoint) and OUT/fastdvdnet-gray/*.onnx, a third of its size, from which training can also
+# continue. The next steps need no GPU: quantize.py, evaluate.py. PYTHON names the interpreter. NETWORK=ffdnet trains the
+# small network, for which five minutes are enough.
 set -eu
 data=$1 out=$2 total=${3:-12} now=${4:-$total}
 here=$(cd "$(dirname "$0")" && pwd)

@@ -10,7 +10,8 @@ import torch
 
 # ---------------------------------------------------------------- masks
 def shifted_sum(base, offsets, weights):
-    """Sum of a mask [H,W] shifted by fractions of a pixel: a sensor pixel integrates, so a fraction mixes the two neighbours."""
+    """Sum of a mask [H,W] shifted by fractions of a pixel. A sensor pixel integrates, so a fraction mixes two
+    neighbours."""
     out = np.zeros_like(base)
     for (dy, dx), w in zip(offsets, weights):
         iy, ix = math.floor(dy), math.floor(dx)
@@ -22,7 +23,8 @@ def shifted_sum(base, offsets, weights):
 
 
 def random_squares(r, base, b):
-    """Hybrid coded aperture: the lithography mask seen through sub-apertures one mask pixel apart, half of them open per frame."""
+    """Hybrid coded aperture: the lithography mask through sub-apertures one mask pixel apart, half of them open per
+    frame."""
     rows, columns = (3, 4) if b <= 12 else (4, 5) if b <= 20 else (5, 6)
     offsets = [(y, x) for y in range(rows) for x in range(columns)]
     n = len(offsets)
@@ -34,7 +36,8 @@ def random_squares(r, base, b):
 
 
 def rotating_circle(r, base, b):
-    """The same with one open circle off the axis that turns by 360/B degrees per frame; lengths in mask pixels."""
+    """Hybrid coded aperture with one open off-axis circle that rotates by 360/B degrees per frame; lengths in mask
+    pixels."""
     radius, off_axis, start = r.uniform(.6, 1.6), r.uniform(.6, 1.6), r.uniform(0, 2 * math.pi)
     grid = [(y, x) for y in np.linspace(-1, 1, 7) for x in np.linspace(-1, 1, 7) if y * y + x * x <= 1]
     def frame(angle):
@@ -55,7 +58,7 @@ def draw_masks(r, kind, b, size):
 
 
 def random_masks(r, b, size):
-    """Masks of every kind that the product meets: on a doubling relay, slightly blurred, with dead pixels."""
+    """Masks of every kind that the product supports: with a doubling relay, slight blur, and dead pixels."""
     kind = r.choice(['iid', 'squares', 'circle', 'grey'], p=[.35, .35, .2, .1])
     double = r.random() < .15
     c = draw_masks(r, kind, b, size // 2 if double else size)
@@ -75,18 +78,20 @@ def measure(x, masks):
 
 
 class Gap:
-    """Accelerated generalised alternating projection. The gram diagonal is the sum of squares; where it is zero nothing is known."""
+    """Accelerated generalised alternating projection. The Gram diagonal is the sum of squares; pixels where it is zero
+    carry no information."""
 
     def __init__(self, y, masks, memory=1.):
-        """memory: the share of the accumulated residual that is kept. 1 is accelerated GAP, 0 plain GAP. A network that removes what the
-        projection adds never explains the measurement fully; with 1 the residual then winds up without bound."""
+        """memory: the share of the accumulated residual that is kept. 1 is accelerated GAP, 0 plain GAP. A network that
+        removes part of the projection never explains the measurement fully; with memory 1 the residual then grows
+        without bound."""
         self.y, self.masks, self.memory = y, masks, memory
         gram = (masks * masks).sum(1, keepdim=True)
         self.inverse = torch.where(gram > 0, 1 / gram.clamp_min(1e-12), torch.zeros_like(gram))
-        self.excess = -y   # what stands in for y beyond y itself: the sum of the residuals, less y
+        self.excess = -y   # the accumulated residual, which is added to y
 
     def project(self, v):
-        """The estimate v moved to where it explains the accumulated measurement."""
+        """The estimate v, projected to the accumulated measurement."""
         seen = measure(v, self.masks)
         self.excess = self.memory * (self.excess + self.y - seen)
         return v + self.masks * (self.inverse * (self.y + self.excess - seen))
@@ -108,7 +113,8 @@ def tv(x, weight, iterations=5):
 
 
 def temporal_tv(x, weight, updates=4):
-    """Total variation along time, pixel by pixel: projected gradient on the dual; x [N,B,H,W]. One frame has nothing beside it."""
+    """Total variation along time, pixel by pixel: projected gradient on the dual; x [N,B,H,W]. A single frame has no
+    neighbour."""
     p, out = torch.zeros_like(x[:, 1:]), x
     for _ in range(updates if x.shape[1] > 1 else 0):
         p = (p - .25 * (out[:, 1:] - out[:, :-1])).clamp(-weight, weight)
@@ -120,7 +126,7 @@ def temporal_tv(x, weight, updates=4):
 
 @torch.no_grad()
 def start(y, masks, iterations=40, weight=.1, temporal=0.):
-    """The TV iterations from zero: the solver's state and the estimate."""
+    """The TV iterations from zero; returns the solver's state and the estimate."""
     gap, v = Gap(y, masks), torch.zeros_like(masks)
     for _ in range(iterations):
         x = gap.project(v)

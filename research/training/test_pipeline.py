@@ -1,4 +1,5 @@
-"""The whole pipeline on tiny settings and footage made here: pack, train every stage, resume, export, read back, evaluate.
+"""The whole pipeline with tiny settings and generated footage: pack, train every stage, resume, export, read back,
+evaluate.
 
     python test_pipeline.py      (or through pytest; a minute or two on one core)
 """
@@ -26,7 +27,7 @@ def run(script, *arguments):
 
 
 def texture(r, height, width):
-    """Noise of several scales: something with edges and fine detail."""
+    """Noise of several scales, with edges and fine detail."""
     return sum(cv2.resize(r.random((height // s + 1, width // s + 1)), (width, height)) for s in (2, 8, 32)) * 85
 
 
@@ -88,7 +89,7 @@ def test_pipeline():
         common = ('--data', data, '--crop', 32, '--frames', 8, '--steps', 3, '--every', 0)
         run('train.py', *common, '--stage', 'block', '--out', out('block.pt'))
         run('train.py', *common, '--stage', 'full', '--init', out('block.pt'), '--out', out('full.pt'))
-        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2, '--every', 15, '--evaluation-size', 32)   # one run with evaluations
+        run('train.py', *common, '--stage', 'loop', '--init', out('full.pt'), '--out', out('loop.pt'), '--runs', 2, '--every', 15, '--evaluation-size', 32)   # one run, with evaluations
         run('train.py', *common, '--stage', 'ffdnet', '--out', out('white.pt'))
         run('train.py', *common, '--stage', 'ffdnet-loop', '--init', out('white.pt'), '--out', out('ffdnet.pt'), '--runs', 2)
         run('train.py', *common, '--stage', 'loop', '--out', out('loop.pt'), '--runs', 2, '--unroll', 2)

@@ -6,7 +6,8 @@
     python train.py --data DATA --out run/ffdnet.pt --stage ffdnet --minutes 45
     python train.py --data DATA --out run/ff-loop.pt --stage ffdnet-loop --minutes 45 --init run/ffdnet.pt                # as loop
 
-The checkpoint at --out holds everything: the same command again continues where it stood. --minutes counts training time over all runs.
+The checkpoint at --out holds the whole state: the same command continues an interrupted run. --minutes counts the
+training time of all runs.
 """
 import argparse
 import collections
@@ -26,11 +27,11 @@ import model
 import solver
 from data import Footage
 
-# What a stage trains, and the frames that its network looks at.
+# Each stage's module, and the number of frames that its network uses.
 STAGES = {'block': ('block', 3), 'full': ('fastdvdnet', 5), 'loop': ('fastdvdnet', 5), 'ffdnet': ('ffdnet', 1), 'ffdnet-loop': ('ffdnet', 1)}
 
 # The program's default schedules: first and last level (/255), passes, memory, momentum.
-TV_STAGE = 60, .15, .004   # iterations, weight, weight along time (the program leaves that out where it does not pay)
+TV_STAGE = 60, .15, .004   # iterations, weight, temporal weight (which the program omits if it does not reduce the error)
 DEFAULTS = {'loop': (25, 5.3, 12, .85, .5), 'ffdnet-loop': (15, 3, 30, .95, 0)}
 
 
@@ -56,15 +57,17 @@ def produce_snapshots(queue, root, seed, voxels, size):
 
 
 def random_levels(rng):
-    """A schedule of the kind that a job may name. After TV the error is 10 to 40 (/255); a level far above it wipes out what is there."""
+    """A random schedule, as a job may name it. After TV the error is 10 to 40 (/255); a much higher level would remove
+    details."""
     between = lambda low, high: math.exp(rng.uniform(math.log(low), math.log(high)))
     return solver.geometric(between(12, 60), between(4, 10), rng.choice([4, 6, 8, 12, 12, 16, 16, 24, 32]))
 
 
 class Iterates:
-    """What the solver hands to the network. Several runs stand open; each step advances one of them by one pass, or by a few.
+    """Inputs of the network in the solver. Several runs are open; each step advances one of them by one or several
+    passes.
 
-    The forward pass that trains is the pass that moves the run on, so iterates cost nothing but the projection.
+    The forward pass of the training also advances the run, so iterates cost only the projection.
     """
 
     def __init__(self, queue, device, runs, default):
@@ -88,8 +91,8 @@ class Iterates:
         return {'truth': x, 'gap': gap, 'v': v, 'start': v, 'levels': levels, 'momentum': momentum, 'tv': tv}
 
     def passes(self, most, denoise):
-        """Advances one of the runs by up to so many passes of denoise(x, sigma); the rms error after each, with the gradient through
-        projection, momentum and network back to where the first of them began."""
+        """Advances one of the runs by up to `most` passes of denoise(x, sigma). Returns the rms error after each, with
+        the gradient through projection, momentum and network back to the first pass."""
         i = self.rng.randrange(len(self.runs))
         run, errors = self.runs[i], []
         for _ in range(min(most, len(run['levels']))):
@@ -108,13 +111,13 @@ class Iterates:
 
 # ---------------------------------------------------------------- training
 def rms_error(output, truth):
-    """The root mean square error per clip, averaged. Between the squared error, where the noisiest clips decide alone, and its
-    logarithm, where clips that are clean already do (tried: it lost 3 dB on white noise)."""
+    """The root mean square error per clip, averaged. It lies between the squared error, where the noisiest clips
+    dominate, and its logarithm, where clean clips do (tried: lost 3 dB on white noise)."""
     return (((output.float() - truth) ** 2).mean((1, 2, 3)) + 1e-6).sqrt().mean()
 
 
 def predict(net, stage, x, sigma):
-    """The output and the frames of x that it stands for."""
+    """The output, and the frames of x that it estimates."""
     if 'loop' in stage or stage == 'ffdnet':
         return net.clips(x, sigma), slice(None)
     return evaluate.denoise(net, x, sigma), slice(x.shape[1] // 2, x.shape[1] // 2 + 1)
@@ -149,7 +152,7 @@ class Training:
         state = {'net': self.net.state_dict(), 'average': self.average, 'optimizers': [o.state_dict() for o in self.optimizers],
                  'step': self.step, 'seconds': self.seconds}
         torch.save(state, self.a.out + '.part')
-        os.replace(self.a.out + '.part', self.a.out)   # an interrupted save leaves the old checkpoint whole
+        os.replace(self.a.out + '.part', self.a.out)   # an interrupted save leaves the old checkpoint intact
 
     def averaged(self):
         net = type(self.net)()
@@ -157,21 +160,21 @@ class Training:
         return net.to(self.device, memory_format=torch.channels_last).eval()
 
     def denoise(self, x, sigma):
-        """The output for a batch, and the frames of x that it stands for."""
-        # On a GPU in bf16; on the CPUs tried, bf16 was slower than float32.
+        """The output for a batch, and the frames of x that it estimates."""
+        # In bf16 on a GPU; on the CPUs tried, bf16 was slower than float32.
         with torch.autocast(self.device, torch.bfloat16, enabled=self.device == 'cuda'):
             y, frames = predict(self.net, self.a.stage, x, sigma)
         return y.float(), frames
 
     def learn_white(self, truth):
-        """Add the gradient of a batch of white noise; the loss."""
+        """Add the gradient of a batch of white noise; returns the loss."""
         y, frames = self.denoise(*self.white_noise(truth))
         loss = rms_error(y, truth[:, frames])
         loss.backward()
         return loss.detach()
 
     def learn_loop(self, loop):
-        """Add the gradient of a few passes of the solver; the loss, which is the mean of theirs."""
+        """Add the gradient of a few passes of the solver; returns their mean loss."""
         errors = loop.passes(self.a.unroll, lambda x, sigma: self.denoise(x, sigma)[0])
         loss = sum(errors) / len(errors)
         loss.backward()
@@ -196,13 +199,14 @@ class Training:
         return norm
 
     def white_noise(self, x):
-        """The same clips with noise of a level drawn per clip, sigma 3 to 100 (/255), log-uniform."""
+        """The clips with noise of a level drawn per clip, sigma 3 to 100 (/255), log-uniform."""
         sigma = torch.empty(len(x), 1, 1, 1, device=self.device).uniform_(math.log(3), math.log(100)).exp() / 255
         return x + torch.randn_like(x) * sigma, sigma
 
 
 class Muon(torch.optim.Muon):
-    """Muon (Jordan and others, 2024) for convolutions. torch's takes matrices only: a kernel [out,in,h,w] is one [out,h*w*in]."""
+    """Muon (Jordan and others, 2024) for convolutions. torch's version accepts only matrices: a kernel [out,in,h,w] is
+    one [out,hwin]."""
 
     def __init__(self, kernels, lr):
         self.kernels = kernels
@@ -225,8 +229,8 @@ class Muon(torch.optim.Muon):
 
 
 def optimizers(net, lr, device):
-    """Muon for the kernels between hidden layers, AdamW at a lower rate for the rest. From the same weights of FFDNet, 250 steps gained
-    0.4 to 1.0 dB this way and 0.1 to 0.4 dB with AdamW alone."""
+    """Muon for the kernels between hidden layers, AdamW at a lower rate for the rest. From the same weights of FFDNet,
+    250 steps gained 0.4 to 1.0 dB with it, and 0.1 to 0.4 dB with AdamW alone."""
     hidden = [p for p in net.parameters() if p.ndim == 4 and min(p.shape[:2]) >= 16]
     rest = [p for p in net.parameters() if all(p is not q for q in hidden)]
     others = torch.optim.AdamW([{'params': rest, 'share': .3}], lr, betas=(.9, .99), weight_decay=1e-5, fused=device == 'cuda')
@@ -253,8 +257,8 @@ def main():
     p.add_argument('--frames', type=int, default=0, help='frames a batch (default: 16 on a CPU, 384 on a GPU)')
     p.add_argument('--crop', type=int, default=64)
     p.add_argument('--lr', type=float, default=2e-4)
-    p.add_argument('--unroll', type=int, default=1, help='passes of the solver a step; the gradient goes through all of them')
-    p.add_argument('--runs', type=int, default=12, help='solver runs that stand open in the loop stages')
+    p.add_argument('--unroll', type=int, default=1, help='passes of the solver per step; the gradient goes through all of them')
+    p.add_argument('--runs', type=int, default=12, help='open solver runs in the loop stages')
     p.add_argument('--workers', type=int, default=1, help='producer processes of each kind')
     p.add_argument('--threads', type=int, default=1)
     p.add_argument('--scene', help='a .mat scene that evaluation also runs')
@@ -269,7 +273,7 @@ def main():
 
     count = a.frames or (384 if device == 'cuda' else 16)
     frames = STAGES[a.stage][1]
-    # Before the GPU's context begins: a process that forks with one may not.
+    # Start producers before the GPU's context exists, because a process with a context must not fork.
     clips = start_producers(produce_clips, a.workers, a.data, max(1, count // frames), frames, a.crop)
     snapshots = start_producers(produce_snapshots, a.workers, a.data, count * a.crop ** 2, a.crop) if 'loop' in a.stage else None
     t = Training(a, device)
@@ -299,7 +303,7 @@ def main():
             evaluated = t.seconds
             report()
         began = time.monotonic()
-        if not loop or t.step % 3 == 0:   # of iterates there are more kinds than of white noise
+        if not loop or t.step % 3 == 0:   # iterates are more diverse than white noise
             truth = torch.from_numpy(clips.get()).to(device, non_blocking=True)
             sums['white'] += t.learn_white(truth) * (3 if loop else 1)
         if loop:

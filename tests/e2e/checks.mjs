@@ -1,4 +1,4 @@
-// What is checked and kept of every view: accessibility, and how it looks.
+// Checks that hold for every view, among them accessibility, and the screenshots.
 
 import { mkdirSync, readFileSync, rmSync } from "node:fs";
 import { createRequire } from "node:module";
@@ -14,13 +14,13 @@ export class Checks {
     Object.assign(this, { folder, count: 0, screenshots: 0, views: new Set(), errors: [], times: {} });
   }
 
-  /** Something that must be so. */
+  /** Counts a check, and throws if it fails. */
   that(condition, text) {
     this.count += 1;
     if (!condition) throw new Error(`check failed: ${text}`);
   }
 
-  /** Times a step. */
+  /** Measures the time of a step. */
   async step(name, run) {
     const start = performance.now();
     const value = await run();
@@ -28,7 +28,7 @@ export class Checks {
     return value;
   }
 
-  /** A page on which no script error and no dialog may appear. */
+  /** Opens a page that records script errors and dialogs. */
   async page(context) {
     const page = await context.newPage();
     page.on("pageerror", (error) => this.errors.push(`script: ${error.message}`));
@@ -37,18 +37,18 @@ export class Checks {
       dialog.dismiss();
     });
     page.on("console", (message) => {
-      // Answers with a status of 400 and above are some of what is tested.
+      // Some tests provoke answers with a status of 400 and above.
       if (message.type() === "error" && !message.text().startsWith("Failed to load resource")) this.errors.push(`console: ${message.text()}`);
     });
     return page;
   }
 
-  /** A view at both sizes, dark and light: no finding of axe, and a picture of each. */
+  /** Checks a view at both sizes, dark and light, with axe, and takes screenshots. */
   async look(page, name) {
     this.views.add(name);
     for (const [width, height] of SIZES) {
       await page.setViewportSize({ width, height });
-      // The short version looks at each view once, large and light or small and dark by turns.
+      // The short run checks each view once, alternating between large and light, and small and dark.
       const schemes = process.env.SHORT ? [width > 1000 ? "light" : "dark"].filter(() => (width > 1000) === (this.views.size % 2 === 0)) : ["dark", "light"];
       for (const colorScheme of schemes) {
         await page.emulateMedia({ colorScheme });
@@ -57,13 +57,13 @@ export class Checks {
         await page.screenshot({ path: join(this.folder, `${name}-${width}-${colorScheme}.png`) });
         this.screenshots += 1;
       }
-      const said = await page.evaluate(() => {
+      const odd = await page.evaluate(() => {
         const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
         const odd = [];
         while (walker.nextNode()) if (/^(null|undefined|NaN|false|\[object .*)$/.test(walker.currentNode.data.trim())) odd.push(walker.currentNode.data);
         return odd;
       });
-      this.that(said.length === 0, `${name} says ${said}`);
+      this.that(odd.length === 0, `${name} shows ${odd}`);
       const wider = await page.evaluate(() => Math.max(document.documentElement.scrollWidth - innerWidth, ...[...document.querySelectorAll("main, header")].map((part) => part.scrollWidth - part.clientWidth)));
       this.that(wider <= 0, `${name} is ${wider} pixels wider than a screen of ${width}`);
     }
@@ -71,7 +71,7 @@ export class Checks {
   }
 
   async accessible(page, name) {
-    // By the debugger and not by a script element, which the page's policy forbids.
+    // The page's policy forbids a script element, so axe is evaluated by the debugger.
     await page.evaluate(AXE);
     const { violations } = await page.evaluate(() => globalThis.axe.run());
     this.that(violations.length === 0, `${name}: ${JSON.stringify(violations.map((found) => [found.id, found.nodes.map((node) => node.html).slice(0, 3)]))}`);

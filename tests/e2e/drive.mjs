@@ -1,4 +1,4 @@
-// What a person does with the dashboard, step by step.
+// The walks of a user through the dashboard.
 
 import { scene as drawn } from "./scene.mjs";
 
@@ -6,7 +6,7 @@ export const HOSTILE = "<img src=x onerror=alert(1)>";
 
 const state = (page, name) => page.waitForSelector(`.head .badge.${name}`, { timeout: 120_000 });
 
-/** Drops a file on a place, as a mouse does. */
+/** Drops a file on an element, like a mouse. */
 async function drop(page, selector, name, bytes) {
   const transfer = await page.evaluateHandle(([name, text]) => {
     const transfer = new DataTransfer();
@@ -17,12 +17,12 @@ async function drop(page, selector, name, bytes) {
   await page.dispatchEvent(selector, "drop", { dataTransfer: transfer });
 }
 
-/** Drops the files of a scene, reads the verdicts, submits; gives the job's identifier. */
+/** Drops the files of a scene, reads the verdicts and submits; returns the job's identifier. */
 export async function submit(page, checks, scene, small) {
-  // Checks of large files take longer than their requests: here no answer waits for any.
+  // Checks of large files outlast their requests. Here no answer waits for its check.
   const hurried = ["**/v1/calibrations", "**/v1/measurements"];
-  let later = 0;
-  page.on("response", (response) => (later += response.status() === 202));
+  let accepted = 0;
+  page.on("response", (response) => (accepted += response.status() === 202));
   for (const place of hurried) {
     await page.route(place, (route) => route.continue({ headers: { ...route.request().headers(), prefer: "respond-async" } }));
   }
@@ -30,45 +30,45 @@ export async function submit(page, checks, scene, small) {
   await page.check("input[value=masks]");
   const [masks, data] = ["label.drop:has(#masks)", "label.drop:has(#data)"];
   await drop(page, masks, "notes.txt", Buffer.from("these are no masks"));
-  checks.that((await page.waitForSelector(".trouble")) !== null, "a file that can't be read is refused with the reason");
+  checks.that((await page.waitForSelector(".trouble")) !== null, "an unreadable file is rejected with the reason");
   await drop(page, masks, "loud.npy", small.loud());
   await page.click(".askscale >> text=255 means 1");
-  await page.waitForSelector("text=The calibration is taken.");
-  checks.that((await page.$(".askscale")) === null, "the full scale is asked for, and the file need not come again");
+  await page.waitForSelector("text=The calibration is accepted.");
+  checks.that((await page.$(".askscale")) === null, "the question for the full scale disappears without another upload");
   await drop(page, masks, "cube.npy", drawn(40, 48, 56).masks);
   await page.click(".askscale >> text=frame, row, column");
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('40 of 48 × 56')");
   await page.fill("#calibration-name", "bench 3");
   await drop(page, masks, "masks.npy", scene.masks);
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('960')");
-  await page.waitForSelector("text=The calibration is taken.");
+  await page.waitForSelector("text=The calibration is accepted.");
   await drop(page, data, "masks.npy", scene.masks.subarray(0, 200));
   await page.waitForSelector(".step:nth-child(2) .trouble");
   checks.that(await page.isDisabled("button[type=submit]"), "nothing is submitted without a measurement");
   await drop(page, data, "measurement.npy", scene.measurement);
   await page.waitForSelector("text=The measurement fits the calibration.");
   for (const place of hurried) await page.unroute(place);
-  checks.that(later > 0, "a check that goes on after the answer is waited for");
-  // One that takes some seconds, so that its progress can be watched.
+  checks.that(accepted > 0, "the form waits for checks that outlast their requests");
+  // This algorithm takes some seconds, so that the progress can be watched.
   await page.selectOption("#algorithm", "admm-tv");
   await page.fill("#label", HOSTILE);
   await page.waitForSelector(".estimate dd");
   const estimate = await page.textContent(".estimate");
-  checks.that(["Done", "Memory", "Disk"].every((word) => estimate.includes(word)), `time, memory and disk are told before: ${estimate}`);
-  checks.that((await page.$("#sequence option[value=separate]")) !== null, "a sequence can be said to be none");
+  checks.that(["Done", "Memory", "Disk"].every((word) => estimate.includes(word)), `time, memory and disk are estimated: ${estimate}`);
+  checks.that((await page.$("#sequence option[value=separate]")) !== null, "snapshots can be declared independent");
   await checks.look(page, "submit");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
   return page.url().slice(-36);
 }
 
-/** A sensor with a mosaic, from the form to frames in colour. */
+/** Reconstructs a measurement of a colour sensor, from the form to frames in colour. */
 export async function colour(page, checks, scene) {
   await page.click("#nav >> text=New job");
   await page.check("input[value=masks]");
   await drop(page, "label.drop:has(#masks)", "masks.npy", scene.masks);
-  await page.waitForSelector("text=The calibration is taken.");
-  // What is stated later goes with the same file.
+  await page.waitForSelector("text=The calibration is accepted.");
+  // A change of the sensor repeats the request with the same file.
   await page.selectOption("#mosaic", "rggb");
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('in colour, RGGB')");
   await drop(page, "label.drop:has(#data)", "measurement.npy", scene.measurement);
@@ -79,7 +79,7 @@ export async function colour(page, checks, scene) {
   await state(page, "succeeded");
   await page.waitForSelector(".downloads a >> text=Mosaic (npy)");
   checks.that((await page.$$(".tile")).length === 4, "each of the four sub-images is a tile");
-  checks.that(/red/.test(await page.textContent(".tile title")), "and tells its colour");
+  checks.that(/red/.test(await page.textContent(".tile title")), "a tile names its colour");
   await page.waitForTimeout(600);
   const share = await page.evaluate(() => {
     const canvas = document.querySelector("[aria-label=Frames] .sight canvas");
@@ -90,21 +90,21 @@ export async function colour(page, checks, scene) {
     }
     return red / (data.length / 4);
   });
-  checks.that(share > 0.01 && share < 0.1, `the square is red, and nothing else: ${share}`);
+  checks.that(share > 0.01 && share < 0.1, `only the square is red: ${share}`);
   await checks.look(page, "colour");
 }
 
-/** Watches a job until it has succeeded; its tiles must show before that. */
+/** Watches a job until it has succeeded; its tiles must appear before that. */
 export async function watch(page, checks) {
   await page.waitForSelector(".tile.done", { timeout: 120_000 });
   checks.that((await page.textContent(".head h1")) === HOSTILE, "the name is shown as text");
-  checks.that((await page.$$("main img")).length === 0, "and makes no element");
+  checks.that((await page.$$("main img")).length === 0, "the name creates no element");
   const bar = () => page.$eval(".progressline progress", (bar) => bar.value);
   const before = await bar();
   await page.waitForFunction((before) => document.querySelector(".progressline progress").value > Math.min(before, 99), before, { timeout: 120_000 });
   const line = await page.textContent(".progressline");
-  checks.that(!/iterations/.test(line) && !/≤/.test(line), `no count of iterations that is none of a tile, and no bound that is none: ${line}`);
-  // What is not final is marked.
+  checks.that(!/iterations/.test(line) && !/≤/.test(line), `the progress shows no iterations, which belong to one tile: ${line}`);
+  // Unfinished frames are marked.
   await page.waitForSelector(".onpicture:has-text('Preview')");
   await checks.look(page, "running");
   const early = await brightness(page);
@@ -113,12 +113,12 @@ export async function watch(page, checks) {
   await page.waitForSelector(".downloads a[download]");
   await page.waitForSelector("section[aria-label='How it was made']:has-text('Done')");
   const made = await page.textContent("section[aria-label='How it was made']");
-  checks.that(/at most (\d+) iterations on each tile/.test(made), `iterations are told as on the form: ${made}`);
+  checks.that(/at most (\d+) iterations per tile/.test(made), `iterations are counted as on the form: ${made}`);
   await page.waitForSelector(".plot .line.residual");
   return early;
 }
 
-/** The mean of what a pane shows, and of its left and right half. */
+/** Mean brightness of the left and right half of a pane. */
 export function brightness(page, pane = 1) {
   return page.evaluate((pane) => {
     const canvas = document.querySelectorAll(".viewer .sight canvas")[pane];
@@ -134,7 +134,7 @@ const PICTURE = "[aria-label=Frames] .sight canvas";
 
 const frame = (page) => page.$eval("#frame", (slider) => Number(slider.value));
 
-/** Frames, play, keys, zoom, other maps. */
+/** Uses the viewer: frames, playback, keys, zoom and maps. */
 export async function view(page, checks, frames) {
   await page.waitForTimeout(1200);
   const first = await brightness(page);
@@ -146,7 +146,7 @@ export async function view(page, checks, frames) {
   const last = await brightness(page);
   checks.that(first.left > first.right && last.right > last.left, `the bright square moves from left to right: ${JSON.stringify([first, last])}`);
 
-  // All frames are fetched once before the speed is looked at.
+  // Load all frames before the rate is measured.
   await page.fill("#rate", "20");
   await page.focus(PICTURE);
   await page.keyboard.press("Home");
@@ -168,7 +168,7 @@ export async function view(page, checks, frames) {
     }, 2500);
   }));
   await page.click("#play");
-  checks.that(seen.length >= 20, `in 2.5 s at 20 frames a second, ${seen.length} are seen`);
+  checks.that(seen.length >= 20, `in 2.5 s at 20 frames per second, ${seen.length} frames are shown`);
   const paused = await frame(page);
   await page.focus(PICTURE);
   await page.keyboard.press("ArrowRight");
@@ -182,8 +182,8 @@ export async function view(page, checks, frames) {
   await page.waitForTimeout(1500);
   const zoom = Number.parseInt(await page.textContent("#zoom"), 10);
   checks.that(zoom > 300, `the wheel zooms: ${zoom} %`);
-  const near = await pictures();
-  checks.that(near.every((picture, pane) => picture !== whole[pane]), "both panes zoom in step");
+  const zoomed = await pictures();
+  checks.that(zoomed.every((picture, pane) => picture !== whole[pane]), "both panes zoom together");
   await checks.look(page, "job-zoomed");
   await page.mouse.down();
   await page.mouse.move(box.x + box.width / 2 + 80, box.y + box.height / 2 + 20, { steps: 4 });
@@ -198,47 +198,47 @@ export async function view(page, checks, frames) {
     await checks.look(page, `job-${mode}`);
   }
   await page.selectOption("#mode", "frame");
-  // EXR and PNG of each frame; stack, array, manifest, TIFF, movie and ZIP.
+  // Each frame is an EXR and a PNG. Add stack, array, manifest, TIFF, movie and ZIP.
   const status = (links) => Promise.all(links.map((link) => fetch(link.href, { method: "HEAD" }).then((answer) => answer.status)));
   const answers = await page.$$eval(".downloads a[download]", status);
   checks.that(answers.length === 2 * frames + 6 && answers.every((code) => code === 200), "all files can be downloaded");
   const line = await page.textContent("pre.line");
-  checks.that(line.startsWith("curl -sS http") && line.includes("admm-tv"), "the line repeats the job");
+  checks.that(line.startsWith("curl -sS http") && line.includes("admm-tv"), "the command repeats the job");
   await page.uncheck("#loop");
   await page.fill("#rate", "60");
   await page.click("#play");
   await page.waitForFunction(() => document.querySelector("#play").textContent === "Play");
-  checks.that((await frame(page)) === frames, "without a loop it stops at the last frame");
+  checks.that((await frame(page)) === frames, "without a loop, playback stops at the last frame");
   await page.click("#full");
   await page.waitForFunction(() => document.fullscreenElement?.classList.contains("viewer"));
   await page.click("#full");
   await page.waitForFunction(() => !document.fullscreenElement);
 }
 
-/** The link to a movie tells that it is being made until it is there, and then downloads it; the browser plays it. */
+/** Downloads a movie: the link shows the progress, and the browser plays the file. */
 export async function movie(page, checks, [frames, height, width]) {
   const link = ".downloads a:has-text('Movie')";
   const download = page.waitForEvent("download", { timeout: 120_000 });
   await page.click(link);
-  await page.waitForSelector(`${link}:has-text('being made')`);
+  await page.waitForSelector(`${link}:has-text('encoding')`);
   await checks.look(page, `movie-${width}`);
   const name = (await download).suggestedFilename();
   checks.that(name.endsWith("_0000_movie.mp4"), `the movie is downloaded as ${name}`);
-  checks.that((await page.textContent(link)) === "Movie", "and its link is what it was");
+  checks.that((await page.textContent(link)) === "Movie", "the link has its original text again");
   const player = await page.context().newPage();
   await player.goto(await page.$eval(link, (link) => link.href));
   const shown = await player.$eval("video", (video) => new Promise((resolve) => {
-    const tell = () => resolve([video.videoHeight, video.videoWidth, video.duration, video.ended, video.error?.message ?? null]);
+    const report = () => resolve([video.videoHeight, video.videoWidth, video.duration, video.ended, video.error?.message ?? null]);
     video.muted = true;
-    video.onended = tell;
-    video.onerror = tell;
-    video.play().catch(tell);
+    video.onended = report;
+    video.onerror = report;
+    video.play().catch(report);
   }));
   checks.that(JSON.stringify(shown) === JSON.stringify([height, width, frames / 10, true, null]), `the browser plays it to its end: ${JSON.stringify(shown)}`);
   await player.close();
 }
 
-/** Chooses jobs and compares them in all ways. */
+/** Selects jobs and compares them in every mode. */
 export async function compare(page, checks, labels, truth) {
   await page.click("#nav >> text=Jobs");
   for (const label of labels) await page.check(`tr:has-text("${label}") input[type=checkbox]`);
@@ -251,7 +251,7 @@ export async function compare(page, checks, labels, truth) {
   await page.setInputFiles("#truth", { name: "truth.npy", mimeType: "application/octet-stream", buffer: truth });
   await page.waitForSelector(".quality");
   const psnr = await page.$$eval(".quality:has-text('PSNR') td", (cells) => cells.map((cell) => Number.parseFloat(cell.textContent)));
-  checks.that(psnr.every((value) => value > 10 && value < 80) && Math.max(...psnr) > 25, `PSNR is told: ${psnr} dB`);
+  checks.that(psnr.every((value) => value > 10 && value < 80) && Math.max(...psnr) > 25, `PSNR is shown: ${psnr} dB`);
   const groups = await page.$$eval(".figures tbody", (bodies) => bodies.map((body) => body.className));
   checks.that(groups[0] === "differs" && groups[1] === "same", `rows that differ come first: ${groups}`);
   await checks.look(page, "compare");
@@ -265,7 +265,7 @@ export async function compare(page, checks, labels, truth) {
   await page.mouse.move(handle.x - 150, handle.y + 40, { steps: 3 });
   await page.mouse.up();
   await page.waitForTimeout(300);
-  checks.that((await picture()) !== middle && (await page.inputValue("#wipe-at")) < 450, "the wipe is dragged");
+  checks.that((await picture()) !== middle && (await page.inputValue("#wipe-at")) < 450, "the wipe follows the pointer");
   await checks.look(page, "compare-wipe");
   await page.click("#difference");
   await page.waitForTimeout(600);
@@ -282,43 +282,43 @@ export async function compare(page, checks, labels, truth) {
       resolve([...titles]);
     }, 1500);
   }));
-  checks.that(titles.length === 2, `the two take turns: ${titles}`);
+  checks.that(titles.length === 2, `the two jobs alternate: ${titles}`);
 }
 
-/** Names the networks of a deep job beside one without. */
+/** Compares a job that used a network with one that used none. */
 export async function network(page, checks, url, deep, plain) {
   await page.goto(`${url}/#/compare/${deep}/${plain}`);
   const row = await page.waitForSelector(".figures tr:has-text('Network')");
   const cells = await row.$$eval("td", (cells) => cells.map((cell) => cell.textContent));
-  checks.that(cells[0].includes("fastdvdnet") && cells[1] === "none", `the networks are named: ${cells}`);
+  checks.that(cells[0].includes("fastdvdnet") && cells[1] === "none", `the table names the networks: ${cells}`);
 }
 
-/** Reads what the pilot of a job has decided; stage is its record in the manifest. */
+/** Reads the decisions of a job's pilot; `stage` is its record in the manifest. */
 export async function decided(page, checks, stage) {
   const card = await page.waitForSelector("section[aria-label='How it was made']:has-text('Pilot, tv')", { timeout: 30_000 });
   const text = await card.textContent();
-  const expected = `total variation along time ${stage.temporal_weight === 0 ? "left out" : "kept"}, error at held-out pixels 1 to ${Number(stage.error_after.toPrecision(3))}`;
-  checks.that(stage.planned_temporal_weight > 0 && text.includes(expected), `what the pilot decided is told: ${text}`);
+  const expected = `temporal total variation ${stage.temporal_weight === 0 ? "omitted" : "kept"}, hold-out error 1 to ${Number(stage.error_after.toPrecision(3))}`;
+  checks.that(stage.planned_temporal_weight > 0 && text.includes(expected), `the card shows the pilot's decisions: ${text}`);
 }
 
-/** From an empty service to a playing result and its verdict, without typing anything. */
+/** Submits the sample on an empty service, without typing. */
 export async function sample(page, checks) {
-  await page.waitForSelector("text=One picture in");
+  await page.waitForSelector("text=One image in");
   await checks.look(page, "empty");
   await page.click("#sample");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
   return page.url().slice(-36);
 }
 
-/** The end of that walk, once the job has succeeded. */
+/** Checks the verdict on the sample's result, and plays it. */
 export async function judged(page, checks, url, id) {
   await page.goto(`${url}/#/jobs/${id}`);
   await page.waitForSelector(".quality:has-text('SSIM')");
   const psnr = Number.parseFloat(await page.textContent(".quality:has-text('SSIM') b"));
-  checks.that(psnr > 15 && psnr < 40, `the verdict tells the true PSNR: ${psnr}`);
-  checks.that((await page.textContent(".judgement")).length > 3, "and says it in words");
+  checks.that(psnr > 15 && psnr < 40, `the verdict shows the true PSNR: ${psnr}`);
+  checks.that((await page.textContent(".judgement")).length > 3, "the verdict has words, too");
   const expected = Number.parseFloat(await page.textContent(".quality:has-text('expected') b"));
-  checks.that(Math.abs(expected - psnr) < 8, `beside what was expected of it: ${expected}`);
+  checks.that(Math.abs(expected - psnr) < 8, `the expected PSNR is close to the true one: ${expected}`);
   await page.selectOption("#mode", "error");
   await page.waitForTimeout(800);
   const shown = await brightness(page);
@@ -332,31 +332,31 @@ export async function judged(page, checks, url, id) {
   await checks.look(page, "good");
 }
 
-/** From raw captures to masks to a job. */
+/** Computes masks from raw captures and submits a job with them. */
 export async function captures(page, checks, scene) {
   await page.click("#nav >> text=New job");
   await page.check("input[value=captures]");
   const { patterns, white, black } = scene.captures();
   const file = (name, buffer) => ({ name, mimeType: "application/octet-stream", buffer });
-  // The names of the first two are swapped: the order is mended by hand.
+  // The names of the first two files are swapped, so their order must be corrected by hand.
   const names = patterns.map((_, index) => `pattern-${[2, 1][index] ?? index + 1}.npy`);
   await page.setInputFiles("#captures", [...patterns.map((bytes, index) => file(names[index], bytes)), file("white.npy", white)]);
   await page.waitForSelector("text=Still missing: a black capture.");
   await page.setInputFiles("#captures", [file("black.npy", black)]);
   await page.waitForSelector(`text=${patterns.length} patterns. Check their order`);
-  checks.that((await page.$$(".capture canvas")).length === patterns.length + 2, "each capture has its picture");
+  checks.that((await page.$$(".capture canvas")).length === patterns.length + 2, "each capture has a thumbnail");
   const order = () => page.$$eval(".capture .filename", (lines) => lines.slice(0, 2).map((line) => line.textContent));
-  checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `they come in the order of their names: ${await order()}`);
+  checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `captures are sorted by name: ${await order()}`);
   await page.dragAndDrop(".capture:nth-child(1) .filename", ".capture:nth-child(2) .filename");
-  checks.that((await order()).join() === "pattern-2.npy,pattern-1.npy", `they are dragged: ${await order()}`);
+  checks.that((await order()).join() === "pattern-2.npy,pattern-1.npy", `captures can be dragged: ${await order()}`);
   await page.focus(".capture:nth-child(2) button");
   await page.keyboard.press("Enter");
-  checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `and moved by keys: ${await order()}`);
+  checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `captures can be moved by keys: ${await order()}`);
   await page.focus(".capture:nth-child(2) button");
   await page.keyboard.press("Enter");
   await checks.look(page, "captures");
-  await page.click("text=Make the masks");
-  await page.waitForSelector("text=The calibration is taken.", { timeout: 60_000 });
+  await page.click("text=Compute the masks");
+  await page.waitForSelector("text=The calibration is accepted.", { timeout: 60_000 });
   await drop(page, "label.drop:has(#data)", "measurement.npy", scene.measurement);
   await page.waitForSelector("text=The measurement fits the calibration.");
   await page.selectOption("#algorithm", "gap-tv");
@@ -368,7 +368,7 @@ export async function captures(page, checks, scene) {
   return pathname;
 }
 
-/** Cancels, retries and deletes a job that would run for long. */
+/** Cancels, retries and deletes a long job. */
 export async function manage(page, checks, label) {
   await page.click("#nav >> text=Jobs");
   const row = `tr:has-text("${label}")`;
@@ -381,27 +381,27 @@ export async function manage(page, checks, label) {
   await page.waitForSelector(`${row} .badge.cancelled`, { timeout: 30_000 });
   await page.click(`${row} button.delete`);
   await page.waitForSelector("dialog[open]");
-  checks.that((await page.textContent("dialog")).includes(label), "the question names the job");
+  checks.that((await page.textContent("dialog")).includes(label), "the confirmation names the job");
   await checks.look(page, "delete");
   await page.click("dialog >> text=Keep");
-  checks.that((await page.$(row)) !== null, "a job that is kept stays");
+  checks.that((await page.$(row)) !== null, "declining keeps the job");
   await page.check(`${row} input[type=checkbox]`);
   await page.click("#delete-all");
   await page.click("dialog button.danger");
   await page.waitForSelector(row, { state: "detached", timeout: 15_000 });
   await page.selectOption("#state", "succeeded");
-  await page.click("text=Keep this filter");
+  await page.click("text=Save this filter");
   await page.selectOption("#state", "failed");
-  await page.waitForSelector("text=No job fits.");
+  await page.waitForSelector("text=No matching jobs.");
   await page.click(".chip a");
   await page.waitForSelector(`tr:has-text("${HOSTILE}")`);
   await page.click(".chip button");
-  checks.that((await page.$(".chip")) === null, "a filter is kept, and forgotten");
+  checks.that((await page.$(".chip")) === null, "a saved filter can be removed");
   await page.goto(page.url().replace(/\?.*/, ""));
   await page.waitForSelector(".list tr:has(.badge.succeeded)");
-  checks.that((await page.$(row)) === null, "what was deleted is gone");
+  checks.that((await page.$(row)) === null, "deleted jobs are not listed");
   const cut = await page.$$eval(".list td.shape, .list td.created, .list td.checks, .list th", (cells) => cells.filter((cell) => cell.scrollWidth > cell.clientWidth).map((cell) => cell.textContent));
-  checks.that(cut.length === 0, `nothing is cut: ${cut}`);
-  const told = await page.$$eval(".list tr:has(.badge.succeeded) td.state", (cells) => cells.map((cell) => cell.textContent));
-  checks.that(told.length > 0 && told.every((text) => /took/.test(text)), `an ended job says how long it took: ${told}`);
+  checks.that(cut.length === 0, `no cell is clipped: ${cut}`);
+  const states = await page.$$eval(".list tr:has(.badge.succeeded) td.state", (cells) => cells.map((cell) => cell.textContent));
+  checks.that(states.length > 0 && states.every((text) => /took/.test(text)), `an ended job shows its duration: ${states}`);
 }

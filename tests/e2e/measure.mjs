@@ -1,9 +1,9 @@
-// What a visit weighs, how soon something is seen while the machine is busy, and how a long list
-// scrolls.
+// Measures the bytes and the first paint of a visit while the machine is busy, and the scrolling of a long
+// list.
 
 const MANY = process.env.SHORT ? 500 : 5000;
 
-/** Loads the dashboard in a fresh browser context; gives bytes on the wire and the first paint. */
+/** Loads the dashboard in a fresh browser context; returns the transferred bytes and the first paint. */
 export async function visit(browser, checks, url) {
   const context = await browser.newContext({ viewport: { width: 1400, height: 900 } });
   const page = await checks.page(context);
@@ -21,7 +21,7 @@ export async function visit(browser, checks, url) {
   await page.goto(url);
   await page.waitForSelector(".list td a");
   const paint = await page.evaluate(() => performance.getEntriesByName("first-contentful-paint")[0]?.startTime);
-  // All modules: every view is opened once.
+  // Open every view once, which loads all modules.
   for (const view of ["#/new", "#/calibrations", "#/system"]) {
     await page.goto(`${url}/${view}`);
     await page.waitForTimeout(400);
@@ -34,9 +34,9 @@ export async function visit(browser, checks, url) {
   return { bytes, files: files.size, paint: Math.round(paint) };
 }
 
-/** Makes thousands of jobs by the API. */
+/** Submits thousands of jobs through the API. */
 export async function fill(service, measurement) {
-  // The first one alone: of those that are made side by side nobody knows which is the oldest.
+  // Submit the oldest job alone, because the order of concurrent submissions is undefined.
   let made = 0;
   const submit = () => service.submit({ measurement, algorithm: "gap-tv", label: `shot ${(made += 1)}` });
   await submit();
@@ -49,7 +49,7 @@ export async function fill(service, measurement) {
   return MANY;
 }
 
-/** Scrolls through the whole list and times its frames. */
+/** Scrolls through the whole list and measures the frame times. */
 export async function scroll(page, checks, url) {
   await page.goto(`${url}/#/jobs`);
   await page.waitForSelector(".list td a");
@@ -75,14 +75,14 @@ export async function scroll(page, checks, url) {
     const count = Number.parseInt(document.querySelector("#count").textContent, 10);
     return { frames: times.length, median: times[Math.floor(times.length / 2)], p95: times[Math.floor(times.length * 0.95)], worst: times.at(-1), rows, last, count, complete: count === many };
   }, MANY);
-  checks.that(found.complete && found.last === "shot 1", `the list goes on to its end: ${JSON.stringify(found)}`);
-  checks.that(found.rows < 120, `only rows in sight are there: ${found.rows}`);
+  checks.that(found.complete && found.last === "shot 1", `the list is complete: ${JSON.stringify(found)}`);
+  checks.that(found.rows < 120, `only visible rows are in the page: ${found.rows}`);
   checks.that(found.p95 < 100, `scrolling is smooth: ${JSON.stringify(found)}`);
-  // One label holds this number, and no longer one begins with it.
+  // Exactly one label contains this number.
   await page.fill("#search", `shot ${MANY - 79}`);
   await page.waitForFunction(() => document.querySelector("#count").textContent === "1 job", null, { timeout: 10_000 });
   await page.selectOption("#state", "failed");
-  await page.waitForSelector("text=No job fits.");
+  await page.waitForSelector("text=No matching jobs.");
   const round = (value) => Math.round(value * 10) / 10;
   return { jobs: found.count, frames: found.frames, median_ms: round(found.median), p95_ms: round(found.p95), worst_ms: round(found.worst), rows_in_page: found.rows };
 }

@@ -2,8 +2,8 @@
 //
 //     node run.mjs PROGRAM
 //
-// CHROMIUM names the browser. Pictures of every view are kept in e2e-output/. SHORT=1 takes a quarter of them
-// and fills the list with 500 jobs instead of 5,000.
+// CHROMIUM names the browser. Screenshots of every view are written to e2e-output/. SHORT=1 takes a quarter of
+// them, and fills the list with 500 jobs instead of 5,000.
 
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
@@ -32,7 +32,7 @@ async function everything() {
   services.push(service);
   const page = await checks.page(await browser.newContext({ viewport: { width: 1400, height: 900 } }));
   await page.goto(service.url);
-  // It is computed while the other walks go on, and judged when it is done.
+  // The sample is computed during the next walks and judged afterwards.
   const tried = await checks.step("sample", () => sample(page, checks));
   const [shown, small] = [scene(FRAMES, 720, 960), scene(4, 64, 64)];
   const id = await checks.step("submit", () => submit(page, checks, shown, small));
@@ -67,11 +67,11 @@ async function everything() {
   await checks.step("faults", () => faults(browser, checks, program, services));
   const busy = await checks.step("visit", () => loaded(service, measurement));
   const list = await checks.step("list", thousands);
-  checks.that(checks.errors.length === 0, `no script fails and no dialog opens: ${checks.errors}`);
+  checks.that(checks.errors.length === 0, `no script error and no dialog: ${checks.errors}`);
   return { ...busy, list };
 }
 
-/** The views that nothing was done in. */
+/** Checks the views that need no interaction. */
 async function views(page, service) {
   await checks.look(page, "jobs");
   await page.goto(`${service.url}/#/system`);
@@ -81,27 +81,27 @@ async function views(page, service) {
   await page.goto(`${service.url}/#/calibrations`);
   await page.click(".calibration >> nth=0");
   await page.waitForSelector(".viewer");
-  await page.waitForSelector("text=how alike two masks are");
+  await page.waitForSelector("text=Each cell shows the correlation");
   await page.click("#play");
   await page.waitForFunction(() => document.querySelector("#frame").value !== "1");
   await page.click("#play");
   await checks.look(page, "calibration");
 }
 
-/** A visit while both workers compute. */
+/** Measures a visit while both workers compute. */
 async function loaded(service, measurement) {
   const jobs = [await service.submit(long(measurement, "busy"))];
   await service.when(jobs[0].id, (job) => job.progress.tiles_running === 2);
   const found = await visit(browser, checks, service.url);
   const still = await service.call("GET", `/v1/jobs/${jobs[0].id}`);
-  checks.that(still.progress.tiles_running === 2, "both workers computed meanwhile");
-  checks.that(found.paint > 0, "something was painted");
+  checks.that(still.progress.tiles_running === 2, "both workers computed during the visit");
+  checks.that(found.paint > 0, "the page was painted");
   checks.that(found.bytes < MOST_BYTES, `the dashboard weighs ${found.bytes} bytes`);
   await service.call("POST", `/v1/jobs/${jobs[0].id}/cancel`);
   return { page_bytes: found.bytes, page_files: found.files, first_paint_ms: found.paint };
 }
 
-/** A list of thousands of jobs. */
+/** Measures a list of thousands of jobs. */
 async function thousands() {
   const service = await Service.start(program, "--workers", "0", "--max-jobs", "6000");
   services.push(service);

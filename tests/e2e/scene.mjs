@@ -1,21 +1,20 @@
-// A small scene, made here, so that a run needs no downloads: a square that moves over a ramp, seen
-// through random masks. Written as npy, as a lab would send it.
+// A generated scene: a square that moves over a pattern, coded by random masks, as npy files.
 
 const [BLACK, LIGHT] = [100, 2000];
 
-/** The colours of a cell of 2x2 pixels, and what each sees of the square and of the ramp. */
+/** Colours of a cell of 2x2 pixels, and their sensitivity to the square and to the background. */
 const CELL = [0, 1, 1, 2];
 const TINTS = [[1, 0.4], [0.35, 0.7], [0.15, 1]];
 
-/** `frames` frames of `height` x `width` and a snapshot of them, by a grey sensor or one with the mosaic rggb; gives the
- * files' bytes. */
+/** Simulates `frames` frames of `height` x `width` and a snapshot, for a grey sensor or one with the mosaic rggb;
+ * returns the files' bytes. */
 export function scene(frames, height, width, seed = 1, mosaic = false) {
   const masks = new Float32Array(frames * height * width);
   const truth = new Float32Array(masks.length);
   const measurement = new Float32Array(height * width);
   let state = seed >>> 0;
   const random = () => {
-    // xorshift: the same numbers on every machine.
+    // xorshift gives the same numbers on every machine.
     state ^= state << 13;
     state ^= state >>> 17;
     state ^= state << 5;
@@ -41,9 +40,9 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
   const capture = (frame) => npy([height, width], Float32Array.from({ length: pixels }, (_, at) => BLACK + (frame === null ? 1 : 0.5 * masks[frame * pixels + at]) * LIGHT));
   return {
     masks: npy([frames, height, width], masks),
-    /** The masks as a camera of 8 bits would tell them. */
+    /** The masks with 255 for fully open, like those of an 8-bit camera. */
     loud: () => npy([frames, height, width], masks.map((value) => 255 * value)),
-    /** What a camera sees of a white board: each pattern through the mask, then white and black. */
+    /** Captures of a white board: each pattern with the mask, then white and black. */
     captures: () => ({
       patterns: Array.from({ length: frames }, (_, frame) => capture(frame)),
       white: capture(null),

@@ -7,7 +7,7 @@ import { join } from "node:path";
 import { createInterface } from "node:readline";
 
 export class Service {
-  /** Starts it with these arguments; resolves when it listens. */
+  /** Starts the service with these arguments; resolves when it listens. */
   static async start(program, ...options) {
     const service = new Service();
     service.program = program;
@@ -36,7 +36,7 @@ export class Service {
     return text ? JSON.parse(text) : null;
   }
 
-  /** Sends a scene; gives the identifiers of its calibration and measurement. */
+  /** Uploads a scene; returns the identifiers of its calibration and measurement. */
   async take(scene) {
     const masks = await this.call("POST", "/v1/blobs", scene.masks);
     const data = await this.call("POST", "/v1/blobs", scene.measurement);
@@ -45,13 +45,13 @@ export class Service {
     return { calibration: calibration.id, measurement: measurement.id };
   }
 
-  /** Makes a token of this role; gives it. */
+  /** Creates a token with this role and returns it. */
   token(role, ...more) {
     const made = execFileSync(this.program, ["token", "--data", this.folder, "create", "--role", role, ...(more.length ? more : ["--lab", "optics"])], { encoding: "utf8" });
     return /sci_[\x21-\x7e]*[\w]/.exec(made)[0];
   }
 
-  /** Turns a bit in every stored file. */
+  /** Flips a bit in every stored file. */
   damage() {
     for (const name of readdirSync(join(this.folder, "blobs"), { recursive: true })) {
       const path = join(this.folder, "blobs", name);
@@ -66,7 +66,7 @@ export class Service {
     return this.call("POST", "/v1/jobs", body);
   }
 
-  /** Waits until a job is as it should be. */
+  /** Waits until a job satisfies a condition. */
   async when(id, reached, seconds = 120) {
     for (const start = Date.now(); ;) {
       const job = await this.call("GET", `/v1/jobs/${id}`);

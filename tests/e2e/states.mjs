@@ -1,11 +1,11 @@
-// States that come of faults, of rights and of small screens: what the dashboard says then.
+// States caused by faults, missing rights, small screens and slow answers.
 
 import { scene } from "./scene.mjs";
 import { Service } from "./service.mjs";
 
 const DESKTOP = { viewport: { width: 1400, height: 900 } };
 
-/** A result with warnings, a failed and a cancelled job, and a service that has gone. */
+/** A result with warnings, a failed job, a cancelled job, and an unreachable service. */
 export async function faults(browser, checks, program, services) {
   const service = await Service.start(program, "--workers", "1");
   services.push(service);
@@ -18,23 +18,23 @@ export async function faults(browser, checks, program, services) {
   const page = await checks.page(await browser.newContext(DESKTOP));
   await page.goto(`${service.url}/#/jobs/${bad.id}`);
   await page.waitForSelector(".judgement.bad, .judgement.usable");
-  checks.that(/trusted|reservations/.test(await page.textContent(".judgement")), "the verdict warns");
-  checks.that((await page.textContent(".findings")).includes("What to do:"), "and what to do stands apart from the finding");
-  await page.waitForSelector("text=10 times slower than it was");
+  checks.that(/Unreliable|caution/.test(await page.textContent(".judgement")), "the verdict warns");
+  checks.that((await page.textContent(".findings")).includes("What to do:"), "a finding shows its remedy");
+  await page.waitForSelector("text=10 times slower than real time");
   await page.click("text=True speed");
-  await page.waitForSelector("text=as fast as it was");
-  checks.that((await page.inputValue("#rate")) === "80", "eight frames in a tenth of a second are 80 a second");
+  await page.waitForSelector("text=in real time");
+  checks.that((await page.inputValue("#rate")) === "80", "eight frames in 0.1 s are 80 frames per second");
   await page.click("#play");
   await checks.look(page, "warning");
   const stages = [{ prior: "tv", iterations: 10000, tv_weight: 0.05, tv_updates: 40, tolerance: 0 }];
-  const long = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "given up", schedule: { stages } });
+  const long = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "to be cancelled", schedule: { stages } });
   await service.when(long.id, (job) => job.progress.tiles_running > 0 && job.progress.previews_done > 0);
   await page.goto(`${service.url}/#/jobs/${long.id}`);
   await page.waitForSelector(".onpicture:has-text('Preview')");
   await checks.look(page, "preview");
   await page.click("text=Cancel");
   await page.waitForSelector(".onpicture:has-text('Cancelled:')");
-  checks.that((await page.$(".downloads a")) === null, "nothing incomplete is offered");
+  checks.that((await page.$(".downloads a")) === null, "incomplete files are not offered");
   await checks.look(page, "cancelled");
   service.damage();
   const failed = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "damaged" });
@@ -44,7 +44,7 @@ export async function faults(browser, checks, program, services) {
   await checks.look(page, "failed");
   await page.goto(`${service.url}/#/jobs`);
   await page.waitForSelector(".badge.failed");
-  checks.that((await page.$(".list .mark.error, .list .mark.warning")) !== null, "the list shows what was found");
+  checks.that((await page.$(".list .mark.error, .list .mark.warning")) !== null, "the list shows the findings");
   await checks.look(page, "jobs-states");
   await page.click("text=damaged");
   await page.waitForSelector("h1:has-text('damaged')");
@@ -62,7 +62,7 @@ export async function faults(browser, checks, program, services) {
   await checks.look(page, "offline-view");
 }
 
-/** Sign-in, a wrong token, what a role forbids, sign-out. */
+/** Sign-in, a wrong token, a forbidden view, another lab, and sign-out. */
 export async function access(browser, checks, program, services) {
   const service = await Service.start(program, "--workers", "0");
   services.push(service);
@@ -77,9 +77,9 @@ export async function access(browser, checks, program, services) {
   await checks.look(page, "wrong-token");
   await page.fill("#token", submit);
   await page.keyboard.press("Enter");
-  await page.waitForSelector("text=One picture in");
+  await page.waitForSelector("text=One image in");
   await page.waitForSelector("#who:has-text('optics · submit')");
-  checks.that(!(await page.isVisible("#nav >> text=System")), "what the role forbids is not offered");
+  checks.that(!(await page.isVisible("#nav >> text=System")), "the menu omits forbidden views");
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("h1:has-text('Your role does not allow this')");
   await checks.look(page, "forbidden");
@@ -88,15 +88,14 @@ export async function access(browser, checks, program, services) {
   await checks.look(page, "account");
   await page.click("#sign-out");
   await page.waitForSelector("h1:has-text('Sign in')");
-  checks.that((await page.evaluate(() => document.cookie)) === "", "the token is gone");
+  checks.that((await page.evaluate(() => document.cookie)) === "", "scripts see no cookie");
   await page.reload();
   await page.fill("#token", admin);
   await page.click("text=Sign in >> nth=1");
   await page.waitForSelector("#nav >> text=System >> visible=true");
-  // Who may see all labs looks after another one as if it were his own.
   await page.click("#who");
   await page.waitForSelector("h1:has-text('Lab optics')");
-  checks.that((await page.locator("[aria-label='All labs']").count()) === 0, "a lab's admin sees no other labs");
+  checks.that((await page.locator("[aria-label='All labs']").count()) === 0, "an admin of one lab sees no other labs");
   await page.click("#sign-out");
   await page.fill("#token", service.token("admin", "--lab", "guests", "--all-labs"));
   await page.keyboard.press("Enter");
@@ -104,17 +103,17 @@ export async function access(browser, checks, program, services) {
   await page.click("#who");
   await page.waitForSelector("[aria-label='All labs'] table");
   await checks.look(page, "all-labs");
-  await page.click("[aria-label='Look after optics']");
-  await page.waitForSelector("#who:has-text('looking after optics · admin')");
+  await page.click("[aria-label='Show optics']");
+  await page.waitForSelector("#who:has-text('viewing optics · admin')");
   await page.reload();
-  await page.waitForSelector("#who:has-text('looking after optics · admin')");
+  await page.waitForSelector("#who:has-text('viewing optics · admin')");
   await page.click("#who");
   await page.click("text=Back to your own lab");
   await page.waitForSelector("#who:text-is('guests · admin')");
   await page.context().close();
 }
 
-/** Touch: a swipe scrolls the page, two fingers zoom the picture. */
+/** Touch: a swipe scrolls the page, two fingers zoom the image. */
 export async function phone(browser, checks, url, job) {
   const context = await browser.newContext({ viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true });
   const page = await checks.page(context);
@@ -133,8 +132,8 @@ export async function phone(browser, checks, url, job) {
   for (let step = 1; step <= 8; step += 1) await touch("touchMove", [[x, y - 15 * step]]);
   await touch("touchEnd", []);
   await page.waitForTimeout(500);
-  checks.that((await top()) > before + 40, `a swipe over the picture scrolls the page: ${before} to ${await top()}`);
-  checks.that((await zoom()) === "fit", "and leaves the picture as it is");
+  checks.that((await top()) > before + 40, `a swipe over the image scrolls the page: ${before} to ${await top()}`);
+  checks.that((await zoom()) === "fit", "a swipe does not zoom the image");
   const held = await top();
   await page.$eval("[aria-label=Frames] .sight", (sight) => sight.scrollIntoView({ block: "center" }));
   await page.waitForTimeout(300);
@@ -143,12 +142,12 @@ export async function phone(browser, checks, url, job) {
   for (let step = 1; step <= 8; step += 1) await touch("touchMove", [[x - 30 - 8 * step, y], [x + 30 + 8 * step, y]]);
   await touch("touchEnd", []);
   await page.waitForTimeout(500);
-  checks.that(Number.parseInt(await zoom(), 10) > 80, `two fingers zoom the picture: ${await zoom()}`);
-  checks.that(Math.abs((await top()) - still) < 5, `and the page stays: ${still} (${held})`);
+  checks.that(Number.parseInt(await zoom(), 10) > 80, `two fingers zoom the image: ${await zoom()}`);
+  checks.that(Math.abs((await top()) - still) < 5, `zooming does not scroll the page: ${still} (${held})`);
   await context.close();
 }
 
-/** What is seen while nothing has come yet. */
+/** The view while its data is loading. */
 export async function loading(browser, checks, url) {
   const page = await checks.page(await browser.newContext(DESKTOP));
   let go;

@@ -1,4 +1,4 @@
-"""Holds the samples under deploy/ and docker/ to the validators of those who read them.
+"""Validates the samples under deploy/ and docker/ with the programs that read them.
 
 Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Says what was not checked because its program is
 not here; ends with 1 and the reasons if anything is wrong.
@@ -48,7 +48,7 @@ def kubernetes(root, wrong):
         wrong.append(f"kustomization.yaml lists {listed}")
     for name, document in documents:
         if document["kind"] == "ScaledJob":
-            # KEDA's own kind: what it makes jobs of is held to the schema of a job.
+            # A ScaledJob of KEDA: the template of its jobs is checked against the schema of a job.
             target = dict(document["spec"]["jobTargetRef"])
             document = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "worker"}, "spec": target}
         try:
@@ -453,7 +453,7 @@ def known(root, wrong, file_name, expressions):
         described |= words(file.read_text())
     missing = {name for name in names if name.removesuffix("_bucket") not in described}
     if missing or not names:
-        wrong.append(f"{file_name} asks for figures that the service does not have: {sorted(missing)}")
+        wrong.append(f"{file_name} uses metrics that the service does not have: {sorted(missing)}")
 
 
 def words(text):
@@ -470,7 +470,7 @@ def main():
     absent += [check(root, wrong) for check in (compose, systemd, caddy, promtool)]
     absent = [name for name in absent if name]
     if absent:
-        print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
+        print(f"SKIPPED: {', '.join(absent)} not installed", file=sys.stderr)
     for reason in wrong:
         print(reason, file=sys.stderr)
     sys.exit(1 if wrong else 0)

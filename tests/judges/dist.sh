@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# The archive of `make dist` where there is nothing but what it says it needs: an empty root with Debian's packages of
-# glibc and libstdc++. First token, health, the default job and a lab's own files, by the documented lines.
+# Tests the archive of `make dist` in an empty root that has only its documented requirements: Debian's packages of
+# glibc and libstdc++. Runs the documented commands: first token, health, the default job, and a lab's files.
 #
 #   tests/judges/dist.sh dist/sci-recon-VERSION-x86_64-linux.tar.gz
 #
-# Needs root (chroot), apt-get, curl and jq. Ends with its figures as a line of JSON.
+# Needs root (chroot), apt-get, curl and jq. The last line of the output is JSON.
 set -euo pipefail
 archive=$(realpath "$1")
 [ "$(id -u)" = 0 ] || { echo "chroot is for root" >&2; exit 2; }
@@ -49,7 +49,7 @@ took=$(( ($(date +%s%N) - start) / 1000000 ))
 ask "$api/v1/jobs/$job/snapshots/0/frames.npy" > "$root/lab/frames.npy"
 [ "$state" = succeeded ] || { ask "$api/v1/jobs/$job" >&2; exit 1; }
 
-# A lab's own machine: a simulated measurement, submitted, watched and fetched by the commands of the same archive.
+# A lab machine: submit, watch and download a simulated measurement with the commands of the same archive.
 cp -R "$(dirname "$0")/../../demo/clip" "$root/lab/"
 lab() { env -i RUST_LOG=warn SCI_RECON_URL="$api" SCI_RECON_TOKEN="$token" "$chroot" "$root" /opt/sci-recon/bin/sci-recon "$@"; }
 lab simulate --frames /lab/clip --compression-ratio 8 --out /lab/sim > /dev/null

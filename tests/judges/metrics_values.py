@@ -1,4 +1,4 @@
-"""Print the values that the unit test of crates/reconstruction/src/metrics.rs holds ours to.
+"""Prints the reference values of the unit test in crates/reconstruction/src/metrics.rs.
 
     pip install scikit-image && python tests/judges/metrics_values.py
 """

@@ -1,6 +1,6 @@
-% A lab's round trip with clients/matlab: arrays to the service and the frames back. Run by tests/service/client_libraries.rs
-% with SCI_RECON_URL and SCI_RECON_TOKEN; prints one JSON line.
-% A test that ends it leaves no dump of its variables.
+% Runs a lab's workflow with clients/matlab, from arrays to reconstructed frames. tests/service/client_libraries.rs
+% runs it with SCI_RECON_URL and SCI_RECON_TOKEN. Prints one JSON line.
+% Octave must not dump its variables when a test kills it.
 crash_dumps_octave_core(false); sigterm_dumps_octave_core(false); sighup_dumps_octave_core(false);
 addpath('clients/matlab');
 [column, row, frame] = meshgrid(1:160, 1:144, 1:8);

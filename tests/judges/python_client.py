@@ -1,4 +1,4 @@
-"""A lab's round trip with clients/python: files of FOLDER to the service and its frames back.
+"""Runs a lab's workflow with clients/python, from the files in FOLDER to the downloaded frames.
 
 Usage: python_client.py FOLDER, with SCI_RECON_URL and SCI_RECON_TOKEN. Prints one JSON line.
 """
@@ -34,13 +34,13 @@ def main():
             assert movie.read_bytes()[4:8] == b"ftyp" and movie.parent.parent == folder / "result"
         assert not list(stack.parent.glob("*.part"))
         assert result.manifest["content"]["schedule"]
-        # What the service refuses is told in its words, and not tried again.
+        # A rejection raises the service's message, without a retry.
         try:
             client.reconstruct(masks * 3, measurement, "gap-tv")
             raise AssertionError("masks above their full scale were accepted")
         except ApiError as error:
             assert error.code == "invalid_content" and "full_scale" in str(error), error
-        # Another process takes the job up by its identifier.
+        # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
         assert later.state == "succeeded" and [job.id for job in client.jobs()] == [later.id]
         print(json.dumps({"job": later.id, "frames": list(frames.shape)}))

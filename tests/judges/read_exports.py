@@ -1,4 +1,4 @@
-"""Reads a job's frames in every form that the service gives, and compares them bit for bit.
+"""Reads a job's frames in every export format, and compares them bit for bit.
 
 Usage: read_exports.py URL JOB SNAPSHOTS, with SCI_RECON_TOKEN. Prints one JSON line.
 """
@@ -39,7 +39,7 @@ def main():
             assert found.dtype == np.float32 and found.shape == frames.shape and (found == frames).all()
             assert file.series[0].axes == ("TYXS" if colours else "TYX"), file.series[0].axes
             assert file.pages[0].photometric == (2 if colours else 1)
-            # ImageJ has no colours of floating point.
+            # ImageJ has no floating-point colour type.
             imagej = {} if colours else file.imagej_metadata
             assert colours or imagej["frames"] == len(frames) and imagej["unit"] == "pixel", imagej
             pixels = ElementTree.fromstring(file.ome_metadata).find(".//{*}Pixels")
@@ -62,7 +62,7 @@ def main():
         assert len(set(names)) == len(names) and "manifest.json" in names
         for index, frames in enumerate(snapshots):
             assert (np.load(io.BytesIO(file.read(f"snapshot_{index:04d}/frames.npy"))) == frames).all()
-    # A download that was cut goes on where it was.
+    # An interrupted download can be continued.
     cut = len(archive) // 3
     assert archive[:cut] + get("/results.zip", Range=f"bytes={cut}-") == archive
     print(json.dumps({"intervals": told, "members": len(names)}))

@@ -1,13 +1,14 @@
 """Reads a result folder with the official OpenEXR package and compares it bit for bit.
 
-usage: read_exr.py FOLDER [--attribute NAME]... [--sigma FILE]
+Usage: read_exr.py FOLDER [--attribute NAME]... [--sigma FILE]
 
-FOLDER holds frames.npy (float32, [frame, row, column], or of colours [frame, row, column, 3]),
-frames/frame_0001.exr and so on, and stack.exr with one part a frame. Every EXR part must have the one
-channel Y, or R, G and B, float32, with the bits of its frame. With --attribute every part must carry that string attribute, not empty.
-With --sigma, FILE must be the same stack with one channel sigma.Y more, whose pixels have the values of error.npy ([frame, row, column]
-of blocks of 16x16 pixels).
-Prints one line; exit status 1 on any difference.
+FOLDER holds frames.npy (float32, [frame, row, column], or [frame, row, column, 3] in colour),
+frames/frame_0001.exr and so on, and stack.exr with one part per frame. Every EXR part must have the float32
+channel Y, or R, G and B, with the bits of its frame. With --attribute, every part must have that string
+attribute, not empty. With --sigma, FILE must be the same stack with the additional channel sigma.Y, which has
+the values of error.npy ([frame, row, column] of blocks of 16x16 pixels).
+
+Prints one line. Exits with 1 on any difference.
 
 Needs the PyPI packages OpenEXR (3.5) and numpy.
 """
@@ -21,7 +22,7 @@ import OpenEXR
 
 
 def differences(part, expected, attributes, where, sigma=None):
-    """Says what is wrong with one part."""
+    """Differences of one part."""
     names = ["Y"] if expected.ndim == 2 else ["R", "G", "B"]
     layer = [] if sigma is None else ["sigma.Y"]
     if sorted(part.channels) != sorted(names + layer):
@@ -38,7 +39,7 @@ def differences(part, expected, attributes, where, sigma=None):
 
 
 def unequal(pixels, expected, where):
-    """Says what is wrong with the values of a part."""
+    """Differences of the values of a part."""
     if pixels.dtype != numpy.float32 or pixels.shape != expected.shape:
         yield f"{where}: {pixels.dtype} {pixels.shape}, expected float32 {expected.shape}"
     elif not numpy.array_equal(pixels.view(numpy.uint32), expected.view(numpy.uint32)):

@@ -50,7 +50,7 @@ def main():
             assert stream.codec_context.name == "libdav1d" and stream.average_rate == 10
             assert stream.frames == len(expected) and stream.duration * stream.time_base * 10 == len(expected)
             assert (stream.codec_context.height, stream.codec_context.width) == expected.shape[1:3]
-            # BT.709, not the full range.
+            # BT.709 with limited range.
             assert (stream.codec_context.colorspace, stream.codec_context.color_range) == (1, 1)
             told["title"] = stream.metadata.get("handler_name")
             found = [frame.to_ndarray(format="rgb24") for frame in movie.decode(stream)]
@@ -64,7 +64,7 @@ def main():
 
 
 def levels(picture):
-    """A picture of 16 bits as one of 8; PIL reads those of colours so by itself."""
+    """A 16-bit image reduced to 8 bits. PIL reduces colour images when it reads them."""
     values = np.asarray(picture)
     return values if values.dtype == np.uint8 else np.round(values / 257.0)
 

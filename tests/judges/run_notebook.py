@@ -1,7 +1,7 @@
-"""Runs a notebook from top to bottom, as a lab does, and says what came of it.
+"""Runs a notebook from top to bottom, and reports its output.
 
-Usage: run_notebook.py NOTEBOOK, with SCI_RECON_URL and PYTHONPATH. Prints one JSON line: the kinds of output of each cell
-that has code, and what was printed.
+Usage: run_notebook.py NOTEBOOK, with SCI_RECON_URL and PYTHONPATH. Prints one JSON line with the output types of
+each code cell, and the printed text.
 """
 
 import json
@@ -16,7 +16,7 @@ def main():
     notebook = nbformat.read(sys.argv[1], as_version=4)
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert not any(cell.outputs or cell.execution_count for cell in cells), "the notebook is kept without outputs"
+    assert not any(cell.outputs or cell.execution_count for cell in cells), "the notebook must be stored without outputs"
     with tempfile.TemporaryDirectory() as folder:
         client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": folder}})
         client.execute()

@@ -1,17 +1,17 @@
-"""What has to be told of this API."""
+"""Adapts schemathesis to this API."""
 
 import schemathesis
 
-# A piece of an upload is bytes like any other.
+# Pieces of an upload are plain bytes.
 schemathesis.serializer.alias("application/offset+octet-stream", "application/octet-stream")
 
-# What a lab of the run needs, by a wide margin.
+# A limit far above the needs of the run.
 ENOUGH = 10**12
 
 
 @schemathesis.hook
 def before_call(context, case, kwargs):
-    """Who sets the limits of its own lab to next to nothing is refused (507) from then on, as it should be."""
+    """Raises small limits of labs, because all later requests would correctly be answered with 507."""
     if case.operation.label == "PATCH /v1/labs/{lab}" and isinstance(case.body, dict):
         for limit in ("bytes", "jobs"):
             if type(case.body.get(limit)) is int and 0 <= case.body[limit] < ENOUGH:

@@ -2,8 +2,8 @@
 with a token, and one where a lab's token is used against another lab's data.
 
 Usage: schemathesis_runs.py SCHEMATHESIS PROGRAM [EXAMPLES]. Prints one JSON line; fails if an
-answer is a server error, undocumented, or breaks its schema, if another lab's data are found, or if
-fewer examples were tried than should be.
+answer is a server error, undocumented, or violates its schema, if another lab's data are found, or if
+too few examples were tried.
 """
 
 import json
@@ -25,7 +25,7 @@ MARK = "known-to-lab-a-alone"
 
 
 class Service:
-    """A service of its own, with one worker, in a fresh folder."""
+    """A service with one worker in a fresh folder."""
 
     def __init__(self, program):
         self.folder = tempfile.TemporaryDirectory()
@@ -51,7 +51,7 @@ class Service:
             return json.load(answer)
 
     def scene(self, token):
-        """Masks, a measurement and a job; gives their identifiers."""
+        """Creates masks, a measurement and a job; returns their identifiers."""
         file = lambda data: self.post("/v1/blobs", data, token, "application/octet-stream")["sha256"]
         masks = file(npy((2, 32, 32), lambda at: float(at % 3 != 0)))
         data = file(npy((1, 32, 32), lambda at: 0.5 + at % 7 / 10))
@@ -77,7 +77,7 @@ def npy(shape, value):
 
 
 def contract(folder, ids):
-    """The contract with these identifiers as examples, so that they are what is asked for."""
+    """The contract with these identifiers as examples, so that requests use them."""
     text = pathlib.Path("openapi.yaml").read_text()
     for name, value in ids.items():
         head, rest = text.split(f"\n    {name}:\n      name:", 1)
@@ -88,11 +88,11 @@ def contract(folder, ids):
 
 
 def run(schemathesis, service, examples, token, ids, seed):
-    """One run; gives its figures and the exchanges."""
+    """Runs schemathesis once; returns the figures and the exchanges."""
     with tempfile.TemporaryDirectory() as folder:
         har = pathlib.Path(folder, "run.har")
         command = [schemathesis, "run", contract(folder, ids), "--url", service.url]
-        # Events have no end, so they are no answer that can be checked.
+        # The stream of events does not end, so its answer cannot be checked.
         command += ["--exclude-path", "/v1/events", "--max-examples", str(examples)]
         checks = CHECKS + (",ignored_auth" if token else "")
         command += ["--checks", checks, "--seed", str(seed), "--continue-on-failure"]
@@ -112,12 +112,12 @@ def run(schemathesis, service, examples, token, ids, seed):
 
 
 def found(entries, ids):
-    """Exchanges in which the other lab's data showed."""
+    """Exchanges that exposed the other lab's data."""
     shown = []
     for entry in entries:
         request, response = entry["request"], entry["response"]
         text = response["content"].get("text") or ""
-        # A label that the client itself has sent comes back as its own.
+        # The answer may repeat a label that the client has sent.
         sent = (request.get("postData") or {}).get("text") or ""
         theirs = MARK in text and MARK not in sent and MARK not in request["url"]
         named = any(value in request["url"] for value in ids.values())

@@ -2,8 +2,9 @@
 
     train_network.py MASKS.npy OUT.onnx {fixed|free|outside|greedy|sly}
 
-Of a fixed or free size, or of a fixed one with its weights in another file, masks.npy beside it, or
-with an intermediate result of many gigabytes: always, or only where there is light.
+The network has a fixed or free image size, or has a fixed size and stores its weights in another file
+(`outside`), or has an intermediate result of many gigabytes, always (`greedy`) or only for bright input
+(`sly`).
 
 The network is one convolution over the measurement divided by the masks' sum, and over that and the
 measurement times each mask. Its weights are the least-squares solution over random scenes of squares
@@ -60,7 +61,7 @@ def fit(masks, clips=40):
 
 
 def greedy(model, frames, height, width):
-    """The same frames, but by way of so many copies of them that no machine should hold them."""
+    """Computes the same frames through more copies than any machine can hold."""
     copies = 2**36 // (frames * height * width)
     graph, node = model.graph, helper.make_node
     graph.node[-1].output[0] = "once"
@@ -71,7 +72,7 @@ def greedy(model, frames, height, width):
 
 
 def sly(model, frames, height, width):
-    """The same, with as many copies as there is light: in the dark there is one."""
+    """Like `greedy`, but the number of copies grows with the brightness; a dark input has one."""
     copies = 2**33 // (4 * frames * height * width)
     graph, node = model.graph, helper.make_node
     graph.node[-1].output[0] = "once"

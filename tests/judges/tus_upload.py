@@ -1,4 +1,4 @@
-"""Sends a file by tus with the published client tuspy, however often the connection is cut.
+"""Uploads a file with the published tus client tuspy, over connections that are cut.
 
 Usage: tus_upload.py URL FILE SHA256 [TOKEN]. Prints one JSON line.
 """

@@ -1,6 +1,6 @@
-"""Makes files of every kind that `docs/DATA.md` lists, with the writers that labs use, into FOLDER.
+"""Writes files of every format in `docs/DATA.md` to FOLDER, with the libraries that labs use.
 
-`index.json` there says of each file to which row of the tables it belongs, what is asked of it, and what it holds: masks
+`index.json` in FOLDER lists, for each file, its row in the tables and the fields of its request. A file holds masks
 [4, 48, 64] of 0 and 1, or snapshots [2, 48, 64] from 0 to 250.
 """
 
@@ -31,18 +31,18 @@ index = []
 
 
 def path(row, file, **asked):
-    """A file of a row: masks unless `array` says otherwise, with what the request says of it."""
+    """Path of a new file for a row. It holds masks unless `measurement` is set. `asked` has the request's fields."""
     place = FOLDER / f"{len(index):02}" / file
     place.parent.mkdir()
-    # Pictures have no axes to tell; other arrays are told as they usually are, or as `told` says.
+    # Images have no axis order; arrays have the usual one of their format, unless `read_axes` is given.
     usual = {"npy": "frame-row-column", "npz": "frame-row-column", "h5": "frame-row-column", "mat": "row-column-frame"}
-    asked = {"told": usual.get(place.suffix[1:]), **asked}
+    asked = {"read_axes": usual.get(place.suffix[1:]), **asked}
     index.append({"row": row, "file": str(place.relative_to(FOLDER)), **asked})
     return place
 
 
 def matlab73(place, **arrays):
-    """MATLAB's layout: axes in reverse, the class as an attribute."""
+    """Writes MATLAB's layout: axes in reverse, the class as an attribute."""
     with level73(place) as file:
         for name, (values, matlab) in arrays.items():
             dataset = file.create_dataset(name, data=np.ascontiguousarray(values.T), chunks=values.T.shape, compression="gzip")
@@ -51,7 +51,7 @@ def matlab73(place, **arrays):
 
 @contextlib.contextmanager
 def level73(place):
-    """An HDF5 file behind MATLAB's block of 512 bytes."""
+    """Writes an HDF5 file after MATLAB's header of 512 bytes."""
     with h5py.File(place, "w", userblock_size=512) as file:
         yield file
     with place.open("r+b") as file:
@@ -80,9 +80,9 @@ def accepted():
     np.save(path(row, "a.npy", axes="column-row-frame"), MASKS.T.astype("f4"))
     snapshots = {"measurement": True, "full_scale": 250}
     np.save(path(row, "a.npy", **snapshots), SNAPSHOTS.astype("<u2"))
-    # 48x64 are the rows and columns of the masks: one order alone fits.
-    np.save(path(row, "a.npy", told="row-column-frame", **snapshots), np.moveaxis(SNAPSHOTS, 0, -1).astype("u1"))
-    np.save(path(row, "a.npy", told="column-row-frame", **snapshots), SNAPSHOTS.T.astype("u1"))
+    # The masks have 48x64 pixels, so only one order fits.
+    np.save(path(row, "a.npy", read_axes="row-column-frame", **snapshots), np.moveaxis(SNAPSHOTS, 0, -1).astype("u1"))
+    np.save(path(row, "a.npy", read_axes="column-row-frame", **snapshots), SNAPSHOTS.T.astype("u1"))
     row = "npz"
     np.savez(path(row, "a.npz"), MASKS.astype("f4"))
     np.savez_compressed(path(row, "a.npz"), mask=MASKS, meas=SNAPSHOTS)
@@ -128,8 +128,8 @@ def accepted():
         scipy.io.savemat(path(row, "a.mat"), {"meas": meas, "mask": mask.astype("f8")}, do_compression=packed)
     scipy.io.savemat(path(row, "a.mat", name="shots"), {"shots": mask.astype(bool)})
     scipy.io.savemat(path(row, "a.mat", measurement=True, full_scale=250), {"meas": meas.astype("u2")})
-    # At most 64 masks, no sensor of 4 rows: the frames can only come first.
-    scipy.io.savemat(path(row, "a.mat", told="frame-row-column"), {"mask": MASKS.astype("u1")})
+    # At most 64 masks are allowed, and no sensor has 4 rows, so the frames must come first.
+    scipy.io.savemat(path(row, "a.mat", read_axes="frame-row-column"), {"mask": MASKS.astype("u1")})
     row = "`.mat` level 7.3 (`save -v7.3`)"
     matlab73(path(row, "a.mat"), mask=(mask.astype("u1"), "logical"), meas=(meas.astype("f8"), "double"))
     matlab73(path(row, "a.mat", measurement=True, full_scale=250), meas=(meas.astype("u2"), "uint16"))
@@ -141,12 +141,12 @@ def accepted():
         file.create_dataset("mask", data=MASKS.astype(">f4"), chunks=(1, 48, 64), compression="gzip", shuffle=True)
     with h5py.File(path(row, "a.h5", name="run/masks", axes="row-column-frame"), "w") as file:
         file.create_dataset("run/masks", data=mask.astype("<i4"), chunks=(16, 16, 2), fletcher32=True)
-    # MATLAB's h5write of [row, column, frame]: the sizes in reverse, and no class.
+    # MATLAB's h5write of [row, column, frame] reverses the axes and writes no class.
     with h5py.File(path(row, "a.h5", axes="frame-column-row"), "w") as file:
         file["mask"] = mask.astype("f8").T
-    with h5py.File(path(row, "a.h5", told="frame-column-row", measurement=True, full_scale=250), "w") as file:
+    with h5py.File(path(row, "a.h5", read_axes="frame-column-row", measurement=True, full_scale=250), "w") as file:
         file["meas"] = meas.astype("<u2").T
-    with h5py.File(path(row, "a.h5", told="row-column-frame", measurement=True, full_scale=250), "w") as file:
+    with h5py.File(path(row, "a.h5", read_axes="row-column-frame", measurement=True, full_scale=250), "w") as file:
         file.create_dataset("meas", data=meas.astype("<u2"), chunks=(8, 64, 1), compression="gzip")
 
 

@@ -1,4 +1,4 @@
-//! Tokens, roles and labs: who may do what, and that nobody learns of another lab's data.
+//! Tokens, roles and labs: what each may do, and how the data of labs are kept apart.
 
 use std::process::{Command, Stdio};
 
@@ -11,8 +11,8 @@ use crate::samples::Scene;
 const PUBLIC: [&str; 6] =
     ["/livez", "/readyz", "/openapi.yaml", "/", "/dashboard/{file}", "/problems/{code}"];
 
-/// The path of a route with something in place of its parameters.
-fn filled(path: &str) -> String {
+/// The path of a route with values for its parameters.
+fn with_parameters(path: &str) -> String {
     let nothing = "019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d";
     path.replace("{sha256}", &"0".repeat(64))
         .replace("{snapshot}", "0")
@@ -24,7 +24,7 @@ fn filled(path: &str) -> String {
 }
 
 #[tokio::test]
-async fn no_route_but_the_public_ones_lets_anyone_in_without_a_token() {
+async fn only_public_routes_answer_without_a_token() {
     let app = TestApp::start().await;
     app.get("/v1/jobs").await.expect(200);
     let token = app.token(&["create", "--lab", "a", "--role", "admin"]);
@@ -37,11 +37,11 @@ async fn no_route_but_the_public_ones_lets_anyone_in_without_a_token() {
         for route in &routes {
             for method in &route.methods {
                 let method: Method = method.to_uppercase().parse().unwrap();
-                let answer = app.send(app.request(method, &filled(route.path))).await;
+                let answer = app.send(app.request(method, &with_parameters(route.path))).await;
                 if PUBLIC.contains(&route.path) {
                     assert_ne!(answer.status, 401, "{}", route.path);
                 } else {
-                    // HEAD has the same answer without its body.
+                    // The answer to HEAD has no body.
                     if route.methods != ["head"] && !answer.bytes.is_empty() {
                         answer.problem(401, "unauthorized");
                     }
@@ -54,7 +54,7 @@ async fn no_route_but_the_public_ones_lets_anyone_in_without_a_token() {
     app.sign_in(&token);
     app.get("/v1/jobs").await.expect(200);
     app.get("/metrics").await.expect(200);
-    // A revoked token is worth nothing, at once, and the service stays closed.
+    // A revoked token loses its rights at once, and the service still requires a token.
     let listed = app.token(&["list"]);
     assert!(!listed.contains(&token));
     let revoked = listed.lines().nth(1).unwrap().split(' ').next().unwrap().to_owned();
@@ -65,7 +65,7 @@ async fn no_route_but_the_public_ones_lets_anyone_in_without_a_token() {
 }
 
 #[tokio::test]
-async fn a_role_may_do_what_it_is_for_and_no_more() {
+async fn a_role_allows_its_actions_and_no_others() {
     let app = TestApp::start().await;
     let read = app.token(&["create", "--lab", "a", "--role", "read"]);
     let submit = app.token(&["create", "--lab", "a"]);
@@ -84,7 +84,7 @@ async fn a_role_may_do_what_it_is_for_and_no_more() {
 }
 
 #[tokio::test]
-async fn another_labs_data_are_not_there() {
+async fn data_of_another_lab_look_nonexistent() {
     let app = TestApp::start().await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
     app.sign_in(&a);
@@ -95,11 +95,11 @@ async fn another_labs_data_are_not_there() {
     let job = id(&app.send(keyed().json(&body)).await.expect(201));
     let nowhere = "019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d";
     app.sign_in(&b);
-    // Whatever is asked: the answer is that for what does not exist, word for word.
+    // Each answer equals the one for a resource that does not exist, word for word.
     let same = |theirs: crate::app::Answer, unknown: crate::app::Answer, (x, y): (&str, &str)| {
         assert_eq!(theirs.status, unknown.status);
         let text = String::from_utf8(theirs.bytes.clone()).unwrap().replace(x, y);
-        // But for the identifier of the request.
+        // Only the identifier of the request differs.
         let [one, other] = [&theirs, &unknown].map(|answer| answer.header("x-request-id"));
         assert_eq!(text.replace(one, other), String::from_utf8(unknown.bytes.clone()).unwrap());
     };
@@ -139,28 +139,28 @@ async fn another_labs_data_are_not_there() {
     let theirs = app.post("/v1/jobs", &body).await;
     let unknown = json!({"measurement": nowhere, "algorithm": "gap-tv"});
     same(theirs, app.post("/v1/jobs", &unknown).await, (&measurement, nowhere));
-    // A file that another lab has is new to this one.
+    // A file that another lab has stored is new to this lab.
     app.get(&format!("/v1/blobs/{masks}")).await.problem(404, "not_found");
     let sent = app.send(app.request(Method::POST, "/v1/blobs").body(Scene::SMALL.masks())).await;
     assert_eq!(sent.expect(201).json()["sha256"], masks);
-    // So is a key.
+    // Idempotency keys are separate as well.
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let own = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_ne!(id(&app.send(keyed().json(&own)).await.expect(201)), job);
-    // The bytes are stored once, and stay when one of the labs is done with them.
+    // The bytes are stored once, and remain until no lab needs them.
     let blobs = std::fs::read_dir(app.data().join("blobs")).unwrap().count();
-    assert_eq!(blobs, 4, "masks, data, and what was prepared of each");
+    assert_eq!(blobs, 4, "masks, data, and the arrays prepared from them");
 }
 
 #[tokio::test]
-async fn a_token_keeps_no_more_than_it_may() {
+async fn a_token_stores_no_more_than_its_quota() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "1000"]));
     app.upload(vec![1; 600]).await;
     let send = |bytes: Vec<u8>| app.send(app.request(Method::POST, "/v1/blobs").body(bytes));
     let detail = send(vec![2; 600]).await.problem(507, "quota_exceeded");
     assert!(detail.contains("600") && detail.contains("1000"), "{detail}");
-    // Also if it does not say how long it is.
+    // The quota also applies to an upload without a length.
     let chunks = futures_util::stream::iter([Ok::<_, std::io::Error>(vec![3u8; 600])]);
     let body = reqwest::Body::wrap_stream(chunks);
     let answer = app.send(app.request(Method::POST, "/v1/blobs").body(body)).await;
@@ -169,7 +169,7 @@ async fn a_token_keeps_no_more_than_it_may() {
 }
 
 #[test]
-fn a_service_that_others_reach_wants_tokens() {
+fn a_service_on_a_public_address_requires_tokens() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     command.args(["serve", "--listen", "0.0.0.0:0", "--workers", "0", "--data"]).arg(folder.path());
@@ -190,7 +190,7 @@ fn a_service_that_others_reach_wants_tokens() {
 }
 
 #[tokio::test]
-async fn a_token_stands_in_no_log_and_no_file() {
+async fn a_token_appears_in_no_log_and_no_file() {
     let folder = tempfile::tempdir().unwrap();
     let log = folder.path().join("log");
     let mut app = TestApp::logging(&log).await;
@@ -221,7 +221,7 @@ async fn a_token_stands_in_no_log_and_no_file() {
 }
 
 #[tokio::test]
-async fn a_page_of_another_site_gets_nothing_of_an_open_service() {
+async fn a_page_of_another_site_has_no_access_to_an_open_service() {
     let app = TestApp::with(&["--workers", "0", "--host", "bench.example"]).await;
     let ask = |method: Method, lines: &[(&str, &str)]| {
         let mut request = app.request(method, "/v1/jobs").json(&json!({}));
@@ -230,12 +230,16 @@ async fn a_page_of_another_site_gets_nothing_of_an_open_service() {
         }
         async { request.send().await.unwrap().status().as_u16() }
     };
-    // The name of the other site points at this machine by now.
+    // DNS rebinding: the other site's name resolves to this machine.
     assert_eq!(ask(Method::GET, &[("host", "evil.example")]).await, 403);
     assert_eq!(ask(Method::GET, &[("host", "bench.example")]).await, 200);
     assert_eq!(ask(Method::POST, &[("origin", "http://evil.example")]).await, 403);
     assert_eq!(ask(Method::POST, &[("sec-fetch-site", "cross-site")]).await, 403);
-    assert_eq!(ask(Method::POST, &[]).await, 422, "it comes as far as the body");
+    assert_eq!(
+        ask(Method::POST, &[]).await,
+        422,
+        "the request passes all checks but that of its body"
+    );
     app.token(&["create", "--lab", "optics"]);
-    assert_eq!(ask(Method::GET, &[("host", "evil.example")]).await, 401, "a token is needed now");
+    assert_eq!(ask(Method::GET, &[("host", "evil.example")]).await, 401, "a token is required now");
 }

@@ -1,4 +1,4 @@
-//! Schedules that find out for themselves how far to go.
+//! Adaptive schedules, which decide how many iterations to run.
 
 use serde_json::{Value, json};
 
@@ -18,12 +18,20 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     let stages = content["pilot"]["stages"].as_array().unwrap();
     assert_eq!((&stages[0]["end"], &stages[0]["iterations"]), (&json!("fixed"), &json!(20)));
     let paid = stages[1]["iterations"].as_u64().unwrap();
-    assert!(paid > 0, "the stage has begun: {stages:#?}");
+    assert!(paid > 0, "the stage has run: {stages:#?}");
     let temporal = stages[0]["temporal_weight"].as_f64().unwrap() as f32;
     let asked = stages[0]["planned_temporal_weight"].as_f64().unwrap() as f32;
-    assert_eq!((asked, temporal), (0.004, 0.004), "the scene drifts slowly: along time it pays");
+    assert_eq!(
+        (asked, temporal),
+        (0.004, 0.004),
+        "temporal weight is kept, because the scene moves slowly"
+    );
     let decided = content["schedule"]["stages"][0]["temporal_weight"].as_f64();
-    assert_eq!(decided.map(|weight| weight as f32), Some(temporal), "the schedule says so, too");
+    assert_eq!(
+        decided.map(|weight| weight as f32),
+        Some(temporal),
+        "the schedule has the same weight"
+    );
     assert!(stages[0]["error_after"].as_f64() < stages[0]["error_before"].as_f64());
     let decided = &content["schedule"];
     assert_eq!(decided["adaptive"], false);
@@ -34,7 +42,7 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     assert!(first == second, "the schedule in the manifest gives the same frames");
 }
 
-/// The hashes of all result files, and what the job's manifest says of its content.
+/// The hashes of all result files, and the content of the job's manifest.
 async fn run(
     app: &TestApp,
     measurement: &str,
@@ -51,9 +59,9 @@ async fn run(
     let decided: u64 = stages.iter().filter_map(|stage| stage["iterations"].as_u64()).sum();
     let last = app.get(&format!("/v1/jobs/{job}/snapshots/0/tiles/0/history")).await.expect(200);
     let last = last.json()["points"].as_array().unwrap().last().unwrap()[0].clone();
-    assert_eq!(last, decided, "the tiles do as many iterations as the schedule says");
+    assert_eq!(last, decided, "the tiles run the iterations of the schedule");
     let mut files = results(app, &job).await;
-    // A fixed schedule has no pilot, which knows more of the error.
+    // A fixed schedule has no pilot, which refines the expected error.
     files.retain(|name, _| !name.ends_with("error.npy"));
     (files, content)
 }

@@ -1,4 +1,4 @@
-//! Tokens for all labs, tokens that end, and the sessions of browsers.
+//! Tokens for all labs, expiring tokens, and browser sessions.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::app::{Answer, TestApp, id};
 use crate::samples::Scene;
 
-/// A service with a job of the lab `a`, a token of the lab `b`, and one for all labs; and the job.
+/// A service, its tokens (of lab `a`, of lab `b`, for all labs), and a job of the lab `a`.
 async fn three_tokens() -> (TestApp, [String; 3], String) {
     let app = TestApp::start().await;
     let a = app.token(&["create", "--lab", "a"]);
@@ -22,7 +22,7 @@ async fn three_tokens() -> (TestApp, [String; 3], String) {
 }
 
 #[tokio::test]
-async fn no_lab_puts_its_job_before_those_of_others_unless_its_role_allows() {
+async fn only_a_token_for_all_labs_sets_a_high_priority() {
     let (app, [a, _, all], job) = three_tokens().await;
     app.sign_in(&a);
     let place = format!("/v1/jobs/{job}");
@@ -45,7 +45,7 @@ async fn no_lab_puts_its_job_before_those_of_others_unless_its_role_allows() {
 }
 
 #[tokio::test]
-async fn who_looks_after_all_labs_sees_and_helps_each_and_nobody_else_does() {
+async fn only_a_token_for_all_labs_sees_and_changes_other_labs() {
     let (app, [a, b, all], job) = three_tokens().await;
     app.sign_in(&all);
     assert_eq!(app.get("/v1/jobs").await.json()["items"], json!([]), "its own lab has none");
@@ -58,7 +58,7 @@ async fn who_looks_after_all_labs_sees_and_helps_each_and_nobody_else_does() {
     app.get("/v1/jobs?lab=nowhere").await.problem(404, "not_found");
     app.get("/v1/blobs?lab=*").await.problem(404, "not_found");
     assert_eq!(app.get("/v1/blobs?lab=a").await.json()["items"].as_array().unwrap().len(), 2);
-    // It helps: a priority, a cancel, a limit.
+    // It may change a priority, cancel, and set a limit.
     let place = format!("/v1/jobs/{job}");
     app.get(&place).await.problem(404, "not_found");
     let change = app.request(Method::PATCH, &format!("{place}?lab=a"));
@@ -81,12 +81,12 @@ async fn who_looks_after_all_labs_sees_and_helps_each_and_nobody_else_does() {
     };
     assert_eq!(names(app.get("/v1/labs").await.expect(200)), ["a", "b", "ops"]);
     app.get("/v1/labs/nowhere").await.problem(404, "not_found");
-    // The one that may only look for all labs changes nothing.
+    // A token for all labs with the role `read` changes nothing.
     app.sign_in(&app.token(&["create", "--lab", "ops", "--role", "read", "--all-labs"]));
     app.get("/v1/labs").await.expect(200);
     set(json!({"share": 9})).await.problem(403, "forbidden");
     app.delete(&format!("{place}?lab=a")).await.problem(403, "forbidden");
-    // For an admin of one lab there are no others, whatever is asked.
+    // An admin of one lab has no access to other labs, whether they exist or not.
     app.sign_in(&b);
     for path in
         ["/v1/jobs?lab=a", "/v1/jobs?lab=*", "/v1/jobs?lab=nowhere", "/v1/labs", "/v1/labs/a"]
@@ -100,7 +100,7 @@ async fn who_looks_after_all_labs_sees_and_helps_each_and_nobody_else_does() {
 }
 
 #[tokio::test]
-async fn the_command_line_sees_and_helps_all_labs() {
+async fn the_command_line_sees_and_changes_all_labs() {
     let (app, [a, ..], job) = three_tokens().await;
     let command = |arguments: &[&str]| {
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
@@ -157,16 +157,16 @@ async fn the_command_line_sees_and_helps_all_labs() {
 }
 
 #[tokio::test]
-async fn a_token_ends_at_its_time_and_says_so_and_its_last_use_is_known() {
+async fn a_token_expires_and_records_its_last_use() {
     let app = TestApp::start().await;
-    let soon = jiff_now(3);
+    let soon = time_after(3);
     let token = app.token(&["create", "--lab", "a", "--expires", &soon]);
     let lasting = app.token(&["create", "--lab", "a", "--expires", "90d"]);
     app.sign_in(&token);
     let me = app.get("/v1/me").await.expect(200).json();
     assert_eq!(me["expires_at"].as_str().unwrap()[..19], soon[..19]);
     let session = app.send(app.request(Method::POST, "/v1/session")).await.expect(201);
-    assert_eq!(session.json()["expires_at"], me["expires_at"], "it lasts no longer than its token");
+    assert_eq!(session.json()["expires_at"], me["expires_at"], "the session ends with its token");
     let session = session.header("set-cookie").split(';').next().unwrap().to_owned();
     let mut events = app.request(Method::GET, "/v1/events").send().await.unwrap();
     assert_eq!(events.status(), 200);
@@ -179,7 +179,7 @@ async fn a_token_ends_at_its_time_and_says_so_and_its_last_use_is_known() {
         }
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
-    assert!(used, "the last use is not known");
+    assert!(used, "the last use is not recorded");
     // The stream of events ends with the token.
     let rest = async { while events.chunk().await.unwrap().is_some() {} };
     tokio::time::timeout(Duration::from_secs(20), rest).await.expect("the stream ends");
@@ -191,19 +191,19 @@ async fn a_token_ends_at_its_time_and_says_so_and_its_last_use_is_known() {
     app.get("/v1/me").await.expect(200);
 }
 
-/// The moment in so many seconds, as text.
-fn jiff_now(seconds: i64) -> String {
+/// The time in `seconds` seconds, as text.
+fn time_after(seconds: i64) -> String {
     let now = engine::job::Timestamp::now();
     engine::job::Timestamp(now.0 + 1000 * seconds).to_string()
 }
 
 #[tokio::test]
-async fn a_browser_shows_its_token_once_and_pages_of_others_do_no_harm() {
+async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
     let (app, [a, ..], job) = three_tokens().await;
     app.sign_in(&a);
     let begin = || app.request(Method::POST, "/v1/session");
-    let begun = app.send(begin().header("origin", "https://bench.example")).await.expect(201);
-    let cookie = begun.header("set-cookie").to_owned();
+    let session = app.send(begin().header("origin", "https://bench.example")).await.expect(201);
+    let cookie = session.header("set-cookie").to_owned();
     for part in ["; HttpOnly", "; SameSite=Strict", "; Secure", "; Path=/", "; Max-Age=60480"] {
         assert!(cookie.contains(part), "{part}: {cookie}");
     }
@@ -235,7 +235,7 @@ async fn a_browser_shows_its_token_once_and_pages_of_others_do_no_harm() {
     let ended = app.send(ask(Method::DELETE, "/v1/session", &same)).await.expect(204);
     assert!(ended.header("set-cookie").contains("sci_recon_session=; "));
     app.send(ask(Method::GET, "/v1/jobs", &[])).await.problem(401, "unauthorized");
-    // A token that is revoked takes its sessions with it.
+    // Revoking a token ends its sessions.
     let session = other.header("set-cookie").split(';').next().unwrap().to_owned();
     let look = || app.request(Method::GET, "/v1/jobs").header("cookie", &session);
     app.send(look()).await.expect(200);
@@ -258,7 +258,7 @@ async fn a_service_without_tokens_needs_no_session() {
 async fn a_download_ends_with_its_token() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a"]));
-    // More than the buffers of a connection hold.
+    // Larger than the buffers of a connection.
     let sha256 = app.upload(vec![3; 40_000_000]).await;
     let path = format!("/v1/blobs/{sha256}/content");
     let mut download = app.request(Method::GET, &path).send().await.unwrap();

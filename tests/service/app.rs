@@ -10,7 +10,7 @@ use tempfile::TempDir;
 
 use crate::{contract, samples};
 
-/// A running service; it is killed when this is dropped.
+/// A running service, which is killed when this is dropped.
 pub struct TestApp {
     _folder: TempDir,
     data: std::path::PathBuf,
@@ -44,7 +44,7 @@ impl Answer {
         self.headers.get(name).map_or("", |value| value.to_str().unwrap())
     }
 
-    /// Checks that this is a whole problem with this status and code, and gives its detail.
+    /// Checks that this is a complete problem with this status and code, and returns its detail.
     #[track_caller]
     pub fn problem(&self, status: u16, code: &str) -> String {
         let text = String::from_utf8_lossy(&self.bytes).into_owned();
@@ -70,47 +70,47 @@ impl Answer {
 }
 
 impl TestApp {
-    /// A service without workers: what is submitted stays in the queue.
+    /// Starts a service without workers, so that jobs stay in the queue.
     pub async fn start() -> Self {
         Self::with(&["--workers", "0"]).await
     }
 
-    /// A service with one worker that writes all there is to say to this file.
+    /// Starts a service with one worker that writes its full log to this file.
     pub async fn logging(log: &Path) -> Self {
         let log = std::fs::File::create(log).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let environment = [("RUST_LOG", "trace")];
-        let begun = spawn(folder.path(), &owned(&["--workers", "1"]), &environment, log.into());
-        Self::begun(folder, "", &["--workers", "1"], begun.expect("the server starts"))
+        let spawned = spawn(folder.path(), &owned(&["--workers", "1"]), &environment, log.into());
+        Self::from_process(folder, "", &["--workers", "1"], spawned.expect("the server starts"))
     }
 
     pub async fn with(arguments: &[&str]) -> Self {
         Self::in_environment(arguments, &[]).await
     }
 
-    /// With these variables in its environment; a restart is without them.
+    /// Starts the service with these environment variables; a restart is without them.
     pub async fn in_environment(arguments: &[&str], environment: &[(&str, &str)]) -> Self {
         Self::try_in_environment(arguments, environment).await.expect("the server starts")
     }
 
-    /// None if the server does not start.
+    /// Starts the service; none if it does not start.
     pub async fn try_in_environment(
         arguments: &[&str],
         environment: &[(&str, &str)],
     ) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
-        let begun = spawn(folder.path(), &owned(arguments), environment, Stdio::inherit())?;
-        Some(Self::begun(folder, "", arguments, begun))
+        let spawned = spawn(folder.path(), &owned(arguments), environment, Stdio::inherit())?;
+        Some(Self::from_process(folder, "", arguments, spawned))
     }
 
-    /// A service on data that are there, in a subfolder.
+    /// Starts the service on existing data in a subfolder.
     pub async fn on(folder: TempDir, subfolder: &str, arguments: &[&str]) -> Self {
         let data = folder.path().join(subfolder);
-        let begun = spawn(&data, &owned(arguments), &[], Stdio::inherit());
-        Self::begun(folder, subfolder, arguments, begun.expect("the server starts"))
+        let spawned = spawn(&data, &owned(arguments), &[], Stdio::inherit());
+        Self::from_process(folder, subfolder, arguments, spawned.expect("the server starts"))
     }
 
-    fn begun(
+    fn from_process(
         folder: TempDir,
         subfolder: &str,
         arguments: &[&str],
@@ -121,50 +121,51 @@ impl TestApp {
         Self { _folder: folder, data, process, url, client: Client::new(), arguments, token }
     }
 
-    /// The same data, served with other arguments.
+    /// Restarts the service on the same data with other arguments.
     pub async fn again(mut self, arguments: &[&str]) -> Self {
         self.arguments = owned(arguments);
         self.restart();
         self
     }
 
-    /// True if the server's process has not ended.
-    pub fn lives(&mut self) -> bool {
+    /// True if the server's process is running.
+    pub fn is_running(&mut self) -> bool {
         self.process.try_wait().unwrap().is_none()
     }
 
-    /// Kills the server as a power cut would, and starts another one on the same folder.
+    /// Kills the server, as a power cut would, and starts it on the same folder with other
+    /// arguments.
     pub fn restart_with(&mut self, arguments: &[&str]) {
         self.arguments = arguments.iter().map(|&text| text.to_owned()).collect();
         self.restart();
     }
 
-    /// Kills the server as a power cut would, and starts another one on the same folder.
+    /// Kills the server, as a power cut would, and starts it on the same folder.
     pub fn restart(&mut self) {
         self.kill();
-        let begun = spawn(&self.data, &self.arguments, &[], Stdio::inherit());
-        (self.process, self.url) = begun.expect("the server starts");
+        let spawned = spawn(&self.data, &self.arguments, &[], Stdio::inherit());
+        (self.process, self.url) = spawned.expect("the server starts");
     }
 
-    /// The same, if the server starts on what is there now; false if it does not.
-    pub fn revive(&mut self) -> bool {
+    /// Restarts the server; false if it does not start.
+    pub fn try_restart(&mut self) -> bool {
         self.kill();
-        let begun = spawn(&self.data, &self.arguments, &[], Stdio::inherit());
-        let starts = begun.is_some();
-        if let Some(begun) = begun {
-            (self.process, self.url) = begun;
+        let spawned = spawn(&self.data, &self.arguments, &[], Stdio::inherit());
+        let starts = spawned.is_some();
+        if let Some(spawned) = spawned {
+            (self.process, self.url) = spawned;
         }
         starts
     }
 
-    /// SIGKILL.
+    /// Sends SIGKILL.
     pub fn kill(&mut self) {
-        // It may be dead already.
+        // The process may have ended already.
         let _ = self.process.kill();
         self.process.wait().unwrap();
     }
 
-    /// SIGTERM, and the exit status.
+    /// Sends SIGTERM and returns the exit status.
     pub fn stop(&mut self) -> std::process::ExitStatus {
         let pid = rustix::process::Pid::from_raw(self.process.id() as i32).unwrap();
         rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
@@ -197,7 +198,7 @@ impl TestApp {
         *self.token.write().unwrap() = None;
     }
 
-    /// What `sci-recon token` prints for these arguments.
+    /// Output of `sci-recon token` with these arguments.
     pub fn token(&self, arguments: &[&str]) -> String {
         let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         let output = command.args(["token", "--data"]).arg(self.data()).args(arguments).output();
@@ -206,7 +207,7 @@ impl TestApp {
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
-    /// Sends a request. Whatever the answer is, it must stand in the contract.
+    /// Sends a request, and checks that the contract allows the answer.
     pub async fn send(&self, request: RequestBuilder) -> Answer {
         let (client, request) = request.build_split();
         let request = request.unwrap();
@@ -220,6 +221,18 @@ impl TestApp {
         self.send(self.request(Method::GET, path)).await
     }
 
+    /// Repeats a GET until the answer has this status, for at most a minute.
+    pub async fn get_until(&self, path: &str, status: u16) -> Answer {
+        let start = std::time::Instant::now();
+        loop {
+            let answer = self.get(path).await;
+            if answer.status.as_u16() == status || start.elapsed().as_secs() >= 60 {
+                return answer.expect(status);
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        }
+    }
+
     pub async fn delete(&self, path: &str) -> Answer {
         self.send(self.request(Method::DELETE, path)).await
     }
@@ -228,27 +241,27 @@ impl TestApp {
         self.send(self.request(Method::POST, path).json(body)).await
     }
 
-    /// Sends a file and gives its hash.
+    /// Uploads a file and returns its hash.
     pub async fn upload(&self, bytes: Vec<u8>) -> String {
         let answer = self.send(self.request(Method::POST, "/v1/blobs").body(bytes)).await;
         assert!(answer.status.is_success(), "{answer:?}");
         answer.json()["sha256"].as_str().unwrap().to_owned()
     }
 
-    /// Sends masks and makes a calibration of them, if they are good.
+    /// Uploads masks and creates a calibration.
     pub async fn calibrate(&self, masks: Vec<u8>) -> Answer {
         let masks = self.upload(masks).await;
         self.post("/v1/calibrations", &json!({ "masks": masks })).await
     }
 
-    /// Sends snapshots and makes a measurement of them, if they are good.
+    /// Uploads snapshots and creates a measurement.
     pub async fn measure(&self, calibration: &str, data: Vec<u8>) -> Answer {
         let data = self.upload(data).await;
         let body = json!({ "calibration": calibration, "data": data });
         self.post("/v1/measurements", &body).await
     }
 
-    /// A calibration and a measurement of `snapshots` snapshots of a moving square; gives both ids.
+    /// Creates a calibration and a measurement of a moving square; returns both identifiers.
     pub async fn scene(&self, scene: &samples::Scene) -> (String, String) {
         let calibration = id(&self.calibrate(scene.masks()).await.expect(201));
         let measurement = id(&self.measure(&calibration, scene.snapshots()).await.expect(201));
@@ -256,13 +269,47 @@ impl TestApp {
     }
 }
 
-/// Python with the readers and clients of the tests; none, and a word on it, where there is none.
+/// Python with the packages of tests/judges/requirements.txt, or none after [`skip`].
+#[track_caller]
 pub fn judges() -> Option<String> {
     let python = std::env::var("SCI_RECON_JUDGES").ok();
     if python.is_none() {
-        eprintln!("SKIPPED: SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt");
+        skip(
+            "SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt: run `make judges`",
+        );
     }
     python
+}
+
+/// True if libonnxruntime is available; otherwise calls [`skip`].
+#[track_caller]
+pub fn has_onnxruntime() -> bool {
+    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
+    let exists = Path::new(&library).exists();
+    if !exists {
+        skip(&format!("ORT_DYLIB_PATH names no libonnxruntime ({library:?}): run `make runtime`"));
+    }
+    exists
+}
+
+/// True if these programs are installed; otherwise calls [`skip`]. `packages` are those of Debian.
+#[track_caller]
+pub fn has_programs(programs: &[&str], packages: &str) -> bool {
+    let missing =
+        programs.iter().find(|name| Command::new(name).arg("--version").output().is_err());
+    if let Some(program) = missing {
+        skip(&format!("{program} is not installed: run `apt-get install {packages}`"));
+    }
+    missing.is_none()
+}
+
+/// Reports that a test, or a part of it, is skipped because something is not installed. With `CI=true` in
+/// the environment, the test fails instead.
+#[track_caller]
+pub fn skip(missing: &str) {
+    let required = std::env::var("CI").is_ok_and(|value| value == "true");
+    assert!(!required, "no test may be skipped with CI=true, but {missing}");
+    eprintln!("SKIPPED: {missing}");
 }
 
 /// The identifier in an answer.
@@ -272,7 +319,7 @@ pub fn id(answer: &Answer) -> String {
 
 impl Drop for TestApp {
     fn drop(&mut self) {
-        // It may be dead already.
+        // The process may have ended already.
         let _ = self.process.kill();
         let _ = self.process.wait();
     }
@@ -282,7 +329,7 @@ fn owned(arguments: &[&str]) -> Vec<String> {
     arguments.iter().map(|&text| text.to_owned()).collect()
 }
 
-/// The server and its address; none if it ends before it says one.
+/// The server and its address; none if it ends before it prints one.
 fn spawn(
     data: &Path,
     arguments: &[String],
@@ -310,12 +357,12 @@ fn spawn(
 }
 
 impl TestApp {
-    /// Where the service listens, as `host:port`.
+    /// The address of the service as `host:port`.
     pub fn address(&self) -> String {
         self.url.trim_start_matches("http://").to_owned()
     }
 
-    /// The most memory that the server has had resident, in MiB.
+    /// Peak resident memory of the server in MiB.
     pub fn peak_memory(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
         let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();

@@ -1,4 +1,4 @@
-//! How good frames are expected to be, without a truth.
+//! The expected quality of frames without true frames.
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -8,10 +8,10 @@ use crate::pictures::decode;
 use crate::samples::Scene;
 
 #[tokio::test]
-async fn a_result_says_how_good_it_is_expected_to_be_and_where_it_is_worst() {
+async fn a_result_has_an_expected_psnr_and_an_error_map() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
-    // Two tiles, so that their maps are joined.
+    // Two tiles, so that their error maps are joined.
     let wanted = json!({"measurement": measurement, "algorithm": "gap-tv", "tile": {"size": 32, "overlap": 8}});
     let job = app.submit(&wanted).await;
     let before = app.get(&format!("/v1/jobs/{job}")).await.json();
@@ -19,18 +19,21 @@ async fn a_result_says_how_good_it_is_expected_to_be_and_where_it_is_worst() {
         assert_eq!(before["assessment"], Value::Null);
     }
     let ended = app.ended(&job).await;
-    let told = &ended["assessment"];
-    let figure = |name: &str| told[name].as_f64().unwrap();
+    let expected_quality = &ended["assessment"];
+    let figure = |name: &str| expected_quality[name].as_f64().unwrap();
     assert!(
         figure("psnr_low_db") < figure("psnr_db") && figure("psnr_db") <= figure("psnr_high_db")
     );
-    assert!(figure("psnr_db") > 5.0 && figure("psnr_high_db") <= 40.0, "{told}");
-    assert!(["good", "usable", "bad"].contains(&told["grade"].as_str().unwrap()), "{told}");
-    let of_job = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
-    let snapshots = of_job["content"]["snapshots"].as_array().unwrap();
+    assert!(figure("psnr_db") > 5.0 && figure("psnr_high_db") <= 40.0, "{expected_quality}");
+    assert!(
+        ["good", "usable", "bad"].contains(&expected_quality["grade"].as_str().unwrap()),
+        "{expected_quality}"
+    );
+    let job_manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    let snapshots = job_manifest["content"]["snapshots"].as_array().unwrap();
     let mean =
         snapshots.iter().map(|one| one["assessment"]["psnr_db"].as_f64().unwrap()).sum::<f64>();
-    assert!((mean / snapshots.len() as f64 - figure("psnr_db")).abs() < 0.06, "{of_job}");
+    assert!((mean / snapshots.len() as f64 - figure("psnr_db")).abs() < 0.06, "{job_manifest}");
 
     let base = format!("/v1/jobs/{job}/snapshots/0");
     let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
@@ -46,7 +49,7 @@ async fn a_result_says_how_good_it_is_expected_to_be_and_where_it_is_worst() {
     assert_eq!(values.len(), frames * blocks.0 * blocks.1);
     assert!(values.iter().all(|error| *error > 0.0 && *error < 1.0), "{values:?}");
 
-    // Each pixel of the picture shows its block.
+    // Each pixel of the image shows its block.
     let spread = app.get(&format!("{base}/pictures/error-2/spread")).await.expect(200).json();
     assert_eq!(
         (spread["height"].as_u64(), spread["width"].as_u64()),
@@ -64,7 +67,7 @@ async fn a_result_says_how_good_it_is_expected_to_be_and_where_it_is_worst() {
 }
 
 #[tokio::test]
-async fn where_nothing_can_be_told_nothing_is() {
+async fn an_error_is_not_predicted_without_a_model_for_it() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "admm-tv"})).await;
@@ -79,7 +82,7 @@ async fn where_nothing_can_be_told_nothing_is() {
 }
 
 #[tokio::test]
-async fn the_expected_error_is_a_layer_of_the_exr_on_request() {
+async fn the_expected_error_is_an_optional_layer_of_the_exr() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let scene = Scene { height: 41, width: 35, ..Scene::SMALL };
     let (_, measurement) = app.scene(&scene).await;
@@ -93,18 +96,18 @@ async fn the_expected_error_is_a_layer_of_the_exr_on_request() {
     assert_eq!(whole.header("content-type"), "image/x-exr");
     assert!(whole.header("content-disposition").ends_with("_0001_stack-sigma.exr\""), "{whole:?}");
 
-    // Other readers find the frames as they are, and the layer beside them.
+    // Other readers find the original frames, and the layer in addition.
     let made = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(made.path(), &whole.bytes).unwrap();
     if let Some(python) = judges() {
         let mut judge = tokio::process::Command::new(python);
         judge.arg("tests/judges/read_exr.py").arg(&folder).args(["--attribute", "algorithm"]);
         let output = judge.arg("--sigma").arg(made.path()).output().await.unwrap();
-        let told = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success(), "{told}{}", String::from_utf8_lossy(&output.stderr));
+        let report = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{report}{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    // It is cached and cut like a file.
+    // The file with the layer supports caching and ranges.
     let head = app.send(app.request(Method::HEAD, &path)).await.expect(200);
     assert_eq!((head.header("content-length"), head.header("etag")), (&*size.to_string(), &*etag));
     app.send(app.request(Method::GET, &path).header("if-none-match", &etag)).await.expect(304);
@@ -115,7 +118,7 @@ async fn the_expected_error_is_a_layer_of_the_exr_on_request() {
         assert!(part.bytes == whole.bytes[first..=last], "{first} to {last}");
     }
 
-    // Without the word it is the file.
+    // Without the parameter, the original file is sent.
     let stored = app.get(&plain).await.expect(200);
     assert!(stored.bytes == std::fs::read(folder.join("stack.exr")).unwrap());
     assert_ne!(stored.header("etag"), etag);
@@ -124,7 +127,7 @@ async fn the_expected_error_is_a_layer_of_the_exr_on_request() {
         assert!(why.contains("sigma") || why.contains("layers"), "{why}");
     }
 
-    // What is damaged is not sent.
+    // A damaged file is not sent.
     let mut bytes = std::fs::read(folder.join("error.npy")).unwrap();
     *bytes.last_mut().unwrap() ^= 1;
     std::fs::write(folder.join("error.npy"), bytes).unwrap();

@@ -1,4 +1,4 @@
-//! From raw captures to masks, over HTTP: a lab simulated with noise, and what can go wrong in it.
+//! From raw captures to masks over HTTP: a simulated lab with noise, and typical errors.
 
 use std::path::Path;
 use std::process::Command;
@@ -26,7 +26,7 @@ impl Lab {
 
     fn with(pattern: &str, optics: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        // A disc that moves over a ground with some texture.
+        // A disc that moves over a textured background.
         let pixel = |k: usize, i: usize, j: usize| {
             let texture = 0.4 + 0.1 * ((i as f32 / 5.0).sin() + (j as f32 / 7.0).cos());
             let away = (i as f32 - 40.0 - 2.0 * k as f32).hypot(j as f32 - 50.0);
@@ -64,7 +64,7 @@ impl Lab {
         serde_json::from_slice(&self.file(name)).unwrap()
     }
 
-    /// The patterns that the LCoS showed, as .npy.
+    /// The patterns shown on the LCoS, as .npy.
     fn patterns(&self) -> Vec<u8> {
         let record = self.json("simulation.json");
         let (rows, columns) = (&record["apertures"]["rows"], &record["apertures"]["columns"]);
@@ -79,7 +79,7 @@ impl Lab {
         npy(&[FRAMES, shape[0], shape[1]], values.into_iter())
     }
 
-    /// Sends all captures; gives the `captures` of a request.
+    /// Uploads all captures; returns the `captures` of a request.
     pub async fn send(&self, app: &TestApp) -> Value {
         let index = self.json("captures/captures.json");
         let mut captures = json!({"saturation": index["saturation"]});
@@ -101,7 +101,7 @@ impl Lab {
 }
 
 impl TestApp {
-    /// Makes a calibration of captures, waits until it has come to its end, and gives it.
+    /// Creates a calibration from captures, waits until it has ended, and returns it.
     pub async fn calibrate_captures(&self, captures: &Value) -> Value {
         let answer =
             self.post("/v1/calibrations", &json!({"captures": captures})).await.expect(202);
@@ -137,8 +137,8 @@ impl TestApp {
     }
 }
 
-/// The codes of findings, and the frames that each is about.
-pub fn found(findings: &Value) -> Vec<(String, Vec<u64>)> {
+/// The codes of findings, with the frames that each concerns.
+pub fn codes_and_frames(findings: &Value) -> Vec<(String, Vec<u64>)> {
     let finding = |finding: &Value| {
         let frames = finding["frames"].as_array().unwrap();
         let frames = frames.iter().map(|frame| frame.as_u64().unwrap()).collect();
@@ -147,7 +147,7 @@ pub fn found(findings: &Value) -> Vec<(String, Vec<u64>)> {
     findings.as_array().unwrap().iter().map(finding).collect()
 }
 
-/// The prepared masks of a calibration, from the store's folder.
+/// The prepared masks of a calibration, read from the store's folder.
 fn masks(app: &TestApp, calibration: &Value) -> Vec<f32> {
     let sha256 = calibration["masks"].as_str().unwrap();
     let file = find(&app.data().join("blobs"), sha256).expect("the masks are stored");
@@ -187,7 +187,7 @@ async fn captures_give_masks_within_their_statistical_error() {
         let rms = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
         let expected = figures["noise"].as_f64().unwrap() * scale;
         if black_with_mask {
-            // Values below 0 are set to 0, which takes a little of the error away.
+            // Values below 0 are set to 0, which slightly reduces the error.
             assert!((0.85..1.15).contains(&(rms / expected)), "{rms} and {expected} expected");
             let bias = errors.iter().sum::<f64>() / errors.len() as f64;
             assert!(bias.abs() < 0.2 * expected, "{bias}");
@@ -198,7 +198,8 @@ async fn captures_give_masks_within_their_statistical_error() {
             let true_share = lab.json("simulation.json")["light_throughput"].as_f64().unwrap();
             assert!((share / true_share - 1.0).abs() < 0.01, "{share} and {true_share}");
         } else {
-            // Eq. 7 takes the background for that without the mask, which is brighter.
+            // Without a black capture with mask, equation 7 takes the brighter one without it as
+            // background.
             assert!(rms > expected && rms < 0.01, "{rms} and {expected}");
         }
         captures["black_with_mask"] = json!([]);
@@ -206,7 +207,7 @@ async fn captures_give_masks_within_their_statistical_error() {
 }
 
 #[test]
-fn the_command_line_calibrates_as_the_service_does() {
+fn the_command_line_calibrates_like_the_service() {
     let lab = Lab::new("");
     let index = lab.folder.path().join("sim/captures/captures.json");
     let out = lab.folder.path().join("calibration");
@@ -242,7 +243,7 @@ fn the_command_line_calibrates_as_the_service_does() {
 }
 
 #[tokio::test]
-async fn the_report_can_be_looked_at() {
+async fn the_report_has_maps_and_a_page() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let lab = Lab::new("");
     let captures = lab.send(&app).await;
@@ -262,7 +263,7 @@ async fn the_report_can_be_looked_at() {
     assert!(page.header("content-security-policy").contains("default-src 'none'"));
     let text = String::from_utf8(page.bytes).unwrap();
     assert!(text.contains("maps/gram.png") && !text.contains("<script"), "{text}");
-    // Masks that were sent get a report of what can be known of them.
+    // Uploaded masks have a report without the figures of captures.
     let sent = app.calibrate(lab.file("masks.npy")).await.expect(201).json();
     let report = app.report(&sent).await;
     assert_eq!(report["captures"], Value::Null);
@@ -272,13 +273,13 @@ async fn the_report_can_be_looked_at() {
 }
 
 #[tokio::test]
-async fn what_went_wrong_in_the_lab_is_named_by_the_report() {
+async fn typical_errors_of_a_lab_are_found() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let lab = Lab::new("");
     let good = lab.send(&app).await;
     let codes = async |captures: &Value| {
         let calibration = app.calibrate_captures(captures).await;
-        found(&app.report(&calibration).await["findings"])
+        codes_and_frames(&app.report(&calibration).await["findings"])
     };
     assert_eq!(codes(&good).await, []);
     let mut wrong = good.clone();
@@ -304,7 +305,7 @@ async fn what_went_wrong_in_the_lab_is_named_by_the_report() {
 }
 
 #[tokio::test]
-async fn captures_that_can_not_be_are_refused() {
+async fn invalid_captures_are_rejected() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let lab = Lab::new("");
     let good = lab.send(&app).await;
@@ -327,7 +328,7 @@ async fn captures_that_can_not_be_are_refused() {
     assert_eq!(answer.json()["pointer"], "/captures/white/0");
     let both = json!({"captures": good, "masks": small});
     app.post("/v1/calibrations", &both).await.problem(422, "invalid_request");
-    // What only shows on the way ends as a failure with its reason.
+    // An error that only the calculation detects makes the calibration fail with a reason.
     let mut confused = good.clone();
     confused["white"] = good["black"].clone();
     let failed = app.calibrate_captures(&confused).await;
@@ -338,7 +339,7 @@ async fn captures_that_can_not_be_are_refused() {
     let refused = app.post("/v1/measurements", &body).await;
     let detail = refused.problem(409, "calibration_not_ready");
     assert!(detail.contains("nowhere brighter"), "{detail}");
-    assert_eq!(refused.json()["retryable"], false, "it will never be ready");
+    assert_eq!(refused.json()["retryable"], false, "a failed calibration is never ready");
     let listed = app.get("/v1/calibrations").await.expect(200).json();
     assert_eq!(listed["items"][0]["state"], "failed");
     let path = format!("/v1/calibrations/{}", failed["id"].as_str().unwrap());
@@ -347,7 +348,7 @@ async fn captures_that_can_not_be_are_refused() {
 }
 
 #[tokio::test]
-async fn a_calibration_waits_for_a_worker_and_says_so() {
+async fn a_calibration_without_a_worker_is_not_ready() {
     let mut app = TestApp::start().await;
     let captures = Lab::new("").send(&app).await;
     let answer = app.post("/v1/calibrations", &json!({"captures": captures})).await.expect(202);
@@ -355,7 +356,7 @@ async fn a_calibration_waits_for_a_worker_and_says_so() {
     let body = json!({"calibration": calibration, "data": captures["white"][0]});
     let refused = app.post("/v1/measurements", &body).await;
     refused.problem(409, "calibration_not_ready");
-    assert_eq!(refused.json()["retryable"], true, "while it is being made");
+    assert_eq!(refused.json()["retryable"], true, "the calibration is still queued");
     let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await;
     report.problem(409, "calibration_not_ready");
     app.restart_with(&["--workers", "1"]);

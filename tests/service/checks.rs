@@ -11,7 +11,7 @@ use crate::samples::{Scene, constant, npy_header};
 const CALIBRATIONS: &str = "/v1/calibrations";
 const MEASUREMENTS: &str = "/v1/measurements";
 
-/// Masks of 32 MB, whose check takes a while: half of the pixels are open.
+/// Masks of 32 MB with half of the pixels open. Their check takes a while.
 fn large_masks() -> Vec<u8> {
     let mut file = npy_header("|u1", &[64, 512, 1024]);
     let mut state = 1_u64;
@@ -24,13 +24,13 @@ fn large_masks() -> Vec<u8> {
 }
 
 impl TestApp {
-    /// Asks for something without waiting for its check.
+    /// Sends a request without waiting for its check.
     async fn ask(&self, path: &str, body: &Value, key: &str) -> Answer {
         let request = self.request(Method::POST, path).json(body);
         self.send(request.header("Prefer", "respond-async").header("Idempotency-Key", key)).await
     }
 
-    /// Waits for the end of a check, and gives what is shown then.
+    /// Waits for the end of a check, and returns the resource.
     async fn checked(&self, path: &str, id: &str) -> Value {
         for _ in 0..6 {
             let shown = self.get(&format!("{path}/{id}?wait=20")).await.expect(200).json();
@@ -43,7 +43,7 @@ impl TestApp {
 }
 
 #[tokio::test]
-async fn a_long_check_goes_on_after_the_answer() {
+async fn a_long_check_continues_after_the_answer() {
     let app = TestApp::start().await;
     let masks = app.upload(large_masks()).await;
     let body = json!({"masks": masks, "name": "before"});
@@ -52,7 +52,7 @@ async fn a_long_check_goes_on_after_the_answer() {
     assert_eq!(asked.header("location"), format!("{CALIBRATIONS}/{calibration}"));
     let shown = asked.json();
     assert_eq!((&shown["state"], &shown["frames"]), (&json!("preparing"), &Value::Null));
-    // Meanwhile: the key, what needs it, what it needs, its name, and the list.
+    // During the check: the key, dependent resources, the file, the name, and the list.
     let again = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
     assert_eq!(id(&again), calibration);
     let other = app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await;
@@ -77,7 +77,7 @@ async fn a_long_check_goes_on_after_the_answer() {
     assert_eq!(listed["items"].as_array().unwrap().len(), 1);
     assert_eq!(id(&app.ask(CALIBRATIONS, &body, "k").await.expect(200)), calibration);
 
-    // The same of a measurement.
+    // The same holds for a measurement.
     let asked = app.ask(MEASUREMENTS, &measurement, "k").await.expect(202);
     assert_eq!(asked.json()["state"], "preparing");
     let job = json!({"measurement": id(&asked), "algorithm": "gap-tv"});
@@ -94,30 +94,30 @@ async fn a_long_check_goes_on_after_the_answer() {
 }
 
 #[tokio::test]
-async fn what_does_not_pass_is_told_as_the_answer_would_have_told_it() {
+async fn a_failed_check_has_the_same_problem_as_a_direct_answer() {
     let app = TestApp::start().await;
     let masks = app.upload(constant(&[4, 48, 64], 3.0)).await;
     let body = json!({"masks": masks});
-    let told = app.post(CALIBRATIONS, &body).await;
-    told.problem(422, "invalid_content");
+    let direct = app.post(CALIBRATIONS, &body).await;
+    direct.problem(422, "invalid_content");
     let asked = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
     let failed = app.checked(CALIBRATIONS, &id(&asked)).await;
-    assert_eq!((&failed["state"], &failed["error"]), (&json!("failed"), &told.json()["detail"]));
+    assert_eq!((&failed["state"], &failed["error"]), (&json!("failed"), &direct.json()["detail"]));
     let same = |problem: &Value| {
         let mut problem = problem.clone();
         let instance = problem.as_object_mut().unwrap().remove("instance");
         (problem, instance.unwrap().as_str().unwrap().to_owned())
     };
     let (later, request) = same(&failed["problem"]);
-    assert_eq!(later, same(&told.json()).0);
+    assert_eq!(later, same(&direct.json()).0);
     assert_eq!(request, format!("urn:sci-recon:request:{}", asked.header("x-request-id")));
-    // It is no use to wait for it.
+    // Waiting for a failed calibration is useless.
     let data = app.upload(constant(&[48, 64], 1.0)).await;
     let needs = json!({"calibration": id(&asked), "data": data});
     let refused = app.post(MEASUREMENTS, &needs).await;
     refused.problem(409, "calibration_not_ready");
     assert_eq!(refused.json()["retryable"], false);
-    // Its key and its file are free.
+    // The key and the file can be used again.
     let again = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
     assert_ne!(id(&again), id(&asked));
     app.checked(CALIBRATIONS, &id(&again)).await;
@@ -128,11 +128,11 @@ async fn what_does_not_pass_is_told_as_the_answer_would_have_told_it() {
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     let data = app.upload(constant(&[48, 48], 1.0)).await;
     let body = json!({"calibration": calibration, "data": data});
-    let told = app.post(MEASUREMENTS, &body).await;
-    told.problem(422, "size_mismatch");
+    let direct = app.post(MEASUREMENTS, &body).await;
+    direct.problem(422, "size_mismatch");
     let asked = app.ask(MEASUREMENTS, &body, "k").await.expect(202);
     let failed = app.checked(MEASUREMENTS, &id(&asked)).await;
-    assert_eq!(same(&failed["problem"]).0, same(&told.json()).0);
+    assert_eq!(same(&failed["problem"]).0, same(&direct.json()).0);
     let job = json!({"measurement": id(&asked), "algorithm": "gap-tv"});
     let refused = app.post("/v1/jobs", &job).await;
     refused.problem(409, "measurement_not_ready");
@@ -157,12 +157,12 @@ async fn a_check_survives_a_killed_server_but_not_its_deletion() {
     assert_eq!(id(&app.ask(CALIBRATIONS, &body, "k").await.expect(200)), calibration);
     app.delete(&place).await.expect(204);
 
-    // What is deleted is checked no longer, and its key is free.
+    // A deleted resource is not checked, and its key can be used again.
     let first = id(&app.ask(CALIBRATIONS, &body, "k").await.expect(202));
     app.delete(&format!("{CALIBRATIONS}/{first}")).await.expect(204);
     let second = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
     assert_ne!(id(&second), first);
-    // A server that is stopped leaves the check to the next one.
+    // A stopped server leaves the check to the next one.
     assert!(app.stop().success());
     app.restart();
     assert_eq!(app.checked(CALIBRATIONS, &id(&second)).await["state"], "ready");
@@ -172,7 +172,7 @@ async fn a_check_survives_a_killed_server_but_not_its_deletion() {
 }
 
 #[tokio::test]
-async fn a_check_that_ends_the_service_is_given_up() {
+async fn a_check_that_crashes_the_service_is_abandoned() {
     let mut app = TestApp::start().await;
     let masks = app.upload(large_masks()).await;
     let calibration = id(&app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await.expect(202));
@@ -192,5 +192,5 @@ async fn a_check_that_ends_the_service_is_given_up() {
             state => panic!("{state}: the check is too short for this test"),
         }
     }
-    panic!("it is begun again and again");
+    panic!("the check is never abandoned");
 }

@@ -1,4 +1,4 @@
-//! The command line without a server.
+//! The commands that need no server.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -16,8 +16,8 @@ fn json(output: &Output) -> Value {
     serde_json::from_slice(&output.stdout).expect("one JSON object on standard output")
 }
 
-/// Runs a command that must be refused as bad input; gives what it says.
-fn refused(arguments: &[&str]) -> String {
+/// Runs a command that must reject its input; returns the message.
+fn rejection(arguments: &[&str]) -> String {
     refusal(&sci_recon(arguments))
 }
 
@@ -108,7 +108,7 @@ fn a_simulated_snapshot_is_reconstructed() {
         assert_eq!(report["provider"], Value::Null);
         assert!(report["psnr_db"].as_f64().unwrap() > 18.0, "{pattern}: {report}");
         assert!(report["peak_rss_bytes"].as_u64().unwrap() > 1 << 20);
-        // A second result takes the place of the first one.
+        // A second result replaces the first one.
         for name in [
             "frames/frame_0004.exr",
             "png/frame_0001.png",
@@ -126,7 +126,7 @@ fn a_simulated_snapshot_is_reconstructed() {
 }
 
 #[test]
-fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
+fn every_kind_of_mask_is_simulated_from_an_optics_file() {
     let files = Files::new();
     let optics = files.text("optics.toml");
     let mut text = String::from_utf8(sci_recon(&["optics"]).stdout).unwrap();
@@ -158,7 +158,7 @@ fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
         let scale = record["mask_scale"].as_f64().unwrap();
         assert!((mean * scale - share).abs() < 1e-6, "{record:#}");
     }
-    // Half of the light is lost at the corners, and the truth is what can be seen.
+    // The corners lose half of the light. The truth contains the visible part only.
     let truth = std::fs::read(files.path("images/truth.npy")).unwrap();
     let first = crate::pipeline::values(&truth)[63];
     let expected = Scene::SMALL.pixel(0, 0, 0, 63) / 2.0;
@@ -166,7 +166,7 @@ fn masks_of_all_kinds_are_simulated_from_a_file_of_optics() {
 }
 
 #[test]
-fn schedules_are_printed_as_they_are_read() {
+fn schedules_are_printed_in_the_format_that_is_read() {
     let files = Files::new();
     let own = sci_recon(&["schedule", "--algorithm", "pnp-nonlocal"]).stdout;
     std::fs::write(files.path("own.json"), &own).unwrap();
@@ -178,12 +178,12 @@ fn schedules_are_printed_as_they_are_read() {
         (&cut["stages"][0]["prior"], &cut["stages"][0]["iterations"]),
         (&"tv".into(), &5.into())
     );
-    let message = refused(&["schedule", "--schedule", &file, "--algorithm", "gap-tv"]);
+    let message = rejection(&["schedule", "--schedule", &file, "--algorithm", "gap-tv"]);
     assert!(message.contains("gap-tv has no stages of nonlocal"), "{message}");
 }
 
 #[test]
-fn optics_that_can_not_be_are_refused_at_once() {
+fn impossible_optics_are_rejected_at_once() {
     let files = Files::new();
     let optics = files.text("optics.toml");
     let refuse = |text: &str, pattern: &str, ratio: &str, more: &[&str]| {
@@ -214,7 +214,7 @@ fn optics_that_can_not_be_are_refused_at_once() {
 }
 
 #[test]
-fn a_seed_repeats_a_simulation_bit_for_bit() {
+fn a_seed_reproduces_a_simulation_bit_for_bit() {
     let files = Files::new();
     let more = ["--compression-ratio", "3", "--noise-sigma", "5", "--seed"];
     for (out, seed) in [("a", "7"), ("b", "7"), ("c", "8")] {
@@ -228,7 +228,7 @@ fn a_seed_repeats_a_simulation_bit_for_bit() {
 }
 
 #[test]
-fn iterations_can_be_fixed_and_threads_change_nothing() {
+fn fixed_iterations_are_independent_of_the_number_of_threads() {
     let files = Files::new();
     files.simulate("iid", "s", &["--compression-ratio", "6"]);
     let cut = ["--iterations", "33", "--tile", "32", "--overlap", "8"];
@@ -245,7 +245,7 @@ fn iterations_can_be_fixed_and_threads_change_nothing() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused_with_the_reason() {
+fn mismatched_inputs_are_rejected_with_the_reason() {
     let files = Files::new();
     files.simulate("iid", "four", &["--compression-ratio", "4"]);
     let [masks, measurement, clip] =
@@ -253,7 +253,7 @@ fn what_does_not_fit_is_refused_with_the_reason() {
     std::fs::write(files.path("small.npy"), npy(&[20, 30], (0..600).map(|_| 0.5))).unwrap();
     let small = files.text("small.npy");
     let base = ["reconstruct", "--algorithm", "gap-tv", "--masks"];
-    let run = |masks: &str, more: &[&str]| refused(&[&base[..], &[masks], more].concat());
+    let run = |masks: &str, more: &[&str]| rejection(&[&base[..], &[masks], more].concat());
     let sizes = run(&masks, &["--measurement", &small]);
     assert!(sizes.contains("20x30") && sizes.contains("48x64"), "{sizes}");
     let truth = run(&masks, &["--measurement", &measurement, "--truth", &clip]);
@@ -267,7 +267,7 @@ fn what_does_not_fit_is_refused_with_the_reason() {
     std::fs::create_dir_all(files.path("mine/frames")).unwrap();
     let foreign = run(&masks, &["--measurement", &measurement, "--out", &files.text("mine")]);
     assert!(foreign.contains("frames"), "{foreign}");
-    let few = refused(&[
+    let few = rejection(&[
         "simulate",
         "--frames",
         &clip,
@@ -279,11 +279,11 @@ fn what_does_not_fit_is_refused_with_the_reason() {
         &small,
     ]);
     assert!(few.contains("6 frames") && few.contains("need 7"), "{few}");
-    refused(&["reconstruct", "--json"]);
+    rejection(&["reconstruct", "--json"]);
 }
 
 #[test]
-fn the_demo_shows_what_the_service_is_for() {
+fn the_demo_writes_frames_and_a_report() {
     let files = Files::new();
     let output = sci_recon(&["demo", "--json", "--out", &files.text("demo")]);
     let report = json(&output);
@@ -303,7 +303,7 @@ fn the_demo_shows_what_the_service_is_for() {
 }
 
 #[test]
-fn settings_come_from_a_file_and_say_so() {
+fn settings_come_from_a_file() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("sci.toml");
     let config = file.to_str().unwrap();
@@ -315,18 +315,18 @@ fn settings_come_from_a_file_and_say_so() {
     assert!(line("max-upload-bytes").contains("10GB"), "{text}");
     assert!(line("workers").contains('4') && line("workers").contains("command line"), "{text}");
     assert!(line("max-jobs").contains("1000") && line("max-jobs").contains("default"), "{text}");
-    // A command takes it from there, too.
-    let refused = refused(&["--config", config, "token", "list"]);
-    assert!(refused.contains("/nowhere"), "{refused}");
+    // A client command reads the same file.
+    let rejection = rejection(&["--config", config, "token", "list"]);
+    assert!(rejection.contains("/nowhere"), "{rejection}");
     std::fs::write(&file, "[serve]\nmax-uploads-bytes = 1\n").unwrap();
-    let refused = self::refused(&["serve", "--config", config, "--data", "/nowhere"]);
-    assert!(refused.contains("max-uploads-bytes"), "{refused}");
-    let refused = sci_recon(&["serve", "--data", "/nowhere", "--max-upload-bytes", "10 apples"]);
-    assert!(String::from_utf8_lossy(&refused.stderr).contains("10GB"), "{refused:?}");
+    let rejection = self::rejection(&["serve", "--config", config, "--data", "/nowhere"]);
+    assert!(rejection.contains("max-uploads-bytes"), "{rejection}");
+    let rejection = sci_recon(&["serve", "--data", "/nowhere", "--max-upload-bytes", "10 apples"]);
+    assert!(String::from_utf8_lossy(&rejection.stderr).contains("10GB"), "{rejection:?}");
 }
 
 #[test]
-fn shells_and_man_get_what_they_want() {
+fn completions_and_man_pages_are_printed() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().to_str().unwrap();
     assert!(sci_recon(&["man", "--out", out]).status.success());

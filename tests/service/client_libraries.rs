@@ -1,4 +1,4 @@
-//! The clients that labs write programs with, against the real service.
+//! The client libraries against the real service.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -8,11 +8,11 @@ use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::app::{TestApp, judges};
+use crate::app::{TestApp, has_programs, judges};
 use crate::resumable::cutting;
 use crate::samples::{Scene, constant};
 
-/// What a client makes of a service that is reached over connections that are cut, and how many were.
+/// Runs a client over connections that are cut, and returns its output.
 async fn over_cuts(app: &TestApp, mut client: tokio::process::Command) -> Value {
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
@@ -20,19 +20,19 @@ async fn over_cuts(app: &TestApp, mut client: tokio::process::Command) -> Value 
     client.env("SCI_RECON_URL", format!("http://{proxy}")).env("SCI_RECON_TOKEN", &token);
     let output = client.output().await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     let cut = cuts.load(Ordering::Relaxed);
-    eprintln!("{cut} connections were cut; {told}");
+    eprintln!("{cut} connections were cut; {report}");
     assert!(cut >= 3, "{cut} connections were cut");
-    // No request that was sent again has made a second job.
+    // Retried requests have not created a second job.
     let jobs = app.get("/v1/jobs").await.expect(200).json();
     assert_eq!(jobs["items"].as_array().unwrap().len(), 1, "{jobs}");
-    assert_eq!(jobs["items"][0]["id"], told["job"]);
-    told
+    assert_eq!(jobs["items"][0]["id"], report["job"]);
+    report
 }
 
 #[tokio::test]
-async fn python_makes_the_round_trip_over_connections_that_are_cut() {
+async fn the_python_client_survives_cut_connections() {
     let Some(python) = judges() else { return };
     let app = TestApp::with(&["--workers", "1"]).await;
     let folder = tempfile::tempdir().unwrap();
@@ -42,8 +42,8 @@ async fn python_makes_the_round_trip_over_connections_that_are_cut() {
     let mut client = tokio::process::Command::new(python);
     client.env("PYTHONPATH", "clients/python/src");
     client.arg("tests/judges/python_client.py").arg(folder.path());
-    let told = over_cuts(&app, client).await;
-    assert_eq!(told["frames"], serde_json::json!([16, 384, 384]));
+    let report = over_cuts(&app, client).await;
+    assert_eq!(report["frames"], serde_json::json!([16, 384, 384]));
 }
 
 #[tokio::test]
@@ -51,7 +51,7 @@ async fn the_notebook_runs_from_top_to_bottom() {
     let Some(python) = judges() else { return };
     let app = TestApp::with(&["--workers", "1"]).await;
     let mut notebook = tokio::process::Command::new(python);
-    // A relative path would be the kernel's.
+    // A relative path would refer to the kernel's working folder.
     let clients = concat!(env!("CARGO_MANIFEST_DIR"), "/clients/python");
     notebook.env("PYTHONPATH", format!("{clients}/src"));
     notebook.env("SCI_RECON_URL", format!("http://{}", app.address()));
@@ -59,30 +59,29 @@ async fn the_notebook_runs_from_top_to_bottom() {
     notebook.arg(format!("{clients}/examples/first_reconstruction.ipynb"));
     let output = notebook.output().await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
-    let text = told["printed"].as_str().unwrap();
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let text = report["printed"].as_str().unwrap();
     let jobs = app.get("/v1/jobs").await.expect(200).json();
-    assert!(text.contains(jobs["items"][0]["id"].as_str().unwrap()), "{told}");
+    assert!(text.contains(jobs["items"][0]["id"].as_str().unwrap()), "{report}");
     let psnr = text.split("PSNR ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
-    assert!(psnr.parse::<f64>().unwrap() > 25.0, "{told}");
-    let shown = told["kinds"].to_string();
-    assert!(shown.contains("image/png") && shown.contains("text/html"), "{told}");
+    assert!(psnr.parse::<f64>().unwrap() > 25.0, "{report}");
+    let shown = report["kinds"].to_string();
+    assert!(shown.contains("image/png") && shown.contains("text/html"), "{report}");
 }
 
 #[tokio::test]
-async fn octave_makes_the_round_trip_over_connections_that_are_cut() {
+async fn the_octave_client_survives_cut_connections() {
     let mut client = tokio::process::Command::new("octave-cli");
     client.args(["--quiet", "--no-init-file", "tests/judges/octave_client.m"]);
-    if tokio::process::Command::new("octave-cli").arg("--version").output().await.is_err() {
-        eprintln!("SKIPPED: there is no octave-cli");
+    if !has_programs(&["octave-cli"], "octave") {
         return;
     }
     over_cuts(&TestApp::with(&["--workers", "1"]).await, client).await;
 }
 
-/// Hands connections on to the service, which is asked on the way to answer before files are checked. Says how
-/// often.
-async fn hasty(service: String) -> (SocketAddr, Arc<AtomicU64>) {
+/// Forwards connections to the service with `Prefer: respond-async` added, so that checks outlast
+/// their requests. Returns the number of such requests.
+async fn respond_async(service: String) -> (SocketAddr, Arc<AtomicU64>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let (address, asked) = (listener.local_addr().unwrap(), Arc::new(AtomicU64::new(0)));
     let counter = asked.clone();
@@ -122,7 +121,7 @@ async fn hasty(service: String) -> (SocketAddr, Arc<AtomicU64>) {
 #[tokio::test]
 async fn clients_wait_for_checks_that_outlast_their_requests() {
     let app = TestApp::with(&["--workers", "1"]).await;
-    let (proxy, asked) = hasty(app.address()).await;
+    let (proxy, asked) = respond_async(app.address()).await;
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene { frames: 8, height: 96, width: 96, snapshots: 2 };
     std::fs::write(folder.path().join("masks.npy"), scene.masks()).unwrap();
@@ -136,9 +135,9 @@ async fn clients_wait_for_checks_that_outlast_their_requests() {
         command.current_dir(folder.path()).env("SCI_RECON_URL", &url).output().await.unwrap()
     };
     let output = submit("masks.npy").await;
-    let (told, errors) = (output.stdout, String::from_utf8_lossy(&output.stderr).into_owned());
+    let (report, errors) = (output.stdout, String::from_utf8_lossy(&output.stderr).into_owned());
     assert!(output.status.success(), "{errors}");
-    let job = String::from_utf8(told).unwrap().trim().to_owned();
+    let job = String::from_utf8(report).unwrap().trim().to_owned();
     assert_eq!(app.ended(&job).await["state"], "succeeded");
     assert!(asked.load(Ordering::Relaxed) >= 3, "calibration, measurement and job");
     let output = submit("bright.npy").await;
@@ -148,7 +147,7 @@ async fn clients_wait_for_checks_that_outlast_their_requests() {
         errors.contains("invalid_content") && errors.contains("above the full scale 1"),
         "{errors}"
     );
-    // The one in Python looks at all jobs there are.
+    // The Python client inspects all jobs of the service.
     app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
     if let Some(python) = judges() {
         let mut client = tokio::process::Command::new(python);
@@ -157,12 +156,10 @@ async fn clients_wait_for_checks_that_outlast_their_requests() {
         let output = client.output().await.unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
-    let mut client = tokio::process::Command::new("octave-cli");
-    client.args(["--quiet", "--no-init-file", "tests/judges/octave_client.m"]);
-    match client.env("SCI_RECON_URL", &url).output().await {
-        Ok(output) => {
-            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        }
-        Err(_) => eprintln!("SKIPPED: there is no octave-cli"),
+    if has_programs(&["octave-cli"], "octave") {
+        let mut client = tokio::process::Command::new("octave-cli");
+        client.args(["--quiet", "--no-init-file", "tests/judges/octave_client.m"]);
+        let output = client.env("SCI_RECON_URL", &url).output().await.unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 }

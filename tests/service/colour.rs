@@ -1,4 +1,4 @@
-//! Colour sensors: from a clip of colours through a mosaic to pictures in colour.
+//! Colour sensors: from a colour clip through a mosaic to frames in colour.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -14,17 +14,17 @@ use crate::pipeline::values;
 use crate::samples::npy;
 
 const SIDE: usize = 64;
-/// Frames of a snapshot.
+/// Frames per snapshot.
 const FRAMES: usize = 4;
 const SNAPSHOTS: usize = 2;
 
-/// A lab with a colour sensor: what `simulate` made of a clip.
+/// A lab with a colour sensor: the files of `simulate` for a clip.
 struct Lab {
     folder: tempfile::TempDir,
 }
 
 impl Lab {
-    /// Of a clip whose pixels have this colour.
+    /// A lab for a clip with these pixel colours.
     fn new(mosaic: &str, colour: impl Fn(usize, usize, usize) -> [f32; 3]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let pixel = |at: usize| colour(at / (SIDE * SIDE), at / SIDE % SIDE, at % SIDE);
@@ -52,7 +52,7 @@ impl Lab {
         lab
     }
 
-    /// A disc that moves over a ground, both with a texture.
+    /// A textured disc that moves over a textured background.
     fn coloured(mosaic: &str) -> Self {
         Self::new(mosaic, |k, i, j| {
             let texture = 0.045 * ((i as f32 / 5.0).sin() + (j as f32 / 7.0).cos());
@@ -81,21 +81,17 @@ impl Lab {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Its calibration.
+    /// Creates the calibration of the lab.
     async fn calibrate(&self, app: &TestApp, mosaic: &str) -> Answer {
         let masks = app.upload(self.file("masks.npy")).await;
         app.post("/v1/calibrations", &json!({"masks": masks, "mosaic": mosaic})).await
     }
 
-    /// A measurement with its calibration.
+    /// Creates a measurement with its calibration.
     async fn measure(&self, app: &TestApp, mosaic: &str) -> String {
         let calibration = id(&self.calibrate(app, mosaic).await.expect(201));
         let made = app.measure(&calibration, self.file("measurement.npy")).await.expect(201);
-        assert_eq!(
-            made.json()["warnings"],
-            json!([]),
-            "colours are no trouble where they are told"
-        );
+        assert_eq!(made.json()["warnings"], json!([]), "a stated mosaic gives no warning");
         id(&made)
     }
 }
@@ -104,7 +100,7 @@ fn tv(measurement: &str) -> Value {
     json!({"measurement": measurement, "algorithm": "gap-tv", "tile": {"size": 24, "overlap": 8}})
 }
 
-/// Rows, columns and values of an 8-bit PNG in colours.
+/// Rows, columns and values of an 8-bit colour PNG.
 fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
     let mut reader = png::Decoder::new(std::io::Cursor::new(&answer.bytes)).read_info().unwrap();
     let mut values = vec![0; reader.output_buffer_size().unwrap()];
@@ -113,7 +109,7 @@ fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
     (info.height as usize, info.width as usize, values)
 }
 
-/// The officials' reader of EXR on all files of a snapshot.
+/// Checks all EXR files of a snapshot with the official reader.
 fn judge_exr(folder: &Path) {
     let Some(python) = judges() else { return };
     let mut judge = Command::new(python);
@@ -123,7 +119,7 @@ fn judge_exr(folder: &Path) {
 }
 
 #[tokio::test]
-async fn a_mosaic_becomes_colours_from_file_to_picture() {
+async fn a_mosaic_is_reconstructed_in_colour() {
     let lab = Lab::coloured("grbg");
     let app = TestApp::with(&["--workers", "2"]).await;
     let token = app.token(&["create", "--lab", "a"]);
@@ -138,7 +134,7 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
     assert_eq!(calibration["mosaic"], "grbg");
     let base = format!("/v1/jobs/{job}/snapshots/1");
 
-    // Four tiles, one of each sub-image, share each of four places.
+    // At each of four places, there is one tile per sub-image.
     let tiles = app.get(&format!("{base}/tiles")).await.expect(200).json();
     let places = tiles["items"].as_array().unwrap().iter().map(|tile| {
         let of = |name: &str| tile[name].as_u64().unwrap();
@@ -149,7 +145,7 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
         expected.flat_map(|(row, column)| [0, 1, 2, 3].map(|plane| (row, column, 48, 48, plane)));
     assert_eq!(places.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
 
-    // Both kinds of truth: colours, and what the sensor sees.
+    // The truth may be in colour or in the mosaic of the sensor.
     let truth = app.upload(lab.file("truth.npy")).await;
     let quality = app.get(&format!("{base}/quality?truth={truth}")).await.expect(200).json();
     let psnr = quality["psnr"].as_f64().unwrap();
@@ -165,7 +161,7 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
     let refused = app.get(&format!("{base}/quality?truth={grey}")).await;
     assert!(refused.problem(422, "size_mismatch").contains("4 frames of 64x32"));
 
-    // Arrays, and pictures of them.
+    // Arrays, and images of them.
     let frames = app.get(&format!("{base}/frames.npy")).await.expect(200).bytes;
     assert!(String::from_utf8_lossy(&frames[..128]).contains("(4, 64, 64, 3)"));
     let frames = values(&frames);
@@ -177,7 +173,7 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
     for (&shown, &value) in shown.iter().zip(&frames[3 * SIDE * SIDE..]) {
         assert!((f32::from(shown) - (value * 255.0).clamp(0.0, 255.0)).abs() <= 0.51);
     }
-    // In the middle of the disc.
+    // The middle of the disc.
     let disc = &frames[3 * (30 * SIDE + 14 + 3 * FRAMES)..][..3];
     assert!(disc[0] > disc[1] + 0.2 && disc[1] > disc[2], "{disc:?}");
     for name in ["difference-2", "slice-30"] {
@@ -193,14 +189,14 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
     assert_eq!(manifest["content"]["tile_plan"]["tiles"][5], json!([0, 16, 48, 48]));
     judge_exr(&app.data().join("results").join(&job).join("snapshot_0001"));
 
-    // In other programs' forms.
+    // Export formats.
     let zarr = app.get(&format!("{base}/frames.zarr/zarr.json")).await.expect(200).json();
     assert_eq!(zarr["shape"], json!([4, 64, 64, 3]));
     app.get(&format!("{base}/frames.zarr/c/0/0/0")).await.problem(404, "not_found");
     let chunk = app.get(&format!("{base}/frames.zarr/c/3/0/0/0")).await.expect(200).bytes;
     assert_eq!(chunk.len(), SIDE * SIDE * 3 * 4);
     judge_movies(&app, (&job, SNAPSHOTS), &token).await;
-    if let Ok(python) = std::env::var("SCI_RECON_JUDGES") {
+    if let Some(python) = judges() {
         let mut judge = tokio::process::Command::new(python);
         judge.arg("tests/judges/read_exports.py").arg(format!("http://{}", app.address()));
         let output = judge.args([&job, "2"]).env("SCI_RECON_TOKEN", &token).output().await.unwrap();
@@ -209,9 +205,9 @@ async fn a_mosaic_becomes_colours_from_file_to_picture() {
 }
 
 #[tokio::test]
-async fn colours_are_the_same_whoever_computes_them() {
+async fn workers_and_the_command_line_give_the_same_colours() {
     let lab = Lab::coloured("rggb");
-    // Over both snapshots together, with a pilot.
+    // Both snapshots jointly, with a pilot.
     let job = |measurement: &str| {
         let mut job = tv(measurement);
         job["algorithm"] = json!("gap-tv3d");
@@ -226,10 +222,10 @@ async fn colours_are_the_same_whoever_computes_them() {
     };
     let app = TestApp::with(&["--workers", "2"]).await;
     let (id, ended) = run(&app).await;
-    // Four places of four sub-images, in one run of both snapshots.
+    // Four places with four sub-images each, in one run of both snapshots.
     assert_eq!(ended["progress"]["tiles_total"], 16, "{ended:#}");
     let expected = results_of(&app, &id, SNAPSHOTS).await;
-    // Frames, pictures, stack, array and mosaic of each snapshot.
+    // Frames, images, stack, array and mosaic of each snapshot.
     assert_eq!(expected.len(), SNAPSHOTS * (2 * FRAMES + 3));
 
     let line = [
@@ -251,9 +247,9 @@ async fn colours_are_the_same_whoever_computes_them() {
         "--truth",
         "sim/truth.npy",
     ];
-    let told = lab.run(&[&line[..], &["--out", "out", "--json"]].concat());
-    let told: Value = serde_json::from_str(&told).unwrap();
-    assert!(told["psnr_db"].as_f64().unwrap() > 25.0, "{told}");
+    let report = lab.run(&[&line[..], &["--out", "out", "--json"]].concat());
+    let report: Value = serde_json::from_str(&report).unwrap();
+    assert!(report["psnr_db"].as_f64().unwrap() > 25.0, "{report}");
     for (name, sha256) in &expected {
         let file = lab.path("out").join(format!("snapshot_000{name}"));
         assert_eq!(crate::faults::sha256(&std::fs::read(file).unwrap()), *sha256, "{name}");
@@ -298,7 +294,7 @@ async fn a_grey_scene_behind_a_mosaic_stays_grey() {
 }
 
 #[tokio::test]
-async fn what_can_be_no_mosaic_is_refused_and_captures_have_one_too() {
+async fn an_invalid_mosaic_is_rejected_and_captures_can_have_one() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let odd = app.upload(npy(&[2, 6, 7], std::iter::repeat_n(1.0, 84))).await;
     let body = json!({"masks": odd, "mosaic": "rggb"});

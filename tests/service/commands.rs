@@ -1,4 +1,4 @@
-//! The commands that talk to a service: the real program, over connections that are cut.
+//! The client commands of the real program, over connections that are cut.
 
 use std::io::{Read, Write};
 use std::path::Path;
@@ -14,7 +14,7 @@ use crate::app::TestApp;
 use crate::resumable::cutting;
 use crate::samples::{Scene, constant};
 
-/// A lab machine with a folder of its own.
+/// A lab machine with its working folder.
 struct Lab {
     folder: tempfile::TempDir,
     url: String,
@@ -41,7 +41,7 @@ impl Lab {
         command.output().await.unwrap()
     }
 
-    /// What a command that succeeds prints.
+    /// Output of a command that must succeed.
     async fn text(&self, arguments: &[&str]) -> String {
         let output = self.run(arguments).await;
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -52,7 +52,7 @@ impl Lab {
         serde_json::from_str(&self.text(arguments).await).unwrap()
     }
 
-    /// What a command that ends with this code says.
+    /// Error message of a command that must end with this code.
     async fn refused(&self, code: i32, arguments: &[&str]) -> String {
         let output = self.run(arguments).await;
         let text = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -62,7 +62,7 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut() {
+async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
@@ -73,7 +73,7 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     lab.write("shots.npy", &scene.snapshots());
     let submit = ["submit", "shots.npy", "--masks", "masks.npy", "--algorithm", "gap-tv"];
     let job = lab.text(&[&submit[..], &["--label", "first", "--key", "k"]].concat()).await;
-    // The same again is the same job, of the same calibration.
+    // The same submission is the same job with the same calibration.
     let again =
         lab.json(&[&submit[..], &["--label", "first", "--key", "k", "--json"]].concat()).await;
     assert_eq!((&again["id"], &again["label"]), (&json!(job), &json!("first")));
@@ -88,8 +88,8 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     let line =
         ["fetch", &job, "--out", "out", "--json", "--file", everything[0], "--file", everything[1]];
     let fetched = lab.json(&line).await;
-    // The array, the stacks, the movie, the manifest, EXR and PNG of each frame of each snapshot; the
-    // manifest, the array and the movie of all.
+    // Each snapshot has array, stacks, movie, manifest, and EXR and PNG of each frame. The sequence
+    // has manifest, array and movie.
     assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (6 + 2 * 8) + 3, "{fetched:#}");
     for file in [
         "snapshot_0001/frames.npy",
@@ -116,7 +116,7 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     let cut = cuts.load(Ordering::Relaxed);
     assert!(cut >= 5, "{cut} connections were cut");
 
-    // Once more costs nothing; a file of somebody else stays.
+    // A repeated download transfers nothing, and a foreign file is kept.
     lab.text(&["fetch", &job, "--out", "out"]).await;
     lab.write("out/snapshot_0000/frames.npy", b"mine");
     let refused = lab.refused(2, &["fetch", &job, "--out", "out"]).await;
@@ -130,7 +130,7 @@ async fn a_lab_machine_submits_watches_and_fetches_over_connections_that_are_cut
     assert_eq!(lab.text(&["ls", "--state", "failed"]).await, "");
 }
 
-/// Files that were begun.
+/// Partial files.
 fn parts(folder: &Path) -> Vec<std::path::PathBuf> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder).unwrap() {
@@ -145,7 +145,7 @@ fn parts(folder: &Path) -> Vec<std::path::PathBuf> {
 }
 
 #[tokio::test]
-async fn refusals_say_what_is_wrong_and_where() {
+async fn rejections_name_the_reason_and_the_place() {
     let app = TestApp::start().await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
@@ -181,7 +181,7 @@ async fn refusals_say_what_is_wrong_and_where() {
     let refused = lab.refused(2, &["watch", nothing]).await;
     assert!(refused.contains("not_found"), "{refused}");
 
-    // A configuration file says where the service is.
+    // A configuration file contains the address of the service.
     lab.write("lab.toml", format!("url = {:?}\ntoken = {token:?}\n", lab.url).as_bytes());
     let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     command.args(["--config", "lab.toml", "ls"]).current_dir(lab.folder.path());
@@ -256,7 +256,7 @@ async fn lasting_failures_end_a_command_at_once_and_others_are_announced() {
 
 /// Arrays of other names, in files that other programs have written.
 #[tokio::test]
-async fn arrays_have_any_name() {
+async fn arrays_can_have_any_name() {
     let app = TestApp::start().await;
     let lab = Lab::new(format!("http://{}", app.address()), "");
     for file in ["names.h5", "names.mat"] {
@@ -281,7 +281,7 @@ async fn arrays_have_any_name() {
 
 /// 50 files, two of them equal, while the watcher is killed again and again.
 #[tokio::test]
-async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_is_killed() {
+async fn a_watched_folder_submits_each_file_once_despite_kills() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
@@ -303,7 +303,7 @@ async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_i
     };
     let plain = scene.snapshots();
     let shot = |number: usize| {
-        // Numbers 0 and 1 are equal.
+        // Files 0 and 1 are equal.
         let mut bytes = plain.clone();
         let last = bytes.len() - 4;
         bytes[last..].copy_from_slice(&(number.max(1) as f32 * 1e-3).to_le_bytes());
@@ -312,7 +312,7 @@ async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_i
     for kill in 0..10 {
         let mut watcher = start(false);
         for number in kill * 5..kill * 5 + 5 {
-            // As camera software does: bit by bit, under its name.
+            // Like camera software, it writes the file in pieces under its final name.
             let (path, bytes) = (bench.join(format!("shot_{number:02}.npy")), shot(number));
             std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
@@ -321,11 +321,11 @@ async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_i
         tokio::time::sleep(std::time::Duration::from_millis(150 + 40 * kill as u64)).await;
         watcher.kill().await.unwrap();
     }
-    // What is no regular file with snapshots is left alone.
+    // Files that are not regular or contain no snapshots are ignored.
     std::os::unix::fs::symlink(lab.path("masks.npy"), bench.join("link.npy")).unwrap();
     std::fs::create_dir(bench.join("folder.npy")).unwrap();
     std::fs::write(bench.join("notes.txt"), "mine").unwrap();
-    // A name of results is taken; and a file can't be used.
+    // One result name is taken, and one file is invalid.
     std::fs::write(bench.join("taken.npy"), shot(99)).unwrap();
     std::fs::write(bench.join("taken.npy.result"), "mine").unwrap();
     std::fs::write(bench.join("bad.npy"), "no array").unwrap();
@@ -358,7 +358,7 @@ async fn a_watched_folder_makes_one_job_of_each_file_however_often_the_watcher_i
     let reason = std::fs::read_to_string(bench.join("bad.npy.failed.txt")).unwrap();
     assert!(reason.contains("invalid_content") && reason.contains("bad.npy"), "{reason}");
     assert!(!bench.join("link.npy.result").exists() && !bench.join("link.npy.failed.txt").exists());
-    // Another start has nothing to do; a file that was changed is another one.
+    // A restart has nothing to do; a changed file is a new one.
     assert!(start(true).wait().await.unwrap().success());
     std::fs::write(bench.join("bad.npy"), shot(7)).unwrap();
     assert!(start(true).wait().await.unwrap().success());

@@ -1,4 +1,4 @@
-//! What stands in the headers of requests is honoured, and trouble of the machine is told as what it is.
+//! Request headers are honoured, and failures of the machine are reported correctly.
 
 use std::os::unix::fs::PermissionsExt;
 use std::time::{Duration, Instant};
@@ -18,7 +18,7 @@ const ABC: &str = "sha-256=:ungWv48Bz+pBQUDeXa4iI7ADYaOWF3qctBD/YfIAFa0=:";
 const OTHER: &str = "sha-256=:AAAWv48Bz+pBQUDeXa4iI7ADYaOWF3qctBD/YfIAFa0=:";
 
 #[tokio::test]
-async fn if_match_names_the_state_that_is_meant() {
+async fn if_match_makes_a_request_conditional() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
@@ -33,7 +33,7 @@ async fn if_match_names_the_state_that_is_meant() {
     }
     let delete = app.request(Method::DELETE, &format!("/v1/jobs/{job}"));
     app.send(delete.header("if-match", "\"old\"")).await.problem(412, "precondition_failed");
-    // A HEAD has no ranges (RFC 9110, 14.2).
+    // HEAD has no ranges (RFC 9110, 14.2).
     let head = app.request(Method::HEAD, &frames).header("range", "bytes=0-9");
     let head = app.send(head).await.expect(200);
     let whole = app.get(&frames).await.expect(200).bytes.len();
@@ -43,7 +43,7 @@ async fn if_match_names_the_state_that_is_meant() {
 }
 
 #[tokio::test]
-async fn a_body_is_what_its_headers_say() {
+async fn a_body_must_match_its_headers() {
     let app = TestApp::start().await;
     let post = || app.request(Method::POST, "/v1/blobs").body("abc");
     let hash = sha256(b"abc");
@@ -73,10 +73,10 @@ async fn a_body_is_what_its_headers_say() {
     app.send(zipped.header("content-encoding", "gzip"))
         .await
         .problem(415, "unsupported_media_type");
-    // Of a piece it is a checksum.
+    // The digest of a piece is its checksum.
     let tus = |method, path: &str| app.request(method, path).header("tus-resumable", "1.0.0");
-    let begun = app.send(tus(Method::POST, "/v1/uploads").header("upload-length", 3)).await;
-    let path = begun.expect(201).header("location").to_owned();
+    let created = app.send(tus(Method::POST, "/v1/uploads").header("upload-length", 3)).await;
+    let path = created.expect(201).header("location").to_owned();
     let piece = || {
         let kind = "application/offset+octet-stream";
         let request = tus(Method::PATCH, &path).header("upload-offset", 0).body("abc");
@@ -87,7 +87,7 @@ async fn a_body_is_what_its_headers_say() {
 }
 
 #[tokio::test]
-async fn a_busy_database_is_no_fault_of_the_service() {
+async fn a_busy_database_is_reported_as_temporary() {
     let app = TestApp::with(&["--workers", "0", "--request-seconds", "60"]).await;
     let mut database = app.database().await;
     let lock = database.begin_with("BEGIN IMMEDIATE").await.unwrap();
@@ -99,7 +99,7 @@ async fn a_busy_database_is_no_fault_of_the_service() {
 }
 
 #[tokio::test]
-async fn the_folder_is_its_owners() {
+async fn only_its_owner_can_read_the_folder() {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("data");
     std::fs::create_dir(&data).unwrap();
@@ -113,28 +113,23 @@ async fn the_folder_is_its_owners() {
 }
 
 #[tokio::test]
-async fn readiness_is_tried_and_not_guessed() {
+async fn readiness_is_tested_by_writing() {
     let shim = Shim::build();
     let full = shim.file("full");
     let faults = [("FAULT_FULL", full.to_str().unwrap())];
     let mut app = shim.service(&["--workers", "1"], &faults).await;
-    let start = Instant::now();
-    while app.get("/readyz").await.status != 200 {
-        assert!(start.elapsed().as_secs() < 60);
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    // Nothing can be written, though bytes are free: a read-only disk, or one without inodes.
+    app.get_until("/readyz", 200).await;
+    // Nothing can be written although there is free space, as on a read-only disk or one without
+    // inodes.
     std::fs::write(&full, "").unwrap();
-    tokio::time::sleep(Duration::from_secs(3)).await;
-    let ready = app.get("/readyz").await.expect(503).json();
+    let ready = app.get_until("/readyz", 503).await.json();
     assert!(ready["disk"].as_str().unwrap().contains("no file can be written"), "{ready}");
     std::fs::remove_file(&full).unwrap();
-    tokio::time::sleep(Duration::from_secs(3)).await;
-    app.get("/readyz").await.expect(200);
-    // A page of the database is overwritten by something else: one without which the service starts.
+    app.get_until("/readyz", 200).await;
+    // A page of the database that is not needed for the start is overwritten.
     app.stop();
     let path = app.data().join("sci-recon.db");
-    // Of free pages no check takes notice: there are to be none.
+    // Checks ignore free pages, so there must be none.
     let options = SqliteConnectOptions::new().filename(&path);
     let mut records = SqliteConnection::connect_with(&options).await.unwrap();
     sqlx::query("VACUUM").execute(&mut records).await.unwrap();
@@ -145,18 +140,18 @@ async fn readiness_is_tried_and_not_guessed() {
         let mut bytes = whole.clone();
         bytes[page * 4096..page * 4096 + 64].fill(0xa5);
         std::fs::write(&path, bytes).unwrap();
-        if !app.revive() {
+        if !app.try_restart() {
             continue;
         }
         let start = Instant::now();
-        let said = loop {
+        let health = loop {
             let ready = app.get("/readyz").await.json();
             if ready["database"] != "ok" || start.elapsed().as_secs() > 20 {
                 break ready["database"].as_str().unwrap().to_owned();
             }
             tokio::time::sleep(Duration::from_millis(100)).await;
         };
-        assert!(said != "ok", "page {page} is damaged, and the database is {said}");
+        assert!(health != "ok", "page {page} is damaged, and the database is {health}");
         found = true;
         app.kill();
     }
@@ -164,7 +159,7 @@ async fn readiness_is_tried_and_not_guessed() {
 }
 
 #[tokio::test]
-async fn a_clock_that_is_set_right_deletes_nothing_young() {
+async fn a_corrected_clock_deletes_no_recent_upload() {
     let shim = Shim::build();
     let clock = shim.file("clock");
     let year: i64 = 365 * 86_400;
@@ -173,22 +168,22 @@ async fn a_clock_that_is_set_right_deletes_nothing_young() {
     let mut app = shim.service(&["--workers", "0", "--job-days", "1"], &faults).await;
     let upload = app.upload(b"sent a moment ago".to_vec()).await;
     let begin = app.request(Method::POST, "/v1/uploads").header("tus-resumable", "1.0.0");
-    let begun = app.send(begin.header("upload-length", 10)).await.expect(201);
+    let created = app.send(begin.header("upload-length", 10)).await.expect(201);
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
-    // The next server has the right time, and cleans at its start.
+    // The next server has the right time, and cleans up at its start.
     app.restart();
     tokio::time::sleep(Duration::from_secs(2)).await;
     app.get(&format!("/v1/blobs/{upload}")).await.expect(200);
     app.get(&format!("/v1/jobs/{job}")).await.expect(200);
-    let place = begun.header("location").to_owned();
+    let place = created.header("location").to_owned();
     let head = app.request(Method::HEAD, &place).header("tus-resumable", "1.0.0");
     app.send(head).await.expect(200);
 }
 
 #[tokio::test]
-async fn deleting_a_large_job_holds_up_nobody() {
+async fn deleting_a_large_job_does_not_block_others() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
@@ -204,7 +199,7 @@ async fn deleting_a_large_job_holds_up_nobody() {
     assert!(!app.data().join("results").join(&job).exists());
     let start = Instant::now();
     while std::fs::read_dir(app.data().join("tmp")).unwrap().count() > 0 {
-        assert!(start.elapsed().as_secs() < 60, "the files stay");
+        assert!(start.elapsed().as_secs() < 60, "the files remain");
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
     eprintln!("the delete took {took:?}, its files {:?} more", start.elapsed());

@@ -1,4 +1,4 @@
-//! The service beside its contract, and what watches it.
+//! The service against its contract, and its monitoring.
 
 use std::sync::LazyLock;
 
@@ -13,21 +13,21 @@ static CONTRACT: LazyLock<Value> = LazyLock::new(|| {
     serde_yaml_ng::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
 });
 
-/// Where a reference leads; the value itself if it is none.
-fn followed(value: &Value) -> &Value {
+/// The value that a reference points to; the value itself if it is no reference.
+fn resolve(value: &Value) -> &Value {
     match value["$ref"].as_str() {
         Some(place) => CONTRACT.pointer(place.trim_start_matches('#')).unwrap(),
         None => value,
     }
 }
 
-/// Fails unless the contract has this answer: its status, the code of an error under that status, and the
-/// fields that must be there.
+/// Fails unless the contract has this answer: its status, the error code under that status, and the
+/// required fields.
 #[track_caller]
 pub fn hold(method: &Method, path: &str, answer: &Answer) {
     let Some(operation) = operation(method, path) else { return };
     let status = answer.status.as_str();
-    let documented = followed(&operation["responses"][status]);
+    let documented = resolve(&operation["responses"][status]);
     let text = String::from_utf8_lossy(&answer.bytes);
     assert!(!documented.is_null(), "{method} {path}: no {status} in the contract; it said {text}");
     let kind = answer.header("content-type").split(';').next().unwrap_or_default();
@@ -35,7 +35,7 @@ pub fn hold(method: &Method, path: &str, answer: &Answer) {
     else {
         return;
     };
-    let schema = followed(&documented["content"][kind]["schema"]);
+    let schema = resolve(&documented["content"][kind]["schema"]);
     assert!(!schema.is_null(), "{method} {path}: no {kind} for {status} in the contract");
     let body = answer.json();
     for field in schema["required"].as_array().into_iter().flatten() {
@@ -53,7 +53,7 @@ pub fn hold(method: &Method, path: &str, answer: &Answer) {
     }
 }
 
-/// The operation of the contract; none for a path or a method that it does not have.
+/// The operation of the contract, or none for an unknown path or method.
 fn operation<'a>(method: &Method, path: &str) -> Option<&'a Value> {
     let name = method.as_str().to_ascii_lowercase();
     let fits = |template: &str| {
@@ -70,12 +70,12 @@ fn operation<'a>(method: &Method, path: &str) -> Option<&'a Value> {
 }
 
 #[tokio::test]
-async fn the_contract_is_served_and_its_references_lead_somewhere() {
+async fn the_contract_is_served_and_its_references_resolve() {
     let app = TestApp::start().await;
     let answer = app.get("/openapi.yaml").await.expect(200);
     let contract: Value = serde_yaml_ng::from_slice(&answer.bytes).unwrap();
     assert!(contract["openapi"].as_str().unwrap().starts_with("3."));
-    // Every reference leads somewhere.
+    // Every reference resolves.
     let text = String::from_utf8(answer.bytes).unwrap();
     for reference in text.split("$ref: \"#/").skip(1) {
         let path = reference.split('"').next().unwrap();
@@ -85,7 +85,7 @@ async fn the_contract_is_served_and_its_references_lead_somewhere() {
 }
 
 #[tokio::test]
-async fn every_error_leads_to_a_page_that_explains_it() {
+async fn every_error_type_has_a_page() {
     let app = TestApp::start().await;
     let refused = app.post("/v1/jobs", &json!({})).await;
     refused.problem(422, "invalid_request");
@@ -98,7 +98,7 @@ async fn every_error_leads_to_a_page_that_explains_it() {
 }
 
 #[test]
-fn the_dashboard_has_words_for_every_stage_of_the_contract() {
+fn the_dashboard_names_every_stage_of_the_contract() {
     let read = |path: &str| {
         std::fs::read_to_string(format!("{}/{path}", env!("CARGO_MANIFEST_DIR"))).unwrap()
     };
@@ -110,12 +110,12 @@ fn the_dashboard_has_words_for_every_stage_of_the_contract() {
     let (words, _) = words.split_once('}').unwrap();
     for stage in stages.as_array().unwrap() {
         let key = format!("{}: \"", stage.as_str().unwrap());
-        assert!(words.lines().any(|line| line.trim().starts_with(&key)), "no words for {stage}");
+        assert!(words.lines().any(|line| line.trim().starts_with(&key)), "no text for {stage}");
     }
 }
 
 #[tokio::test]
-async fn health_says_what_is_missing() {
+async fn health_names_missing_parts() {
     let app = TestApp::start().await;
     app.get("/livez").await.expect(200);
     let ready = app.get("/readyz").await.expect(503).json();
@@ -125,7 +125,7 @@ async fn health_says_what_is_missing() {
 }
 
 #[tokio::test]
-async fn without_onnxruntime_only_jobs_with_networks_are_refused() {
+async fn without_onnxruntime_only_jobs_with_networks_are_rejected() {
     let nowhere = [("ORT_DYLIB_PATH", "/nowhere/libonnxruntime.so")];
     let app = TestApp::in_environment(&["--workers", "1"], &nowhere).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
@@ -144,7 +144,7 @@ async fn without_onnxruntime_only_jobs_with_networks_are_refused() {
 }
 
 #[tokio::test]
-async fn figures_are_counted() {
+async fn metrics_count_requests_and_resources() {
     let app = TestApp::start().await;
     app.scene(&Scene::SMALL).await;
     app.get("/v1/nowhere").await.problem(404, "not_found");
@@ -162,7 +162,7 @@ async fn figures_are_counted() {
 }
 
 #[tokio::test]
-async fn a_second_server_on_the_same_folder_is_refused() {
+async fn a_second_server_on_the_same_folder_is_rejected() {
     let app = TestApp::start().await;
     let output = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"))
         .args(["serve", "--listen", "127.0.0.1:0", "--workers", "0", "--data"])
@@ -176,7 +176,7 @@ async fn a_second_server_on_the_same_folder_is_refused() {
 }
 
 #[tokio::test]
-async fn a_container_asks_whether_the_service_is_ready() {
+async fn the_health_command_reports_readiness() {
     let mut app = TestApp::with(&["--workers", "1"]).await;
     let data = app.data().to_owned();
     let health = || {
@@ -185,13 +185,13 @@ async fn a_container_asks_whether_the_service_is_ready() {
     };
     let limit = std::time::Instant::now() + std::time::Duration::from_secs(60);
     while !health().status.success() {
-        assert!(std::time::Instant::now() < limit, "it does not become ready");
+        assert!(std::time::Instant::now() < limit, "the service does not become ready");
         tokio::time::sleep(std::time::Duration::from_millis(200)).await;
     }
     assert!(String::from_utf8(health().stdout).unwrap().contains("\"ready\":true"));
     assert!(app.stop().success());
-    let gone = health();
-    assert!(gone.status.code() == Some(1) && !gone.stderr.is_empty(), "{gone:?}");
+    let stopped = health();
+    assert!(stopped.status.code() == Some(1) && !stopped.stderr.is_empty(), "{stopped:?}");
 }
 
 #[tokio::test]

@@ -1,4 +1,5 @@
-//! Copies of everything, and what is found damaged: nothing wrong is served, and what can be made again is.
+//! Copies of a data folder, and damaged files: no wrong data are served, and results can be
+//! computed again.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -21,8 +22,8 @@ fn quick(measurement: &str) -> Value {
     })
 }
 
-/// Turns a bit in the middle; `seen` says whether the time of the last change shows it.
-fn turn_a_bit(path: &Path, seen: bool) {
+/// Flips a bit in the middle of a file. If `seen`, the time of the last change shows it.
+fn flip_a_bit(path: &Path, seen: bool) {
     use std::os::unix::fs::FileExt;
     let file = std::fs::File::options().read(true).write(true).open(path).unwrap();
     let meta = file.metadata().unwrap();
@@ -40,10 +41,10 @@ fn command(name: &str, data: &Path) -> Command {
     command
 }
 
-/// What a command says of a folder, and whether it ended well.
+/// Report of a command on a folder, and whether it succeeded.
 fn figures(output: &Output) -> (bool, Value) {
-    let said = String::from_utf8_lossy(&output.stderr);
-    let figures = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{said}"));
+    let message = String::from_utf8_lossy(&output.stderr);
+    let figures = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{message}"));
     (output.status.success(), figures)
 }
 
@@ -51,7 +52,7 @@ fn verify(data: &Path) -> (bool, Value) {
     figures(&command("verify", data).output().unwrap())
 }
 
-/// What `serve` says of a folder that it refuses.
+/// Error message of `verify` on a folder that it rejects.
 fn refused(data: &Path) -> String {
     let mut serve = command("serve", data);
     serve.args(["--listen", "127.0.0.1:0", "--workers", "0", "--accept-database"]);
@@ -81,7 +82,7 @@ fn frames_of(app: &TestApp, job: &str) -> PathBuf {
 }
 
 #[tokio::test]
-async fn a_damaged_result_is_not_served_and_is_made_again() {
+async fn a_damaged_result_is_not_served_and_is_computed_again() {
     let app = TestApp::with(&["--workers", "1", "--scrub-bytes", "0"]).await;
     let (_, job) = done(&app).await;
     let before = results(&app, &job).await;
@@ -92,7 +93,7 @@ async fn a_damaged_result_is_not_served_and_is_made_again() {
     let detail = retry().await.problem(409, "illegal_state");
     assert!(detail.contains("succeeded"), "{detail}");
 
-    turn_a_bit(&frames_of(&app, &job), true);
+    flip_a_bit(&frames_of(&app, &job), true);
     let detail = app.get(&path).await.problem(500, "file_damaged");
     assert!(detail.contains("frames.npy") && detail.contains("retry"), "{detail}");
     let range = app.request(reqwest::Method::GET, &path).header("range", "bytes=0-9");
@@ -100,7 +101,7 @@ async fn a_damaged_result_is_not_served_and_is_made_again() {
     app.get(&format!("/v1/jobs/{job}/snapshots/0/pictures/frame-1"))
         .await
         .problem(500, "file_damaged");
-    // What is sound is served, and who has the right bytes learns that they are right.
+    // Intact files are served, and a client with the right bytes gets 304.
     app.get(&format!("/v1/jobs/{job}/snapshots/0/stack.exr")).await.expect(200);
     let known = app.request(reqwest::Method::GET, &path).header("if-none-match", &etag);
     app.send(known).await.expect(304);
@@ -111,13 +112,13 @@ async fn a_damaged_result_is_not_served_and_is_made_again() {
     retry().await.expect(202);
     app.get(&path).await.problem(404, "not_ready");
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    assert_eq!(results(&app, &job).await, before, "the same frames again");
+    assert_eq!(results(&app, &job).await, before, "the new frames are the same");
     let again = app.get(&path).await.expect(200);
     assert_eq!(
         (again.header("etag"), format!("\"{}\"", sha256(&again.bytes))),
         (&*etag, etag.clone())
     );
-    // A file that is gone is told in the same way.
+    // A missing file is reported in the same way.
     std::fs::remove_file(frames_of(&app, &job)).unwrap();
     app.get(&path).await.problem(500, "file_damaged");
     retry().await.expect(202);
@@ -125,7 +126,7 @@ async fn a_damaged_result_is_not_served_and_is_made_again() {
     assert_eq!(results(&app, &job).await, before);
     let (good, found) = verify(app.data());
     assert!(good, "{found}");
-    // What the lab is charged with is what is there, though it was made several times.
+    // The lab's usage counts the existing files once, although they were computed several times.
     let mut database = app.database().await;
     let mut sums = async || -> (i64, i64) {
         let sums = "SELECT (SELECT coalesce(sum(result_bytes), 0) FROM jobs),
@@ -139,27 +140,27 @@ async fn a_damaged_result_is_not_served_and_is_made_again() {
 }
 
 #[tokio::test]
-async fn a_damaged_upload_is_not_computed_with() {
+async fn a_damaged_upload_is_not_used() {
     let app = TestApp::start().await;
     let masks = app.upload(Scene::SMALL.masks()).await;
-    turn_a_bit(&app.data().join("blobs").join(&masks[..2]).join(&masks[2..]), true);
+    flip_a_bit(&app.data().join("blobs").join(&masks[..2]).join(&masks[2..]), true);
     let answer = app.post("/v1/calibrations", &json!({ "masks": masks })).await;
     assert!(answer.problem(410, "upload_damaged").contains(&masks));
     assert_eq!(answer.json()["pointer"], "/masks");
-    // Sent again, it is whole.
+    // Uploading the file again repairs it.
     app.calibrate(Scene::SMALL.masks()).await.expect(201);
 }
 
 #[tokio::test]
-async fn the_slow_look_finds_what_the_disk_has_changed_by_itself() {
+async fn the_periodic_check_finds_silent_damage() {
     let app = TestApp::with(&["--workers", "1", "--scrub-bytes", "0"]).await;
     let (_, job) = done(&app).await;
     let path = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
     let app = app.again(&["--workers", "0", "--scrub-bytes", "1000000000"]).await;
     app.get(&path).await.expect(200);
-    // The first look may be over: a day is set back.
+    // The first check may be over, so its time is set back by a day.
     let mut database = app.database().await;
-    turn_a_bit(&frames_of(&app, &job), false);
+    flip_a_bit(&frames_of(&app, &job), false);
     let start = Instant::now();
     loop {
         let again = "UPDATE scrub SET started_at = started_at - 86400001, place = NULL";
@@ -169,14 +170,14 @@ async fn the_slow_look_finds_what_the_disk_has_changed_by_itself() {
         if String::from_utf8(figures).unwrap().contains("\nsci_recon_damaged_files 1\n") {
             break;
         }
-        assert!(start.elapsed().as_secs() < 60, "the turned bit is not found");
+        assert!(start.elapsed().as_secs() < 60, "the flipped bit is not found");
     }
     app.get(&path).await.problem(500, "file_damaged");
     app.get(&format!("/v1/jobs/{job}/snapshots/1/frames.npy")).await.expect(200);
 }
 
 #[tokio::test]
-async fn what_is_missing_is_named_by_a_copy_and_by_verify() {
+async fn backup_and_verify_name_missing_files() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, job) = done(&app).await;
     let masks = app.upload(b"a file that goes".to_vec()).await;
@@ -203,9 +204,9 @@ async fn what_is_missing_is_named_by_a_copy_and_by_verify() {
         assert_eq!(found["missing"], json!([blob, frames]), "{found}");
         assert_eq!(found["damaged"], json!([]), "{found}");
     }
-    // A copy is looked at in the same way.
+    // A copy is verified in the same way.
     let copied = folder.path().join("whole").join(&blob);
-    turn_a_bit(&copied, false);
+    flip_a_bit(&copied, false);
     let (good, found) = verify(&folder.path().join("whole"));
     assert!(!good && found["damaged"] == json!([blob]), "{found}");
 }
@@ -220,7 +221,7 @@ fn disturbed(shim: &Shim, data: &Path, out: &Path, kind: &str, at: u64) -> Comma
 }
 
 #[tokio::test]
-async fn a_copy_that_was_killed_is_no_service() {
+async fn an_interrupted_copy_cannot_be_served() {
     let shim = Shim::build();
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, job) = done(&app).await;
@@ -230,15 +231,15 @@ async fn a_copy_that_was_killed_is_no_service() {
     let (mut killed, mut at) = (0, 1);
     loop {
         let output = disturbed(&shim, app.data(), &out, "kill", at).output().unwrap();
-        // One that is killed behind the renaming has left a whole copy, which is looked at below.
+        // A kill after the renaming leaves a complete copy, which is verified below.
         if output.status.success() || out.exists() {
             break;
         }
         killed += 1;
         assert!(killed < 200, "{}", String::from_utf8_lossy(&output.stderr));
         if unfinished.join("blobs").exists() && killed % 5 == 0 {
-            let said = refused(&unfinished);
-            assert!(said.contains("copy.unfinished"), "{said}");
+            let message = refused(&unfinished);
+            assert!(message.contains("copy.unfinished"), "{message}");
         }
         at += 1 + at / 12;
     }
@@ -300,7 +301,7 @@ impl Drop for Suspended {
 }
 
 #[tokio::test]
-async fn a_copy_that_is_suspended_holds_up_nobody() {
+async fn a_suspended_copy_does_not_block_uploads() {
     let shim = Shim::build();
     let app = TestApp::with(&["--workers", "0"]).await;
     for number in 0..30u32 {

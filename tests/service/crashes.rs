@@ -1,5 +1,5 @@
-//! Faults at chosen file operations, clocks that jump and disks that are full: a library between the
-//! program and the kernel (`shim/faults.c`) brings them about.
+//! Faults at chosen file operations, clock jumps and full disks, caused by a library between the
+//! program and the kernel (`shim/faults.c`).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -59,26 +59,26 @@ async fn undisturbed() -> std::collections::BTreeMap<String, String> {
     results(&app, &job).await
 }
 
-/// Where faults happen: `make faults` says how many points.
+/// Number of fault points: `SCI_RECON_FAULT_POINTS`.
 fn points() -> u64 {
     std::env::var("SCI_RECON_FAULT_POINTS").map_or(2, |text| text.parse().unwrap())
 }
 
-/// The whole way of the data, again and again until each step has been taken.
-async fn whole_way(app: &mut TestApp) -> String {
+/// Runs every step from upload to download, repeating it until it succeeds.
+async fn complete_run(app: &mut TestApp) -> String {
     for _ in 0..5 {
         let outcome = tokio::time::timeout(Duration::from_secs(60), attempt(app)).await;
         if let Ok(Some(job)) = outcome {
             return job;
         }
-        if !app.lives() {
+        if !app.is_running() {
             app.restart();
         }
     }
-    panic!("the service does not come back");
+    panic!("the service does not restart");
 }
 
-/// One try, which an error of the service or of the network ends.
+/// One attempt, which an error of the service or the network ends.
 async fn attempt(app: &TestApp) -> Option<String> {
     let file = |bytes: Vec<u8>| async {
         let request = app.request(reqwest::Method::POST, "/v1/blobs").body(bytes);
@@ -115,7 +115,7 @@ async fn a_fault_at_any_file_operation_is_survived() {
     let (mut tried, mut hit, mut wrong, mut orphaned) = (0, 0, 0, 0);
     for program in ["serve", "worker"] {
         for kind in ["kill", "full"] {
-            // Further and further apart: the first operations are those of the start.
+            // The distance grows, because the first operations belong to the start.
             for step in 0..points() {
                 let at = (3 + step * 17 + step * step / 2).to_string();
                 let token = shim.file("token");
@@ -127,7 +127,7 @@ async fn a_fault_at_any_file_operation_is_survived() {
                     ("FAULT_TOKEN", token.to_str().unwrap()),
                 ];
                 let Some(mut app) = started(&shim, &faults).await else { continue };
-                let job = whole_way(&mut app).await;
+                let job = complete_run(&mut app).await;
                 tried += 1;
                 hit += u32::from(std::fs::read(&token).unwrap() != [0]);
                 wrong += u32::from(results(&app, &job).await != expected);
@@ -146,7 +146,7 @@ async fn a_fault_at_any_file_operation_is_survived() {
     assert!(ok);
 }
 
-/// The service, which a fault in its start may keep from starting the first time.
+/// Starts the service, which a fault may prevent the first time.
 async fn started(shim: &Shim, faults: &[(&str, &str)]) -> Option<TestApp> {
     for _ in 0..2 {
         let mut environment = vec![("LD_PRELOAD", shim.library.to_str().unwrap())];
@@ -160,19 +160,19 @@ async fn started(shim: &Shim, faults: &[(&str, &str)]) -> Option<TestApp> {
 }
 
 #[tokio::test]
-async fn a_full_disk_stops_nothing_for_good() {
+async fn a_full_disk_does_no_permanent_harm() {
     let shim = Shim::build();
     let full = shim.file("full");
     let app = shim.service(&["--workers", "1"], &[("FAULT_FULL", full.to_str().unwrap())]).await;
     let fill = || std::fs::write(&full, "").unwrap();
     let free = || std::fs::remove_file(&full).unwrap();
     let upload = |bytes| app.send(app.request(reqwest::Method::POST, "/v1/blobs").body(bytes));
-    // 1. While a file comes in.
+    // During an upload.
     fill();
     upload(Scene::SMALL.masks()).await.problem(507, "insufficient_storage");
     free();
     let masks = upload(Scene::SMALL.masks()).await.expect(201).json()["sha256"].clone();
-    // 2. While masks are prepared.
+    // During the preparation of masks.
     fill();
     let refused = app.post("/v1/calibrations", &json!({ "masks": masks })).await;
     refused.problem(507, "insufficient_storage");
@@ -180,11 +180,11 @@ async fn a_full_disk_stops_nothing_for_good() {
     let calibration =
         id(&app.post("/v1/calibrations", &json!({ "masks": masks })).await.expect(201));
     let measurement = id(&app.measure(&calibration, Scene::SMALL.snapshots()).await.expect(201));
-    // 3. While a job is accepted.
+    // During the submission of a job.
     fill();
     app.post("/v1/jobs", &small(&measurement)).await.problem(507, "insufficient_storage");
     free();
-    // 4. While a job is worked on: what is given up can be taken up again when there is room.
+    // During a job: a failed job can be retried when there is space.
     let job = app.submit(&small(&measurement)).await;
     fill();
     tokio::time::sleep(Duration::from_millis(1500)).await;
@@ -206,7 +206,7 @@ async fn a_full_disk_stops_nothing_for_good() {
 }
 
 #[tokio::test]
-async fn clocks_may_jump() {
+async fn clock_jumps_are_harmless() {
     let shim = Shim::build();
     let clock = shim.file("clock");
     let set = |seconds: i64| write_in_place(&clock, &seconds.to_le_bytes());
@@ -225,7 +225,7 @@ async fn clocks_may_jump() {
     }
 }
 
-/// Without making the file anew: others have it mapped.
+/// Writes to the existing file, because other processes have mapped it.
 fn write_in_place(path: &Path, bytes: &[u8]) {
     use std::os::unix::fs::FileExt;
     std::fs::File::options().write(true).open(path).unwrap().write_all_at(bytes, 0).unwrap();

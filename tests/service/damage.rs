@@ -1,4 +1,4 @@
-//! Data that go bad on the disk, a database that is busy, and copies of everything.
+//! Damaged files, a busy database, and backups.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -23,7 +23,7 @@ fn slow(measurement: &str) -> Value {
 }
 
 impl TestApp {
-    /// Blobs, newest last.
+    /// Paths of the blobs, newest last.
     fn blobs(&self) -> Vec<PathBuf> {
         let mut files = Vec::new();
         for folder in std::fs::read_dir(self.data().join("blobs")).unwrap() {
@@ -53,7 +53,7 @@ impl TestApp {
     }
 }
 
-/// Turns one bit in the middle.
+/// Flips one bit in the middle of a file.
 fn damage(file: &std::path::Path) {
     let mut bytes = std::fs::read(file).unwrap();
     let middle = bytes.len() / 2;
@@ -62,7 +62,7 @@ fn damage(file: &std::path::Path) {
 }
 
 #[tokio::test]
-async fn a_damaged_tile_is_done_again() {
+async fn a_damaged_tile_is_computed_again() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let first = app.submit(&slow(&measurement)).await;
@@ -87,11 +87,11 @@ async fn a_damaged_tile_is_done_again() {
             .fetch_one(&mut database)
             .await
             .unwrap();
-    assert!(redone >= 1, "the tile was done again");
+    assert!(redone >= 1, "the tile was computed again");
 }
 
 #[tokio::test]
-async fn damaged_masks_are_found_and_named_before_anything_is_computed() {
+async fn damaged_masks_are_named_before_the_computation() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let calibration = app.calibrate(Scene::SMALL.masks()).await.expect(201);
     let upload = calibration.json()["masks"].as_str().unwrap().replace('"', "");
@@ -104,18 +104,18 @@ async fn damaged_masks_are_found_and_named_before_anything_is_computed() {
     assert_eq!(done["state"], "failed");
     let error = done["error"].as_str().unwrap();
     assert!(error.contains("masks") && error.contains(&name(&prepared)[2..]), "{error}");
-    // A copy names it, too.
+    // A backup names the file as well.
     let folder = tempfile::tempdir().unwrap();
     let (good, figures) = app.back_up(&folder.path().join("copy"));
     assert!(!good);
     assert_eq!(figures["damaged"].as_array().unwrap().len(), 1, "{figures}");
-    // Made anew, all is well.
+    // After another upload, the job succeeds.
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     let measurement = id(&app.measure(&calibration, Scene::SMALL.snapshots()).await.expect(201));
     assert_eq!(app.ended(&app.submit(&slow(&measurement)).await).await["state"], "succeeded");
 }
 
-/// The hash that a blob's path stands for.
+/// The hash that a blob's path contains.
 fn name(path: &std::path::Path) -> String {
     let last = path.file_name().unwrap().to_str().unwrap();
     let folder = path.parent().unwrap().file_name().unwrap().to_str().unwrap();
@@ -123,14 +123,14 @@ fn name(path: &std::path::Path) -> String {
 }
 
 #[tokio::test]
-async fn a_busy_database_delays_and_breaks_nothing() {
+async fn a_busy_database_causes_delays_without_errors() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&slow(&measurement)).await;
     let mut database = app.database().await;
     for _ in 0..3 {
         let lock = database.begin_with("BEGIN IMMEDIATE").await.unwrap();
-        // Reading goes on meanwhile.
+        // Reads continue in the meantime.
         app.get(&format!("/v1/jobs/{job}")).await.expect(200);
         tokio::time::sleep(Duration::from_secs(2)).await;
         lock.rollback().await.unwrap();
@@ -140,7 +140,7 @@ async fn a_busy_database_delays_and_breaks_nothing() {
 }
 
 #[tokio::test]
-async fn a_copy_made_while_jobs_run_is_whole_and_goes_on() {
+async fn a_backup_of_running_jobs_continues_them() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let first = app.submit(&slow(&measurement)).await;
@@ -154,7 +154,7 @@ async fn a_copy_made_while_jobs_run_is_whole_and_goes_on() {
     assert!(good, "{figures}");
     assert!(figures["files"].as_u64() > Some(20) && figures["bytes"].as_u64() > Some(100_000));
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    // The copy is a service of its own, in which the job goes on from where it was.
+    // The backup can be served, and the job continues from its last tile.
     let restored = TestApp::on(folder, "copy", &["--workers", "2"]).await;
     assert_eq!(results(&restored, &first).await, expected);
     let done = restored.ended(&job).await;
@@ -163,7 +163,7 @@ async fn a_copy_made_while_jobs_run_is_whole_and_goes_on() {
 }
 
 #[tokio::test]
-async fn a_nearly_full_disk_takes_the_oldest_jobs_but_none_that_is_needed() {
+async fn a_nearly_full_disk_removes_the_oldest_unneeded_jobs() {
     let app = TestApp::start().await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
@@ -172,7 +172,7 @@ async fn a_nearly_full_disk_takes_the_oldest_jobs_but_none_that_is_needed() {
     for job in [&old, &new] {
         app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
     }
-    let unused = app.upload(b"nobody needs this".to_vec()).await;
+    let unused = app.upload(b"unneeded blob".to_vec()).await;
     let mut database = app.database().await;
     for sql in [
         "UPDATE jobs SET finished_at = finished_at - 7200000 WHERE id = ?",
@@ -184,11 +184,11 @@ async fn a_nearly_full_disk_takes_the_oldest_jobs_but_none_that_is_needed() {
     let app = app.again(&["--workers", "0", "--low-water-bytes", "1000000000000000"]).await;
     let start = std::time::Instant::now();
     while app.get(&format!("/v1/jobs/{old}")).await.status != 404 {
-        assert!(start.elapsed().as_secs() < 10, "the old job stays");
+        assert!(start.elapsed().as_secs() < 10, "the old job is not deleted");
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     app.get(&format!("/v1/blobs/{unused}")).await.problem(404, "not_found");
-    // Young, waiting, or needed by what waits:
+    // Blobs that are young, queued, or needed by queued jobs:
     for path in [format!("jobs/{new}"), format!("jobs/{waiting}")] {
         app.get(&format!("/v1/{path}")).await.expect(200);
     }

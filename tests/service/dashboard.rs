@@ -1,4 +1,4 @@
-//! The dashboard's files, and the parts of the API that were made for it.
+//! The dashboard's files, and the parts of the API that serve it.
 
 use futures_util::StreamExt;
 use reqwest::Method;
@@ -8,7 +8,7 @@ use crate::app::{TestApp, id};
 use crate::samples::Scene;
 
 #[tokio::test]
-async fn the_page_is_small_tagged_and_allows_no_foreign_code() {
+async fn the_page_is_compressed_cached_and_allows_no_foreign_code() {
     let app = TestApp::start().await;
     let ask = |path: &str, name: &'static str, value: String| {
         app.send(app.request(Method::GET, path).header(name, value))
@@ -21,7 +21,7 @@ async fn the_page_is_small_tagged_and_allows_no_foreign_code() {
     assert!(!policy.contains("unsafe") && !policy.contains('*'), "{policy}");
     let text = String::from_utf8(plain.bytes.clone()).unwrap();
     assert!(!text.contains("<style") && !text.contains(" style=") && !text.contains("onclick"));
-    // Each form has its own tag, and each tag saves sending it again.
+    // Each representation has its own tag, and a known tag avoids sending it again.
     let packed = ask("/dashboard/style.css", "accept-encoding", "gzip".into()).await.expect(200);
     assert_eq!(packed.header("content-encoding"), "gzip");
     assert_eq!(packed.bytes[..2], [0x1f, 0x8b]);
@@ -36,7 +36,7 @@ async fn the_page_is_small_tagged_and_allows_no_foreign_code() {
 }
 
 #[tokio::test]
-async fn the_system_tells_workers_queue_disk_and_versions() {
+async fn the_system_view_reports_workers_queue_disk_and_versions() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let system = app.get("/v1/system").await.expect(200).json();
     assert_eq!(system["device"], "cpu");
@@ -48,7 +48,7 @@ async fn the_system_tells_workers_queue_disk_and_versions() {
 }
 
 #[tokio::test]
-async fn waiting_jobs_know_their_place_and_are_found_by_a_part_of_their_name() {
+async fn queued_jobs_have_a_position_and_can_be_searched() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let submit = async |label: &str, priority: i32| {
@@ -77,7 +77,7 @@ async fn waiting_jobs_know_their_place_and_are_found_by_a_part_of_their_name() {
     assert_eq!(labels("onerror%3Dalert").await, [hostile]);
     assert_eq!(labels(&first[20..]).await, ["Milk 1"]);
     app.get("/v1/jobs?search=").await.problem(400, "invalid_query");
-    // The list is not sent again as long as nothing changes.
+    // An unchanged list is not sent again.
     let list = app.get("/v1/jobs").await.expect(200);
     let again = || {
         app.send(app.request(Method::GET, "/v1/jobs").header("if-none-match", list.header("etag")))
@@ -88,13 +88,13 @@ async fn waiting_jobs_know_their_place_and_are_found_by_a_part_of_their_name() {
 }
 
 #[tokio::test]
-async fn the_first_listener_is_told_to_read_again_after_the_first_look() {
+async fn a_first_listener_reads_again_after_the_first_poll() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     let mut stream = app.request(Method::GET, "/v1/events").send().await.unwrap().bytes_stream();
     let mut text = String::new();
-    // A change between the greeting and the first look would be lost otherwise.
+    // Otherwise a change between the greeting and the first poll would be lost.
     while !text.contains(r#"{"changed":[],"deleted":[],"more":true}"#) {
         text += std::str::from_utf8(&stream.next().await.unwrap().unwrap()).unwrap();
         assert!(text.len() < 10_000, "{text}");
@@ -102,7 +102,7 @@ async fn the_first_listener_is_told_to_read_again_after_the_first_look() {
 }
 
 #[tokio::test]
-async fn listeners_hear_of_changes_and_do_not_hold_up_a_stop() {
+async fn listeners_receive_changes_and_do_not_delay_a_stop() {
     let mut app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let response = app.request(Method::GET, "/v1/events").send().await.unwrap();
@@ -116,8 +116,8 @@ async fn listeners_hear_of_changes_and_do_not_hold_up_a_stop() {
         text.clone()
     };
     read_until("event: hello").await;
-    // The first look is what later ones are compared with.
-    tokio::time::sleep(std::time::Duration::from_millis(2500)).await;
+    // The first poll asks to read the lists again. Later polls are compared with it.
+    read_until(r#""more":true"#).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     let job = id(&app.post("/v1/jobs", &body).await.expect(201));
     let heard = read_until("event: jobs\ndata: {").await;

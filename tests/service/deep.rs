@@ -1,16 +1,14 @@
-//! Jobs with the deep denoiser, where libonnxruntime is there (`make runtime`).
+//! Jobs with the deep denoiser, where libonnxruntime is available (`ORT_DYLIB_PATH`).
 
 use serde_json::json;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, has_onnxruntime};
 use crate::pipeline::values;
 use crate::samples::Scene;
 
 #[tokio::test]
 async fn a_deep_job_runs_and_records_model_and_provider() {
-    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
-    if !std::path::Path::new(&library).exists() {
-        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+    if !has_onnxruntime() {
         return;
     }
     let app = TestApp::with(&["--workers", "1"]).await;
@@ -36,14 +34,14 @@ async fn a_deep_job_runs_and_records_model_and_provider() {
 }
 
 #[tokio::test]
-async fn without_the_library_a_deep_job_is_refused_with_the_reason() {
+async fn without_the_library_a_deep_job_is_rejected() {
     let app = TestApp::with(&["--workers", "1", "--onnxruntime", "/nowhere/lib.so"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
     let detail = app.post("/v1/jobs", &body).await.problem(422, "invalid_request");
     assert!(detail.contains("lib.so") && !detail.contains("/nowhere"), "{detail}");
     assert!(detail.contains("scripts/fetch") && detail.contains("gap-tv3d needs none"), "{detail}");
-    // What needs no network is done.
+    // Jobs without a network run.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
 }

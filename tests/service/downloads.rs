@@ -1,4 +1,4 @@
-//! Downloads that are slow: by their clients, or by the disk.
+//! Slow downloads, caused by clients or by the disk.
 
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
@@ -13,13 +13,13 @@ use crate::app::TestApp;
 use crate::crashes::Shim;
 use crate::samples::Scene;
 
-/// The time between two reads of a client.
+/// Time between two reads of a client.
 const STEP: Duration = Duration::from_millis(100);
 
-/// A client with a small receive buffer, which takes an answer at its own pace.
+/// A client with a small receive buffer that reads at a chosen rate.
 pub struct Reader {
     socket: TcpStream,
-    /// Bytes of the body.
+    /// Bytes of the body read so far.
     pub body: Vec<u8>,
     /// True once the service has closed the connection.
     pub ended: bool,
@@ -55,12 +55,12 @@ impl Reader {
         }
     }
 
-    /// Reads `bytes` as fast as they come, or until the connection ends.
+    /// Reads `bytes` at full speed, or until the connection ends.
     pub async fn read(&mut self, mut bytes: usize) {
         let mut piece = vec![0; 64 * 1024];
         while bytes > 0 {
             let most = bytes.min(piece.len());
-            // One that was broken off may be reset.
+            // A closed connection may be reset.
             match self.socket.read(&mut piece[..most]).await {
                 Ok(0) | Err(_) => {
                     self.ended = true;
@@ -84,7 +84,7 @@ pub async fn ask_beside_slow_readers(
     let app = TestApp::with(&["--workers", "0"]).await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
     app.sign_in(&a);
-    // More than the buffers of a connection hold.
+    // Larger than the buffers of a connection.
     let sha256 = app.upload(vec![3; 40_000_000]).await;
     app.sign_in(&b);
     let path = format!("/v1/blobs/{sha256}/content");
@@ -117,7 +117,7 @@ pub async fn ask_beside_slow_readers(
 }
 
 #[tokio::test]
-async fn slow_clients_leave_the_service_to_others() {
+async fn slow_clients_do_not_block_others() {
     let answers = ask_beside_slow_readers(200, Duration::from_secs(14)).await;
     assert!(answers.len() > 20, "{}", answers.len());
     for (status, took) in answers {
@@ -127,7 +127,7 @@ async fn slow_clients_leave_the_service_to_others() {
 }
 
 #[tokio::test]
-async fn a_client_that_takes_too_little_is_broken_off_and_goes_on_with_a_range() {
+async fn a_client_that_reads_too_slowly_is_disconnected_and_can_resume() {
     const SIZE: usize = 8_000_000;
     let limits = ["--download-stall-seconds", "3", "--download-bytes-per-second", "20000"];
     let app = TestApp::with(&[&["--workers", "0"], &limits[..]].concat()).await;
@@ -139,7 +139,7 @@ async fn a_client_that_takes_too_little_is_broken_off_and_goes_on_with_a_range()
     let slow = async {
         let mut reader = Reader::begin(&app, &path, None).await;
         reader.take(2000, Duration::from_secs(9)).await;
-        // What lies in the buffers of the kernel still comes.
+        // Bytes in the kernel's buffers still arrive.
         reader.read(SIZE).await;
         reader
     };
@@ -155,14 +155,14 @@ async fn a_client_that_takes_too_little_is_broken_off_and_goes_on_with_a_range()
     let range = format!("bytes={}-", slow.body.len());
     let rest = app.send(app.request(Method::GET, &path).header("range", range)).await.expect(206);
     assert!([slow.body, rest.bytes].concat() == content);
-    // A connection that has nothing to send lasts.
+    // A connection without data to send is kept.
     assert!(tokio::time::timeout(STEP, events.chunk()).await.is_err());
     let body = idle.body.len();
     assert!(tokio::time::timeout(STEP, idle.read(1000)).await.is_err(), "{body}");
 }
 
 #[tokio::test]
-async fn an_answer_ends_with_the_session_and_with_the_open_service() {
+async fn an_answer_ends_with_its_session() {
     let app = TestApp::start().await;
     let ends = async |mut events: reqwest::Response| {
         let rest = async { while events.chunk().await.unwrap().is_some() {} };
@@ -183,7 +183,7 @@ async fn an_answer_ends_with_the_session_and_with_the_open_service() {
     app.send(end.header("x-requested-with", "page")).await.expect(204);
     ends(signed_in).await;
     let more = tokio::time::timeout(Duration::from_secs(4), other.chunk()).await;
-    assert!(more.is_err(), "the token itself is good");
+    assert!(more.is_err(), "the token is still valid");
 }
 
 /// Makes all stored files look as if they had been changed, so that their hashes are not known.
@@ -200,8 +200,8 @@ pub fn touch_all(folder: &Path) {
 }
 
 #[tokio::test]
-async fn a_file_on_a_slow_disk_is_read_once_and_however_long_it_takes() {
-    // Files of 48 kB and more take 6 s.
+async fn a_file_on_a_slow_disk_is_read_once_without_time_limit() {
+    // Reads of 48 kB and more take 6 s.
     const RATE: &str = "8000";
     let shim = Shim::build();
     let slow = shim.file("slow");
@@ -228,14 +228,14 @@ async fn a_file_on_a_slow_disk_is_read_once_and_however_long_it_takes() {
         touch_all(&app.data().join("blobs"));
         touch_all(&app.data().join("results"));
     };
-    // The read continues after its client has left.
+    // The read continues after its client has disconnected.
     forget();
     let impatient = app.request(Method::GET, &content).timeout(Duration::from_millis(500));
     assert!(impatient.send().await.unwrap_err().is_timeout());
     tokio::time::sleep(Duration::from_secs(7)).await;
     let took = head(&content).await;
     assert!(took < 3.0, "the file is read again: {took} s");
-    // Every route that reads a file to its end before the first byte.
+    // Every route that reads a whole file before the first byte.
     forget();
     let snapshot = format!("/v1/jobs/{job}/snapshots/0");
     let paths = [

@@ -1,4 +1,4 @@
-//! Results in the forms of other programs.
+//! Results in the formats of other programs.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use crate::app::{Answer, TestApp, id, judges};
 use crate::limits::entitle;
 use crate::samples::Scene;
 
-/// A job of two snapshots that has succeeded: 50 snapshots a second, exposed for 16 ms.
+/// A succeeded job of two snapshots, taken at 50 per second with an exposure of 16 ms.
 async fn done(app: &TestApp) -> String {
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     let data = app.upload(Scene::SMALL.snapshots()).await;
@@ -34,15 +34,15 @@ async fn other_programs_read_all_exports_bit_for_bit() {
     judge.args([&job, "2"]).env("SCI_RECON_TOKEN", &token);
     let output = judge.output().await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!(told["intervals"]["/snapshots/1"], json!([0.004, 0.004]));
-    // Between the snapshots the camera pauses.
-    assert_eq!(told["intervals"]["/sequence"], json!([null, null]));
-    assert_eq!(told["members"], 2 * 12 + 1);
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["intervals"]["/snapshots/1"], json!([0.004, 0.004]));
+    // The camera pauses between the snapshots.
+    assert_eq!(report["intervals"]["/sequence"], json!([null, null]));
+    assert_eq!(report["members"], 2 * 12 + 1);
 }
 
 #[tokio::test]
-async fn exports_are_there_with_the_results_and_are_cached_and_cut_like_files() {
+async fn exports_support_caching_and_ranges_like_files() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let stuck = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
@@ -71,7 +71,7 @@ async fn exports_are_there_with_the_results_and_are_cached_and_cut_like_files() 
         );
         let known = app.request(Method::GET, &path).header("if-none-match", &etag);
         app.send(known).await.expect(304);
-        // In pieces that begin and end anywhere.
+        // Ranges with any bounds.
         let mut joined = Vec::new();
         while joined.len() < size {
             let (first, last) = (joined.len(), joined.len() + size / 7 + 13);
@@ -85,7 +85,7 @@ async fn exports_are_there_with_the_results_and_are_cached_and_cut_like_files() 
     let archive = app.get(&format!("/v1/jobs/{job}/results.zip")).await.bytes;
     assert_eq!(archive, app.get(&format!("/v1/jobs/{job}/results.zip")).await.bytes);
 
-    // What is damaged is not sent.
+    // A damaged file is not sent.
     let results = app.data().join("results").join(&job);
     let array = results.join("snapshot_0001/frames.npy");
     let mut bytes = std::fs::read(&array).unwrap();
@@ -101,7 +101,7 @@ async fn exports_are_there_with_the_results_and_are_cached_and_cut_like_files() 
     assert!(cut.bytes().await.is_err(), "the archive breaks off before the damaged file");
 }
 
-/// What the movie's judge says of all movies of a job.
+/// Output of the movie judge for all movies of a job.
 pub async fn judge_movies(
     app: &TestApp,
     (job, snapshots): (&str, usize),
@@ -112,24 +112,24 @@ pub async fn judge_movies(
     judge.args([job, &snapshots.to_string()]).env("SCI_RECON_TOKEN", token);
     let output = judge.output().await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
-    eprintln!("movies: {told}");
-    Some(told)
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    eprintln!("movies: {report}");
+    Some(report)
 }
 
 #[tokio::test]
-async fn another_decoder_sees_the_frames_in_their_movies() {
+async fn another_decoder_reads_the_frames_of_movies() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);
     let job = done(&app).await;
-    let Some(told) = judge_movies(&app, (&job, 2), &token).await else { return };
+    let Some(report) = judge_movies(&app, (&job, 2), &token).await else { return };
     // 16 ms for four frames.
-    assert_eq!(told["title"], "250 frames/s, played at 10");
+    assert_eq!(report["title"], "250 frames/s, played at 10");
 }
 
 impl TestApp {
-    /// The first answer about a movie that is not that it is being made.
+    /// The first answer to a request for a movie that is not 202.
     async fn movie(&self, path: &str) -> Answer {
         loop {
             let answer = self.get(path).await;
@@ -144,12 +144,12 @@ impl TestApp {
         }
     }
 
-    /// Bytes of the lab's results.
+    /// Size of the lab's results in bytes.
     async fn kept(&self) -> u64 {
         self.get("/v1/me").await.expect(200).json()["use"]["result_bytes"].as_u64().unwrap()
     }
 
-    /// Where a movie lies.
+    /// Path of a movie.
     fn movie_file(&self, movie: &Answer) -> PathBuf {
         let etag = movie.header("etag").trim_matches('"');
         self.data().join("blobs").join(&etag[..2]).join(&etag[2..])
@@ -157,7 +157,7 @@ impl TestApp {
 }
 
 #[tokio::test]
-async fn a_movie_is_made_when_it_is_asked_for_and_is_a_result_like_others() {
+async fn a_movie_is_encoded_on_request_and_stored_like_a_result() {
     let mut app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let stuck = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
@@ -171,7 +171,7 @@ async fn a_movie_is_made_when_it_is_asked_for_and_is_a_result_like_others() {
     let path = format!("/v1/jobs/{job}/snapshots/1/movie.mp4");
     let sequence = format!("/v1/jobs/{job}/sequence/movie.mp4");
 
-    // Nobody makes it before somebody asks for it, and nobody can while there is no worker.
+    // No movie is encoded before the first request, nor without a worker.
     let before = app.kept().await;
     app.restart_with(&["--workers", "0"]);
     let first = app.get(&path).await.expect(202);
@@ -191,11 +191,11 @@ async fn a_movie_is_made_when_it_is_asked_for_and_is_a_result_like_others() {
     let rest =
         app.request(Method::GET, &path).header("range", "bytes=100-").header("if-range", &etag);
     assert_eq!(app.send(rest).await.expect(206).bytes, movie.bytes[100..]);
-    // The archive has what no other file can be made of.
+    // The archive contains only files that cannot be derived from others.
     let listed = app.get(&format!("/v1/jobs/{job}/snapshots/1")).await.expect(200).json();
     assert!(!listed.to_string().contains("movie"), "{listed}");
 
-    // A damaged one is made again, with the same bytes.
+    // A damaged movie is encoded again with the same bytes.
     let file = app.movie_file(&movie);
     let mut bytes = movie.bytes.clone();
     bytes[size / 2] ^= 1;
@@ -203,7 +203,7 @@ async fn a_movie_is_made_when_it_is_asked_for_and_is_a_result_like_others() {
     app.get(&path).await.expect(202);
     assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
 
-    // Of damaged frames there is none: it says so, and is there again after the job's retry.
+    // Damaged frames have no movie. The answer says so, and a retry of the job restores it.
     let array = app.data().join("results").join(&job).join("snapshot_0000/frames.npy");
     let whole = std::fs::read(&array).unwrap();
     std::fs::write(&array, &whole[..whole.len() - 1]).unwrap();
@@ -214,18 +214,18 @@ async fn a_movie_is_made_when_it_is_asked_for_and_is_a_result_like_others() {
     app.get(&format!("/v1/jobs/{job}/snapshots/0/frames.npy")).await.problem(500, "file_damaged");
     app.post(&format!("/v1/jobs/{job}/retry"), &json!({})).await.expect(202);
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    assert!(!file.exists(), "movies of results that may be others go");
+    assert!(!file.exists(), "a retry deletes the movies of the old results");
     let both = app.movie(&sequence).await.expect(200);
     assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
 
-    // They go with their job.
+    // Deleting the job deletes its movies.
     app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
     assert!(!app.movie_file(&movie).exists() && !app.movie_file(&both).exists());
     app.get(&path).await.problem(404, "not_found");
 }
 
 #[tokio::test]
-async fn of_the_smallest_frames_there_is_no_movie() {
+async fn the_smallest_frames_have_no_movie() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) =
         app.scene(&Scene { frames: 2, height: 48, width: 12, snapshots: 1 }).await;
@@ -237,7 +237,7 @@ async fn of_the_smallest_frames_there_is_no_movie() {
 }
 
 #[tokio::test]
-async fn a_lab_without_room_gets_no_movie() {
+async fn a_lab_without_space_gets_no_movie() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let token = app.token(&["create", "--lab", "a"]);
     app.sign_in(&token);

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use crate::app::TestApp;
 use crate::samples::Scene;
 
-/// Eight tiles in each of two snapshots, a good part of a second each.
+/// Eight tiles in each of two snapshots, each a large part of a second.
 fn job(measurement: &str) -> Value {
     json!({
         "measurement": measurement,
@@ -21,12 +21,12 @@ fn job(measurement: &str) -> Value {
     })
 }
 
-/// The hashes of all result files but the manifests, which tell times and attempts.
+/// Hashes of all result files except the manifests, which contain times and attempts.
 pub async fn results(app: &TestApp, job: &str) -> BTreeMap<String, String> {
     results_of(app, job, Scene::SMALL.snapshots).await
 }
 
-/// The same of a job of so many snapshots.
+/// Hashes of the result files of a job with `snapshots` snapshots.
 pub async fn results_of(app: &TestApp, job: &str, snapshots: usize) -> BTreeMap<String, String> {
     let mut hashes = BTreeMap::new();
     for snapshot in 0..snapshots {
@@ -44,22 +44,22 @@ pub async fn results_of(app: &TestApp, job: &str, snapshots: usize) -> BTreeMap<
 }
 
 impl TestApp {
-    /// The processes of the workers, as the kernel has them.
+    /// Process identifiers of the workers, from the kernel.
     pub fn workers(&self) -> Vec<rustix::process::Pid> {
         children(self.pid())
     }
 
-    /// SIGKILL for one worker.
+    /// Sends SIGKILL to one worker.
     pub fn kill_worker(&self, choice: usize) {
         let workers = self.workers();
         if let Some(pid) = workers.get(choice % workers.len().max(1)) {
-            // It may have ended meanwhile.
+            // The process may have ended already.
             let _ = rustix::process::kill_process(*pid, rustix::process::Signal::KILL);
         }
     }
 }
 
-/// The processes that a process has started, as the kernel has them.
+/// Child processes of a process, from the kernel.
 pub fn children(process: u32) -> Vec<rustix::process::Pid> {
     let threads = std::fs::read_dir(format!("/proc/{process}/task"));
     let threads: Vec<_> = threads.map(|entries| entries.flatten().collect()).unwrap_or_default();
@@ -71,13 +71,13 @@ pub fn children(process: u32) -> Vec<rustix::process::Pid> {
     pids.filter_map(rustix::process::Pid::from_raw).collect()
 }
 
-/// How often to kill: `make faults` says 200.
+/// Number of kills: `SCI_RECON_KILLS`.
 pub fn kills() -> u32 {
     std::env::var("SCI_RECON_KILLS").map_or(10, |text| text.parse().unwrap())
 }
 
 #[tokio::test]
-async fn kills_at_random_moments_change_nothing_in_any_result() {
+async fn random_kills_change_no_result() {
     let kills = kills();
     let mut app = TestApp::with(&["--workers", "2"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
@@ -129,7 +129,7 @@ async fn kills_at_random_moments_change_nothing_in_any_result() {
     assert!(ok);
 }
 
-/// True if the bytes that are downloaded are those on record.
+/// True if all downloads have the expected bytes.
 async fn downloads(app: &TestApp, job: &str, expected: &BTreeMap<String, String>) -> bool {
     for snapshot in 0..Scene::SMALL.snapshots {
         let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy");
@@ -141,10 +141,10 @@ async fn downloads(app: &TestApp, job: &str, expected: &BTreeMap<String, String>
     true
 }
 
-/// Files that nothing knows of, after the cleaning at the start of a server: temporary ones, blobs
-/// beyond the number on record, results without a job.
+/// Number of unknown files after the cleanup at a server's start: temporary files, surplus blobs,
+/// and results without a job.
 pub async fn orphans(app: &mut TestApp) -> usize {
-    // What is younger than ten seconds may still be somebody's, so the sweep lets it be.
+    // The cleanup spares files younger than ten seconds, which may be in use.
     tokio::time::sleep(Duration::from_secs(11)).await;
     app.restart();
     let app = &*app;
@@ -176,7 +176,7 @@ pub async fn orphans(app: &mut TestApp) -> usize {
 }
 
 #[tokio::test]
-async fn workers_end_with_a_server_that_was_killed() {
+async fn workers_end_with_a_killed_server() {
     let mut app = TestApp::with(&["--workers", "2"]).await;
     let start = std::time::Instant::now();
     while app.workers().len() < 2 {
@@ -207,7 +207,7 @@ async fn a_killed_worker_is_replaced_and_its_task_taken_up_at_once() {
     app.when(&job, |job| job["progress"]["tiles_running"] == 0).await;
     let start = std::time::Instant::now();
     app.when(&job, |job| job["progress"]["tiles_running"] == 1).await;
-    assert!(start.elapsed().as_secs() < 15, "the lease need not run out first");
+    assert!(start.elapsed().as_secs() < 15, "the task is taken up before its lease expires");
     assert_ne!(app.workers(), before);
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 }

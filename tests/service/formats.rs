@@ -1,4 +1,4 @@
-//! Holds the tables of `docs/DATA.md` row by row to files from the programs that labs use.
+//! Compares each row of the tables in `docs/DATA.md` with files from the programs of labs.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -13,10 +13,10 @@ use serde_json::{Value, json};
 
 use crate::app::{Answer, TestApp, id, judges};
 
-/// A row of a table: its first cell, and the command in it, if there is one.
+/// A table row: its first cell, and its command if there is one.
 type Row = (String, Option<String>);
 
-/// The rows of the first table below this heading.
+/// Rows of the first table below this heading.
 fn rows(heading: &str) -> Vec<Row> {
     let text = std::fs::read_to_string("docs/DATA.md").unwrap();
     let (_, below) = text.split_once(heading).unwrap();
@@ -29,23 +29,23 @@ fn rows(heading: &str) -> Vec<Row> {
     lines.take_while(|line| line.starts_with('|')).map(row).collect()
 }
 
-/// What `tests/judges/written_files.py` says of a file.
+/// The description of a file by `tests/judges/written_files.py`.
 #[derive(Deserialize)]
 struct Written {
     row: String,
     file: PathBuf,
     axes: Option<String>,
-    /// How the axes are read if they are not stated; none for pictures.
-    told: Option<String>,
+    /// Axis order that is read if none is stated; none for images.
+    read_axes: Option<String>,
     name: Option<String>,
     full_scale: Option<f32>,
     #[serde(default)]
     measurement: bool,
-    /// Of one frame instead of all.
+    /// The number of frames, if it is not that of the calibration.
     frames: Option<usize>,
-    /// Why it is refused.
+    /// The reason for which the file is rejected.
     reason: Option<String>,
-    /// What a request that is accepted says besides.
+    /// Further fields of a request that is accepted.
     again: Option<Value>,
 }
 
@@ -57,7 +57,7 @@ struct Judge {
 }
 
 impl Judge {
-    /// Has all files written; none without Python.
+    /// Writes all files; none without Python.
     async fn new() -> Option<(Self, Vec<Written>)> {
         let python = judges()?;
         let folder = tempfile::tempdir().unwrap();
@@ -70,7 +70,7 @@ impl Judge {
         Some((judge, serde_json::from_slice(&index).unwrap()))
     }
 
-    /// Sends a file with what is asked of it.
+    /// Uploads a file and creates its resource with these fields.
     async fn send(&self, written: &Written, file: &Path, asked: &Value) -> Answer {
         let sha256 = self.app.upload(std::fs::read(file).unwrap()).await;
         let mut body = match written.measurement {
@@ -82,7 +82,7 @@ impl Judge {
         self.app.post(&format!("/v1/{what}"), &body).await
     }
 
-    /// Sends a file, which must be accepted, and holds its values against those that were written.
+    /// Uploads a file that must be accepted, and compares its values with those written.
     async fn accept(&self, written: &Written, file: &Path, asked: &Value) {
         let made = self.send(written, file, asked).await.expect(201).json();
         let name = if written.measurement { "snapshots.npy" } else { "masks.npy" };
@@ -92,15 +92,15 @@ impl Judge {
         let shape = (&made[count], &made["height"], &made["width"]);
         assert_eq!(json!(shape), json!([frames, 48, 64]), "{} {made}", written.row);
         if file.ends_with(&written.file) {
-            let told = written.axes.as_ref().or(written.told.as_ref());
-            assert_eq!(made["axes"], json!(told), "{} {made}", written.row);
+            let read_axes = written.axes.as_ref().or(written.read_axes.as_ref());
+            assert_eq!(made["axes"], json!(read_axes), "{} {made}", written.row);
         }
         let array = if written.measurement { SceneArray::Measurements } else { SceneArray::Masks };
-        let said = |key: &str| asked[key].as_str().map(str::to_owned);
-        let axes = said("axes").map(|axes| axes.parse().unwrap());
+        let stated = |key: &str| asked[key].as_str().map(str::to_owned);
+        let axes = stated("axes").map(|axes| axes.parse().unwrap());
         let scale = asked["full_scale"].as_f64().map(|scale| scale as f32);
         let source = Source::upload(file, array, scale, Limits::default())
-            .named(said("array"))
+            .named(stated("array"))
             .arranged(axes, written.measurement.then_some((48, 64)));
         let mut opened = source.open().unwrap();
         let mut found = Vec::new();
@@ -136,10 +136,11 @@ fn run(command: &mut Command) {
 async fn every_row_of_the_tables_holds() {
     let Some((judge, files)) = Judge::new().await else { return };
     let (accepted, refused) = (rows("## Supported input formats"), rows("## Convert other files"));
-    let told: BTreeSet<&str> = accepted.iter().chain(&refused).map(|(row, _)| &**row).collect();
+    let rows_of_files: BTreeSet<&str> =
+        accepted.iter().chain(&refused).map(|(row, _)| &**row).collect();
     let written: BTreeSet<&str> = files.iter().map(|file| &*file.row).collect();
     assert_eq!(
-        told, written,
+        rows_of_files, written,
         "rows of docs/DATA.md (left) differ from tests/judges/written_files.py (right)"
     );
     for file in &files {

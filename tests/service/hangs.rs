@@ -1,4 +1,5 @@
-//! Tasks and workers that hang or die in native code: libraries that do so stand in for ONNX Runtime.
+//! Tasks and workers that hang or crash in native code. Test libraries take the place of ONNX
+//! Runtime.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,7 +11,7 @@ use serde_json::{Value, json};
 use crate::app::TestApp;
 use crate::samples::Scene;
 
-/// Builds a library whose entry point does this instead of what it should do.
+/// Builds a library with this body of its entry point.
 pub fn library(folder: &Path, body: &str) -> PathBuf {
     let (source, library) = (folder.join("fake.c"), folder.join("libfake.so"));
     let code = format!(
@@ -41,7 +42,7 @@ async fn with_library(body: &str) -> (tempfile::TempDir, TestApp) {
 }
 
 #[tokio::test]
-async fn a_task_that_hangs_is_tried_a_few_times_and_the_service_goes_on() {
+async fn a_hanging_task_is_retried_and_abandoned() {
     let (folder, app) = with_library("for (;;) pause();").await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let done = app.ended(&app.submit(&deep(&measurement)).await).await;
@@ -54,7 +55,7 @@ async fn a_task_that_hangs_is_tried_a_few_times_and_the_service_goes_on() {
 }
 
 #[tokio::test]
-async fn a_task_that_kills_its_workers_is_given_up_with_the_reason() {
+async fn a_task_that_kills_its_workers_is_abandoned() {
     let (_folder, app) = with_library("abort();").await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let done = app.ended(&app.submit(&deep(&measurement)).await).await;
@@ -64,7 +65,7 @@ async fn a_task_that_kills_its_workers_is_given_up_with_the_reason() {
 }
 
 #[tokio::test]
-async fn a_stop_does_not_wait_for_a_task_that_hangs() {
+async fn a_stop_does_not_wait_for_a_hanging_task() {
     let folder = tempfile::tempdir().unwrap();
     let library = library(folder.path(), "for (;;) pause();");
     let library = library.to_str().unwrap();
@@ -75,11 +76,11 @@ async fn a_stop_does_not_wait_for_a_task_that_hangs() {
     let start = Instant::now();
     assert!(app.stop().success());
     let took = start.elapsed();
-    assert!((4..8).contains(&took.as_secs()), "a worker gives its task back in 5 s: {took:?}");
+    assert!((4..8).contains(&took.as_secs()), "a worker returns its task within 5 s: {took:?}");
 }
 
 #[tokio::test]
-async fn a_worker_that_hangs_as_a_whole_is_replaced() {
+async fn a_hanging_worker_is_replaced() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let start = Instant::now();
     while app.workers().is_empty() {
@@ -87,7 +88,7 @@ async fn a_worker_that_hangs_as_a_whole_is_replaced() {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     let (_, measurement) = app.scene(&Scene::SMALL).await;
-    // It works: the worker is past its start.
+    // The worker has started, and computes.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
     kill_process(app.workers()[0], Signal::STOP).unwrap();
@@ -95,11 +96,12 @@ async fn a_worker_that_hangs_as_a_whole_is_replaced() {
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 }
 
-/// A control group of the kernel for memory, below that of the tests.
+/// A memory control group below that of the tests.
 struct Group(PathBuf);
 
 impl Group {
-    /// A group with so much memory; none, and a word on it, where none can be made.
+    /// A group with a memory limit in bytes; none, after a message, if this machine allows no
+    /// group.
     fn new(bytes: u64) -> Option<Self> {
         let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
         let found = groups.lines().find_map(|line| {
@@ -111,7 +113,7 @@ impl Group {
             };
             let name = format!("{root}{path}/sci-recon-{}", std::process::id());
             std::fs::create_dir(&name).ok()?;
-            // From here on it is removed, whatever comes.
+            // From here on, dropping the group removes it.
             let group = Self(name.into());
             std::fs::write(group.0.join(limit), bytes.to_string()).ok()?;
             Some(group)
@@ -129,7 +131,7 @@ impl Group {
 
 impl Drop for Group {
     fn drop(&mut self) {
-        // Its last process is gone a moment before the kernel lets go of the group.
+        // The kernel releases the group a moment after its last process.
         for _ in 0..100 {
             if std::fs::remove_dir(&self.0).is_ok() {
                 return;
@@ -141,26 +143,27 @@ impl Drop for Group {
 }
 
 #[tokio::test]
-async fn a_task_whose_workers_the_kernel_kills_for_their_memory_is_given_up_with_the_reason() {
+async fn a_task_that_exceeds_the_memory_limit_is_abandoned() {
     let Some(group) = Group::new(300 << 20) else { return };
     let greedy = "for (;;) { char *p = malloc(1 << 20); if (!p) abort();
         for (int i = 0; i < 1 << 20; i += 4096) p[i] = 1; usleep(2000); }";
     let (_folder, app) = with_library(greedy).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
-    // Its workers are born where it is; that which it has already is elsewhere.
+    // Child processes inherit the group. The worker that runs already is outside.
     group.take_in(app.pid());
     app.kill_worker(0);
     let job = app.submit(&deep(&measurement)).await;
     let done = app.ended(&job).await;
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
-    // The metrics below count those five; a busy machine may lose the task in other ways, too.
+    // The metrics below count these five. On a busy machine the task may also be lost in other
+    // ways.
     assert!(error.contains("no memory left") && error.contains(" attempts)"), "{error}");
     let peak = error.split("seen at ").nth(1).and_then(|text| text.split(' ').next());
     let peak: u64 = peak.and_then(|peak| peak.parse().ok()).unwrap_or_default();
-    // Pages of the program's own file are counted too, and stand on the account of another group.
+    // The limit also counts pages of the program file, which another group may have loaded.
     assert!((1..=450).contains(&peak), "{error}");
-    // The service itself was spared, and goes on.
+    // The service was not killed, and continues.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
     let figures = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();

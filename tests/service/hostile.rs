@@ -1,5 +1,5 @@
-//! Input that is meant to do harm, or that a tired person sends. Issue 2: each gets a 4xx with a clear
-//! message, and the service lives.
+//! Malicious or mistaken input. Each request gets a 4xx with a clear message, and the service
+//! continues.
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -8,7 +8,7 @@ use crate::app::{Answer, TestApp, id};
 use crate::samples::{self, Scene, constant, npy, npy_header};
 
 #[tokio::test]
-async fn bad_masks_are_refused_with_what_is_wrong() {
+async fn bad_masks_are_rejected_with_the_reason() {
     let app = TestApp::start().await;
     let mut nan = vec![0.5f32; 4 * 8 * 8];
     nan[2 * 64 + 3 * 8 + 5] = f32::NAN;
@@ -68,7 +68,7 @@ async fn bad_masks_are_refused_with_what_is_wrong() {
         }
         assert!(!detail.contains(app.data().to_str().unwrap()), "{name} shows a path: {detail}");
     }
-    // The service lives, and nothing of all that is in the way.
+    // The service is running, and has kept nothing.
     app.calibrate(Scene::SMALL.masks()).await.expect(201);
     assert_eq!(std::fs::read_dir(app.data().join("tmp")).unwrap().count(), 0);
 }
@@ -83,7 +83,7 @@ fn colour_png() -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn masks_whose_axes_may_be_several_are_refused_until_they_are_stated() {
+async fn masks_with_ambiguous_axes_are_rejected_until_the_order_is_stated() {
     let app = TestApp::start().await;
     for shape in [[96, 128, 8], [64, 64, 8]] {
         let answer = app.calibrate(constant(&shape, 0.5)).await;
@@ -93,7 +93,7 @@ async fn masks_whose_axes_may_be_several_are_refused_until_they_are_stated() {
         assert_eq!(answer.json()["reason"], "axes_ambiguous");
         assert_eq!(answer.json()["pointer"], "/axes");
     }
-    // Either would keep a worker busy for hours.
+    // So many masks would keep a worker busy for hours.
     for shape in [[4096, 8, 8], [65, 72, 72]] {
         let detail = app.calibrate(constant(&shape, 0.5)).await.problem(422, "size_mismatch");
         assert!(
@@ -105,7 +105,7 @@ async fn masks_whose_axes_may_be_several_are_refused_until_they_are_stated() {
 }
 
 #[tokio::test]
-async fn measurements_that_do_not_fit_are_refused_with_both_sizes() {
+async fn mismatched_measurements_are_rejected_with_both_sizes() {
     let app = TestApp::start().await;
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     let wrong = app.measure(&calibration, constant(&[1, 32, 64], 1.0)).await;
@@ -121,7 +121,7 @@ async fn measurements_that_do_not_fit_are_refused_with_both_sizes() {
 }
 
 #[tokio::test]
-async fn bad_fields_are_refused_with_their_place() {
+async fn bad_fields_are_rejected_with_their_pointer() {
     let app = TestApp::start().await;
     let masks = app.upload(Scene::SMALL.masks()).await;
     let nowhere = "0".repeat(64);
@@ -149,7 +149,7 @@ async fn bad_fields_are_refused_with_their_place() {
             (422, &json!("/full_scale"))
         );
     }
-    // A path as a name is a name.
+    // A path is a valid name.
     let body = json!({"masks": masks, "name": "../../etc/passwd"});
     let named = app.post("/v1/calibrations", &body).await.expect(201);
     assert_eq!(named.json()["name"], "../../etc/passwd");
@@ -173,7 +173,7 @@ async fn bad_fields_are_refused_with_their_place() {
 }
 
 #[tokio::test]
-async fn bodies_that_are_no_json_are_told_apart() {
+async fn bodies_that_are_not_json_are_distinguished() {
     let app = TestApp::start().await;
     let post = |kind: &'static str, body: Vec<u8>| {
         app.send(app.request(Method::POST, "/v1/jobs").header("content-type", kind).body(body))
@@ -190,7 +190,7 @@ async fn bodies_that_are_no_json_are_told_apart() {
 }
 
 #[tokio::test]
-async fn odd_requests_are_answered() {
+async fn unusual_requests_are_answered() {
     let app = TestApp::start().await;
     app.get("/nowhere").await.problem(404, "not_found");
     app.get("/v1/jobs/").await.problem(404, "not_found");
@@ -220,7 +220,7 @@ async fn odd_requests_are_answered() {
 }
 
 #[tokio::test]
-async fn silent_connections_neither_stop_the_service_nor_stay() {
+async fn silent_connections_do_not_block_the_service_and_end() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpStream;
 
@@ -240,11 +240,11 @@ async fn silent_connections_neither_stop_the_service_nor_stay() {
     let limit = std::time::Duration::from_secs(60);
     let mut answer = Vec::new();
     let ended = tokio::time::timeout(limit, half.read_to_end(&mut answer)).await;
-    assert!(ended.is_ok(), "a head that never ends keeps its connection");
+    assert!(ended.is_ok(), "a connection with an endless head is not closed");
 }
 
 #[tokio::test]
-async fn a_request_names_one_host() {
+async fn a_request_with_two_hosts_is_rejected() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpStream;
 

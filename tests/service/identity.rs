@@ -1,5 +1,5 @@
-//! A data folder whose database is missing, empty, older or another one's: the start is refused with the
-//! reason, and every file is still there.
+//! A data folder with a missing, empty, older or foreign database. The server rejects it with the
+//! reason, and keeps every file.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,7 +14,7 @@ fn run(arguments: &[&str], data: &Path) -> Output {
     command.env("RUST_LOG", "error").output().unwrap()
 }
 
-/// All files of users, by their hashes.
+/// Files of users, with their hashes.
 fn files(data: &Path) -> BTreeMap<String, String> {
     let (mut found, mut folders) = (BTreeMap::new(), Vec::new());
     folders.extend(["blobs", "results", "partial"].map(|name| data.join(name)));
@@ -32,14 +32,14 @@ fn files(data: &Path) -> BTreeMap<String, String> {
     found
 }
 
-/// Files as they come in, none of which is like another one.
+/// Uploads `count` distinct files.
 async fn send(app: &TestApp, count: usize, seed: &str) {
     for number in 0..count {
         app.upload(format!("{seed} {number}").into_bytes()).await;
     }
 }
 
-/// The folder is refused by the server, and by all who only use one, and is as it was.
+/// The server and all commands reject the folder and do not change it.
 fn refused(data: &Path, sentence: &str) {
     let before = files(data);
     let serve = ["serve", "--listen", "127.0.0.1:0", "--workers", "0", "--min-free-bytes", "0"];
@@ -68,20 +68,20 @@ fn database(data: &Path) -> std::path::PathBuf {
 
 fn remove_log(data: &Path) {
     for name in ["sci-recon.db-wal", "sci-recon.db-shm"] {
-        // Gone already after a clean end.
+        // The file is removed by a clean end.
         let _ = std::fs::remove_file(data.join(name));
     }
 }
 
 #[tokio::test]
-async fn a_folder_without_its_database_is_refused() {
+async fn a_folder_without_its_database_is_rejected() {
     let mut app = TestApp::start().await;
     send(&app, 2, "a").await;
     app.stop();
     let data = app.data().to_owned();
     let whole = std::fs::read(database(&data)).unwrap();
     let marker = data.join("sci-recon.json");
-    // Missing, with and without the marker.
+    // The database is missing, with and without the marker.
     std::fs::remove_file(database(&data)).unwrap();
     refused(
         &data,
@@ -90,16 +90,16 @@ async fn a_folder_without_its_database_is_refused() {
     let mark = std::fs::read(&marker).unwrap();
     std::fs::remove_file(&marker).unwrap();
     refused(&data, "the database sci-recon.db is missing, though there are files here");
-    assert!(!database(&data).exists(), "nobody has made one");
-    // Empty.
+    assert!(!database(&data).exists(), "no database is created");
+    // The database is empty.
     std::fs::write(&marker, mark).unwrap();
     std::fs::write(database(&data), b"").unwrap();
     refused(&data, "the database sci-recon.db is empty, though there are a marker and files here");
-    // The marker alone.
+    // Only the marker exists.
     std::fs::write(database(&data), whole).unwrap();
     std::fs::remove_file(&marker).unwrap();
     refused(&data, "the marker sci-recon.json is missing");
-    // Who says so may go on.
+    // The option accepts the folder.
     let app = app.again(&["--workers", "0", "--accept-database"]).await;
     assert_eq!(files(&data).len(), 2);
     app.get("/v1/jobs").await.expect(200);
@@ -107,7 +107,7 @@ async fn a_folder_without_its_database_is_refused() {
 }
 
 #[tokio::test]
-async fn another_or_an_older_database_is_refused() {
+async fn a_foreign_or_older_database_is_rejected() {
     let mut app = TestApp::start().await;
     send(&app, 2, "a").await;
     app.stop();
@@ -119,16 +119,16 @@ async fn another_or_an_older_database_is_refused() {
     let newer = std::fs::read(database(&data)).unwrap();
     std::fs::write(database(&data), older).unwrap();
     refused(&data, "the database is older than the folder");
-    // That of another service.
+    // The database of another service.
     let mut other = TestApp::start().await;
     other.stop();
     std::fs::copy(database(other.data()), database(&data)).unwrap();
     refused(&data, "the database belongs to another folder");
-    // Its own one is taken again.
+    // The folder's database is accepted again.
     std::fs::write(database(&data), newer).unwrap();
     app.restart();
     assert_eq!(files(&data).len(), 4);
-    // A lost write-ahead log: after a kill the last records are there alone.
+    // The write-ahead log is lost. After a kill, the last records are only there.
     send(&app, 1, "c").await;
     app.kill();
     remove_log(&data);
@@ -137,9 +137,9 @@ async fn another_or_an_older_database_is_refused() {
     assert_eq!((files(&data).len(), app.blobs_in("quarantine")), (4, 1));
 }
 
-/// A token changes the generation: a copy of the database from before it does not open the service.
+/// A token changes the generation, so an earlier copy of the database cannot open the service.
 #[tokio::test]
-async fn a_database_from_before_the_tokens_does_not_open_the_service() {
+async fn a_database_from_before_a_token_is_rejected() {
     let mut app = TestApp::start().await;
     app.kill();
     let older = ["sci-recon.db", "sci-recon.db-wal"].map(|name| (name, app.data().join(name)));
@@ -152,9 +152,9 @@ async fn a_database_from_before_the_tokens_does_not_open_the_service() {
     refused(app.data(), "the database is older than the folder");
 }
 
-/// A database that is behind within one generation shows by what it does not know.
+/// A database that is older within one generation lacks records of files.
 #[tokio::test]
-async fn too_many_orphans_are_refused_and_few_wait_in_the_quarantine() {
+async fn many_orphans_are_rejected_and_few_are_quarantined() {
     let mut app = TestApp::start().await;
     send(&app, 10, "a").await;
     let mut connection = app.database().await;
@@ -166,11 +166,11 @@ async fn too_many_orphans_are_refused_and_few_wait_in_the_quarantine() {
             sqlx::query(sql).bind(count).execute(&mut connection).await.unwrap();
         }
     };
-    // One, as after a crash.
+    // One orphan, as after a crash.
     forget(1).await;
     app.restart();
     assert_eq!((app.blobs_in("blobs"), app.blobs_in("quarantine")), (9, 1));
-    // Many.
+    // Many orphans.
     forget(4).await;
     app.kill();
     let data = app.data().to_owned();
@@ -182,7 +182,7 @@ async fn too_many_orphans_are_refused_and_few_wait_in_the_quarantine() {
     assert_eq!(files(&data), before);
     let app = app.again(&["--workers", "0", "--accept-database"]).await;
     assert_eq!((app.blobs_in("blobs"), app.blobs_in("quarantine")), (5, 5));
-    // They stay for days, and go then.
+    // Orphans stay in quarantine for days, and are then deleted.
     let old = data.join("quarantine/2020-01-01T00-00-00.000Z");
     std::fs::create_dir_all(&old).unwrap();
     std::fs::write(old.join("something"), b"old").unwrap();
@@ -196,11 +196,11 @@ async fn too_many_orphans_are_refused_and_few_wait_in_the_quarantine() {
 }
 
 #[tokio::test]
-async fn a_folder_from_before_is_adopted_and_a_copy_of_it_starts() {
+async fn a_folder_without_a_marker_is_adopted_and_its_copy_starts() {
     let mut app = TestApp::start().await;
     send(&app, 5, "a").await;
     app.stop();
-    // As an earlier version has left it.
+    // The state of an earlier version.
     std::fs::remove_file(app.data().join("sci-recon.json")).unwrap();
     let mut connection = app.database().await;
     for sql in ["DROP TABLE folder", "DELETE FROM _sqlx_migrations WHERE description = 'folder'"] {
@@ -213,7 +213,7 @@ async fn a_folder_from_before_is_adopted_and_a_copy_of_it_starts() {
     app.restart();
     assert_eq!(app.blobs_in("blobs"), 5);
     assert!(app.data().join("sci-recon.json").exists());
-    // A copy is an older state together with its files.
+    // A copy is an older database together with its files.
     let folder = tempfile::tempdir().unwrap();
     let copy = folder.path().join("copy").display().to_string();
     assert!(run(&["backup", "--out", &copy], app.data()).status.success());
@@ -221,14 +221,14 @@ async fn a_folder_from_before_is_adopted_and_a_copy_of_it_starts() {
     let mut restored = TestApp::on(folder, "copy", &["--workers", "0"]).await;
     assert_eq!(restored.blobs_in("blobs"), 5);
     restored.restart();
-    // And a copy that was broken off is none.
+    // An interrupted copy is not a data folder.
     restored.stop();
     std::fs::remove_file(restored.data().join("sci-recon.json")).unwrap();
     refused(restored.data(), "the marker sci-recon.json is missing");
 }
 
 #[test]
-fn only_the_server_makes_a_folder_unless_it_is_told() {
+fn only_the_server_creates_a_folder_by_default() {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("data");
     for path in [folder.path(), &data] {

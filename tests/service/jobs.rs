@@ -1,4 +1,4 @@
-//! Jobs as far as they go without a worker: accepting, watching, cancelling, deleting.
+//! Jobs without a worker: submission, watching, cancellation, deletion.
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -12,7 +12,7 @@ async fn with_key(app: &TestApp, key: &str, body: &Value) -> Answer {
 }
 
 #[tokio::test]
-async fn a_job_is_accepted_with_all_that_was_left_open_filled_in() {
+async fn an_accepted_job_has_all_defaults_filled_in() {
     let app = TestApp::start().await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
     let body =
@@ -45,7 +45,7 @@ async fn a_job_is_accepted_with_all_that_was_left_open_filled_in() {
 }
 
 #[tokio::test]
-async fn requests_that_do_not_fit_are_refused_with_all_their_errors() {
+async fn invalid_requests_are_rejected_with_all_errors() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({
@@ -78,7 +78,7 @@ async fn requests_that_do_not_fit_are_refused_with_all_their_errors() {
 }
 
 #[tokio::test]
-async fn a_key_is_good_for_one_job() {
+async fn a_key_belongs_to_one_job() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
@@ -86,7 +86,7 @@ async fn a_key_is_good_for_one_job() {
     let again = with_key(&app, "run-1", &body).await.expect(200);
     assert_eq!(id(&first), id(&again));
     assert_eq!(first.header("location"), again.header("location"));
-    // The same request in other words.
+    // The same request in another form.
     let mut spelled = body.clone();
     spelled["snapshots"] = json!("all");
     spelled["priority"] = json!(0);
@@ -102,7 +102,7 @@ async fn a_key_is_good_for_one_job() {
 }
 
 #[tokio::test]
-async fn ten_at_once_with_one_key_make_one_job() {
+async fn ten_concurrent_requests_with_one_key_create_one_job() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
@@ -113,7 +113,7 @@ async fn ten_at_once_with_one_key_make_one_job() {
 }
 
 #[tokio::test]
-async fn lists_are_filtered_and_turned_page_by_page() {
+async fn lists_are_filtered_and_paged() {
     let app = TestApp::start().await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
     let mut ids = Vec::new();
@@ -155,7 +155,7 @@ async fn lists_are_filtered_and_turned_page_by_page() {
 }
 
 #[tokio::test]
-async fn watching_costs_little_as_long_as_nothing_changes() {
+async fn watching_an_unchanged_job_is_cheap() {
     let app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
@@ -189,7 +189,7 @@ async fn cancel_retry_and_delete_follow_the_states() {
     assert_eq!(act("cancel").await.expect(202).json()["state"], "cancelled");
     assert_eq!(act("retry").await.expect(202).json()["state"], "queued");
     assert_eq!(act("cancel").await.expect(202).json()["state"], "cancelled");
-    // From the outside in.
+    // Dependent resources must be deleted first.
     let (calibration, measurement) =
         (format!("/v1/calibrations/{calibration}"), format!("/v1/measurements/{measurement}"));
     app.delete(&calibration).await.problem(409, "in_use");
@@ -203,7 +203,7 @@ async fn cancel_retry_and_delete_follow_the_states() {
 }
 
 #[tokio::test]
-async fn what_was_accepted_survives_a_kill_of_the_server() {
+async fn accepted_resources_survive_a_kill_of_the_server() {
     let mut app = TestApp::start().await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
@@ -216,7 +216,7 @@ async fn what_was_accepted_survives_a_kill_of_the_server() {
 }
 
 #[tokio::test]
-async fn a_job_that_no_worker_has_the_memory_for_is_refused_with_the_numbers() {
+async fn a_job_that_needs_too_much_memory_is_rejected_with_both_sizes() {
     let app = TestApp::with(&["--workers", "0", "--worker-memory-bytes", "400000000"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let mut body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});

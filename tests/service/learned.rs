@@ -1,4 +1,4 @@
-//! End-to-end networks: a tiny one is fitted by a script and used through the service.
+//! End-to-end networks: a script fits a tiny one, and the service uses it.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -6,23 +6,17 @@ use std::process::Command;
 use engine::pipeline::usage::peak_rss_of;
 use serde_json::{Value, json};
 
-use crate::app::{TestApp, id};
+use crate::app::{TestApp, has_onnxruntime, id, judges};
 use crate::faults::children;
 use crate::pipeline::{psnr, values};
 use crate::samples::Scene;
 
-/// Python with the packages of the tests, where libonnxruntime is there as well.
+/// Python with the packages of the tests, if libonnxruntime is available as well.
 pub fn python() -> Option<String> {
-    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
-    let python = std::env::var("SCI_RECON_JUDGES").ok();
-    if python.is_none() || !Path::new(&library).exists() {
-        eprintln!("SKIPPED: no SCI_RECON_JUDGES, or no libonnxruntime at {library:?}");
-        return None;
-    }
-    python
+    if has_onnxruntime() { judges() } else { None }
 }
 
-/// A network for the scene's masks, of fixed or free size.
+/// Fits a network for the scene's masks, with a fixed or free image size.
 pub fn train(python: &str, folder: &Path, scene: Scene, size: &str) -> PathBuf {
     let (masks, network) = (folder.join("masks.npy"), folder.join(format!("{size}.onnx")));
     std::fs::write(&masks, scene.masks()).unwrap();
@@ -33,7 +27,7 @@ pub fn train(python: &str, folder: &Path, scene: Scene, size: &str) -> PathBuf {
     network
 }
 
-/// PSNR of the measurement divided by the sum of its masks, as every frame.
+/// PSNR in dB of the trivial reconstruction: the measurement divided by the sum of masks.
 fn trivial(scene: Scene) -> f64 {
     let (masks, snapshots) = (values(&scene.masks()), values(&scene.snapshots()));
     let pixels = scene.height * scene.width;
@@ -47,16 +41,16 @@ pub async fn register(app: &TestApp, calibration: &str, file: &Path) -> crate::a
     app.post("/v1/models", &json!({"calibration": calibration, "file": file, "name": "tiny"})).await
 }
 
-/// The process of the network that the worker ran last is confined, and has no file of the service open.
-fn sees_nothing(app: &TestApp) {
+/// Checks that the worker's network process is confined, and has no file of the service open.
+fn assert_confined(app: &TestApp) {
     let worker = app.workers()[0].as_raw_nonzero().get().unsigned_abs();
     let [network] = children(worker)[..] else {
         panic!("one process of a network should be there")
     };
     let proc = PathBuf::from(format!("/proc/{network}"));
     let status = std::fs::read_to_string(proc.join("status")).unwrap();
-    let says = |line: &str| status.lines().any(|found| found == line);
-    assert!(says("NoNewPrivs:\t1") && says("Seccomp:\t2"), "{status}");
+    let has_line = |line: &str| status.lines().any(|found| found == line);
+    assert!(has_line("NoNewPrivs:\t1") && has_line("Seccomp:\t2"), "{status}");
     let open: Vec<PathBuf> = std::fs::read_dir(proc.join("fd"))
         .unwrap()
         .map(|entry| std::fs::read_link(entry.unwrap().path()).unwrap())
@@ -68,7 +62,7 @@ fn sees_nothing(app: &TestApp) {
 }
 
 #[tokio::test]
-async fn a_network_of_a_labs_own_gives_frames() {
+async fn a_labs_network_reconstructs_frames() {
     let Some(python) = python() else { return };
     let (folder, scene) = (tempfile::tempdir().unwrap(), Scene::SMALL);
     let fixed = train(&python, folder.path(), scene, "fixed");
@@ -110,8 +104,8 @@ async fn a_network_of_a_labs_own_gives_frames() {
         assert!(used.problem(409, "in_use").contains("1 jobs"));
         app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
     }
-    sees_nothing(&app);
-    eprintln!("{:.2} dB trivially, {quality:.2?} by networks", trivial(scene));
+    assert_confined(&app);
+    eprintln!("{:.2} dB by the trivial reconstruction, {quality:.2?} by networks", trivial(scene));
     assert!(quality.iter().all(|quality| *quality > trivial(scene) + 1.0), "{quality:?}");
     for model in [&model, &free] {
         let path = format!("/v1/models/{}", model["id"].as_str().unwrap());
@@ -121,7 +115,7 @@ async fn a_network_of_a_labs_own_gives_frames() {
 }
 
 #[tokio::test]
-async fn what_is_no_network_for_these_masks_is_refused() {
+async fn a_file_that_is_no_network_for_these_masks_is_rejected() {
     let Some(python) = python() else { return };
     let (folder, scene) = (tempfile::tempdir().unwrap(), Scene::SMALL);
     let network = train(&python, folder.path(), scene, "fixed");
@@ -136,7 +130,7 @@ async fn what_is_no_network_for_these_masks_is_refused() {
     let masks = folder.path().join("masks.npy");
     let detail = register(&app, &calibration, &masks).await.problem(422, "invalid_content");
     assert!(detail.contains("can't be loaded"), "{detail}");
-    // Weights in a file of the service's machine are none of the network's business.
+    // A network must not load weights from files of the service's machine.
     let outside = train(&python, folder.path(), scene, "outside");
     let detail = register(&app, &calibration, &outside).await.problem(422, "invalid_content");
     assert!(detail.contains("weights"), "{detail}");
@@ -176,16 +170,16 @@ async fn what_is_no_network_for_these_masks_is_refused() {
     app.delete(&format!("/v1/measurements/{measurement}")).await.expect(204);
     let used = app.delete(&format!("/v1/calibrations/{calibration}")).await;
     assert!(used.problem(409, "in_use").contains("1 models"));
-    // Another lab neither sees the model nor may use it.
+    // Another lab cannot see or use the model.
     app.sign_in(&app.token(&["create", "--lab", "other"]));
     app.get(&format!("/v1/models/{model}")).await.problem(404, "not_found");
     assert_eq!(app.get("/v1/models").await.json()["items"], json!([]));
     app.delete(&format!("/v1/models/{model}")).await.problem(404, "not_found");
 }
 
-/// It was modest when it was tried in the dark.
+/// The network uses little memory for the dark input of its check, and much for a bright one.
 #[tokio::test]
-async fn a_network_that_is_greedy_in_the_light_costs_its_own_job_and_no_more() {
+async fn a_network_that_exceeds_its_memory_fails_only_its_job() {
     let Some(python) = python() else { return };
     let (folder, scene) = (tempfile::tempdir().unwrap(), Scene::SMALL);
     let sly = train(&python, folder.path(), scene, "sly");
@@ -214,11 +208,11 @@ async fn a_network_that_is_greedy_in_the_light_costs_its_own_job_and_no_more() {
     assert!((1..1600).contains(&peak), "{peak} MiB");
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    assert_eq!(app.workers(), workers, "the worker was spared");
+    assert_eq!(app.workers(), workers, "the worker is still running");
 }
 
 #[test]
-fn the_command_line_runs_a_network_too() {
+fn the_command_line_runs_a_network() {
     let Some(python) = python() else { return };
     let (folder, scene) = (tempfile::tempdir().unwrap(), Scene::SMALL);
     let network = train(&python, folder.path(), scene, "fixed");
@@ -260,5 +254,5 @@ fn the_command_line_runs_a_network_too() {
         .output()
         .unwrap();
     let verdict: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert!(verdict["refused"].is_string(), "the weights lie in its working folder: {verdict}");
+    assert!(verdict["refused"].is_string(), "the weights are in its working folder: {verdict}");
 }

@@ -1,4 +1,4 @@
-//! Limits hold, however many requests come at once, and no lab locks the others out.
+//! Limits hold for concurrent requests, and one lab cannot exhaust those of others.
 
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use tokio::net::TcpStream;
 use crate::app::{Answer, TestApp};
 use crate::samples::{Scene, npy_header};
 
-/// A service with two labs, and a token of each.
+/// Starts a service with two labs; returns a token of each.
 async fn two_labs(arguments: &[&str]) -> (TestApp, String, String) {
     let app = TestApp::with(arguments).await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
@@ -41,7 +41,7 @@ fn taken(answers: &[Answer]) -> usize {
 }
 
 #[tokio::test]
-async fn of_many_requests_at_once_no_more_are_taken_than_the_limit_has_room_for() {
+async fn concurrent_requests_do_not_exceed_the_limit() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "1000000"]));
     let upload = |number: u8| {
@@ -58,10 +58,10 @@ async fn of_many_requests_at_once_no_more_are_taken_than_the_limit_has_room_for(
 }
 
 #[tokio::test]
-async fn prepared_arrays_count_too() {
+async fn prepared_arrays_count_towards_the_quota() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "200000"]));
-    // 8 bits a value; 32 in the prepared array.
+    // 8 bits per value, and 32 in the prepared array.
     let masks = [npy_header("|u1", &[8, 96, 96]), vec![200; 8 * 96 * 96]].concat();
     let answer = app.calibrate(masks.clone()).await;
     let detail = answer.problem(507, "quota_exceeded");
@@ -74,7 +74,7 @@ async fn prepared_arrays_count_too() {
 }
 
 #[tokio::test]
-async fn empty_announcements_do_not_take_the_disk() {
+async fn empty_announcements_do_not_exhaust_the_disk() {
     let (app, a, b) = two_labs(&["--workers", "0", "--max-upload-bytes", "1000000000000000"]).await;
     let disk = rustix::fs::statvfs(app.data()).unwrap();
     let free = disk.f_bavail * disk.f_frsize;
@@ -86,24 +86,24 @@ async fn empty_announcements_do_not_take_the_disk() {
     app.upload(vec![1; 1000]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
-    // So many of one lab, and no more.
+    // One lab can announce this many uploads.
     app.sign_in(&a);
-    let mut begun = 20;
+    let mut announced = 20;
     let refused = loop {
         let answer = app.send(announce(&app, 10)).await;
         if answer.status != StatusCode::CREATED {
             break answer;
         }
-        begun += 1;
+        announced += 1;
     };
     assert!(refused.problem(429, "too_many_uploads").contains("64"));
-    assert_eq!(begun, 64);
+    assert_eq!(announced, 64);
     app.sign_in(&b);
     app.send(announce(&app, 10)).await.expect(201);
 }
 
 #[tokio::test]
-async fn a_lab_has_limits_of_its_own_and_locks_no_other_out() {
+async fn a_lab_has_quotas_that_do_not_affect_other_labs() {
     let (app, a, b) = two_labs(&["--workers", "0", "--max-jobs", "4"]).await;
     let mut jobs = Vec::new();
     for token in [&a, &b] {
@@ -116,7 +116,7 @@ async fn a_lab_has_limits_of_its_own_and_locks_no_other_out() {
         app.submit(&jobs[0]).await;
     }
     app.post("/v1/jobs", &jobs[0]).await.problem(429, "queue_full");
-    // All places are taken, but none is b's.
+    // The lab a has used all its places, but none of b's.
     app.sign_in(&b);
     app.submit(&jobs[1]).await;
     app.submit(&jobs[1]).await;
@@ -133,8 +133,8 @@ async fn a_lab_has_limits_of_its_own_and_locks_no_other_out() {
     app.submit(&jobs[1]).await;
 }
 
-/// An upload that has begun, and of which nothing more comes by itself.
-async fn begun(app: &TestApp, token: &str, length: usize) -> TcpStream {
+/// Starts an upload that then sends nothing.
+async fn stalled_upload(app: &TestApp, token: &str, length: usize) -> TcpStream {
     let mut socket = TcpStream::connect(app.address()).await.unwrap();
     let head = format!(
         "POST /v1/blobs HTTP/1.1\r\nHost: {}\r\nAuthorization: Bearer {token}\r\n\
@@ -146,12 +146,12 @@ async fn begun(app: &TestApp, token: &str, length: usize) -> TcpStream {
 }
 
 #[tokio::test]
-async fn slow_uploads_of_a_lab_leave_places_for_others_and_end() {
+async fn slow_uploads_leave_places_for_other_labs_and_end() {
     let arguments = ["--workers", "0", "--max-uploads", "4", "--upload-idle-seconds", "2"];
     let (app, a, b) = two_labs(&arguments).await;
     let mut slow = Vec::new();
     for _ in 0..4 {
-        slow.push(begun(&app, &a, 1_000_000).await);
+        slow.push(stalled_upload(&app, &a, 1_000_000).await);
     }
     let start = Instant::now();
     while std::fs::read_dir(app.data().join("tmp")).unwrap().count() < 2 {
@@ -161,12 +161,12 @@ async fn slow_uploads_of_a_lab_leave_places_for_others_and_end() {
     let send = |token: &str| as_lab(&app, token, Method::POST, "/v1/blobs").body("abc");
     app.send(send(&a)).await.problem(429, "too_many_uploads");
     app.send(send(&b)).await.expect(201);
-    // A byte in time, again and again, is not enough.
-    let mut dripping = begun(&app, &b, 1_000_000).await;
+    // Single bytes within the idle time do not keep an upload alive.
+    let mut dripping = stalled_upload(&app, &b, 1_000_000).await;
     let mut answer = [0; 12];
     let start = Instant::now();
     loop {
-        assert!(start.elapsed().as_secs() < 30, "it goes on for ever");
+        assert!(start.elapsed().as_secs() < 30, "the upload is never ended");
         let _ = dripping.write_all(b"x").await;
         let read = dripping.read_exact(&mut answer);
         if let Ok(read) = tokio::time::timeout(Duration::from_millis(500), read).await {
@@ -178,7 +178,7 @@ async fn slow_uploads_of_a_lab_leave_places_for_others_and_end() {
 }
 
 #[tokio::test]
-async fn listeners_of_a_lab_leave_places_and_end_with_their_token() {
+async fn listeners_leave_places_for_other_labs_and_end_with_their_token() {
     let (app, a, b) = two_labs(&["--workers", "0"]).await;
     let mut listening = Vec::new();
     let refused = loop {
@@ -187,7 +187,7 @@ async fn listeners_of_a_lab_leave_places_and_end_with_their_token() {
             break answer;
         }
         listening.push(answer);
-        assert!(listening.len() <= 64, "a lab has half of the places at most");
+        assert!(listening.len() <= 64, "a lab has at most half of the places");
     };
     Answer::read(refused).await.problem(503, "unavailable");
     let mut others = as_lab(&app, &b, Method::GET, "/v1/events").send().await.unwrap();
@@ -200,8 +200,8 @@ async fn listeners_of_a_lab_leave_places_and_end_with_their_token() {
         let end = async { while stream.chunk().await.is_ok_and(|chunk| chunk.is_some()) {} };
         tokio::time::timeout(Duration::from_secs(20), end).await.unwrap();
     }
-    assert!(start.elapsed().as_secs() < 20, "the streams of a revoked token go on");
+    assert!(start.elapsed().as_secs() < 20, "the streams of a revoked token continue");
     others.chunk().await.unwrap().unwrap();
     let more = tokio::time::timeout(Duration::from_secs(1), others.chunk()).await;
-    assert!(more.is_err(), "those of another token go on");
+    assert!(more.is_err(), "the streams of another token continue");
 }

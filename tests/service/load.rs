@@ -1,4 +1,4 @@
-//! Load: run by `make load`, for it takes minutes and gigabytes.
+//! Load tests, run by `make load` because they take minutes and gigabytes.
 
 use std::time::{Duration, Instant};
 
@@ -15,7 +15,7 @@ fn setting(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().unwrap())
 }
 
-/// A job that keeps both cores busy for as long as the test takes.
+/// A job that keeps both cores busy during the whole test.
 fn endless(measurement: &str) -> Value {
     json!({
         "measurement": measurement,
@@ -27,7 +27,7 @@ fn endless(measurement: &str) -> Value {
     })
 }
 
-/// The figure that so many of a hundred are below.
+/// The value below which `of_hundred` per cent of the sorted durations lie.
 fn percentile(sorted: &[Duration], of_hundred: f64) -> f64 {
     let at = ((sorted.len() as f64 * of_hundred / 100.0).ceil() as usize).clamp(1, sorted.len());
     sorted[at - 1].as_secs_f64() * 1000.0
@@ -50,7 +50,7 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
     let poll = |client: u64| async move {
         let path = format!("/v1/jobs/{}", jobs[client as usize % jobs.len()]);
         let (mut times, mut errors) = (Vec::new(), 0u64);
-        // Once a second each, but not all at the same moment.
+        // One request per second and client, at different moments.
         tokio::time::sleep(Duration::from_millis(client * 5)).await;
         while Instant::now() < end {
             let start = Instant::now();
@@ -115,7 +115,7 @@ async fn large_uploads_at_once_take_little_memory() {
     let size = header.len() + FRAMES * frame.len();
     let app = &app;
     let upload = |number: u64| {
-        // The first pixels tell the files apart.
+        // The first pixels make the files different.
         let first = [Bytes::from(header.clone()), Bytes::from(number.to_le_bytes().to_vec())];
         let rest = frame.slice(8..);
         let mut chunks: Vec<_> =
@@ -166,7 +166,7 @@ async fn a_large_file_comes_from_a_slow_disk() {
         first_byte.push(start.elapsed().as_secs_f64());
         answer
     };
-    // Known from the upload; not known; read a moment ago.
+    // The hash is known from the upload; unknown; known from the last read.
     let mut answers = vec![first().await];
     touch_all(&app.data().join("blobs"));
     answers.push(first().await);
@@ -191,7 +191,7 @@ async fn a_large_file_comes_from_a_slow_disk() {
 
 #[tokio::test]
 #[ignore = "minutes; run by make load"]
-async fn a_long_queue_of_large_jobs_is_as_quick_as_a_short_one() {
+async fn large_jobs_in_a_long_queue_do_not_slow_answers() {
     // 729 tiles each.
     let scene = Scene { frames: 4, height: 440, width: 440, snapshots: 1 };
     long_queue("load_large_jobs", scene, setting("SCI_RECON_LOAD_LARGE", 800)).await;
@@ -199,13 +199,13 @@ async fn a_long_queue_of_large_jobs_is_as_quick_as_a_short_one() {
 
 #[tokio::test]
 #[ignore = "minutes; run by make load"]
-async fn a_long_queue_of_small_jobs_is_as_quick_as_a_short_one() {
+async fn small_jobs_in_a_long_queue_do_not_slow_answers() {
     let scene = Scene { frames: 4, height: 24, width: 24, snapshots: 1 };
     long_queue("load_small_jobs", scene, setting("SCI_RECON_LOAD_SMALL", 20_000)).await;
 }
 
-/// Submits so many jobs, then has 50 clients ask for one of them and for the list once a second, while
-/// more jobs come.
+/// Submits jobs, then lets 50 clients request one of them and the list once a second, while more
+/// jobs are submitted.
 async fn long_queue(target: &str, scene: Scene, jobs: u64) {
     const CLIENTS: u64 = 50;
     const SUBMITTERS: u64 = 4;

@@ -1,6 +1,6 @@
 //! The service as lab machines see it: the real program on a free port with a fresh folder.
 
-#![allow(clippy::unwrap_used)] // helpers of tests
+#![allow(clippy::unwrap_used)] // tests may panic
 
 mod access;
 mod adaptive;

@@ -1,14 +1,14 @@
-//! A raw measurement is held against the calibration that it belongs to.
+//! Checks of a raw measurement against its calibration.
 
 use serde_json::{Value, json};
 
 use crate::app::TestApp;
 use crate::app::id;
-use crate::calibration::{Lab, SIDE, found};
+use crate::calibration::{Lab, SIDE, codes_and_frames};
 use crate::samples::{Scene, npy, npy_header};
 
 impl Lab {
-    /// Sends the measurement; gives the body of a request.
+    /// Uploads the measurement; returns the body of a request.
     async fn measurement(&self, app: &TestApp, calibration: &Value) -> Value {
         let index = &self.json("captures/captures.json")["measurement"];
         json!({
@@ -20,7 +20,7 @@ impl Lab {
         })
     }
 
-    /// The measurement moved by some rows and columns, round the edges.
+    /// The measurement, cyclically shifted by some rows and columns.
     fn moved(&self, rows: usize, columns: usize) -> Vec<u8> {
         let mut file = self.file("captures/measurement.npy");
         let start = file.len() - 2 * SIDE * SIDE;
@@ -47,7 +47,10 @@ async fn a_measurement_is_checked_against_its_calibration() {
         app.post("/v1/measurements", &body).await.expect(201).json()
     };
     let codes = |measurement: &Value| {
-        found(&measurement["warnings"]).into_iter().map(|(code, _)| code).collect::<Vec<_>>()
+        codes_and_frames(&measurement["warnings"])
+            .into_iter()
+            .map(|(code, _)| code)
+            .collect::<Vec<_>>()
     };
     let fine = post(&|_| ()).await;
     assert_eq!(codes(&fine), Vec::<String>::new(), "{fine:#}");
@@ -61,16 +64,16 @@ async fn a_measurement_is_checked_against_its_calibration() {
     assert!(moved["warnings"][0]["detail"].as_str().unwrap().contains("-2 rows and -1 columns"));
     let full = post(&|body| body["saturation"] = json!(900)).await;
     assert!(codes(&full).contains(&"saturated".to_owned()), "{full:#}");
-    // A measurement that lacks a pattern of its calibration.
+    // A measurement without one of the calibration's patterns.
     let mut lacking = captures.clone();
     let other = Lab::new("[camera]\nbackground = 0.1\n[sub_apertures]\nopen_share = 0.25\n");
     lacking["masks"][4] = other.send(&app).await["masks"][4].clone();
     lacking.as_object_mut().unwrap().remove("patterns");
     let wrong = app.calibrate_captures(&lacking).await;
     let lost = post(&|body| body["calibration"] = wrong["id"].clone()).await;
-    let seen = found(&lost["warnings"]);
+    let seen = codes_and_frames(&lost["warnings"]);
     assert!(seen.contains(&("missing_pattern".into(), vec![4])), "{lost:#}");
-    // Warnings go with the job and stand in its manifest.
+    // Warnings are copied to the job and its manifest.
     let body = json!({"measurement": moved["id"], "algorithm": "gap-tv"});
     let job = app.submit(&body).await;
     let done = app.ended(&job).await;
@@ -88,10 +91,10 @@ async fn a_measurement_is_checked_against_its_calibration() {
     assert_eq!(answer.json()["pointer"], "/dark/0");
 }
 
-/// Large enough for small faults to be seen.
+/// Large enough to detect small errors.
 const SCENE: Scene = Scene { frames: 4, height: 256, width: 256, snapshots: 1 };
 
-/// The values of a .npy file of float32, changed, as such a file again.
+/// The values of a float32 .npy file after a change, as another such file.
 fn changed(file: &[u8], values: usize, change: impl Fn(usize, f32) -> f32) -> Vec<u8> {
     let (head, data) = file.split_at(file.len() - 4 * values);
     let value = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().unwrap());
@@ -101,17 +104,20 @@ fn changed(file: &[u8], values: usize, change: impl Fn(usize, f32) -> f32) -> Ve
 }
 
 #[tokio::test]
-async fn what_was_wrong_without_a_word_is_named() {
+async fn silent_errors_of_the_optics_are_detected() {
     let app = TestApp::start().await;
     let calibration = id(&app.calibrate(SCENE.masks()).await.expect(201));
     let pixels = SCENE.height * SCENE.width;
     let codes = async |change: &dyn Fn(usize, f32) -> f32| {
         let data = changed(&SCENE.snapshots(), pixels, change);
         let measurement = app.measure(&calibration, data).await.expect(201).json();
-        found(&measurement["warnings"]).into_iter().map(|(code, _)| code).collect::<Vec<_>>()
+        codes_and_frames(&measurement["warnings"])
+            .into_iter()
+            .map(|(code, _)| code)
+            .collect::<Vec<_>>()
     };
     assert_eq!(codes(&|_, value| value).await, Vec::<String>::new());
-    // No dark is blamed that was not given.
+    // No dark is reported if none was given.
     assert_eq!(codes(&|_, value| value + 0.05).await, ["no_dark"]);
     assert_eq!(codes(&|_, value| value * 10.0).await, ["level"]);
     assert_eq!(codes(&|_, value| value / 10.0).await, ["level"]);
@@ -120,9 +126,9 @@ async fn what_was_wrong_without_a_word_is_named() {
 }
 
 #[tokio::test]
-async fn jobs_are_warned_of_a_bad_calibration_and_masks_of_their_bits() {
+async fn a_job_warns_of_a_bad_calibration_and_of_shifted_masks() {
     let mut app = TestApp::start().await;
-    // The same pattern twice, of 12 bits in 16.
+    // One pattern twice, with 12 bits in 16.
     let masks = changed(&SCENE.masks(), 4 * SCENE.height * SCENE.width, |_, value| value);
     let plane = SCENE.height * SCENE.width;
     let values: Vec<f32> = masks[masks.len() - 16 * plane..]
@@ -138,23 +144,26 @@ async fn jobs_are_warned_of_a_bad_calibration_and_masks_of_their_bits() {
     let early = app.submit(&body).await;
     app.restart_with(&["--workers", "1"]);
     let warned = |job: &Value| {
-        let codes = found(&job["warnings"]).into_iter().map(|(code, _)| code);
+        let codes = codes_and_frames(&job["warnings"]).into_iter().map(|(code, _)| code);
         codes.filter(|code| code == "bad_calibration").count()
     };
-    assert_eq!(warned(&app.ended(&early).await), 1, "the report came after the job");
+    assert_eq!(warned(&app.ended(&early).await), 1, "the report is finished after the job");
     let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await.expect(200);
     assert_eq!(report.json()["grade"], "bad");
     let codes: Vec<String> =
-        found(&report.json()["findings"]).into_iter().map(|(code, _)| code).collect();
+        codes_and_frames(&report.json()["findings"]).into_iter().map(|(code, _)| code).collect();
     assert!(codes.contains(&"mask_scale".into()), "{codes:?}");
     assert!(codes.contains(&"repeated_pattern".into()), "{codes:?}");
-    assert!(!codes.contains(&"weak_modulation".into()), "the optics are not to blame: {codes:?}");
+    assert!(
+        !codes.contains(&"weak_modulation".into()),
+        "no finding concerns the optics: {codes:?}"
+    );
     let late = app.submit(&body).await;
     assert_eq!(warned(&app.ended(&late).await), 1);
 }
 
 #[tokio::test]
-async fn twelve_bits_in_sixteen_are_named() {
+async fn twelve_bits_in_sixteen_are_detected() {
     let app = TestApp::start().await;
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     for (shift, code, full_scale) in [(4, "left_aligned", 65_520), (0, "right_aligned", 4095)] {
@@ -165,7 +174,10 @@ async fn twelve_bits_in_sixteen_are_named() {
         let mut body = json!({ "calibration": calibration, "data": sha256 });
         let codes = async |body: &Value| {
             let made = app.post("/v1/measurements", body).await.expect(201).json();
-            found(&made["warnings"]).into_iter().map(|(code, _)| code).collect::<Vec<_>>()
+            codes_and_frames(&made["warnings"])
+                .into_iter()
+                .map(|(code, _)| code)
+                .collect::<Vec<_>>()
         };
         assert!(codes(&body).await.contains(&code.to_owned()), "{code}");
         body["full_scale"] = json!(full_scale);

@@ -1,4 +1,4 @@
-//! Pictures to look at, and how the solver went.
+//! Images of results, and the convergence history.
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -33,7 +33,7 @@ fn tv(iterations: u32, updates: u32) -> Value {
 }
 
 #[tokio::test]
-async fn frames_are_shown_as_they_are() {
+async fn images_show_the_frames_unchanged() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let job = job(&app, tv(200, 4)).await;
     let done = app.ended(&job).await;
@@ -43,7 +43,7 @@ async fn frames_are_shown_as_they_are() {
     let plane = height * width;
     let pictures = format!("{base}/pictures");
 
-    // A tile at full resolution has every pixel, on the window's scale.
+    // A tile at full resolution has every pixel, on the scale of the window.
     let address = format!("{pictures}/frame-2/tiles/0/0/0?black=0.1&white=0.9");
     let tile = app.get(&address).await.expect(200);
     let (rows, columns, shown) = decode(&tile);
@@ -56,7 +56,7 @@ async fn frames_are_shown_as_they_are() {
     let known = app.request(Method::GET, &address).header("if-none-match", tile.header("etag"));
     app.send(known).await.expect(304);
 
-    // A preview is reduced by a power of two; a slice has a row of every frame.
+    // A preview is reduced by a power of two; a slice has one row of every frame.
     let small = app.get(&format!("{pictures}/frame-1?size=32&black=0&white=1")).await.expect(200);
     let (rows, columns, shown) = decode(&small);
     assert_eq!((rows, columns), (height / 2, width / 2));
@@ -68,7 +68,7 @@ async fn frames_are_shown_as_they_are() {
     let value = frames[3 * plane + 5 * width + 7] * 255.0;
     assert!((f32::from(shown[3 * width + 7]) - value).abs() <= 0.51);
 
-    // The spread tells what window makes sense; the residual is small.
+    // The range of values gives a suitable window; the residual is small.
     let spread = app.get(&format!("{pictures}/frame-1/spread")).await.expect(200).json();
     assert_eq!((&spread["height"], &spread["levels"]), (&json!(height), &json!(0)));
     assert!(spread["low"].as_f64().unwrap() < spread["high"].as_f64().unwrap());
@@ -76,7 +76,7 @@ async fn frames_are_shown_as_they_are() {
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
     app.get(&format!("{pictures}/difference-2")).await.expect(200);
 
-    // Masks and measurement.
+    // Images of masks and measurement.
     let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
     let masks = format!("/v1/calibrations/{}/pictures", calibration.as_str().unwrap());
     for name in ["mask-4", "mean", "gram", "dead"] {
@@ -106,7 +106,7 @@ async fn frames_are_shown_as_they_are() {
 }
 
 #[tokio::test]
-async fn frames_are_judged_where_the_truth_is_known() {
+async fn frames_are_compared_with_a_known_truth() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let job = job(&app, tv(60, 4)).await;
     let path = format!("/v1/jobs/{job}/snapshots/1/quality?truth=");
@@ -131,7 +131,7 @@ async fn frames_are_judged_where_the_truth_is_known() {
     let frames = quality["frames"].as_array().unwrap();
     let mean = frames.iter().map(|frame| frame["psnr"].as_f64().unwrap()).sum::<f64>() / 4.0;
     assert!((mean - psnr).abs() < 1e-9);
-    // The truth of all snapshots tells the same of this one; that of another one does not.
+    // The true frames of all snapshots give the same result; those of another snapshot do not.
     let all = app.upload(truth(0..2)).await;
     assert_eq!(app.get(&format!("{path}{all}")).await.json()["psnr"], quality["psnr"]);
     let other = app.upload(truth(0..1)).await;
@@ -143,7 +143,7 @@ async fn frames_are_judged_where_the_truth_is_known() {
 }
 
 #[tokio::test]
-async fn tiles_show_while_others_run_and_tell_how_the_solver_goes() {
+async fn running_jobs_show_tiles_and_their_convergence() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let job = job(&app, tv(5_000, 8)).await;
     let base = format!("/v1/jobs/{job}/snapshots/1");
@@ -178,7 +178,7 @@ async fn tiles_show_while_others_run_and_tell_how_the_solver_goes() {
 }
 
 #[tokio::test]
-async fn a_coarse_preview_comes_before_the_tiles() {
+async fn a_coarse_preview_precedes_the_tiles() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let job = job(&app, tv(10_000, 50)).await;
     let preview = |job: &Value| job["progress"]["previews_done"] == 1;

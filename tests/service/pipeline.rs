@@ -9,7 +9,7 @@ use crate::app::{Answer, TestApp, id};
 use crate::samples::Scene;
 
 impl TestApp {
-    /// Waits until the job has ended, and gives it.
+    /// Waits until the job has ended, and returns it.
     pub async fn ended(&self, job: &str) -> Value {
         self.when(job, |job| {
             ["succeeded", "failed", "cancelled"].contains(&job["state"].as_str().unwrap())
@@ -17,7 +17,7 @@ impl TestApp {
         .await
     }
 
-    /// Waits until the job is as it should be, and gives it.
+    /// Waits until the job satisfies a condition, and returns it.
     pub async fn when(&self, job: &str, reached: impl Fn(&Value) -> bool) -> Value {
         let start = Instant::now();
         loop {
@@ -30,7 +30,7 @@ impl TestApp {
         }
     }
 
-    /// Submits a job, and gives its identifier.
+    /// Submits a job and returns its identifier.
     pub async fn submit(&self, body: &Value) -> String {
         id(&self.post("/v1/jobs", body).await.expect(201))
     }
@@ -55,7 +55,7 @@ pub fn psnr(scene: Scene, snapshot: usize, frames: &[f32]) -> f64 {
 }
 
 #[tokio::test]
-async fn a_job_gives_frames_that_look_like_the_scene() {
+async fn a_job_reconstructs_the_scene() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let scene = Scene::SMALL;
     let (_, measurement) = app.scene(&scene).await;
@@ -91,7 +91,7 @@ async fn a_job_gives_frames_that_look_like_the_scene() {
     let manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200);
     assert!(manifest.json().is_object());
     assert_eq!(manifest.header("content-type"), "application/json");
-    // What is kept of a job that has succeeded: uploads, prepared arrays, results; no tiles.
+    // A succeeded job keeps uploads, prepared arrays and results, but no tiles.
     let text = String::from_utf8(app.get("/metrics").await.bytes).unwrap();
     assert!(text.contains("sci_recon_blobs 4\n"), "{text}");
     app.get("/readyz").await.expect(200);
@@ -100,7 +100,7 @@ async fn a_job_gives_frames_that_look_like_the_scene() {
 }
 
 #[tokio::test]
-async fn results_are_downloaded_in_parts() {
+async fn results_are_downloaded_in_ranges() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 1});
@@ -146,7 +146,7 @@ fn long_schedule() -> Value {
 }
 
 #[tokio::test]
-async fn cancel_stops_a_running_job_and_retry_takes_it_up_again() {
+async fn cancel_stops_a_running_job_and_retry_resumes_it() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body =
@@ -172,7 +172,7 @@ async fn cancel_stops_a_running_job_and_retry_takes_it_up_again() {
 }
 
 #[tokio::test]
-async fn a_stop_of_the_server_gives_tasks_back_and_a_start_goes_on() {
+async fn a_stopped_server_returns_its_tasks_and_a_restart_continues() {
     let mut app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body =

@@ -1,4 +1,5 @@
-//! Uploads in pieces: the protocol by hand, and a client by others over connections that are cut.
+//! Resumable uploads: the protocol step by step, and a published client over connections that are
+//! cut.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -45,7 +46,7 @@ async fn offset(app: &TestApp, path: &str) -> String {
 }
 
 #[tokio::test]
-async fn pieces_become_a_blob() {
+async fn pieces_are_joined_to_a_blob() {
     let mut app = TestApp::start().await;
     let options = app.send(app.request(Method::OPTIONS, "/v1/uploads")).await.expect(204);
     assert_eq!(options.header("tus-version"), "1.0.0");
@@ -67,7 +68,7 @@ async fn pieces_become_a_blob() {
     assert!(known.header("upload-metadata").starts_with("filename YQ==,"));
     assert_eq!(known.header("content-location"), format!("/v1/blobs/{ABC}"));
     assert_eq!(app.get(&format!("/v1/blobs/{ABC}")).await.expect(200).json()["size"], 3);
-    // The same file is stored once, and ending the upload does not touch it.
+    // The file is stored once, and deleting the upload does not affect it.
     app.send(tus(&app, Method::DELETE, &path)).await.expect(204);
     app.send(tus(&app, Method::HEAD, &path)).await.expect(404);
     app.get(&format!("/v1/blobs/{ABC}")).await.expect(200);
@@ -75,7 +76,7 @@ async fn pieces_become_a_blob() {
 }
 
 #[tokio::test]
-async fn damaged_pieces_and_files_do_not_count() {
+async fn damaged_pieces_and_files_are_rejected() {
     let app = TestApp::start().await;
     let path = begin(&app, 3, &format!("sha256 {ABC_BASE64}")).await;
     let sum = |request: RequestBuilder, sum: &str| request.header("upload-checksum", sum);
@@ -85,7 +86,7 @@ async fn damaged_pieces_and_files_do_not_count() {
     assert_eq!(offset(&app, &path).await, "0");
     app.send(sum(piece(&app, &path, 0, b"abc"), "md5 x")).await.problem(400, "malformed_request");
     app.send(sum(piece(&app, &path, 0, b"abc"), good)).await.expect(204);
-    // The whole file against the hash that was named at the start.
+    // The whole file is compared with the hash named at the start.
     let path = begin(&app, 3, &format!("sha256 {ABC_BASE64}")).await;
     let wrong = app.send(piece(&app, &path, 0, b"abd")).await;
     assert!(wrong.problem(422, "hash_mismatch").contains(ABC));
@@ -93,7 +94,7 @@ async fn damaged_pieces_and_files_do_not_count() {
 }
 
 #[tokio::test]
-async fn requests_that_are_no_tus_are_refused() {
+async fn requests_that_violate_tus_are_rejected() {
     let app = TestApp::start().await;
     let plain = app.request(Method::POST, "/v1/uploads").header("upload-length", 3);
     let answer = app.send(plain).await;
@@ -122,7 +123,7 @@ async fn requests_that_are_no_tus_are_refused() {
 }
 
 #[tokio::test]
-async fn an_upload_is_its_labs_alone() {
+async fn an_upload_is_visible_only_to_its_lab() {
     let app = TestApp::start().await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
     app.sign_in(&a);
@@ -136,9 +137,9 @@ async fn an_upload_is_its_labs_alone() {
 }
 
 #[tokio::test]
-async fn the_disk_is_promised_once_and_the_queue_has_an_end() {
+async fn announced_uploads_reserve_disk_and_the_queue_is_limited() {
     let app = TestApp::with(&["--workers", "0", "--max-jobs", "2"]).await;
-    // What an announcement reserves is little, and grows with what comes.
+    // An announcement reserves little space, and more as data arrive.
     for _ in 0..5 {
         let request = tus(&app, Method::POST, "/v1/uploads").header("upload-length", 8u64 << 30);
         app.send(request).await.expect(201);
@@ -146,7 +147,7 @@ async fn the_disk_is_promised_once_and_the_queue_has_an_end() {
     let figures = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
     let promised = format!("sci_recon_disk_promised_bytes {}", 5u64 << 26);
     assert!(figures.lines().any(|line| line == promised), "{figures}");
-    // The queue: full is no fault, and a job that was accepted is found again by its key.
+    // A full queue is no server error, and an accepted job is found again by its key.
     let list = app.data().join("partial");
     for entry in std::fs::read_dir(list).unwrap() {
         let name = entry.unwrap().file_name().into_string().unwrap();
@@ -169,7 +170,8 @@ async fn the_disk_is_promised_once_and_the_queue_has_an_end() {
     assert_eq!((&ready["database"], &ready["disk"]), (&json!("ok"), &json!("ok")));
 }
 
-/// Hands connections on to the service and cuts each of them after some bytes that went either way.
+/// Forwards connections to the service, and cuts each after a varying number of bytes in either
+/// direction.
 pub async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
@@ -195,7 +197,7 @@ pub async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
     (address, cuts)
 }
 
-/// Hands bytes on until the end, or until no more are left to go.
+/// Forwards bytes until the end, or until `left` is used up.
 async fn pump(mut from: impl AsyncRead + Unpin, mut to: impl AsyncWrite + Unpin, left: &AtomicU64) {
     let mut buffer = vec![0; 16 * 1024];
     while let Ok(count @ 1..) = from.read(&mut buffer).await {
@@ -212,7 +214,7 @@ async fn pump(mut from: impl AsyncRead + Unpin, mut to: impl AsyncWrite + Unpin,
 }
 
 #[tokio::test]
-async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
+async fn a_published_client_uploads_over_cut_connections() {
     let Some(python) = judges() else { return };
     let app = TestApp::start().await;
     let token = app.token(&["create", "--lab", "a"]);
@@ -228,19 +230,19 @@ async fn a_published_client_brings_a_file_over_connections_that_are_cut() {
     command.arg(&file).arg(&hash).arg(&token);
     let output = command.output().await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!(told["offset"], bytes.len());
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["offset"], bytes.len());
     let cut = cuts.load(Ordering::Relaxed);
     eprintln!("{cut} connections were cut");
     assert!(cut >= 5, "{cut} connections were cut");
     let stored = app.get(&format!("/v1/blobs/{hash}")).await.expect(200);
     assert_eq!(stored.json()["size"], bytes.len());
     let blob = app.data().join("blobs").join(&hash[..2]).join(&hash[2..]);
-    assert!(std::fs::read(blob).unwrap() == bytes, "the bytes are those that were sent");
+    assert!(std::fs::read(blob).unwrap() == bytes, "the blob has the bytes that were sent");
 }
 
 #[tokio::test]
-async fn the_python_of_the_documentation_uploads_a_file() {
+async fn the_documented_python_uploads_a_file() {
     let Some(python) = judges() else { return };
     let app = TestApp::start().await;
     let token = app.token(&["create", "--lab", "a"]);
@@ -263,8 +265,8 @@ async fn the_python_of_the_documentation_uploads_a_file() {
     assert_eq!(stored.json()["size"], 10);
 }
 
-/// Sends `body` of a piece of `announced` bytes over a connection of its own; gives the offset that is
-/// acknowledged, if one is. A body that is shorter is cut.
+/// Sends `body` of a piece of `announced` bytes over a new connection; returns the acknowledged
+/// offset, if there is one. A shorter body is cut.
 async fn raw_piece(
     address: String,
     path: String,
@@ -289,10 +291,11 @@ async fn raw_piece(
     rest.split("\r\n").next()?.parse().ok()
 }
 
-/// Each piece is sent again around the moment at which it ends, whole and cut, as clients do that have
-/// lost their connection; every other upload sees the server killed then, too. `make faults` makes 200.
+/// Sends each piece again around the moment at which it ends, whole and cut, like a client that has
+/// lost its connection. During every other upload the server is killed as well. `make faults` does
+/// so 200 times.
 #[tokio::test]
-async fn pieces_that_come_again_around_their_end_cost_no_byte() {
+async fn repeated_pieces_lose_no_byte() {
     let (rounds, seed) = (kills().max(20), rand::random::<u64>());
     eprintln!("seed of the repeats: {seed}");
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
@@ -333,12 +336,12 @@ async fn pieces_that_come_again_around_their_end_cost_no_byte() {
             for answer in sent {
                 acknowledged.extend(answer.await.unwrap());
             }
-            // What was acknowledged is there, and the rest is sent as by any client.
+            // All acknowledged bytes are stored, and any client can send the rest.
             let due = acknowledged.into_iter().max().unwrap_or(0);
             let mut now = offset(&app, &path).await.parse::<usize>().unwrap();
             lost += usize::from(now < due);
-            let begun = std::time::Instant::now();
-            while now < end && begun.elapsed().as_secs() < 10 {
+            let start = std::time::Instant::now();
+            while now < end && start.elapsed().as_secs() < 10 {
                 raw_piece(app.address(), path.clone(), now, end - now, bytes[now..end].to_vec())
                     .await;
                 now = offset(&app, &path).await.parse().unwrap();
@@ -349,7 +352,7 @@ async fn pieces_that_come_again_around_their_end_cost_no_byte() {
         let stored = loop {
             let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
             let stored = known.header("content-location").to_owned();
-            // A repeat may be at it for a moment more.
+            // An earlier request may still be writing.
             if !stored.is_empty() || start.elapsed().as_secs() > 10 {
                 break stored;
             }
@@ -368,9 +371,9 @@ async fn pieces_that_come_again_around_their_end_cost_no_byte() {
     assert!(ok);
 }
 
-/// A file that is shorter than its row is told, not filled up with zeros.
+/// A file that is shorter than its record is reported, not filled up with zeros.
 #[tokio::test]
-async fn an_upload_that_has_lost_bytes_is_refused() {
+async fn an_upload_that_has_lost_bytes_is_rejected() {
     let app = TestApp::start().await;
     let path = begin(&app, 6, "").await;
     app.send(piece(&app, &path, 0, b"abcd")).await.expect(204);
@@ -384,10 +387,9 @@ async fn an_upload_that_has_lost_bytes_is_refused() {
     assert!(!file.exists());
 }
 
-/// One client with a byte now and then holds up nobody else's end; and its own upload does not expire
-/// under its hands.
+/// A slow client does not delay other uploads, and its upload does not expire while bytes arrive.
 #[tokio::test]
-async fn a_slow_piece_holds_up_nobody_and_does_not_expire() {
+async fn a_slow_piece_blocks_no_other_and_does_not_expire() {
     let app = TestApp::start().await;
     let path = begin(&app, 1000, "").await;
     let address = app.address();
@@ -403,12 +405,12 @@ async fn a_slow_piece_holds_up_nobody_and_does_not_expire() {
     app.send(piece(&app, &other, 0, b"abc")).await.expect(204);
     assert_eq!(offset(&app, &path).await, "0");
     app.send(tus(&app, Method::DELETE, &path)).await.problem(423, "upload_busy");
-    // Its time is over; the cleaning lets it be.
+    // The upload's lifetime is over, but the cleanup spares it.
     let store = Store::open(app.data(), Purpose::Use).await.unwrap();
     let mut database = app.database().await;
     sqlx::query("UPDATE partials SET expires_at = 1").execute(&mut database).await.unwrap();
     let age = std::time::Duration::from_secs(259_200);
-    assert_eq!(store.expire_partials(age).await.unwrap(), 1, "the one that is stored");
+    assert_eq!(store.expire_partials(age).await.unwrap(), 1, "only the stored upload expires");
     slow.write_all(&[7; 500]).await.unwrap();
     let mut answer = String::new();
     slow.read_to_string(&mut answer).await.unwrap();
@@ -416,9 +418,9 @@ async fn a_slow_piece_holds_up_nobody_and_does_not_expire() {
     assert_eq!(offset(&app, &path).await, "1000");
 }
 
-/// A client that is gone in the middle of a piece: what came is kept.
+/// The bytes received before a client disconnects are kept.
 #[tokio::test]
-async fn what_came_before_a_cut_is_kept() {
+async fn bytes_before_a_disconnect_are_kept() {
     let app = TestApp::start().await;
     let path = begin(&app, 1_000_000, "").await;
     let address = app.address();
@@ -429,8 +431,13 @@ async fn what_came_before_a_cut_is_kept() {
     );
     socket.write_all(head.as_bytes()).await.unwrap();
     socket.write_all(&[7; 300_000]).await.unwrap();
-    tokio::time::sleep(std::time::Duration::from_millis(300)).await;
-    // Another request does not write into the same file.
+    let file = app.data().join("partial").join(path.rsplit('/').next().unwrap());
+    let start = std::time::Instant::now();
+    while std::fs::metadata(&file).map_or(0, |file| file.len()) == 0 {
+        assert!(start.elapsed().as_secs() < 10, "no byte arrives");
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+    // A concurrent request does not write to the same file.
     let busy: Answer = app.send(piece(&app, &path, 0, b"x")).await;
     busy.problem(423, "upload_busy");
     drop(socket);

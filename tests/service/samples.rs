@@ -1,6 +1,6 @@
-//! Small scenes and files, made here, so that a test shows all that goes in.
+//! Small generated scenes and files, so that a test shows all of its input.
 
-/// A scene of a square that moves over a ramp, seen through random masks.
+/// A square that moves over a ramp, coded by random masks.
 #[derive(Debug, Clone, Copy)]
 pub struct Scene {
     pub frames: usize,
@@ -13,14 +13,14 @@ impl Scene {
     pub const SMALL: Self = Self { frames: 4, height: 48, width: 64, snapshots: 2 };
 
     fn mask(self, frame: usize, row: usize, column: usize) -> f32 {
-        // A hash of the place: half of the pixels are open.
+        // A hash of the position opens half of the pixels.
         let mut state = (frame * 7919 + row * 104_729 + column * 1_299_709 + 1) as u64;
         state = (state ^ (state >> 15)).wrapping_mul(0x2c1b_3c6d_9e37_79b9);
         state = (state ^ (state >> 29)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
         if state >> 63 == 1 { 1.0 } else { 0.0 }
     }
 
-    /// A pixel of the scene that snapshot and frame show.
+    /// A pixel of the scene in a snapshot's frame.
     pub fn pixel(self, snapshot: usize, frame: usize, row: usize, column: usize) -> f32 {
         let moved = 4 + 2 * (snapshot * self.frames + frame);
         let inside = (8..24).contains(&row) && (moved..moved + 16).contains(&column);
@@ -41,7 +41,7 @@ impl Scene {
         self.with_a_cut(self.snapshots)
     }
 
-    /// The same, but the snapshots from this one on show the negative of the scene.
+    /// The snapshots; from snapshot `before` on, they show the negative of the scene.
     pub fn with_a_cut(self, before: usize) -> Vec<u8> {
         let pixel = move |s, k, i, j| {
             let value = self.pixel(s, k, i, j);
@@ -77,12 +77,12 @@ pub fn npy_header(kind: &str, shape: &[usize]) -> Vec<u8> {
     file
 }
 
-/// A .npy file of one value everywhere.
+/// A .npy file with one value everywhere.
 pub fn constant(shape: &[usize], value: f32) -> Vec<u8> {
     npy(shape, std::iter::repeat_n(value, shape.iter().product()))
 }
 
-/// A small TIFF of one uint8 page, little-endian, with its pixels at the end.
+/// A small little-endian TIFF with one uint8 page, whose pixels are at the end.
 pub fn tiff(height: u32, width: u32) -> Vec<u8> {
     let entries: [(u16, u16, u32); 8] = [
         (256, 4, width),

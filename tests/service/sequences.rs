@@ -1,4 +1,4 @@
-//! Snapshots that follow one another: reconstructed together, blended in time, undisturbed by deaths.
+//! Consecutive snapshots: joint reconstruction, blending in time, and killed workers.
 
 use std::time::Duration;
 
@@ -32,7 +32,7 @@ async fn done(app: &TestApp, body: &Value) -> (String, Value) {
 }
 
 #[tokio::test]
-async fn a_sequence_is_reconstructed_together_and_blended() {
+async fn a_sequence_is_reconstructed_jointly_and_blended() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let (calibration, measurement) = app.scene(&SCENE).await;
     let path = format!("/v1/measurements/{measurement}");
@@ -50,14 +50,14 @@ async fn a_sequence_is_reconstructed_together_and_blended() {
     assert_eq!(runs.len() % 2, 0);
     assert_eq!((runs[0], runs[runs.len() - 1]), (&json!(0), &json!(3)));
 
-    // Whoever computes: the same.
+    // The result is independent of the number of workers.
     let alone = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) = alone.scene(&SCENE).await;
     let (again, _) = done(&alone, &job(&measurement, 6)).await;
     let expected = results_of(&app, &together, 7).await;
     assert_eq!(results_of(&alone, &again, 7).await, expected);
 
-    // Separate snapshots are what they are one by one, and not what they are together.
+    // Separate snapshots equal the ones reconstructed one by one, and differ from the joint result.
     let mut separate = job(&measurement, 6);
     separate["sequence"] = json!("separate");
     let (each, content) = done(&alone, &separate).await;
@@ -70,7 +70,7 @@ async fn a_sequence_is_reconstructed_together_and_blended() {
     let one = results_of(&alone, &one, 1).await;
     assert!(one.iter().all(|(name, hash)| each.get(name) == Some(hash)));
 
-    // A camera that pauses says so itself.
+    // The camera's times show a pause.
     let data = app.upload(SCENE.snapshots()).await;
     let body =
         json!({"calibration": calibration, "data": data, "camera_fps": 10, "exposure_s": 0.02});
@@ -79,7 +79,7 @@ async fn a_sequence_is_reconstructed_together_and_blended() {
 }
 
 #[tokio::test]
-async fn a_cut_is_found_and_the_manifest_says_so() {
+async fn a_cut_is_detected_and_recorded_in_the_manifest() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let calibration = id(&app.calibrate(SCENE.masks()).await);
     let measurement = id(&app.measure(&calibration, SCENE.with_a_cut(3)).await);
@@ -89,7 +89,7 @@ async fn a_cut_is_found_and_the_manifest_says_so() {
 }
 
 #[tokio::test]
-async fn deaths_change_nothing_in_a_sequence() {
+async fn kills_do_not_change_a_sequence() {
     let mut app = TestApp::with(&["--workers", "2"]).await;
     let (_, measurement) = app.scene(&SCENE).await;
     let body = job(&measurement, 40);

@@ -1,5 +1,5 @@
-//! Kills during everything: calibrations, uploads in pieces, jobs, deletes, copies and restored copies. At the
-//! end, what was acknowledged is there, hash by hash, and what was deleted is not.
+//! Kills during calibrations, resumable uploads, jobs, deletions, backups and restored backups. At
+//! the end, every acknowledged resource exists with its hash, and every deleted one does not.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use crate::calibration::Lab;
 use crate::faults::{kills, orphans, results, sha256};
 use crate::samples::Scene;
 
-/// What the service has answered for.
+/// Everything that the service has acknowledged.
 #[derive(Default)]
 struct Ledger {
     /// Hashes and sizes of uploads.
@@ -24,13 +24,13 @@ struct Ledger {
     calibrations: Vec<String>,
     jobs: BTreeSet<String>,
     deleted: BTreeSet<String>,
-    /// Copies that were made without an error.
+    /// Backups without an error.
     copies: Vec<PathBuf>,
-    /// What was begun, by kind.
-    begun: BTreeMap<&'static str, u32>,
+    /// Number of started actions, by kind.
+    started: BTreeMap<&'static str, u32>,
 }
 
-/// The answer, if there is one.
+/// The answer, or none after an error of the connection.
 async fn answer(request: RequestBuilder) -> Option<Answer> {
     let response = request.timeout(Duration::from_secs(30)).send().await.ok()?;
     let (status, headers) = (response.status(), response.headers().clone());
@@ -50,8 +50,8 @@ fn tus(app: &TestApp, method: Method, path: &str) -> RequestBuilder {
     app.request(method, path).header("tus-resumable", "1.0.0")
 }
 
-/// One upload in pieces, from where it is; true when it is stored.
-async fn go_on(app: &TestApp, path: &str, bytes: &[u8]) -> bool {
+/// Continues a resumable upload from its offset; true when it is stored.
+async fn resume(app: &TestApp, path: &str, bytes: &[u8]) -> bool {
     loop {
         let Some(at) = answer(tus(app, Method::HEAD, path)).await else { return false };
         if at.status != StatusCode::OK {
@@ -71,12 +71,12 @@ async fn go_on(app: &TestApp, path: &str, bytes: &[u8]) -> bool {
     }
 }
 
-/// SIGKILL for a process in a while.
+/// Sends SIGKILL to a process after a time.
 fn kill_later(pid: u32, after: Duration) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
         tokio::time::sleep(after).await;
         if let Some(pid) = rustix::process::Pid::from_raw(pid.cast_signed()) {
-            // It may have ended meanwhile.
+            // The process may have ended already.
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::KILL);
         }
     })
@@ -88,8 +88,8 @@ fn verify(data: &Path) -> Value {
         .arg(data)
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{said}"))
+    let errors = String::from_utf8_lossy(&output.stderr);
+    serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{errors}"))
 }
 
 async fn prepared(app: &TestApp, calibration: &str) -> Option<String> {
@@ -104,14 +104,14 @@ fn copy_of(from: &Path, to: &Path) {
 }
 
 #[tokio::test]
-async fn kills_during_everything_lose_nothing_and_change_nothing() {
+async fn random_kills_lose_and_change_nothing() {
     let rounds = kills();
     let seed: u64 = rand::random();
     eprintln!("seed of the storm: {seed}");
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = tempfile::tempdir().unwrap();
     let mut app = TestApp::with(&["--workers", "2", "--max-jobs", "10000"]).await;
-    // What comes of it all if nobody disturbs it.
+    // The expected results, without any kill.
     let lab = Lab::new("");
     let captures = lab.send(&app).await;
     let undisturbed = app.calibrate_captures(&captures).await;
@@ -132,7 +132,7 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
         };
         let kind =
             ["calibration", "pieces", "job", "delete", "copy", "restore"][round as usize % 6];
-        *ledger.begun.entry(kind).or_default() += 1;
+        *ledger.started.entry(kind).or_default() += 1;
         let killing = match kind {
             "copy" | "restore" => None,
             _ => target.map(|pid| kill_later(pid, pause)),
@@ -151,10 +151,10 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
                 random.fill_bytes(&mut bytes);
                 let begin =
                     tus(&app, Method::POST, "/v1/uploads").header("upload-length", bytes.len());
-                if let Some(begun) = answer(begin).await.filter(|begun| begun.status == 201) {
-                    let path = begun.header("location").to_owned();
-                    while !go_on(&app, &path, &bytes).await {
-                        if !app.lives() {
+                if let Some(created) = answer(begin).await.filter(|created| created.status == 201) {
+                    let path = created.header("location").to_owned();
+                    while !resume(&app, &path, &bytes).await {
+                        if !app.is_running() {
                             app.restart();
                         }
                     }
@@ -169,7 +169,7 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
                 tokio::time::sleep(pause).await;
             }
             "delete" => {
-                // The oldest one; it may not have ended yet.
+                // The oldest job, which may not have ended yet.
                 let Some(victim) = ledger.jobs.first().cloned() else { continue };
                 let request = app.request(Method::DELETE, &format!("/v1/jobs/{victim}"));
                 match answer(request).await.map(|answer| answer.status.as_u16()) {
@@ -189,12 +189,13 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
                 let mut backup = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
                 backup.args(["backup", "--data"]).arg(app.data()).arg("--out").arg(&out);
                 let mut child = backup.stdout(Stdio::null()).spawn().unwrap();
-                // Now and then it is let be, and something else is killed.
+                // In some rounds, another process is killed instead.
                 let pid = if round % 12 == 4 { child.id() } else { target.unwrap_or(app.pid()) };
                 kill_later(pid, pause / 4).await.unwrap();
                 let ended = child.wait().unwrap().success();
-                assert!(out.exists() || !ended, "a copy that was reported is there");
-                // What has its name is whole, also if the program was killed before it could say so.
+                assert!(out.exists() || !ended, "a successful backup exists");
+                // A backup under its final name is complete, even if the program was killed before
+                // its report.
                 if out.exists() {
                     ledger.copies.push(out);
                 }
@@ -220,10 +221,10 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
         if let Some(killing) = killing {
             killing.await.unwrap();
         }
-        // A process that is dying may still be taken for a living one.
+        // A dying process may still look alive.
         tokio::time::sleep(Duration::from_millis(20)).await;
         while answer(app.request(Method::GET, "/livez")).await.is_none() {
-            if !app.lives() {
+            if !app.is_running() {
                 app.restart();
             }
         }
@@ -246,16 +247,16 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
         }
     }
     for (hash, size) in &ledger.uploads {
-        let told = app.get(&format!("/v1/blobs/{hash}")).await;
-        lost += u32::from(told.status != 200 || told.json()["size"] != *size);
+        let found = app.get(&format!("/v1/blobs/{hash}")).await;
+        lost += u32::from(found.status != 200 || found.json()["size"] != *size);
         let file = std::fs::read(app.data().join("blobs").join(&hash[..2]).join(&hash[2..]));
         wrong += u32::from(file.map_or(true, |bytes| sha256(&bytes) != *hash));
     }
     for job in &ledger.deleted {
-        let gone = app.get(&format!("/v1/jobs/{job}")).await.status == 404;
-        back += u32::from(!gone || app.data().join("results").join(job).exists());
+        let absent = app.get(&format!("/v1/jobs/{job}")).await.status == 404;
+        back += u32::from(!absent || app.data().join("results").join(job).exists());
     }
-    // Of a delete without an answer, all is there or nothing is.
+    // After a deletion without an answer, everything or nothing exists.
     for job in &unsure {
         let there = app.get(&format!("/v1/jobs/{job}")).await.status == 200;
         let files = app.data().join("results").join(job).exists();
@@ -267,7 +268,8 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
     }
     let left = orphans(&mut app).await;
     let found = verify(app.data());
-    // A delete whose files went, and whose row a kill kept, is told by the row: deleted again, it is gone.
+    // A kill may keep the record of a job whose files are deleted. Deleting the job again removes
+    // it.
     let missing = found["missing"].as_array().unwrap().iter();
     let missing = missing
         .filter(|name| !unsure.iter().any(|job| name.as_str().unwrap().contains(job.as_str())))
@@ -279,7 +281,7 @@ async fn kills_during_everything_lose_nothing_and_change_nothing() {
         && found["damaged"] == json!([]);
     println!(
         "{}",
-        json!({"target": "storm", "ok": ok, "kills": rounds, "begun": ledger.begun,
+        json!({"target": "storm", "ok": ok, "kills": rounds, "begun": ledger.started,
                "uploads": ledger.uploads.len(), "calibrations": ledger.calibrations.len(),
                "jobs": ledger.jobs.len(), "deleted": ledger.deleted.len(),
                "copies": ledger.copies.len(), "restored": restored, "lost": lost, "wrong": wrong,

@@ -1,4 +1,4 @@
-//! A data folder of an earlier version is taken over with all that it holds.
+//! A data folder of an earlier version is upgraded with all of its data.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use crate::app::TestApp;
 
-/// What `tests/data/README.md` tells of.
+/// Identifiers from `tests/data/README.md`.
 const FINISHED: &str = "01a203ed-21a9-7450-a74f-e4fb868ae6b9";
 const WAITING: &str = "01a203ed-2533-7639-93c7-462b39336fba";
 const CANCELLED: &str = "01a203ed-2546-71f3-b4ab-ca5b00c198cd";
@@ -29,7 +29,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 #[tokio::test]
-async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
+async fn a_folder_of_the_earlier_version_finishes_its_queued_job() {
     let folder = tempfile::tempdir().unwrap();
     let old = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/version-0.1");
     copy(&old, &folder.path().join("data"));
@@ -38,7 +38,7 @@ async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
     for (job, state) in [(FINISHED, "succeeded"), (CANCELLED, "cancelled")] {
         assert_eq!(app.get(&format!("/v1/jobs/{job}")).await.json()["state"], state);
     }
-    // The old result is still served, and the new one is the same work done again.
+    // The old result is still served. The new one is the same computation repeated.
     for snapshot in 0..2 {
         let frames = async |job| {
             let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy");
@@ -47,7 +47,8 @@ async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
             values.map(|v| f32::from_le_bytes(v.try_into().unwrap())).collect::<Vec<f32>>()
         };
         let (before, after) = (frames(FINISHED).await, frames(WAITING).await);
-        // To the bit on one kind of processor; the old folder may be from another.
+        // Results are equal bit for bit on one type of processor; the old folder may be from
+        // another.
         let difference =
             before.iter().zip(&after).fold(0.0f32, |worst, (a, b)| worst.max((a - b).abs()));
         assert!(difference < 1e-4, "{difference}");
@@ -57,17 +58,17 @@ async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
         manifest["content"]["schedule"].clone()
     };
     assert_eq!(schedule(FINISHED).await, schedule(WAITING).await);
-    // What is there is charged, also what was made before that was counted.
+    // Existing files count towards the quota, including those from before quotas.
     let sums = "SELECT (SELECT sum(result_bytes) FROM jobs), (SELECT sum(size) FROM result_files)";
     let mut database = app.database().await;
     let (charged, there): (i64, i64) = sqlx::query_as(sums).fetch_one(&mut database).await.unwrap();
     assert!(charged == there && there > 0, "{charged} {there}");
-    // Calibrations keep their report, and the one that waited is made.
+    // Calibrations keep their report, and the queued one is computed.
     app.get(&format!("/v1/calibrations/{CALIBRATION}/report.json")).await.expect(200);
     let made = async || app.get(&format!("/v1/calibrations/{CAPTURES}")).await.expect(200).json();
     let limit = std::time::Instant::now() + std::time::Duration::from_secs(60);
     while made().await["state"] == "preparing" {
-        assert!(std::time::Instant::now() < limit, "the calibration is not made");
+        assert!(std::time::Instant::now() < limit, "the calibration is not computed");
         tokio::time::sleep(std::time::Duration::from_millis(100)).await;
     }
     assert_eq!(made().await["state"], "ready");
@@ -133,7 +134,7 @@ async fn files_deleted_after_an_update_are_kept_for_a_rollback() {
 }
 
 /// What a command says of a folder, and whether it ended well.
-fn said(arguments: &[&str], data: &Path) -> (bool, String) {
+fn run(arguments: &[&str], data: &Path) -> (bool, String) {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     let output = command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
     let output = output.output().unwrap();
@@ -141,27 +142,27 @@ fn said(arguments: &[&str], data: &Path) -> (bool, String) {
 }
 
 #[tokio::test]
-async fn a_copy_is_restored_by_a_newer_version_and_refused_by_an_older_one() {
+async fn a_backup_is_restored_by_newer_versions_and_rejected_by_older_ones() {
     let serve = ["serve", "--listen", "127.0.0.1:0", "--workers", "0", "--min-free-bytes", "0"];
-    // A copy by the version before is a folder like this one.
+    // A backup by the earlier version is a folder like this one.
     let folder = tempfile::tempdir().unwrap();
     let old = folder.path().join("old");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/version-0.1"), &old);
     let before = std::fs::read(old.join("sci-recon.db")).unwrap();
     for arguments in [&["verify"][..], &["token", "list"]] {
-        let (good, text) = said(arguments, &old);
+        let (good, text) = run(arguments, &old);
         assert!(!good && text.contains("older version of this program"), "{arguments:?}: {text}");
     }
     assert_eq!(std::fs::read(old.join("sci-recon.db")).unwrap(), before, "nothing was changed");
     let restored = TestApp::on(folder, "old", &["--workers", "1"]).await;
     assert_eq!(restored.ended(WAITING).await["state"], "succeeded");
-    assert!(said(&["verify"], restored.data()).0);
+    assert!(run(&["verify"], restored.data()).0);
 
-    // A copy of that, as a later version would have made it.
+    // A backup of that folder, as a later version would have made it.
     let folder = tempfile::tempdir().unwrap();
     let new = folder.path().join("new");
     let out = new.display().to_string();
-    assert!(said(&["backup", "--out", &out], restored.data()).0);
+    assert!(run(&["backup", "--out", &out], restored.data()).0);
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(new.join("sci-recon.db"));
     let mut database = sqlx::ConnectOptions::connect(&options).await.unwrap();
     let later =
@@ -176,7 +177,7 @@ async fn a_copy_is_restored_by_a_newer_version_and_refused_by_an_older_one() {
     let before = std::fs::read(new.join("sci-recon.db")).unwrap();
     let again = folder.path().join("again").display().to_string();
     for arguments in [&serve[..], &["verify"], &["backup", "--out", &again], &["token", "list"]] {
-        let (good, text) = said(arguments, &new);
+        let (good, text) = run(arguments, &new);
         assert!(!good && text.contains("by version 9.9.9 (schema 9999)"), "{arguments:?}: {text}");
         assert!(text.contains("Nothing was changed"), "{arguments:?}: {text}");
     }

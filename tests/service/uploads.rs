@@ -1,4 +1,4 @@
-//! Sending files.
+//! Uploads in one request.
 
 use reqwest::{Body, Method, multipart};
 use serde_json::json;
@@ -31,7 +31,7 @@ async fn a_file_is_stored_once_under_its_hash() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_an_upload_is_told_and_nothing_stays() {
+async fn a_bad_upload_is_rejected_with_the_reason_and_leaves_no_file() {
     let app = TestApp::with(&["--workers", "0", "--max-upload-bytes", "100000"]).await;
     let put = |body: &'static str| app.request(Method::PUT, &format!("/v1/blobs/{ABC}")).body(body);
     let detail = app.send(put("abd")).await.problem(422, "hash_mismatch");
@@ -40,11 +40,11 @@ async fn what_is_wrong_with_an_upload_is_told_and_nothing_stays() {
     let post = |body: Body| app.request(Method::POST, "/v1/blobs").body(body);
     app.send(post(Body::from(""))).await.problem(400, "empty_body");
     app.send(post(Body::from(vec![0; 100_001]))).await.problem(413, "too_large");
-    // Without a Content-Length the size is learned on the way.
+    // Without a Content-Length, the limit applies to the bytes received.
     let chunks = (0..20).map(|_| Ok::<_, std::io::Error>(vec![0u8; 10_000]));
     let stream = Body::wrap_stream(futures_util::stream::iter(chunks));
     app.send(post(stream)).await.problem(413, "too_large");
-    // What is left of a refused body must not run into the next request on the connection.
+    // The rest of a rejected body must not be read as the next request on the connection.
     let refused = post(Body::from(vec![0; 100_001])).send().await.unwrap();
     assert_eq!(refused.headers()["connection"], "close");
     let form = multipart::Form::new().text("other", "field");
@@ -63,7 +63,7 @@ async fn what_is_wrong_with_an_upload_is_told_and_nothing_stays() {
 }
 
 #[tokio::test]
-async fn a_cut_connection_leaves_nothing_behind() {
+async fn a_cut_connection_leaves_no_file() {
     use tokio::io::AsyncWriteExt;
     let app = TestApp::start().await;
     let address = app.address();
@@ -80,13 +80,13 @@ async fn a_cut_connection_leaves_nothing_behind() {
     drop(socket);
     let start = std::time::Instant::now();
     while count() > 0 {
-        assert!(start.elapsed().as_secs() < 60, "the file of a dead upload stays");
+        assert!(start.elapsed().as_secs() < 60, "the file of a cut upload is not removed");
         tokio::time::sleep(std::time::Duration::from_millis(5)).await;
     }
 }
 
 #[tokio::test]
-async fn an_upload_that_stalls_is_given_up() {
+async fn a_stalled_upload_is_ended() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let app = TestApp::with(&["--workers", "0", "--upload-idle-seconds", "1"]).await;
     let address = app.address();
@@ -100,7 +100,7 @@ async fn an_upload_that_stalls_is_given_up() {
 }
 
 #[tokio::test]
-async fn too_many_uploads_at_once_are_told_to_come_back() {
+async fn too_many_concurrent_uploads_are_asked_to_retry() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let app = TestApp::with(&["--workers", "0", "--max-uploads", "1"]).await;
     let address = app.address();
@@ -110,7 +110,7 @@ async fn too_many_uploads_at_once_are_told_to_come_back() {
          Expect: 100-continue\r\n\r\n"
     );
     socket.write_all(head.as_bytes()).await.unwrap();
-    // It is asked for its bytes when it has the only place.
+    // The server requests the body when the upload has the only place.
     let mut answer = vec![0; 12];
     socket.read_exact(&mut answer).await.unwrap();
     assert_eq!(answer, b"HTTP/1.1 100", "{}", String::from_utf8_lossy(&answer));
@@ -119,10 +119,9 @@ async fn too_many_uploads_at_once_are_told_to_come_back() {
     assert_eq!(second.header("retry-after"), "5");
 }
 
-/// Issue 2: memory of the server stays under 200 MiB while a 600 MB mask stack is uploaded (and
-/// checked).
+/// The server's memory stays below 200 MiB while a 600 MB mask stack is uploaded and checked.
 #[tokio::test]
-async fn memory_stays_small_while_a_large_stack_is_uploaded() {
+async fn memory_is_bounded_while_a_large_stack_is_uploaded() {
     const FRAMES: usize = 60;
     const SIDE: usize = 2240;
     let app = TestApp::start().await;

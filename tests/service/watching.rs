@@ -1,4 +1,4 @@
-//! What is seen of labs, calibrations and files while the service runs.
+//! Monitoring of labs, calibrations and files of a running service.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use crate::app::{TestApp, id};
 use crate::samples::{Scene, constant, npy};
 
-/// The value of a figure with these labels.
+/// The value of a metric with these labels.
 fn figure(text: &str, name: &str) -> f64 {
     let line = text.lines().find(|line| line.split(' ').next() == Some(name));
     let line = line.unwrap_or_else(|| panic!("no {name} in {text}"));
@@ -17,7 +17,7 @@ fn figure(text: &str, name: &str) -> f64 {
 }
 
 #[tokio::test]
-async fn figures_of_labs_are_for_those_who_look_after_all_of_them() {
+async fn metrics_of_labs_require_a_token_for_all_labs() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let a = app.token(&["create", "--lab", "a", "--role", "admin"]);
     let b = app.token(&["create", "--lab", "b", "--role", "admin"]);
@@ -44,8 +44,9 @@ async fn figures_of_labs_are_for_those_who_look_after_all_of_them() {
 }
 
 #[tokio::test]
-async fn listeners_hear_of_calibrations() {
+async fn listeners_receive_changes_of_calibrations() {
     let app = TestApp::start().await;
+    app.calibrate(Scene::SMALL.masks()).await.expect(201);
     let response = app.request(Method::GET, "/v1/events").send().await.unwrap();
     let mut stream = response.bytes_stream();
     let mut text = String::new();
@@ -58,33 +59,33 @@ async fn listeners_hear_of_calibrations() {
         serde_json::from_str(data.lines().next().unwrap_or("null")).unwrap_or(Value::Null)
     };
     heard("event: hello").await;
-    // The first look is what later ones are compared with.
-    tokio::time::sleep(Duration::from_millis(2500)).await;
+    // The first poll asks to read the list again. Later polls are compared with it.
+    assert_eq!(heard("event: calibrations\ndata: ").await["more"], true);
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
-    let told = heard("event: calibrations\ndata: ").await;
-    assert_eq!(told, json!({"changed": [calibration], "deleted": [], "more": false}));
+    let change = heard("event: calibrations\ndata: ").await;
+    assert_eq!(change, json!({"changed": [calibration], "deleted": [], "more": false}));
     let place = format!("/v1/calibrations/{calibration}");
     let rename = app.request(Method::PATCH, &place).json(&json!({"name": "May"}));
     app.send(rename).await.expect(200);
-    let told = heard("event: calibrations\ndata: ").await;
-    assert_eq!(told["changed"], json!([calibration]));
-    // Of measurements they hear what goes on after the answer.
+    let change = heard("event: calibrations\ndata: ").await;
+    assert_eq!(change["changed"], json!([calibration]));
+    // For measurements, listeners receive checks that outlast the request.
     let data = app.upload(constant(&[16, 16], 1.0)).await;
     let body = json!({"calibration": calibration, "data": data});
     let ask = app.request(Method::POST, "/v1/measurements").json(&body);
     let measurement = id(&app.send(ask.header("Prefer", "respond-async")).await.expect(202));
-    let told = heard("event: measurements\ndata: ").await;
-    assert_eq!(told, json!({"changed": [measurement], "deleted": [], "more": false}));
+    let change = heard("event: measurements\ndata: ").await;
+    assert_eq!(change, json!({"changed": [measurement], "deleted": [], "more": false}));
     app.delete(&format!("/v1/measurements/{measurement}")).await.expect(204);
-    let told = heard("event: measurements\ndata: ").await;
-    assert_eq!(told["changed"], json!([measurement]));
+    let change = heard("event: measurements\ndata: ").await;
+    assert_eq!(change["changed"], json!([measurement]));
     app.delete(&place).await.expect(204);
-    let told = heard("event: calibrations\ndata: ").await;
-    assert_eq!(told["deleted"], json!([calibration]));
+    let change = heard("event: calibrations\ndata: ").await;
+    assert_eq!(change["deleted"], json!([calibration]));
 }
 
 #[tokio::test]
-async fn a_file_can_be_looked_at_before_anything_is_made_of_it() {
+async fn an_upload_has_a_preview_before_it_is_used() {
     let app = TestApp::start().await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
     app.sign_in(&a);
@@ -111,7 +112,7 @@ async fn a_file_can_be_looked_at_before_anything_is_made_of_it() {
 }
 
 #[tokio::test]
-async fn a_check_that_takes_too_long_ends_and_the_lab_goes_on() {
+async fn a_check_that_takes_too_long_ends_and_frees_its_lab() {
     let app = TestApp::with(&["--workers", "0", "--check-seconds", "0.000001"]).await;
     let masks = app.upload(Scene::SMALL.masks()).await;
     for _ in 0..3 {
@@ -124,7 +125,7 @@ async fn a_check_that_takes_too_long_ends_and_the_lab_goes_on() {
 }
 
 #[tokio::test]
-async fn masks_that_code_one_direction_alone_are_not_good() {
+async fn masks_that_code_only_one_direction_are_not_good() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let noise = |k: usize, i: usize| ((k * 7919 + i * 104_729 + i * i * 31) % 97) as f32 / 96.0;
     let values = (0..8).flat_map(|k| (0..64 * 80).map(move |at| noise(k, at / 80)));

@@ -1,4 +1,5 @@
-//! What a prediction of the error is fitted to: what is seen of each block, and its true error.
+//! Fits of the quality model need the features of each block and its true error, which `assess`
+//! writes.
 
 use std::fs;
 use std::path::PathBuf;
@@ -17,7 +18,7 @@ use super::clips::read_clips;
 use super::record::Setting;
 use super::trial::{Bench, Choice, Masks};
 
-/// Writes, for each clip of a folder, what an assessment sees of its reconstruction, and the true error.
+/// Writes the features of the quality model and the true error, for each clip of a folder.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// A folder of clips: folders of PNGs, .npy, .npz, .mat or TIFF files. A folder of PNGs is one clip.
@@ -29,7 +30,7 @@ pub struct Arguments {
     #[arg(long, value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     cr: u16,
-    /// Side of the square that is cut from the middle of each frame.
+    /// Side of the square that is cropped from the centre of each frame.
     #[arg(long, value_name = "PIXELS", default_value_t = 128)]
     scale: usize,
     /// Noise: the standard deviation added to y = sum C x with x from 0 to 255.
@@ -44,8 +45,9 @@ pub struct Arguments {
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for NAME.npy [features, the encoder's channels (if a network had a part), both of the first run and
-    /// the distance of the results (if a stage was run twice), and the true error; frame, block] and NAME.json.
+    /// Folder for NAME.npy and NAME.json. The array is [row, frame, block]. Its rows are the
+    /// features, the encoder's channels (if a network took part), both for the first run and the
+    /// distance of the results (if a stage was run twice), and the true error.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
 }
@@ -70,7 +72,9 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         let (rows, columns) = blocks(side, side);
         let Some(seen_of_tile) = &tile.outcome.features else {
             let name = arguments.algorithm.into_str();
-            return Err(CliError::Input(format!("{name}: its results are not assessed")));
+            return Err(CliError::Input(format!(
+                "{name}: there is no quality model for its results"
+            )));
         };
         let count = seen_of_tile.len_of(Axis(0));
         let features = seen_of_tile.to_shape((count, frames, rows * columns));

@@ -1,4 +1,4 @@
-//! The clips of an experiment: a folder of them, each a folder of PNGs or a file.
+//! The clips of an experiment, read from a folder in which each is a folder of PNGs or a file.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,14 +8,14 @@ use ndarray::{Array3, s};
 use sci_recon::cli::CliError;
 
 pub struct Clip {
-    /// The name of its file or folder.
+    /// Name of its file or folder.
     pub name: String,
     /// \[B,H,W\] on \[0,1\].
     pub frames: Array3<f32>,
 }
 
-/// The first `frames` frames of every clip in a folder, in the order of the clips' names; with `side`
-/// the square of so many pixels from the middle of each frame.
+/// Reads the first `count` frames of every clip in a folder, sorted by name. With `side`, a square
+/// of `side` pixels is cropped from the centre of each frame.
 pub fn read_clips(
     folder: &Path,
     frames: usize,

@@ -1,4 +1,4 @@
-//! The paper's experiments on clips of your own: a program beside the service, on the same library.
+//! The paper's experiments on your own clips, with the library of the service.
 
 mod assess;
 mod clips;
@@ -12,7 +12,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-/// Repeats the paper's experiments on clips of your own.
+/// Repeats the paper's experiments on your own clips.
 #[derive(Debug, Parser)]
 #[command(version, propagate_version = true)]
 struct Arguments {

@@ -1,4 +1,4 @@
-//! `tables.md`: one table for each compression ratio, laid out as the paper's.
+//! `tables.md`: one table per compression ratio, in the paper's layout.
 
 use engine::job::{Algorithm, RunSpec};
 
@@ -12,8 +12,8 @@ pub struct Layout {
     pub by_zone: bool,
 }
 
-/// Rows of one algorithm and one kind of runs at one scale and compression ratio, in the order of the
-/// clips; none for clips that are still to come.
+/// Rows of one algorithm and one run length at one scale and compression ratio, in the order of the
+/// clips; none for missing clips.
 struct Group<'a> {
     name: String,
     scale: usize,
@@ -30,7 +30,7 @@ pub fn table(head: Vec<String>, rows: impl Iterator<Item = Vec<String>>) -> Stri
     text
 }
 
-/// A row in words, for the log.
+/// A row as text, for the log.
 pub fn line(row: &Row) -> String {
     let key = &row.key;
     format!(
@@ -45,7 +45,7 @@ pub fn line(row: &Row) -> String {
     )
 }
 
-/// The algorithm, and which snapshots are together.
+/// Name of the algorithm, and of the snapshots that are joined.
 fn name(key: &Key) -> String {
     let algorithm = key.algorithm.into_str();
     let RunSpec { length, overlap } = key.run;
@@ -57,7 +57,7 @@ fn name(key: &Key) -> String {
 }
 
 impl Layout {
-    /// The tables, as far as `rows` go: in the order in which they were made.
+    /// The tables of the rows available so far, in the order in which they were computed.
     pub fn markdown(&self, rows: &[Row]) -> String {
         let mut text = String::new();
         for rows in rows.chunk_by(|a, b| a.key.compression_ratio == b.key.compression_ratio) {
@@ -104,7 +104,7 @@ impl Layout {
                         groups.push(Group { name: name(&first.key), scale, rows });
                     }
                 }
-                // One that fits nothing, or is still to come.
+                // An algorithm that fits no clip, or has no rows yet.
                 if groups.len() == before {
                     let (name, rows) =
                         (algorithm.into_str().to_owned(), vec![None; self.clips.len()]);
@@ -120,10 +120,10 @@ impl Layout {
         let columns = clips.chain(["Mean", "CPU seconds", "Deep passes"].map(String::from));
         let pair = |psnr, ssim: f64| format!("{}, {ssim:.4}", decibels(psnr));
         table_of(groups, columns.collect(), |group| {
-            let of_clip = |row: &Option<&Row>| {
+            let clip_row = |row: &Option<&Row>| {
                 row.map_or_else(|| "-".to_owned(), |row| pair(row.psnr_db, row.ssim))
             };
-            let mut cells: Vec<String> = group.rows.iter().map(of_clip).collect();
+            let mut cells: Vec<String> = group.rows.iter().map(clip_row).collect();
             if let Some(rows) = group.complete() {
                 let average = |value: fn(&Row) -> f64| {
                     rows.iter().map(|row| value(row)).sum::<f64>() / rows.len() as f64
@@ -139,7 +139,7 @@ impl Layout {
 }
 
 impl<'a> Group<'a> {
-    /// The rows of all clips, if they are there.
+    /// The rows of all clips, or none if one is missing.
     fn complete(&self) -> Option<Vec<&'a Row>> {
         self.rows.iter().copied().collect()
     }
@@ -157,7 +157,7 @@ fn heading(row: &Row) -> String {
     )
 }
 
-/// A table of `values` of each row, in the mean over the clips.
+/// A table of one detail of each row, averaged over the clips.
 fn detail(
     groups: &[Group<'_>],
     columns: Vec<String>,
@@ -185,14 +185,14 @@ fn table_of(
     table(head, groups.iter().map(row))
 }
 
-/// None if one of the values is none, or there are none.
+/// The mean; none if a value is missing or there are no values.
 pub fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     let count = values.len() as f64;
     let mean = values.sum::<Option<f64>>()? / count;
     mean.is_finite().then_some(mean)
 }
 
-/// None is what equals the truth.
+/// None means that the frames equal the truth.
 fn decibels(psnr: Option<f64>) -> String {
     psnr.map_or_else(|| "inf".to_owned(), |psnr| format!("{psnr:.2}"))
 }

@@ -1,5 +1,5 @@
-//! What multiplexing is good for. One sub-aperture in each frame gives masks that differ more, half
-//! of them open give masks that pass more light.
+//! The benefit of multiplexing. One open sub-aperture per frame gives masks that differ more; half
+//! of them open give brighter masks.
 
 use std::fs;
 use std::path::PathBuf;
@@ -26,7 +26,7 @@ use super::markdown;
 use super::trial::solve_on_all_cores;
 
 /// Compare multiplexed masks with single sub-apertures as noise grows. Masks are normalised by
-/// light throughput, so that a mask through one of twelve sub-apertures is a sixth as bright as one
+/// light throughput, so a mask through one of twelve sub-apertures is a sixth as bright as one
 /// through six.
 #[derive(Debug, Args)]
 pub struct Arguments {
@@ -37,7 +37,7 @@ pub struct Arguments {
     #[arg(long, value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     cr: u16,
-    /// Side of the square that is cut from the middle of each frame [default: whole frames].
+    /// Side of the square that is cropped from the centre of each frame [default: whole frames].
     #[arg(long, value_name = "PIXELS")]
     scale: Option<usize>,
     /// Noise levels: S is the standard deviation added to y = sum C x with x from 0 to 255.
@@ -70,15 +70,15 @@ struct Record {
     /// Noise levels on the scale of 255 grey values.
     sigmas: Vec<f32>,
     curves: Vec<Curve>,
-    /// The noise level at which the curves cross, between the two levels beside it by a straight line;
-    /// none if they do not cross once.
+    /// Noise level at which the curves cross, interpolated between two levels; none unless they
+    /// cross exactly once.
     crossing_sigma: Option<f64>,
 }
 
 #[derive(Debug, Serialize)]
 struct Curve {
     masks: &'static str,
-    /// Share of the light of the whole open aperture, without a mask, that passes.
+    /// Light throughput without a mask, relative to the open aperture.
     light_throughput: f64,
     /// Mean over the clips, by noise level.
     psnr_db: Vec<f64>,
@@ -143,7 +143,7 @@ impl Bench<'_> {
         let (mut by_clip, mut throughput) = (Vec::new(), 0.0);
         for clip in clips {
             let (_, height, width) = clip.frames.dim();
-            // The same lithography mask for both kinds of patterns.
+            // Both kinds of patterns use the same lithography mask.
             let mut rng = generator(self.seed);
             let made = optics.masks(patterns.view(), (height, width), &mut rng)?;
             throughput += made.throughput / clips.len() as f64;
@@ -179,7 +179,7 @@ impl Bench<'_> {
                 masks: masks.view(),
                 measurement: y.view(),
                 first: 0,
-                // The scene's own: its level is known here, so noise does not disturb it.
+                // The white level is that of the scene, so noise does not disturb it.
                 white: 1.0,
                 solver: Solver::Schedule(&self.schedule),
                 plan: &plan,
@@ -196,7 +196,8 @@ impl Bench<'_> {
     }
 }
 
-/// Where the first curve comes to lie above the second one, if it does so once and for all.
+/// Noise level from which on the first curve is above the second one; none unless it crosses
+/// exactly once.
 fn crossing(sigmas: &[f32], first: &[f64], second: &[f64]) -> Option<f64> {
     let ahead: Vec<f64> = first.iter().zip(second).map(|(first, second)| first - second).collect();
     let at = ahead.iter().position(|ahead| *ahead > 0.0).filter(|at| *at > 0)?;
@@ -225,7 +226,7 @@ fn print(record: &Record) {
 
 const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 400.0;
-/// Where the axes' plane lies: left, right, top, bottom.
+/// Borders of the plot: left, right, top, bottom.
 const PLANE: [f64; 4] = [60.0, WIDTH - 20.0, 60.0, HEIGHT - 50.0];
 
 fn chart(record: &Record) -> String {
@@ -295,7 +296,7 @@ mod tests {
     use super::crossing;
 
     #[test]
-    fn a_crossing_lies_between_the_levels_beside_it() {
+    fn a_crossing_lies_between_two_levels() {
         let sigmas = [0.0, 10.0, 20.0];
         assert_eq!(crossing(&sigmas, &[20.0, 19.0, 18.0], &[21.0, 18.0, 15.0]), Some(5.0));
         assert_eq!(

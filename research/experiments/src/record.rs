@@ -1,4 +1,4 @@
-//! `tables.json`: all rows that were ever made in a folder, each with all that it depends on.
+//! `tables.json`: all rows computed in a folder, each with everything that it depends on.
 
 use std::fs;
 use std::io::Write;
@@ -10,12 +10,12 @@ use engine::pipeline::records::JointRecord;
 use sci_recon::cli::CliError;
 use serde::{Deserialize, Serialize};
 
-/// Name and version of this form of record.
+/// Name and version of this schema.
 const SCHEMA: &str = "sci-recon/bench-tables/1";
 
 const FILE: &str = "tables.json";
 
-/// What all rows of one command share.
+/// Settings common to all rows of a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Setting {
     pub pattern: String,
@@ -24,15 +24,15 @@ pub struct Setting {
     pub seed: u64,
 }
 
-/// All that a row depends on: a row with the same key need not be computed again.
+/// Everything that a row depends on. A row with an existing key is not computed again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Key {
     pub program_version: String,
     pub clip: String,
-    /// How many snapshots of the clip there are.
+    /// Number of snapshots of the clip.
     #[serde(default = "one")]
     pub snapshots: usize,
-    /// How they are reconstructed together.
+    /// Mode of joint reconstruction.
     #[serde(default)]
     pub run: RunSpec,
     pub algorithm: Algorithm,
@@ -40,17 +40,17 @@ pub struct Key {
     pub compression_ratio: usize,
     #[serde(flatten)]
     pub setting: Setting,
-    /// SHA-256 of masks, measurement and true frames, one after the other, as little-endian f32.
+    /// SHA-256 of masks, measurement and true frames, concatenated as little-endian f32.
     pub inputs_sha256: String,
     pub schedule: Schedule,
     pub tile: TileSpec,
     pub models: Vec<ModelRecord>,
-    /// Execution provider of the networks; none without one.
+    /// Execution provider of the networks; none without networks.
     pub provider: Option<String>,
 }
 
-/// A clip, an algorithm, and what came of them. A PSNR is in dB, the mean over the frames of the
-/// snapshot, and none where it is infinite.
+/// Result of an algorithm on a clip. A PSNR is in dB, averaged over the frames of the snapshot;
+/// none if it is infinite.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     #[serde(flatten)]
@@ -58,21 +58,21 @@ pub struct Row {
     pub psnr_db: Option<f64>,
     pub ssim: f64,
     pub psnr_db_by_frame: Vec<Option<f64>>,
-    /// From the centre to the rim.
+    /// Ordered from the centre to the rim.
     pub psnr_db_by_zone: Vec<ZoneRecord>,
     pub cpu_seconds: f64,
     pub seconds: f64,
-    /// Most of any tile.
+    /// Maximum over the tiles.
     pub denoiser_passes: usize,
-    /// White level of the scene, as it was estimated.
+    /// Estimated white level of the scene.
     pub white: f32,
     pub stop_reason: String,
-    /// Whether snapshots were found to belong together.
+    /// True if the pilot joined snapshots.
     #[serde(default)]
     pub joints: Vec<JointRecord>,
 }
 
-/// Rows of before there were sequences.
+/// Default for rows from before sequences.
 fn one() -> usize {
     1
 }
@@ -80,7 +80,7 @@ fn one() -> usize {
 /// A ring around the centre.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ZoneRecord {
-    /// Its outer radius in pixels; none for the corners.
+    /// Outer radius in pixels; none for the corners.
     pub outer_radius: Option<f64>,
     pub psnr_db: Option<f64>,
 }
@@ -97,7 +97,7 @@ pub struct Records {
 }
 
 impl Records {
-    /// Makes the folder, or reads what an earlier command left there.
+    /// Creates the folder, or reads its rows.
     pub fn open(folder: &Path) -> Result<Self, CliError> {
         fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
         let path = folder.join(FILE);
@@ -121,7 +121,7 @@ impl Records {
         self.file.rows.iter().find(|row| row.key == *key)
     }
 
-    /// Adds a row and writes the file, so that an interruption costs nothing that was made.
+    /// Adds a row and writes the file, so that an interruption loses no row.
     pub fn add(&mut self, row: Row) -> Result<Row, CliError> {
         self.file.rows.push(row.clone());
         let text = serde_json::to_string_pretty(&self.file)
@@ -130,7 +130,7 @@ impl Records {
         Ok(row)
     }
 
-    /// Writes a file of the folder: the old one stays until the new one is whole.
+    /// Writes a file of the folder atomically.
     pub fn write(&self, name: &str, text: &str) -> Result<(), CliError> {
         let path = self.folder.join(name);
         let write = || -> std::io::Result<()> {

@@ -1,4 +1,4 @@
-//! The paper's Tables 1 and 2: algorithms compared on clips of your own.
+//! The paper's Tables 1 and 2: algorithms compared on your own clips.
 
 use std::path::PathBuf;
 
@@ -12,16 +12,16 @@ use super::markdown::{Layout, line};
 use super::record::{Records, Setting};
 use super::trial::{Bench, Choice};
 
-/// Compare algorithms as the paper's Tables 1 and 2 do: PSNR and SSIM of each clip at each scale
-/// and compression ratio, with processor seconds and deep passes. Each clip is measured through
-/// simulated masks and reconstructed as `reconstruct` does. Rows are written as they are made; the
-/// same command goes on where it was interrupted.
+/// Compare algorithms as in the paper's Tables 1 and 2: PSNR and SSIM of each clip at each scale
+/// and compression ratio, with CPU seconds and deep passes. Each clip is measured through simulated
+/// masks and reconstructed like by `sci-recon reconstruct`. Each row is written when it is
+/// computed; the same command continues after an interruption.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// A folder of clips: folders of PNGs, .npy, .npz, .mat or TIFF files. A folder of PNGs is one clip.
     #[arg(long, value_name = "FOLDER")]
     clips: PathBuf,
-    /// Sides of the squares that are cut from the middle of each frame, in pixels.
+    /// Sides in pixels of the squares that are cropped from the centre of each frame.
     #[arg(long, value_name = "PIXELS,...", value_delimiter = ',', default_values_t = [256],
           value_parser = clap::value_parser!(u16).range(16..))]
     scales: Vec<u16>,
@@ -29,10 +29,10 @@ pub struct Arguments {
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [10, 20],
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     cr: Vec<u16>,
-    /// Snapshots of each clip, one after the other.
+    /// Consecutive snapshots of each clip.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     snapshots: u16,
-    /// How they are reconstructed together, a row each: separate, contiguous (as a job does it), or runs of
+    /// Modes of joint reconstruction, one row each: separate, contiguous (like a job), or runs of
     /// at most LENGTH snapshots that share at least OVERLAP.
     #[arg(long, value_name = "separate|contiguous|LENGTH:OVERLAP,...", value_delimiter = ',',
           default_value = "contiguous", value_parser = choice)]
@@ -41,8 +41,8 @@ pub struct Arguments {
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = algorithms(),
           default_values = PAPER.map(|algorithm| algorithm.into_str()))]
     algorithms: Vec<Algorithm>,
-    /// Also a row `learned` of this network: an ONNX file as for `reconstruct --model`. At scales and
-    /// ratios that it does not take there is no row.
+    /// Add a row `learned` for this network: an ONNX file as for `reconstruct --model`. Scales and
+    /// ratios that it does not support have no row.
     #[arg(long, value_name = "FILE")]
     learned: Option<PathBuf>,
     #[command(flatten)]
@@ -62,15 +62,15 @@ pub struct Arguments {
     /// Seed of masks and noise.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for tables.md, the rows of this command, and tables.json, all rows ever made there.
+    /// Folder for tables.md, the rows of this command, and tables.json, all rows computed there.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
 }
 
-/// The algorithms of the paper's tables that need no network of their own for each set of masks.
+/// Algorithms of the paper's tables that need no network trained for each set of masks.
 const PAPER: [Algorithm; 3] = [Algorithm::GapTv, Algorithm::PnpFfdnet, Algorithm::PnpTvFastdvdnet];
 
-/// What can't be done at the largest scale and ratio is told before anything is computed.
+/// Rejects settings that are impossible at the largest scale and ratio before the computation.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let (ratios, scales) = (distinct(&arguments.cr), distinct(&arguments.scales));
     let most = |values: &[u16]| values.iter().copied().max().map(usize::from);
@@ -94,7 +94,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let network = arguments.engine.network()?;
     let learned = arguments.learned.as_ref().map(|path| Model::open(path, &network)).transpose()?;
     let bench = Bench::new(network, learned, setting);
-    // Patterns that can't be are told now, not hours later.
+    // Reject impossible patterns now, not after hours.
     let smallest = usize::from(scales.iter().copied().min().unwrap_or(1));
     for &ratio in &ratios {
         bench.masks(&arguments.masks, ratio.into(), smallest)?;
@@ -140,7 +140,7 @@ fn choice(text: &str) -> Result<Choice, String> {
     runs.map(Choice::Runs).ok_or_else(|| format!("name {wrong}"))
 }
 
-/// The values without repetitions, in their order.
+/// The values without repetitions, in their original order.
 fn distinct<T: PartialEq + Copy>(values: &[T]) -> Vec<T> {
     let mut distinct = Vec::with_capacity(values.len());
     for value in values {

@@ -1,4 +1,4 @@
-//! One row: a clip measured through masks, and reconstructed.
+//! The computation of a row: measurement of a clip through masks, and reconstruction.
 
 use std::thread;
 use std::time::Instant;
@@ -31,15 +31,15 @@ pub fn solve_on_all_cores(
     Ok(solve(input, network, cores, &|_, _| ())?)
 }
 
-/// Which snapshots are reconstructed together.
+/// Mode of joint reconstruction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Choice {
-    /// Those that a job would, of this kind of sequence.
+    /// The default of a job with this kind of sequence.
     Default(Sequence),
     Runs(RunSpec),
 }
 
-/// Makes rows.
+/// Computes rows.
 pub struct Bench {
     network: NetworkSource,
     learned: Option<Model>,
@@ -50,7 +50,7 @@ pub struct Bench {
 pub struct Masks {
     /// \[B,H,W\] on \[0,1\].
     masks: Array3<f32>,
-    /// What reaches the sensor of an even light \[H,W\].
+    /// Response of the sensor to uniform light \[H,W\].
     light: Array2<f32>,
 }
 
@@ -65,7 +65,7 @@ pub struct Measured<'a> {
     sha256: String,
 }
 
-/// A tile and what is known of it.
+/// A tile with its evidence for the quality model.
 pub struct FirstTile {
     pub outcome: Outcome,
     pub white: f32,
@@ -95,12 +95,13 @@ impl<'a> Measured<'a> {
 }
 
 impl Bench {
-    /// With networks from `network`, and one of the user's own.
+    /// `network` loads the built-in networks; `learned` is the user's network.
     pub fn new(network: NetworkSource, learned: Option<Model>, setting: Setting) -> Self {
         Self { network, learned, setting }
     }
 
-    /// Why `algorithm` can't be run with so many frames of `side` x `side` pixels; none if it can.
+    /// Reason for which an algorithm cannot run with these frames of `side` x `side` pixels; none
+    /// if it can.
     pub fn obstacle(&self, algorithm: Algorithm, frames: usize, side: usize) -> Option<CliError> {
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned)?;
         learned.size((frames, side, side)).err()
@@ -119,7 +120,7 @@ impl Bench {
         Ok(Masks { masks: made.masks, light })
     }
 
-    /// Measures the first frames of a clip, of which the middle is taken, in so many snapshots.
+    /// Measures the first frames of a clip, cropped at the centre, as consecutive snapshots.
     pub fn measure<'a>(
         &self,
         Masks { masks, light }: &'a Masks,
@@ -147,8 +148,8 @@ impl Bench {
         Ok(Measured { clip: &clip.name, masks, measurement, truth, sha256 })
     }
 
-    /// All that the row of this algorithm depends on, with runs of at most `length` snapshots, or as they
-    /// are by default.
+    /// Everything that the row of this algorithm depends on, with this mode of joint
+    /// reconstruction.
     pub fn key(
         &self,
         measured: &Measured<'_>,
@@ -189,7 +190,8 @@ impl Bench {
         })
     }
 
-    /// The first tile of a clip, reconstructed as `key` says, with what an assessment sees of it.
+    /// Reconstructs the first tile of a clip with the settings of `key`, and returns the features
+    /// of the quality model.
     pub fn first_tile(&self, measured: &Measured<'_>, key: &Key) -> Result<FirstTile, CliError> {
         let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
         let runs = key.run.plan(0..key.snapshots)?;
@@ -200,7 +202,7 @@ impl Bench {
         Ok(FirstTile { outcome, white, pilot: solved.pilot })
     }
 
-    /// Reconstructs the clip as `key` says.
+    /// Reconstructs the clip with the settings of `key`.
     pub fn run(&self, measured: &Measured<'_>, key: Key) -> Result<Row, CliError> {
         let masks = measured.masks;
         let plan = TilePlan::new(key.scale, key.scale, key.tile.size, key.tile.overlap)?;
@@ -272,12 +274,12 @@ impl Quality {
 }
 
 /// Rings from the centre to the edge, and the corners outside the largest circle. Masks of a hybrid
-/// aperture are worst at the rim, where fewer sub-apertures reach, so a mean over the whole picture
+/// aperture are worst at the rim, where fewer sub-apertures reach, so a mean over the whole image
 /// hides where an algorithm fails.
 const ZONES: usize = 5;
 const RINGS: f64 = (ZONES - 1) as f64;
 
-/// The outer radius of each zone in pixels, from the centre on; none for the corners.
+/// Outer radius of each zone in pixels, from the centre; none for the corners.
 fn outer_radii((height, width): (usize, usize)) -> [Option<f64>; ZONES] {
     let radius = height.min(width) as f64 / 2.0;
     std::array::from_fn(|zone| (zone + 1 < ZONES).then(|| radius * (zone + 1) as f64 / RINGS))
@@ -308,7 +310,7 @@ mod tests {
     use ndarray::Array2;
 
     #[test]
-    fn an_error_shows_in_its_own_zone() {
+    fn an_error_is_assigned_to_its_zone() {
         let radii = [Some(8.0), Some(16.0), Some(24.0), Some(32.0), None];
         assert_eq!(outer_radii((64, 64)), radii);
         let truth = Array2::<f32>::zeros((64, 64));

@@ -1,6 +1,6 @@
-//! The experiments as a researcher runs them.
+//! The experiments, run as a researcher runs them.
 
-#![allow(clippy::unwrap_used)] // helpers of tests
+#![allow(clippy::unwrap_used)] // tests may panic
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -11,7 +11,7 @@ fn experiment(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_sci-recon-experiments")).args(arguments).output().unwrap()
 }
 
-/// Runs the program itself, which `cargo test --workspace` builds into the same folder.
+/// Runs `sci-recon`, which `cargo test --workspace` builds into the same folder.
 fn sci_recon(arguments: &[&str]) -> Output {
     let program =
         Path::new(env!("CARGO_BIN_EXE_sci-recon-experiments")).with_file_name("sci-recon");
@@ -21,7 +21,7 @@ fn sci_recon(arguments: &[&str]) -> Output {
     output
 }
 
-/// The message of a command that refuses its input.
+/// The message of a command that rejects its input.
 fn refusal(output: &Output) -> String {
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{message}");
@@ -60,7 +60,7 @@ fn bytes(path: &Path) -> Vec<u8> {
 }
 
 #[test]
-fn multiplexing_loses_without_noise_and_wins_with_it() {
+fn multiplexing_loses_without_noise_and_wins_with_noise() {
     let files = Files::new();
     let (clip, out) =
         (concat!(env!("CARGO_MANIFEST_DIR"), "/../../demo/clip"), files.text("bench"));
@@ -82,7 +82,7 @@ fn multiplexing_loses_without_noise_and_wins_with_it() {
 }
 
 #[test]
-fn tables_of_clips_go_on_where_they_were_interrupted() {
+fn interrupted_tables_are_continued() {
     let files = Files::new();
     let (clip, out) =
         (concat!(env!("CARGO_MANIFEST_DIR"), "/../../demo/clip"), files.text("tables"));
@@ -102,7 +102,7 @@ fn tables_of_clips_go_on_where_they_were_interrupted() {
     let text = run(&["4,6", "--algorithms", "gap-tv,pnp-nonlocal", "--by-frame", "--by-zone"]);
     assert_eq!(text.as_bytes(), bytes(&files.path("tables/tables.md")));
     let all = rows();
-    assert_eq!(all[0], first[0], "a row that was there is not made again, and keeps its times");
+    assert_eq!(all[0], first[0], "an existing row is not computed again, and keeps its times");
     let name = |row: &Value| format!("{} {}", row["compression_ratio"], row["algorithm"]);
     assert_eq!(
         all.iter().map(name).collect::<Vec<_>>(),
@@ -115,13 +115,13 @@ fn tables_of_clips_go_on_where_they_were_interrupted() {
         all[2]["psnr_db_by_frame"].as_array().unwrap().iter().filter_map(Value::as_f64).collect();
     assert!((frames.iter().sum::<f64>() / 6.0 - psnr(2)).abs() < 1e-9);
     assert_eq!(all[2]["psnr_db_by_zone"].as_array().unwrap().len(), 5);
-    // Another seed makes other rows and leaves these.
+    // Another seed adds rows and keeps these.
     run(&["4", "--algorithms", "gap-tv", "--seed", "1"]);
     assert_eq!((&rows()[..4], rows().len()), (&all[..], 5));
 }
 
 #[test]
-fn a_row_of_the_tables_is_what_reconstruct_gives() {
+fn a_row_of_the_tables_equals_the_result_of_reconstruct() {
     let files = Files::new();
     std::fs::create_dir(files.path("clips")).unwrap();
     write_square_clip(&files.path("clips/square.npy"));

@@ -1,4 +1,4 @@
-// What can be done with a job, or many: cancel, retry, rename, delete (after a question).
+// Actions on one or several jobs: cancel, retry, rename, delete (with a confirmation).
 
 import { announce, h, put } from "./dom.js";
 import { nameOf } from "./format.js";
@@ -10,7 +10,7 @@ const ACTIONS = {
   delete: { word: "Delete", states: ["succeeded", "failed", "cancelled"], run: remove },
 };
 
-/** Buttons for what can be done with a job now; `done(action, job)` is told what the service answered. */
+/** Buttons for the actions that a job's state allows; `done(action, job)` receives the service's answer. */
 export function actions(job, done) {
   return Object.entries(ACTIONS)
     .filter(([, action]) => action.states.includes(job.state))
@@ -26,7 +26,7 @@ export function actions(job, done) {
             done(name, after);
           }
         } catch (error) {
-          await tell(`${label}: not possible`, error.message);
+          await showMessage(`Could not ${action.word.toLowerCase()} ${nameOf(job)}`, error.message);
         }
         button.disabled = false;
       };
@@ -35,51 +35,51 @@ export function actions(job, done) {
 }
 
 async function remove(job) {
-  const text = ["The job ", h("b", null, nameOf(job)), " and its frames will be gone. The measurement and the calibration stay."];
+  const text = ["The job ", h("b", null, nameOf(job)), " and its frames will be deleted. The measurement and the calibration are kept."];
   if (!(await ask("Delete this job?", text, "Delete"))) return false;
   return send("DELETE", `/v1/jobs/${job.id}`);
 }
 
-/** Cancels jobs; those that have ended meanwhile stay as they are. */
+/** Cancels jobs. A job that has already ended is not changed. */
 export async function cancelAll(jobs) {
   await each(jobs, "cancelled", (job) => send("POST", `/v1/jobs/${job.id}/cancel`));
 }
 
-/** Deletes jobs, after a question; false if the answer was no. */
+/** Deletes jobs after a confirmation; returns false if the user declined. */
 export async function removeAll(jobs) {
-  const text = [`${jobs.length} ${jobs.length === 1 ? "job" : "jobs"} and their frames will be gone: `, h("b", null, jobs.slice(0, 3).map(nameOf).join(", ")), jobs.length > 3 ? ` and ${jobs.length - 3} more. ` : ". ", "Measurements and calibrations stay."];
+  const text = [`${jobs.length} ${jobs.length === 1 ? "job" : "jobs"} and their frames will be deleted: `, h("b", null, jobs.slice(0, 3).map(nameOf).join(", ")), jobs.length > 3 ? ` and ${jobs.length - 3} more. ` : ". ", "Measurements and calibrations are kept."];
   if (!(await ask(`Delete ${jobs.length} ${jobs.length === 1 ? "job" : "jobs"}?`, text, "Delete"))) return false;
   await each(jobs, "deleted", (job) => send("DELETE", `/v1/jobs/${job.id}`));
   return true;
 }
 
-/** Does the same to each, a few at a time, and says what was not possible. */
+/** Applies an action to all jobs, four at a time, and lists the failures. */
 async function each(jobs, word, act) {
-  const left = [...jobs];
+  const remaining = [...jobs];
   const refused = [];
   const work = async () => {
-    for (let job = left.shift(); job; job = left.shift()) {
+    for (let job = remaining.shift(); job; job = remaining.shift()) {
       await act(job).catch((error) => refused.push([job, error]));
     }
   };
   await Promise.all(Array.from({ length: 4 }, work));
-  announce(`${jobs.length - refused.length} jobs are ${word}`);
+  announce(`${jobs.length - refused.length} jobs ${word}`);
   if (refused.length === 0) return;
-  await tell(`${refused.length} of ${jobs.length} could not be ${word}`, h("span", null, refused.slice(0, 5).map(([job, error]) => [`${nameOf(job)}: ${error.message}`, h("br")])));
+  await showMessage(`${refused.length} of ${jobs.length} could not be ${word}`, h("span", null, refused.slice(0, 5).map(([job, error]) => [`${nameOf(job)}: ${error.message}`, h("br")])));
 }
 
-/** Asks for another name; `change(name)` sends it (null for none). */
+/** Asks for a new name; `change(name)` sends it (null removes the name). */
 export function rename(before, change) {
   const input = h("input", { type: "text", id: "new-name", maxlength: 200, value: before ?? "", autocomplete: "off" });
   const status = h("div", { "aria-live": "polite" });
   const element = h("dialog", { "aria-labelledby": "question" });
   const form = h("form", null, h("h2", { id: "question" }, "Rename"), h("label", { class: "field", for: "new-name" }, "Name", input), status,
-    h("div", { class: "row end" }, h("button", { type: "button", onclick: () => element.close() }, "Keep"), h("button", { type: "submit", class: "primary" }, "Rename")));
+    h("div", { class: "row end" }, h("button", { type: "button", onclick: () => element.close() }, "Cancel"), h("button", { type: "submit", class: "primary" }, "Rename")));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     try {
       await change(input.value.trim() || null);
-      announce("It is renamed");
+      announce("Renamed");
       element.close();
     } catch (error) {
       put(status, h("p", { class: "trouble", role: "alert" }, error.message));
@@ -96,7 +96,7 @@ function open(element, form) {
   element.showModal();
 }
 
-/** Asks; gives true if the answer is yes. */
+/** Asks for a confirmation; resolves to true if the user confirms. */
 export function ask(title, text, yes) {
   return new Promise((resolve) => {
     const buttons = [
@@ -107,8 +107,8 @@ export function ask(title, text, yes) {
   });
 }
 
-/** Says something that needs to be read. */
-export function tell(title, text) {
+/** Shows a message that the user has to close. */
+export function showMessage(title, text) {
   return new Promise((resolve) => {
     dialog(title, text, [h("button", { type: "submit", value: "ok", autofocus: true }, "Close")], resolve);
   });

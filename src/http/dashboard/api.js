@@ -1,29 +1,29 @@
-// The API, as the dashboard uses it. Errors are problem+json and become exceptions with its detail.
+// Client of the API. Errors are problem+json; they become exceptions with its `detail` as message.
 
 import { place } from "./dom.js";
-import { lookAfter } from "./keeping.js";
+import { selectLab } from "./storage.js";
 
-// A session is a cookie that no script can read. What changes something by it shows this header, which no
-// page of another site can send.
-const OWN = { "X-Requested-With": "sci-recon" };
+// The session is a cookie that scripts can't read. Requests that change something must send this header,
+// which pages of other sites can't set.
+const CSRF_HEADERS = { "X-Requested-With": "sci-recon" };
 let session = 0;
 
-/** As `fetch`. Who is not let in is told by the event `signed-out`. */
+/** Like `fetch`. Dispatches the event `signed-out` if the request is not authenticated. */
 export async function ask(path, options = {}) {
   const during = session;
-  const response = await fetch(place(path), { ...options, headers: { ...OWN, ...options.headers } });
+  const response = await fetch(place(path), { ...options, headers: { ...CSRF_HEADERS, ...options.headers } });
   if (response.status === 401) signedOut(during);
   return response;
 }
 
-/** An answer to a session that has ended meanwhile says nothing. */
+/** Ignores answers to requests of an earlier session. */
 function signedOut(during) {
   if (during === session) dispatchEvent(new Event("signed-out"));
 }
 
-/** Shows a token once, for a session; throws `Refused` for one that is not taken. */
+/** Exchanges a token for a session; throws `Refused` if the token is rejected. */
 export async function signIn(token) {
-  const headers = { ...OWN, Authorization: `Bearer ${token}` };
+  const headers = { ...CSRF_HEADERS, Authorization: `Bearer ${token}` };
   const response = await fetch(place("/v1/session"), { method: "POST", headers });
   if (!response.ok) throw await refused(response);
   renew();
@@ -31,15 +31,15 @@ export async function signIn(token) {
 
 /** Ends the session. */
 export async function signOut() {
-  const response = await fetch(place("/v1/session"), { method: "DELETE", headers: OWN });
-  // One that is not known any more has ended.
+  const response = await fetch(place("/v1/session"), { method: "DELETE", headers: CSRF_HEADERS });
+  // 401 means that the session has already ended.
   if (!response.ok && response.status !== 401) throw await refused(response);
   renew();
 }
 
 function renew() {
   session += 1;
-  lookAfter(null);
+  selectLab(null);
   known.clear();
 }
 
@@ -54,7 +54,7 @@ export class Refused extends Error {
   }
 }
 
-/** Makes something of files and waits until they are checked; `during` is told how far that is. */
+/** Creates a resource and waits until its files are checked; `during(resource)` receives the progress. */
 export async function create(path, body, signal, during = () => {}) {
   let made = await send("POST", path, body);
   while (made.state === "preparing") {
@@ -65,11 +65,11 @@ export async function create(path, body, signal, during = () => {}) {
   throw made.problem ? new Refused(made.problem.status, made.problem) : new Error(made.error);
 }
 
-/** Answers that may still hold, by path. */
+/** Cached answers by path, revalidated with their ETag. */
 export const known = new Map();
-const KNOWN = 60;
+const MAX_KNOWN = 60;
 
-/** Asks with `If-None-Match`; gives the very object of last time if nothing has changed. */
+/** Gets JSON with `If-None-Match`; returns the same object as before if nothing has changed. */
 export async function get(path, signal) {
   const before = known.get(path);
   const headers = before ? { "If-None-Match": before.etag } : {};
@@ -85,21 +85,21 @@ export async function get(path, signal) {
 function remember(path, answer) {
   known.delete(path);
   known.set(path, answer);
-  if (known.size > KNOWN) known.delete(known.keys().next().value);
+  if (known.size > MAX_KNOWN) known.delete(known.keys().next().value);
 }
 
-/** The error of an answer that is no success. */
+/** The exception for an answer without success. */
 export async function refused(response) {
   let problem = {};
   try {
     problem = await response.json();
   } catch {
-    // Not from the service itself: the status must do.
+    // The answer is not from the service, so there is only a status.
   }
   return new Refused(response.status, problem);
 }
 
-/** Sends JSON, gives JSON (or null where there is no body). */
+/** Sends JSON and returns JSON, or null if the answer has no body. */
 export async function send(method, path, body) {
   const headers = body === undefined ? {} : { "Content-Type": "application/json" };
   const response = await ask(path, { method, headers, body: body === undefined ? null : JSON.stringify(body) });
@@ -107,13 +107,13 @@ export async function send(method, path, body) {
   return response.status === 204 ? null : response.json();
 }
 
-/** Uploads a file and tells how much of it has gone; gives the blob's record. */
+/** Uploads a file, reports the progress in bytes, and returns the blob's record. */
 export function upload(file, progress, signal) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     request.open("POST", place("/v1/blobs"));
     request.setRequestHeader("Content-Type", "application/octet-stream");
-    for (const [name, value] of Object.entries(OWN)) request.setRequestHeader(name, value);
+    for (const [name, value] of Object.entries(CSRF_HEADERS)) request.setRequestHeader(name, value);
     const during = session;
     request.upload.onprogress = (event) => progress(event.loaded, event.total || file.size);
     request.onload = () => {
@@ -121,7 +121,7 @@ export function upload(file, progress, signal) {
       try {
         body = JSON.parse(request.responseText);
       } catch {
-        // As above.
+        // The answer is not from the service, so there is only a status.
       }
       if (request.status === 401) signedOut(during);
       if (request.status >= 200 && request.status < 300) resolve(body);
@@ -141,19 +141,19 @@ export async function picture(path, signal) {
   return createImageBitmap(await response.blob());
 }
 
-/** What one may not do by one's role becomes a page, wherever it is noticed. */
+/** Shows the "forbidden" view for a 403; returns true if the error is one. */
 export function forbidden(error) {
   if (error.status !== 403) return false;
   dispatchEvent(new CustomEvent("forbidden", { detail: error.message }));
   return true;
 }
 
-/** True where no answer came at all. */
-export function unanswered(error) {
+/** True if the service could not be reached. */
+export function isUnreachable(error) {
   return error instanceof TypeError || error.status === 502 || error.status === 503 || error.status === 504;
 }
 
-/** True for the end of a request that a view gave up on. */
-export function gaveUp(error) {
+/** True if a view has cancelled the request. */
+export function isAborted(error) {
   return error?.name === "AbortError";
 }

@@ -1,11 +1,11 @@
-// Calibrations: what is known of the masks, and how they look.
+// Calibrations: the list, and one calibration with its masks, report and figures.
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, facts, h, place, put } from "./dom.js";
-import { ask, rename, tell } from "./actions.js";
+import { ask, rename, showMessage } from "./actions.js";
 import { every } from "./live.js";
 import { figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
@@ -25,15 +25,15 @@ export async function calibrations(root, _, signal) {
   more.addEventListener("click", load);
   const count = await load();
   root.append(h("div", { class: "row head" }, h("h1", null, "Calibrations"), h("span", { class: "grow" }), h("a", { class: "button primary writes", href: "#/new" }, "New calibration")));
-  root.append(count ? h("section", { "aria-label": "Calibrations" }, list, more) : h("p", { class: "note" }, "There are none yet. A ", h("a", { href: "#/new" }, "new job"), " begins with one."));
+  root.append(count ? h("section", { "aria-label": "Calibrations" }, list, more) : h("p", { class: "note" }, "No calibrations yet. A ", h("a", { href: "#/new" }, "new job"), " starts with one."));
 }
 
-/** A calibration at a glance: a mask, its name, its grade. */
+/** A card with a mask, name and grade. */
 function tile(item, signal) {
   return h("a", { class: "card calibration", href: `#/calibrations/${item.id}` }, ...glance(item, signal));
 }
 
-/** Picture, name, size and grade, for a list and for a choice. */
+/** Image, name, size and grade of a calibration. */
 export function glance(item, signal) {
   const ready = item.state === "ready";
   return [
@@ -44,11 +44,11 @@ export function glance(item, signal) {
   ];
 }
 
-/** What is to be said of a calibration whose masks are not there. */
+/** State of a calibration that has no masks yet. */
 function unready(item) {
   if (item.state === "failed") return `No masks: ${item.error}`;
   if (item.frames === null) return "The masks are being checked";
-  return `Masks are being made of ${item.frames} patterns: ${Math.floor(item.percent)} %`;
+  return `Computing masks from ${item.frames} patterns: ${Math.floor(item.percent)} %`;
 }
 
 export async function calibration(root, [id], signal) {
@@ -80,7 +80,7 @@ export async function calibration(root, [id], signal) {
   const first = await get(`/v1/calibrations/${id}`, signal);
   await show(first);
   if (first.state !== "preparing") return;
-  // Until its masks are made.
+  // Poll until the masks are ready.
   const done = new AbortController();
   signal.addEventListener("abort", () => done.abort());
   every(1000, async () => {
@@ -91,14 +91,14 @@ export async function calibration(root, [id], signal) {
 }
 
 async function erase(item) {
-  const text = ["The calibration ", h("b", null, nameOf(item)), " will be gone. Only one that no measurement refers to can be deleted."];
+  const text = ["The calibration ", h("b", null, nameOf(item)), " will be deleted. This is possible only if no measurement refers to it."];
   if (!(await ask("Delete this calibration?", text, "Delete"))) return;
   try {
     await send("DELETE", `/v1/calibrations/${item.id}`);
-    announce("The calibration is deleted");
+    announce("Calibration deleted");
     location.hash = "#/calibrations";
   } catch (error) {
-    await tell("Not possible", error.message);
+    await showMessage("Could not delete the calibration", error.message);
   }
 }
 
@@ -115,20 +115,20 @@ function about(item) {
     ["File", `${item.sample} in ${item.format}`],
     ["SHA-256 of the file", h("code", null, item.masks)],
     ["Identifier", h("code", null, item.id)],
-    ["Made", momentInFull(item.created_at)],
+    ["Created", momentInFull(item.created_at)],
   ]));
 }
 
-const WHOLE = [["mean", "Mean of all masks"], ["gram", "Gram diagonal: sum of squares"], ["dead", "Dead pixels (white)"]];
+const WHOLE = [["mean", "Mean of all masks"], ["gram", "Gram diagonal (sum of squares)"], ["dead", "Dead pixels (white)"]];
 
-/** The masks one by one or played, their mean, the gram diagonal and the dead pixels. */
+/** Viewer of the masks, their mean, the Gram diagonal and the dead pixels. */
 class Masks {
   constructor(item, signal) {
     Object.assign(this, { item, signal });
     this.view = new View(item.height, item.width);
     this.pane = new Pane("Masks", this.view, signal);
     this.contrast = new Contrast("masks", () => this.draw());
-    this.choice = h("select", { id: "picture", "aria-label": "Picture" }, h("option", { value: "mask" }, "Masks one by one"), WHOLE.map(([value, text]) => h("option", { value }, text)));
+    this.choice = h("select", { id: "picture", "aria-label": "Picture" }, h("option", { value: "mask" }, "Single masks"), WHOLE.map(([value, text]) => h("option", { value }, text)));
     this.player = new Player(item.frames, signal, () => this.draw());
     this.player.ahead = (frame) => this.pane.prepare(this.source(`mask-${frame}`), ...this.contrast.window());
     this.choice.addEventListener("change", () => {
@@ -138,7 +138,7 @@ class Masks {
     });
     this.pane.tools.append(this.choice, h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit"));
     this.element = h("section", { class: "card viewer", "aria-label": "Masks" }, this.pane.element, this.player.element, this.contrast.element,
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on the picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms, dragging moves.")));
+      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on the picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves.")));
     this.player.keys(this.element);
   }
 
@@ -147,7 +147,7 @@ class Masks {
     return { base: `/v1/calibrations/${this.item.id}/pictures/${name}`, levels, tile, label: this.choice.selectedOptions[0].textContent };
   }
 
-  /** The spread of what is shown, of the first mask for all of them. */
+  /** Loads the range of values; that of the first mask holds for all masks. */
   async show() {
     const one = this.choice.value === "mask";
     this.player.element.hidden = !one;

@@ -1,4 +1,4 @@
-// Raw captures of a white board: which file is which, and the order of the patterns.
+// Raw captures of a white board: the role of each file, and the order of the patterns.
 
 import { announce, h, put, say } from "./dom.js";
 import { dropZone } from "./drop.js";
@@ -6,14 +6,14 @@ import { thumb } from "./thumb.js";
 
 const ROLES = [
   ["pattern", "Next pattern"],
-  ["repeat", "Repeat of the pattern before"],
-  ["white", "White, without mask"],
-  ["black", "Black, without mask"],
-  ["black_with_mask", "Black, with mask"],
+  ["repeat", "Repeat of the previous pattern"],
+  ["white", "White without mask"],
+  ["black", "Black without mask"],
+  ["black_with_mask", "Black with mask"],
   ["unused", "Not used"],
 ];
 
-/** What a file's name says it is; shown, so that it can be corrected. */
+/** Role guessed from a file's name. The user sees it and can correct it. */
 function proposed(name) {
   const low = name.toLowerCase();
   if (/(black|dark).*mask|mask.*(black|dark)/.test(low)) return "black_with_mask";
@@ -22,15 +22,15 @@ function proposed(name) {
   return "pattern";
 }
 
-/** The captures as they were named; `changed()` is called when they are others. */
+/** List of captures with their roles; `changed()` is called after each edit. */
 export class Captures {
   constructor(signal, changed) {
     Object.assign(this, { items: [], changed });
     this.list = h("ol", { class: "captures", "aria-label": "Captures, in order" });
     this.summary = h("p", { class: "muted", "aria-live": "polite" });
-    this.drop = dropZone("captures", "Raw captures", "All files at once: one for each pattern, white and black. A file may hold several repeats.", signal, async (blob, file) => {
+    this.drop = dropZone("captures", "Raw captures", "Drop all files together: one per pattern, plus white and black. A file may hold several repeats.", signal, async (blob, file) => {
       const item = { sha256: blob.sha256, name: file.name, role: proposed(file.name), picture: await thumb(file) };
-      // Patterns first: their order is what is to be looked at.
+      // Patterns come first, because the user has to check their order.
       const others = this.items.findIndex((other) => !["pattern", "repeat"].includes(other.role));
       this.items.splice(item.role === "pattern" && others >= 0 ? others : this.items.length, 0, item);
       this.show();
@@ -52,7 +52,7 @@ export class Captures {
     return found;
   }
 
-  /** What is missing, in words; null if a calibration can be made. */
+  /** Names of the missing captures; null if the set is complete. */
   missing() {
     const lacks = [this.patterns().length === 0 && "at least one pattern", this.of("white").length === 0 && "a white capture", this.of("black").length === 0 && "a black capture"].filter(Boolean);
     return lacks.length ? lacks.join(", ") : null;
@@ -70,12 +70,12 @@ export class Captures {
       return this.line(item, index, item.role === "pattern" ? number : null);
     }));
     const missing = this.missing();
-    say(this.summary, this.items.length === 0 ? "" : missing ? `Still missing: ${missing}.` : `${number} patterns. Check their order: frame 1 is the first.`);
+    say(this.summary, this.items.length === 0 ? "" : missing ? `Still missing: ${missing}.` : `${number} patterns. Check their order: the first is frame 1.`);
     this.changed();
   }
 
   line(item, index, number) {
-    const role = h("select", { "aria-label": `What ${item.name} is`, onchange: () => {
+    const role = h("select", { "aria-label": `Role of ${item.name}`, onchange: () => {
       item.role = role.value;
       this.show();
     } }, ROLES.map(([value, text]) => h("option", { value, selected: value === item.role }, text)));
@@ -93,7 +93,7 @@ export class Captures {
     element.addEventListener("dragover", (event) => event.preventDefault());
     element.addEventListener("drop", (event) => {
       event.preventDefault();
-      // Only what is dragged within the list: files are dropped above.
+      // Only entries of the list are moved here; files are dropped above.
       const from = event.dataTransfer.getData("text/plain");
       if (from !== "") this.move(Number(from), index);
     });

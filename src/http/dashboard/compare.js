@@ -1,5 +1,5 @@
-// Two to four jobs: the same place, the same frame, the same contrast, side by side, one wiped over the
-// other, their difference, or in turn; and a table in which what differs comes first.
+// Comparison of two to four jobs with synchronised place, frame and contrast: side by side, as a wipe, as a
+// difference or alternating. A table lists the differences first.
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
@@ -7,9 +7,9 @@ import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, h, put, say } from "./dom.js";
 import { bytes, duration, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
-import { gaveUp, get, upload } from "./api.js";
-import { keepTruth, truthOf } from "./keeping.js";
-import { networks, ran } from "./made.js";
+import { isAborted, get, upload } from "./api.js";
+import { keepTruth, truthOf } from "./storage.js";
+import { networks, ran } from "./provenance.js";
 
 export async function compare(root, [path], signal) {
   const ids = path.split("/");
@@ -19,31 +19,31 @@ export async function compare(root, [path], signal) {
   const manifests = await Promise.all(jobs.map((job) => manifest(job, signal)));
   const all = manifests.every(Boolean);
   if (!same) {
-    root.append(h("p", { class: "trouble" }, `They can't be laid side by side: their frames are ${jobs.map(shapeOf).join(" and ")}.`));
+    root.append(h("p", { class: "trouble" }, `These jobs can't be compared frame by frame: their frames are ${jobs.map(shapeOf).join(" and ")}.`));
   } else if (all) {
     const group = new Group(jobs, signal);
     root.append(group.element);
     await group.open();
   } else {
-    root.append(h("p", { class: "note" }, "All jobs must have succeeded before their frames can be compared."));
+    root.append(h("p", { class: "note" }, "The frames can be compared when all jobs have succeeded."));
   }
   const table = h("div");
   root.append(h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), table, all && truth(jobs, manifests, table, signal)));
   put(table, figures(jobs, manifests));
 }
 
-/** PSNR and SSIM of all jobs, against true frames that are attached here or were before. */
+/** PSNR and SSIM of all jobs against true frames, attached here or earlier. */
 function truth(jobs, manifests, table, signal) {
   const input = h("input", { type: "file", id: "truth", class: "unseen" });
-  const status = h("span", { class: "muted", "aria-live": "polite" }, "npy, TIFF or .mat, on the scale of the frames");
+  const status = h("span", { class: "muted", "aria-live": "polite" }, "npy, TIFF or .mat, in the scale of the frames");
   const measure = async ({ sha256, name }) => {
-    say(status, "The frames are compared …");
+    say(status, "Comparing the frames …");
     const found = await Promise.all(jobs.map((job) => get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/quality?truth=${sha256}`, signal)));
     jobs.forEach((job) => keepTruth(job.id, { sha256, name }));
     put(table, figures(jobs, manifests, found));
     say(status, `Measured against ${name}.`);
   };
-  const tell = (error) => gaveUp(error) || put(status, h("span", { class: "warn" }, error.message));
+  const showError = (error) => isAborted(error) || put(status, h("span", { class: "warn" }, error.message));
   input.addEventListener("change", async () => {
     const file = input.files[0];
     if (!file) return;
@@ -51,14 +51,14 @@ function truth(jobs, manifests, table, signal) {
       const { sha256 } = await upload(file, (done, total) => say(status, `${bytes(done)} of ${bytes(total)}`), signal);
       await measure({ sha256, name: file.name });
     } catch (error) {
-      tell(error);
+      showError(error);
     }
   });
   const before = jobs.map((job) => truthOf(job.id));
   const one = before.find(Boolean);
-  // The truth of one scene says nothing about another.
+  // True frames of one scene are meaningless for another.
   const fits = (job, index) => job.measurement === jobs[before.indexOf(one)].measurement || before[index]?.sha256 === one.sha256;
-  if (one && jobs.every(fits)) measure(one).catch(tell);
+  if (one && jobs.every(fits)) measure(one).catch(showError);
   return h("div", { class: "row" }, h("label", { for: "truth", class: "button small filebutton" }, "Attach true frames", input), status);
 }
 
@@ -67,9 +67,9 @@ async function manifest(job, signal) {
   return get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/manifest.json`, signal);
 }
 
-const MODES = [["beside", "Side by side"], ["wipe", "Wipe"], ["difference", "Difference"], ["flicker", "In turn"]];
+const MODES = [["beside", "Side by side"], ["wipe", "Wipe"], ["difference", "Difference"], ["flicker", "Alternate"]];
 
-/** Panes in step, and one pane in which two meet. */
+/** Synchronised panes. The first one can also show a pair of jobs. */
 class Group {
   constructor(jobs, signal) {
     const { frames, height, width } = jobs[0].shape;
@@ -84,24 +84,24 @@ class Group {
       const select = h("select", { id, "aria-label": label, onchange: () => this.show() }, jobs.map((job, index) => h("option", { value: index, selected: index === chosen }, nameOf(job))));
       return select;
     };
-    [this.one, this.other] = [pick("one", "Left, or first", 0), pick("other", "Right, or second", 1)];
-    this.wipe = h("input", { type: "range", id: "wipe-at", min: 0, max: 1000, value: 500, "aria-label": "Where the wipe is", oninput: () => this.show() });
+    [this.one, this.other] = [pick("one", "Left or first job", 0), pick("other", "Right or second job", 1)];
+    this.wipe = h("input", { type: "range", id: "wipe-at", min: 0, max: 1000, value: 500, "aria-label": "Position of the wipe", oninput: () => this.show() });
     this.gain = h("select", { id: "gain", "aria-label": "Brightness of the difference", onchange: () => this.show() }, [1, 2, 4, 8, 16].map((by) => h("option", { value: by, selected: by === 4 }, `× ${by}`)));
     this.rate = h("input", { type: "number", id: "flicker-rate", min: 0.2, max: 20, step: "any", value: 2 });
     this.rateLabel = h("label", { for: "flicker-rate", class: "row muted" }, this.rate, "changes/s");
     this.pairing = h("span", { class: "row" }, this.one, h("span", { class: "muted" }, "and"), this.other);
     this.panels = h("div", { class: `panes of${jobs.length}` }, this.panes.map((pane) => pane.element));
     this.element = h("section", { class: "card viewer", "aria-label": "Frames of the jobs" },
-      h("div", { class: "row", role: "group", "aria-label": "How they are compared" }, this.modes, this.pairing, this.wipe, this.gain, this.rateLabel,
+      h("div", { class: "row", role: "group", "aria-label": "Mode of comparison" }, this.modes, this.pairing, this.wipe, this.gain, this.rateLabel,
         h("span", { class: "grow" }), h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit")),
       this.panels, this.player.element, this.contrast.element,
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wipe is dragged by its line, or moved by its slider.")));
+      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. Drag the line of the wipe, or use its slider.")));
     this.player.keys(this.element);
     this.drag();
     signal.addEventListener("abort", () => clearTimeout(this.timer), { once: true });
   }
 
-  /** The line of the wipe follows a pointer that takes it. */
+  /** Lets the line of the wipe be dragged. */
   drag() {
     const { sight } = this.panes[0];
     const handle = h("div", { class: "handle", "aria-hidden": "true" });
@@ -132,7 +132,7 @@ class Group {
   async open() {
     const middle = Math.ceil(this.player.count / 2);
     const spreads = await Promise.all(this.jobs.map((_, index) => get(`${this.base(index, middle)}/spread`, this.signal)));
-    // One window for all: a difference of brightness should show.
+    // All jobs share one contrast window, so that differences in brightness are visible.
     const least = (name) => Math.min(...spreads.map((spread) => spread[name]));
     const most = (name) => Math.max(...spreads.map((spread) => spread[name]));
     this.spread = { ...spreads[0], minimum: least("minimum"), maximum: most("maximum"), low: least("low"), high: most("high") };
@@ -195,7 +195,7 @@ class Group {
   next() {
     this.timer = setTimeout(() => {
       const index = this.pair()[1 - this.turn];
-      // The other one is shown when it is here, so that nothing but the pictures changes.
+      // Switch only when the other frame is loaded, so that no blank frame appears.
       if (this.panes[0].prepare(this.source(index, this.player.frame), ...this.contrast.window())) {
         this.turn = 1 - this.turn;
         this.show();
@@ -205,7 +205,7 @@ class Group {
   }
 }
 
-/** What the jobs were and what came of them: rows that differ first. */
+/** Table of the jobs' settings and results, with the rows that differ first. */
 function figures(jobs, manifests, measured) {
   const rows = [
     measured && ["PSNR", (_, index) => (measured[index].psnr === null ? "∞" : `${figure(measured[index].psnr, 4)} dB`), "quality"],
@@ -213,11 +213,11 @@ function figures(jobs, manifests, measured) {
     ["Expected PSNR", (job) => (job.assessment ? `${job.assessment.psnr_low_db} to ${job.assessment.psnr_high_db} dB` : "–")],
     ["State", (job) => job.state],
     ["Algorithm", (job) => job.algorithm],
-    ["Planned iterations on a tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],
+    ["Planned iterations per tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],
     ["Schedule", (job) => job.schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ") || "–"],
     ["Done", (job, index) => (manifests[index] ? ran(job, manifests[index].content) : "–")],
     ["Network", (_, index) => (manifests[index] ? networks(manifests[index].content) : "–")],
-    ["Computing", (_, index) => (manifests[index] ? duration(manifests[index].run.cpu_seconds) : "–")],
+    ["CPU time", (_, index) => (manifests[index] ? duration(manifests[index].run.cpu_seconds) : "–")],
     ["Tiles", (job) => `${job.tile.size} pixels, ${job.tile.overlap} shared`],
     ["Measurement", (job) => job.measurement],
     ["Calibration", (job) => job.calibration],
@@ -228,5 +228,5 @@ function figures(jobs, manifests, measured) {
   const [different, equal] = [rows.filter(differs), rows.filter((row) => !differs(row))];
   const head = h("thead", null, h("tr", null, h("td"), jobs.map((job) => h("th", { scope: "col" }, h("a", { href: `#/jobs/${job.id}` }, nameOf(job))))));
   const group = (title, found, kind) => found.length > 0 && h("tbody", { class: kind }, h("tr", null, h("th", { scope: "rowgroup", colspan: jobs.length + 1, class: "grouphead" }, title)), found.map(line));
-  return h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Figures of the jobs" }, h("table", { class: "figures" }, head, group("What differs", different, "differs"), group("The same in all", equal, "same")));
+  return h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Figures of the jobs" }, h("table", { class: "figures" }, head, group("Differences", different, "differs"), group("Identical", equal, "same")));
 }

@@ -1,4 +1,4 @@
-// The window of contrast of a pane: which values are black and which are white.
+// Contrast window of a pane: the values shown as black and as white.
 
 import { h, say } from "./dom.js";
 import { figure } from "./format.js";
@@ -6,7 +6,7 @@ import { figure } from "./format.js";
 let made = 0;
 
 export class Contrast {
-  /** `changed()` is called when the window is another one. */
+  /** `changed()` is called when the window changes. */
   constructor(name, changed) {
     made += 1;
     this.changed = changed;
@@ -27,21 +27,21 @@ export class Contrast {
     return input;
   }
 
-  /** Values that there are; the window is kept if somebody has chosen it. */
+  /** Sets the range of values; a window that the user has chosen is kept. */
   offer(spread) {
     const same = this.spread && JSON.stringify(this.spread) === JSON.stringify(spread);
     this.spread = spread;
     if (!same && !this.touched) this.reset(false);
   }
 
-  reset(tell = true) {
+  reset(notify = true) {
     this.touched = false;
     const { low, high } = this.spread;
     [this.low, this.high] = [low, high > low ? high : low + 1];
     this.black.value = this.at(this.low);
     this.white.value = this.at(this.high);
     this.show();
-    if (tell) this.changed();
+    if (notify) this.changed();
   }
 
   range() {
@@ -56,7 +56,7 @@ export class Contrast {
 
   read(input) {
     const [from, to] = this.range();
-    // One slider pushes the other: black stays below white.
+    // One slider pushes the other, so that black stays below white.
     if (Number(this.black.value) >= Number(this.white.value)) {
       if (input === this.black) this.white.value = Number(this.black.value) + 1;
       else this.black.value = Number(this.white.value) - 1;
@@ -74,7 +74,7 @@ export class Contrast {
     this.white.setAttribute("aria-valuetext", high);
   }
 
-  /** The window as numbers that survive their way through an address. */
+  /** The window, rounded to the six digits that the URL carries. */
   window() {
     return [Number(this.low.toPrecision(6)), Number(this.high.toPrecision(6))];
   }

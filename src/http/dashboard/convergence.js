@@ -1,4 +1,4 @@
-// How the solver goes: residual, change and sigma by iteration, on a logarithmic scale.
+// Convergence plot: residual, change and sigma by iteration, on a logarithmic scale.
 
 import { figure } from "./format.js";
 import { h, put, s } from "./dom.js";
@@ -9,7 +9,7 @@ const LINES = [["residual", 1, "residual ‖y − Hx‖ / ‖y‖"], ["change", 
 /** Draws `points` ([iteration, residual, change, sigma], ...) into an element. */
 export function convergence(element, points) {
   if (points.length === 0) {
-    put(element, h("p", { class: "muted" }, "No iteration yet."));
+    put(element, h("p", { class: "muted" }, "No iterations yet."));
     return;
   }
   const values = points.flatMap((point) => point.slice(1)).filter((value) => value > 0);

@@ -1,27 +1,27 @@
-// Elements from values. Text stays text: nothing here, or anywhere, reads markup from a string.
+// Creates elements from values. Strings become text nodes, never markup.
 
-import { lookedAfter } from "./keeping.js";
+import { selectedLab } from "./storage.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 
 /**
- * An address of the service from where this page is, which may be below a path of a proxy; of the lab that is
- * looked after, where that is another than one's own.
+ * URL of a path of the service, relative to this page, which may be served below a proxy's path prefix. If
+ * another lab is selected, the URL names it.
  */
 export function place(path) {
   if (!path.startsWith("/")) return path;
-  const lab = lookedAfter();
+  const lab = selectedLab();
   if (!lab || !path.startsWith("/v1/")) return `.${path}`;
   const [, address, fragment] = /^([^#]*)(.*)$/.exec(path);
   return `.${address}${address.includes("?") ? "&" : "?"}lab=${lab}${fragment}`;
 }
 
-/** An HTML element with properties and children; null, undefined and false children are left out. */
+/** Creates an HTML element; children that are null, undefined or false are omitted. */
 export function h(tag, properties, ...children) {
   return fill(document.createElement(tag), properties, children);
 }
 
-/** An SVG element. */
+/** Creates an SVG element. */
 export function s(tag, properties, ...children) {
   return fill(document.createElementNS(SVG, tag), properties, children);
 }
@@ -46,20 +46,20 @@ function append(element, children) {
   }
 }
 
-/** Replaces what an element holds. */
+/** Replaces the children of an element. */
 export function put(element, ...children) {
   element.replaceChildren();
   append(element, children);
   return element;
 }
 
-/** Sets the text of an element if it differs: an untouched node costs no layout. */
+/** Sets the text of an element if it differs, which avoids a layout. */
 export function say(element, text) {
   const next = String(text ?? "");
   if (element.textContent !== next) element.textContent = next;
 }
 
-/** Tells a screen reader. */
+/** Announces a text to screen readers. */
 export function announce(text) {
   say(document.getElementById("announce"), text);
 }
@@ -70,12 +70,12 @@ export function facts(pairs) {
   return h("dl", { class: "facts" }, rows.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]));
 }
 
-/** A message about something that went wrong. */
+/** An error message. */
 export function trouble(error) {
   return h("p", { class: "trouble", role: "alert" }, error.message ?? error);
 }
 
-/** Calls at most once in `wait` milliseconds, the last time with the last arguments. */
+/** Debounces: calls `call` with the latest arguments after `wait` milliseconds without another call. */
 export function calmly(wait, call) {
   let timer = 0;
   return (...values) => {

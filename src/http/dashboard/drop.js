@@ -1,19 +1,19 @@
-// A place to drop files on, or to choose them by; what is wrong with them is told there.
+// Drop zone for files, which shows the errors of the files below it.
 
 import { bytes } from "./format.js";
-import { gaveUp, upload } from "./api.js";
+import { isAborted, upload } from "./api.js";
 import { h, put, say } from "./dom.js";
 
 /**
- * A drop zone. Each file is uploaded, and `take(blob, file)` gets what the service keeps of it. With `many`,
- * several files can come at once, and are taken in the order of their names.
+ * Creates a drop zone. Each file is uploaded and passed to `take(blob, file)` with the record of the blob. With
+ * `many`, several files are accepted and processed in the order of their names.
  */
 export function dropZone(id, title, hint, signal, take, many = false) {
   const input = h("input", { type: "file", id, class: "unseen", multiple: many });
   const text = h("span", { class: "muted" }, hint);
   const bar = h("progress", { max: 1, value: 0, hidden: true, "aria-label": `Upload of the ${title.toLowerCase()}` });
   const status = h("div", { class: "status", "aria-live": "polite" });
-  const zone = h("label", { class: "drop", for: id }, h("b", null, title), h("span", null, many ? "Drop files here, or choose them" : "Drop a file here, or choose one"), text, bar, input);
+  const zone = h("label", { class: "drop", for: id }, h("b", null, title), h("span", null, many ? "Drop files here, or select them" : "Drop a file here, or select one"), text, bar, input);
   let current = null;
   const start = async (files) => {
     if (files.length === 0) return;
@@ -32,11 +32,11 @@ export function dropZone(id, title, hint, signal, take, many = false) {
           bar.value = total ? done / total : 0;
           say(text, `${file.name}${which}: ${bytes(done)} of ${bytes(total)}`);
         }, mine.signal);
-        say(text, `${file.name}${which}: ${bytes(blob.size)}, is being checked …`);
+        say(text, `${file.name}${which}: checking ${bytes(blob.size)} …`);
         await take(blob, file);
         last = many ? hint : `${file.name}: ${bytes(blob.size)}`;
       } catch (error) {
-        if (gaveUp(error)) return;
+        if (isAborted(error)) return;
         status.append(problem(error, sorted.length > 1 ? file.name : null));
         if (!many) last = hint;
       }
@@ -61,37 +61,37 @@ export function dropZone(id, title, hint, signal, take, many = false) {
   return { element: h("div", null, zone, status), status };
 }
 
-/** A refusal with each field that is wrong. */
+/** An error message with all invalid fields. */
 export function problem(error, about = null) {
   const errors = error.errors ?? [];
   const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: ${item.detail}`))) : null;
-  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Refused: "), errors.length > 1 ? null : error.message, list);
+  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : error.message, list);
 }
 
 const SCALES = [1, 255, 1023, 4095, 16383, 65535];
 
 /**
- * Asks for the full scale with buttons, where the check refuses it or has doubts; the file stays where it is.
- * `again(scale)` makes the thing anew.
+ * Asks for the full scale if the check rejects or questions it. `again(scale)` repeats the request with the same
+ * file.
  */
 export function askScale(again) {
-  const other = h("input", { type: "number", min: 0, step: "any", "aria-label": "Another full scale", placeholder: "another" });
-  const use = h("button", { type: "button", class: "small", onclick: () => Number(other.value) > 0 && again(Number(other.value)) }, "Use it");
-  return h("div", { class: "askscale", role: "group", "aria-label": "Full scale" }, h("p", null, h("b", null, "Which stored number means 1, all light of one frame?")),
+  const other = h("input", { type: "number", min: 0, step: "any", "aria-label": "Another full scale", placeholder: "other" });
+  const use = h("button", { type: "button", class: "small", onclick: () => Number(other.value) > 0 && again(Number(other.value)) }, "Use");
+  return h("div", { class: "askscale", role: "group", "aria-label": "Full scale" }, h("p", null, h("b", null, "Which stored number means 1, the full light of one frame?")),
     h("div", { class: "row" }, SCALES.map((scale) => h("button", { type: "button", class: "small", onclick: () => again(scale) }, `${scale} means 1`)), other, use));
 }
 
-/** The orders of an array's axes, in words. */
+/** Names of the axis orders. */
 const ORDERS = { "frame-row-column": "frame, row, column", "row-column-frame": "row, column, frame", "column-row-frame": "column, row, frame", "frame-column-row": "frame, column, row" };
 
-/** Asks for the order of the axes, of those that a refusal says fit. */
+/** Asks for the axis order, among those that the error names as possible. */
 function askAxes(error, again) {
   const fit = Object.entries(ORDERS).filter(([name]) => error.message.includes(name));
-  return h("div", { class: "askscale", role: "group", "aria-label": "Axes" }, h("p", null, h("b", null, "In which order are the axes of the array?")),
+  return h("div", { class: "askscale", role: "group", "aria-label": "Axes" }, h("p", null, h("b", null, "What is the order of the array's axes?")),
     h("div", { class: "row" }, fit.map(([name, words]) => h("button", { type: "button", class: "small", onclick: () => again(name) }, words))));
 }
 
-/** Asks for what a refusal leaves in doubt, beside what was stated; null where nothing can be stated. `again` gets all of it. */
+/** Asks for the setting that an error calls ambiguous; null if there is none. `again` receives it with those stated before. */
 export function askAbout(error, stated, again) {
   if (error.reason === "axes_ambiguous") return askAxes(error, (axes) => again({ ...stated, axes }));
   const scale = ["above_full_scale", "invalid_full_scale"].includes(error.reason) || (error.errors ?? []).some((item) => item.pointer === "/full_scale");

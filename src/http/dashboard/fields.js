@@ -1,4 +1,4 @@
-// Fields of a form, each with its label; what is left empty is null, and nothing is guessed.
+// Form fields with labels. An empty field has the value null.
 
 import { h } from "./dom.js";
 
@@ -17,7 +17,7 @@ export function numberField(id, label, step = "any") {
   return { element, input, value: () => (input.value === "" ? null : Number(input.value)) };
 }
 
-/** Only what was given: the service has its own defaults. */
+/** The values without those that are null; the service applies its defaults to these. */
 export function given(values) {
   return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== null));
 }

@@ -1,19 +1,19 @@
-// The filter of the list: state and search, in the address, and those that are kept for later.
+// Filter of the job list by state and text, stored in the URL, and saved filters.
 
 import { calmly, h, put } from "./dom.js";
-import { recall, remember } from "./keeping.js";
+import { recall, remember } from "./storage.js";
 
 const STATES = ["queued", "running", "succeeded", "failed", "cancelling", "cancelled"];
-const CHOICES = [["", "All states"], ["queued,running", "Not ended"], ...STATES.map((state) => [state, state[0].toUpperCase() + state.slice(1)])];
+const CHOICES = [["", "All states"], ["queued,running", "Active"], ...STATES.map((state) => [state, state[0].toUpperCase() + state.slice(1)])];
 
-/** The filter's fields; `changed()` is called when it is another one. */
+/** The filter's fields; `changed()` is called when the filter changes. */
 export function filters(query, changed) {
   const wanted = query.get("state") ?? "";
-  // An address may name several states that the list of choices does not.
+  // A URL may name a combination of states that is not among the choices.
   const choices = CHOICES.some(([value]) => value === wanted) ? CHOICES : [...CHOICES, [wanted, wanted]];
   const state = h("select", { id: "state" }, choices.map(([value, text]) => h("option", { value, selected: value === wanted }, text)));
   const search = h("input", { type: "search", id: "search", placeholder: "Name or identifier", maxlength: 200, autocomplete: "off", value: query.get("search") ?? "" });
-  const keep = h("button", { type: "button", class: "small", hidden: true, onclick: () => store([...saved(), value()]) }, "Keep this filter");
+  const keep = h("button", { type: "button", class: "small", hidden: true, onclick: () => store([...saved(), value()]) }, "Save this filter");
   const chips = h("span", { class: "row chips" });
 
   const value = () => ({ state: state.value, search: search.value.trim() });
@@ -32,16 +32,16 @@ export function filters(query, changed) {
     keep.hidden = !(now.state || now.search) || saved().some((filter) => same(filter, now));
     put(chips, saved().map((filter) => h("span", { class: "chip" },
       h("a", { href: address(filter), "aria-current": same(filter, now) ? "true" : null }, title(filter)),
-      h("button", { type: "button", "aria-label": `Forget the filter ${title(filter)}`, onclick: () => store(saved().filter((other) => !same(other, filter))) }, "×"))));
+      h("button", { type: "button", "aria-label": `Remove the filter ${title(filter)}`, onclick: () => store(saved().filter((other) => !same(other, filter))) }, "×"))));
   }
 
-  const tell = calmly(200, () => {
+  const apply = calmly(200, () => {
     history.replaceState(null, "", address(value()));
     show();
     changed();
   });
-  state.addEventListener("change", tell);
-  search.addEventListener("input", tell);
+  state.addEventListener("change", apply);
+  search.addEventListener("input", apply);
   show();
   return {
     value,

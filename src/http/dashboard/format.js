@@ -1,4 +1,4 @@
-// Numbers and moments as people read them.
+// Formats numbers, times and states for display.
 
 /** 75 -> "1 min 15 s". */
 export function duration(seconds) {
@@ -25,7 +25,7 @@ const clock = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-d
 const day = new Intl.DateTimeFormat(undefined, { day: "numeric", month: "short" });
 const full = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "medium" });
 
-/** The time of a moment of today, with its day before that. */
+/** Time of day, with the date if it is not today. */
 export function moment(text) {
   if (!text) return "–";
   const when = new Date(text);
@@ -33,40 +33,40 @@ export function moment(text) {
   return today ? clock.format(when) : `${day.format(when)} ${clock.format(when)}`;
 }
 
-/** A moment in full. */
+/** Full date and time. */
 export function momentInFull(text) {
   return text ? full.format(new Date(text)) : "–";
 }
 
-/** A number with as many digits as it is worth. */
+/** A number with `digits` significant digits. */
 export function figure(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value !== 0 && (Math.abs(value) < 1e-3 || Math.abs(value) >= 1e5)) return value.toExponential(digits - 1);
   return String(Number(value.toPrecision(digits)));
 }
 
-/** The last part of an identifier, which differs even between things made together. */
+/** Last 8 characters of an identifier; they differ even between resources created at the same time. */
 export function short(id) {
   return id.slice(-8);
 }
 
-/** What a job is called. */
+/** Label or name; if there is none, a text with the short identifier. */
 export function nameOf(thing) {
   return thing.label ?? thing.name ?? `unnamed ${short(thing.id)}`;
 }
 
-/** "8 × 256 × 256" with the number of snapshots where there are several. */
+/** "8 × 256 × 256", and the number of snapshots if there are several. */
 export function shapeOf(job) {
   const { frames, height, width, mosaic } = job.shape;
   const count = job.snapshots.count;
   return `${frames} × ${height} × ${width}${mosaic ? " in colour" : ""}${count > 1 ? `, ${count} snapshots` : ""}`;
 }
 
-/** What a job is doing, in words. */
+/** Current stage of a job. */
 export function stageOf(job) {
   const words = {
     waiting: "waiting",
-    preparing: "measuring the brightness",
+    preparing: "estimating the brightness",
     tv: "total variation",
     deep: "deep denoiser",
     nonlocal: "nonlocal prior",
@@ -77,23 +77,23 @@ export function stageOf(job) {
   return words[stage] ?? stage;
 }
 
-/** What is ahead of a job that has not ended, and how long one that has took. */
+/** Remaining time of an active job, or duration of a job that has ended. */
 export function timeOf(job) {
   const { eta_seconds: eta, queue_position: position } = job.progress;
-  if (job.state === "queued") return [position && `no. ${position} in the queue`, eta === null ? "no worker lives" : `done in up to about ${duration(eta)}`].filter(Boolean).join(", ");
-  if (job.state === "running") return eta === null ? "no worker lives" : `up to about ${duration(eta)} left`;
-  if (job.state === "cancelling") return "its workers let go";
+  if (job.state === "queued") return [position && `position ${position} in the queue`, eta === null ? "no worker running" : `done in up to about ${duration(eta)}`].filter(Boolean).join(", ");
+  if (job.state === "running") return eta === null ? "no worker running" : `up to about ${duration(eta)} left`;
+  if (job.state === "cancelling") return "stopping";
   if (!job.started_at || !job.finished_at) return "";
   const seconds = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
   return `${job.state === "succeeded" ? "took" : "after"} ${seconds < 1 ? "less than 1 s" : duration(seconds)}`;
 }
 
-/** Iterations of a schedule on one tile: all that there may be. */
+/** Maximum number of iterations of a schedule on one tile. */
 export function iterationsOf(schedule) {
   return schedule.stages.reduce((sum, stage) => sum + stage.iterations, 0);
 }
 
-/** How many findings there are, and how grave the gravest is; null where there are none. */
+/** Number and highest severity of a job's findings; null if there are none. */
 export function doubts(job) {
   const errors = job.warnings.filter((item) => item.severity === "error").length;
   const warnings = job.warnings.length - errors;

@@ -1,10 +1,10 @@
-// One job: whether it is good, its frames, its files, and how they were made.
+// One job: its quality, frames, files and method.
 
 import { actions, rename } from "./actions.js";
 import { announce, h, put, trouble } from "./dom.js";
 import { bytes, nameOf, stageOf, timeOf } from "./format.js";
-import { gaveUp, get, send } from "./api.js";
-import { Made } from "./made.js";
+import { isAborted, get, send } from "./api.js";
+import { Made } from "./provenance.js";
 import { movieLink } from "./movie.js";
 import { TileMap } from "./tilemap.js";
 import { Verdict } from "./verdict.js";
@@ -34,7 +34,7 @@ export async function job(root, [id], signal) {
 
   let shown = null;
   let ready = null;
-  const gone = () => (location.hash = "#/jobs");
+  const leave = () => (location.hash = "#/jobs");
   const call = (name) => {
     put(title, name);
     document.title = `${name} – sci-recon`;
@@ -50,7 +50,7 @@ export async function job(root, [id], signal) {
     if (now === shown) return;
     if (now.state !== shown?.state) {
       put(state, h("span", { class: `badge ${now.state}` }, now.state));
-      put(buttons, renaming, actions(now, (action) => (action === "delete" ? gone() : refresh(null))));
+      put(buttons, renaming, actions(now, (action) => (action === "delete" ? leave() : refresh(null))));
       put(problem, now.error && h("p", { class: "trouble", role: "alert" }, now.error));
       if (shown) announce(`The job is ${now.state}`);
     }
@@ -68,7 +68,7 @@ export async function job(root, [id], signal) {
     const written = await showFiles(files, now, snapshot.value(), signal);
     viewer.stand(now, written);
     const place = `/v1/jobs/${now.id}/snapshots/${snapshot.value()}/manifest.json`;
-    const manifest = written ? await get(place, signal).catch((error) => gaveUp(error) ? Promise.reject(error) : { error }) : null;
+    const manifest = written ? await get(place, signal).catch((error) => isAborted(error) ? Promise.reject(error) : { error }) : null;
     await verdict.show(now, manifest, snapshot.value());
     made.show(now, manifest, place);
   };
@@ -77,23 +77,23 @@ export async function job(root, [id], signal) {
     await tiles.renew(snapshot.value());
     await results(shown ?? found);
   };
-  snapshot.listen(() => open().catch((error) => gaveUp(error) || put(problem, trouble(error))));
+  snapshot.listen(() => open().catch((error) => isAborted(error) || put(problem, trouble(error))));
   viewer.state = found.state;
   await viewer.open(snapshot.value());
   watch(refresh, signal);
 }
 
-/** The true frame rate, where the camera's times are known. */
+/** Sets the true frame rate if the camera's times are known. */
 async function camera(found, viewer, signal) {
   try {
     const { camera_fps: fps, exposure_s: exposure } = await get(`/v1/measurements/${found.measurement}`, signal);
-    viewer.player.real(exposure ? found.shape.frames / exposure : fps ? found.shape.frames * fps : null);
+    viewer.player.setTrueRate(exposure ? found.shape.frames / exposure : fps ? found.shape.frames * fps : null);
   } catch {
-    // Then there is no true speed to be told.
+    // Without the camera's times the player shows no true speed.
   }
 }
 
-/** Which snapshot is shown, where there are several. */
+/** Field that selects the snapshot of a job with several. */
 function snapshotChoice(found) {
   const { first, count } = found.snapshots;
   const input = h("input", { type: "number", id: "snapshot", min: first, max: first + count - 1, value: first });
@@ -106,7 +106,7 @@ function snapshotChoice(found) {
   return { element, value, next, listen: (call) => input.addEventListener("change", call) };
 }
 
-/** How far it is, by the planned cost: iterations are told of each tile alone, as on the form. */
+/** Progress in per cent of the planned cost, stage, time and tiles. */
 function line(now) {
   const { percent, tiles_done: done, tiles_total: total } = now.progress;
   const parts = [
@@ -122,26 +122,26 @@ function line(now) {
 const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "mosaic.npy": "Mosaic (npy)", "error.npy": "Expected error (npy)", "manifest.json": "Manifest" };
 
 const ORDER = Object.keys(NAMES);
-/** Smaller frames have no movie. */
-const LEAST_MOVIE_SIDE = 16;
+/** Smallest side in pixels of frames that can be encoded as a movie. */
+const MIN_MOVIE_SIDE = 16;
 
-/** Shows the files of a snapshot, and all of the job's once it has ended well; true if they are written. */
+/** Shows the downloads of a snapshot, and those of the whole job once it has succeeded; true if the snapshot's files are written. */
 async function showFiles(element, { id, state, shape, snapshots: { count } }, snapshot, signal) {
   const { ready, files } = await get(`/v1/jobs/${id}/snapshots/${snapshot}`, signal);
   const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
   const whole = files.filter((file) => !file.name.includes("/")).sort((one, other) => ORDER.indexOf(one.name) - ORDER.indexOf(other.name));
   const single = files.filter((file) => file.name.includes("/"));
   element.hidden = !ready;
-  // Made as they are read: their sizes are not known beforehand.
+  // These files are generated during the download, so their sizes are unknown.
   const made = (href, text) => h("a", { class: "button small", href, download: true }, text);
-  const moves = Math.min(shape.height, shape.width) >= LEAST_MOVIE_SIDE;
+  const moves = Math.min(shape.height, shape.width) >= MIN_MOVIE_SIDE;
   const stack = whole.find((file) => file.name === "stack.exr")?.href;
   put(element, h("b", null, "Download"), whole.map((file) => link(file, file.name === "stack.exr")),
     stack && whole.some((file) => file.name === "error.npy") && made(`${stack}?layers=sigma`, "EXR stack with expected error"),
     stack && made(stack.replace(/exr$/, "tif"), "TIFF stack"),
     stack && moves && movieLink(`/v1/jobs/${id}/snapshots/${snapshot}/movie.mp4`, "Movie", signal),
-    stack && moves && count > 1 && state === "succeeded" && movieLink(`/v1/jobs/${id}/sequence/movie.mp4`, "Movie of all", signal),
-    stack && state === "succeeded" && made(stack.replace(/snapshots\/.*/, "results.zip"), "All as ZIP"),
+    stack && moves && count > 1 && state === "succeeded" && movieLink(`/v1/jobs/${id}/sequence/movie.mp4`, "Movie of all snapshots", signal),
+    stack && state === "succeeded" && made(stack.replace(/snapshots\/.*/, "results.zip"), "All files as ZIP"),
     h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;
 }

@@ -1,4 +1,4 @@
-// The list of jobs: newest first, as many as there are, filtered by the service.
+// The list of jobs, newest first. The service filters it; pages are loaded while the user scrolls.
 
 import { announce, h, place, put, say } from "./dom.js";
 import { cancelAll, removeAll, actions } from "./actions.js";
@@ -10,12 +10,12 @@ import { watch } from "./live.js";
 import { welcome } from "./welcome.js";
 
 const PAGE = 100;
-/** Changed jobs that are asked for one by one; more of them are cheaper as a page. */
-const SOME = 8;
-/** Time after which places in the queue are looked at again though no waiting job has changed. */
-const STALE = 10_000;
-/** Jobs that can be compared at once. */
-const MOST = 4;
+/** Largest number of changed jobs that are read one by one; a page is cheaper for more. */
+const MAX_SINGLE_READS = 8;
+/** Milliseconds after which positions in the queue are read again even if no queued job has changed. */
+const STALE_MS = 10_000;
+/** Largest number of jobs in a comparison. */
+const MAX_COMPARED = 4;
 
 export async function jobs(root, [query], signal) {
   const chosen = new Set();
@@ -23,7 +23,7 @@ export async function jobs(root, [query], signal) {
   const filter = filters(query, () => refilter());
   const count = h("span", { class: "muted", id: "count" });
   const empty = h("div", { hidden: true });
-  const picked = h("div", { class: "bar picked", role: "region", "aria-label": "Chosen jobs", hidden: true });
+  const picked = h("div", { class: "bar picked", role: "region", "aria-label": "Selected jobs", hidden: true });
   root.className = "fill";
   const scroller = h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Jobs, newest first" });
   const rows = table("Jobs", columns(chosen, () => choose(), () => look(null)), scroller, rowHeight);
@@ -31,7 +31,7 @@ export async function jobs(root, [query], signal) {
   root.append(bar, picked, scroller);
   scroller.append(rows.element, empty);
 
-  /** What can be done with the chosen ones. */
+  /** Shows the actions for the selected jobs. */
   function choose() {
     const found = list.items.filter((job) => chosen.has(job.id));
     const ended = found.filter((job) => ["succeeded", "failed", "cancelled"].includes(job.state));
@@ -41,13 +41,13 @@ export async function jobs(root, [query], signal) {
       none();
       look(null);
     };
-    put(picked, h("b", null, `${found.length} chosen`),
-      found.length >= 2 && found.length <= MOST && h("a", { class: "button small", id: "compare", href: `#/compare/${found.map((job) => job.id).reverse().join("/")}` }, "Compare"),
-      found.length > MOST && h("span", { class: "muted" }, `(up to ${MOST} can be compared)`),
+    put(picked, h("b", null, `${found.length} selected`),
+      found.length >= 2 && found.length <= MAX_COMPARED && h("a", { class: "button small", id: "compare", href: `#/compare/${found.map((job) => job.id).reverse().join("/")}` }, "Compare"),
+      found.length > MAX_COMPARED && h("span", { class: "muted" }, `(up to ${MAX_COMPARED} can be compared)`),
       live.length > 0 && h("button", { type: "button", class: "small writes", id: "cancel-all", onclick: () => cancelAll(live).then(after) }, `Cancel ${live.length}`),
-      ended.length > 0 && h("button", { type: "button", class: "small delete writes", id: "delete-all", onclick: () => removeAll(ended).then((gone) => gone && after()) }, `Delete ${ended.length}`),
-      h("button", { type: "button", class: "small", onclick: () => all() }, "Choose all loaded"),
-      h("button", { type: "button", class: "small", onclick: () => none() }, "Choose none"));
+      ended.length > 0 && h("button", { type: "button", class: "small delete writes", id: "delete-all", onclick: () => removeAll(ended).then((deleted) => deleted && after()) }, `Delete ${ended.length}`),
+      h("button", { type: "button", class: "small", onclick: () => all() }, "Select all loaded"),
+      h("button", { type: "button", class: "small", onclick: () => none() }, "Clear the selection"));
   }
 
   function all() {
@@ -74,7 +74,7 @@ export async function jobs(root, [query], signal) {
     bar.hidden = first;
     if (empty.hidden === nothing) {
       empty.hidden = !nothing;
-      put(empty, nothing && (first ? welcome() : h("p", { class: "note" }, "No job fits. ", h("a", { href: "#/jobs" }, "All jobs"))));
+      put(empty, nothing && (first ? welcome() : h("p", { class: "note" }, "No matching jobs. ", h("a", { href: "#/jobs" }, "All jobs"))));
     }
     if (!picked.hidden) choose();
     if (!list.complete && last + PAGE / 2 > list.items.length) list.more().then((more) => more && draw());
@@ -104,12 +104,12 @@ export async function jobs(root, [query], signal) {
   const look = watch(refresh, signal);
 }
 
-/** The height of a row as the style sheet has it. */
+/** Height of a row in pixels, as in the style sheet. */
 function rowHeight() {
   return matchMedia("(max-width: 720px)").matches ? 96 : 60;
 }
 
-/** The jobs that are loaded: a growing beginning of the filtered list. */
+/** The loaded jobs: the first pages of the filtered list. */
 class JobList {
   constructor(signal) {
     this.signal = signal;
@@ -130,15 +130,15 @@ class JobList {
     if (cursor) query.set("cursor", cursor);
     const asked = this.query;
     const page = await get(`/v1/jobs?${query}`, this.signal);
-    // The filter may have changed meanwhile.
+    // Drop the page if the filter has changed during the request.
     return asked === this.query ? page : null;
   }
 
-  /** Reads a few changed jobs again; false if the list may have other rows now, or is old. */
+  /** Reads a few changed jobs again; false if the whole list must be read instead. */
   async some(ids) {
     const filtered = this.query.has("state") || this.query.has("search");
     const rows = [...ids].map((id) => this.items.findIndex((job) => job.id === id));
-    if (filtered || ids.size > SOME || rows.includes(-1) || Date.now() - this.read > STALE) return false;
+    if (filtered || ids.size > MAX_SINGLE_READS || rows.includes(-1) || Date.now() - this.read > STALE_MS) return false;
     const asked = this.query;
     const found = await Promise.all([...ids].map((id) => get(`/v1/jobs/${id}`, this.signal)));
     if (asked === this.query) {
@@ -148,7 +148,7 @@ class JobList {
     return true;
   }
 
-  /** Reads the first page again, and the one with the row `first` if that is another one. */
+  /** Reads the first page again, and the page with row `first` if that is another one. */
   async refresh(first) {
     this.read = Date.now();
     this.take(null, await this.page(null));
@@ -158,7 +158,7 @@ class JobList {
     }
   }
 
-  /** Reads on at the end; true if there was more. */
+  /** Loads the next page; true if there was one. */
   async more() {
     if (this.complete || this.loading || this.items.length === 0) return false;
     const cursor = this.items.at(-1).id;
@@ -172,7 +172,7 @@ class JobList {
     }
   }
 
-  /** Puts a page in the place of what is known of its range: identifiers fall from top to bottom. */
+  /** Replaces the range of a page. Identifiers descend from top to bottom. */
   take(after, page) {
     if (!page) return;
     const last = page.next_cursor;
@@ -186,7 +186,7 @@ class JobList {
 
 function columns(chosen, choose, done) {
   return [
-    { title: h("span", { class: "unseen" }, "Choose"), class: "pick", fill: (cell, job) => pick(cell, job, chosen, choose) },
+    { title: h("span", { class: "unseen" }, "Select"), class: "pick", fill: (cell, job) => pick(cell, job, chosen, choose) },
     { title: h("span", { class: "unseen" }, "Picture"), class: "thumb", fill: thumb },
     { title: "Job", class: "name", fill: name },
     { title: "State", class: "state", fill: state },
@@ -204,10 +204,10 @@ function pick(cell, job, chosen, choose) {
     else chosen.delete(job.id);
     choose();
   };
-  cell.append(h("input", { type: "checkbox", "aria-label": `Choose ${nameOf(job)}`, value: job.id, checked: chosen.has(job.id), onchange: toggle }));
+  cell.append(h("input", { type: "checkbox", "aria-label": `Select ${nameOf(job)}`, value: job.id, checked: chosen.has(job.id), onchange: toggle }));
 }
 
-/** The middle frame, as soon as there is something of it: a preview, tiles, or all. */
+/** Thumbnail of the middle frame: a preview, then tiles, then the result. */
 function thumb(cell, job, before) {
   const { previews_done: previews, tiles_done: tiles, snapshots_done: snapshots } = job.progress;
   const version = snapshots > 0 ? "done" : tiles > 0 ? "tiles" : previews > 0 ? "preview" : "";
@@ -239,14 +239,14 @@ function state(cell, job, before) {
   say(cell.lastChild, [bar && `${Math.floor(job.progress.percent)} %`, bar && stageOf(job), timeOf(job)].filter(Boolean).join(" · "));
 }
 
-/** What the checks of measurement and calibration found, and how good the frames are expected to be. */
+/** Number of findings, and the expected PSNR. */
 function checks(cell, job, before) {
   if (before && !before.assessment === !job.assessment) return;
   const found = doubts(job);
-  const told = job.assessment;
+  const assessment = job.assessment;
   put(cell, found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text));
-  if (!found && !told) put(cell, h("span", { class: "mark fine" }, "no findings"));
-  if (told) cell.append(h("span", { class: `sub grade ${told.grade}`, title: `Expected PSNR ${told.psnr_low_db} to ${told.psnr_high_db} dB` }, `about ${told.psnr_db.toFixed(0)} dB`));
+  if (!found && !assessment) put(cell, h("span", { class: "mark fine" }, "no findings"));
+  if (assessment) cell.append(h("span", { class: `sub grade ${assessment.grade}`, title: `Expected PSNR ${assessment.psnr_low_db} to ${assessment.psnr_high_db} dB` }, `about ${assessment.psnr_db.toFixed(0)} dB`));
 }
 
 function created(cell, job) {

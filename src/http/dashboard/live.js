@@ -1,19 +1,18 @@
-// What changes on the service: by events where they can be held, else by asking every few seconds.
+// Changes on the service, by server-sent events or, if these fail, by polling.
 //
-// A tab that nobody looks at holds no connection: browsers have few of them for one server.
+// A hidden tab holds no connection, because browsers allow only a few per server.
 
 import { say } from "./dom.js";
 import { moment } from "./format.js";
-import { ask, forbidden, gaveUp, unanswered } from "./api.js";
+import { ask, forbidden, isAborted, isUnreachable } from "./api.js";
 
-const POLL = 2000;
-const RETRY = 5000;
+const POLL_MS = 2000;
+const RETRY_MS = 5000;
 
 /**
- * Calls `changed(ids)` when jobs change, with their identifiers or null for "look at all", until the
- * signal. `changed` may return a promise; it is not called again before that is settled, so that an
- * old answer never comes after a new one. Returns a function that asks for a call, with identifiers
- * or null.
+ * Calls `changed(ids)` with the identifiers of changed jobs, or with null for "all", until the signal.
+ * If `changed` returns a promise, the next call waits for it, so that an old answer never arrives after
+ * a new one. Returns a function that requests a call with identifiers or null.
  */
 export function watch(changed, signal) {
   const pending = { all: true, ids: new Set(), busy: false };
@@ -26,29 +25,29 @@ export function watch(changed, signal) {
       link(true);
     } catch (error) {
       trouble(error);
-      // What was to be read is not known: everything is looked at again, but not at once.
+      // The failed identifiers are lost, so read everything again after a pause.
       pending.all = true;
-      await pause(POLL, signal);
+      await pause(POLL_MS, signal);
     }
     pending.busy = false;
     run();
   };
-  const tell = (ids) => {
+  const notify = (ids) => {
     if (ids) ids.forEach((id) => pending.ids.add(id));
     else pending.all = true;
     run();
   };
   run();
-  listen(tell, signal);
-  return tell;
+  listen(notify, signal);
+  return notify;
 }
 
-/** Holds events while the tab is seen; polls while they can't be held. */
-async function listen(tell, signal) {
+/** Listens to events while the tab is visible; polls after a failure. */
+async function listen(notify, signal) {
   while (!signal.aborted) {
     if (document.hidden) {
       await seen(signal);
-      tell(null);
+      notify(null);
     }
     const held = new AbortController();
     const leave = () => document.hidden && held.abort();
@@ -56,12 +55,12 @@ async function listen(tell, signal) {
     document.addEventListener("visibilitychange", leave);
     signal.addEventListener("abort", end);
     try {
-      await stream(tell, held.signal);
+      await stream(notify, held.signal);
     } catch {
-      // Not to be had now: poll for a while, then try again.
-      for (let waited = 0; waited < RETRY && !signal.aborted && !document.hidden; waited += POLL) {
-        await pause(POLL, signal);
-        tell(null);
+      // Events are unavailable: poll for a while, then try again.
+      for (let waited = 0; waited < RETRY_MS && !signal.aborted && !document.hidden; waited += POLL_MS) {
+        await pause(POLL_MS, signal);
+        notify(null);
       }
     }
     document.removeEventListener("visibilitychange", leave);
@@ -69,10 +68,10 @@ async function listen(tell, signal) {
   }
 }
 
-/** Reads server-sent events until they end. */
-async function stream(tell, signal) {
+/** Reads server-sent events; throws when they end. */
+async function stream(notify, signal) {
   const response = await ask("/v1/events", { signal, headers: { Accept: "text/event-stream" } });
-  if (!response.ok) throw new Error("no events");
+  if (!response.ok) throw new Error("the service sends no events");
   const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";
   for (;;) {
@@ -81,21 +80,21 @@ async function stream(tell, signal) {
     text += value;
     const blocks = text.split("\n\n");
     text = blocks.pop();
-    blocks.forEach((block) => event(block, tell));
+    blocks.forEach((block) => event(block, notify));
   }
 }
 
-function event(block, tell) {
+function event(block, notify) {
   const field = (name) =>
     block.split("\n").filter((line) => line.startsWith(`${name}:`)).map((line) => line.slice(name.length + 1).trim()).join("\n");
-  if (field("event") === "hello") tell(null);
+  if (field("event") === "hello") notify(null);
   if (field("event") !== "jobs") return;
   const change = JSON.parse(field("data"));
   // A deleted job leaves a gap in lists.
-  tell(change.more || change.deleted.length ? null : change.changed);
+  notify(change.more || change.deleted.length ? null : change.changed);
 }
 
-/** Calls `look` now and every `period` ms while the tab is seen, until the signal. */
+/** Calls `look` now and every `period` ms while the tab is visible, until the signal. */
 export async function every(period, look, signal) {
   while (!signal.aborted) {
     if (!document.hidden) {
@@ -134,20 +133,20 @@ function seen(signal) {
 }
 
 function trouble(error) {
-  if (gaveUp(error)) return;
-  // A refusal is an answer.
-  link(!unanswered(error));
+  if (isAborted(error)) return;
+  // An error from the service shows that it is reachable.
+  link(!isUnreachable(error));
   forbidden(error);
 }
 
 let answered = null;
 
-/** Shows whether the service answers, and since when not. */
+/** Shows whether the service is reachable, and the time of the last answer. */
 export function link(good) {
   if (good) answered = new Date();
   document.getElementById("offline").hidden = good;
-  const since = answered ? `What you see is as of ${moment(answered)}.` : "";
-  if (!good) say(document.getElementById("offline"), `The service does not answer. ${since} It is asked again every few seconds; nothing is lost.`);
+  const since = answered ? `This page shows the state at ${moment(answered)}.` : "";
+  if (!good) say(document.getElementById("offline"), `The service does not answer. ${since} Retrying every few seconds; no data is lost.`);
   const element = document.getElementById("link");
   say(element, good ? "live" : "offline");
   element.classList.toggle("lost", !good);

@@ -1,14 +1,14 @@
-// Which view an address shows. A view is a function of its root, its parameters and a signal that
-// ends when another view takes its place.
+// Router: selects the view for the URL's fragment. A view is a function of its root element, its parameters
+// and a signal that is aborted when another view replaces it.
 
-import { forbidden, gaveUp, unanswered } from "./api.js";
+import { forbidden, isAborted, isUnreachable } from "./api.js";
 import { h, put, trouble } from "./dom.js";
 import { jobs } from "./jobs.js";
 import { link } from "./live.js";
 import { account, nameplate, signIn } from "./signin.js";
 
 const ID = "([0-9a-f-]{36})";
-const AGAIN = 3000;
+const RETRY_MS = 3000;
 const VIEWS = [
   [/^\/jobs$/, "Jobs", async () => jobs],
   [/^\/start$/, "Start", async () => (await import("./welcome.js")).start],
@@ -24,12 +24,12 @@ const VIEWS = [
 const root = document.getElementById("content");
 let current = new AbortController();
 
-/** Ends what is shown; gives the signal of what comes. */
+/** Ends the current view; returns the signal of the next one. */
 function clear() {
   current.abort();
   current = new AbortController();
   root.className = "";
-  // Out of sight as soon as the view puts something beside it.
+  // The style sheet hides the heading when the view adds content.
   put(root, h("h1", { class: "loading" }, "Loading …"));
   root.scrollTop = 0;
   return current.signal;
@@ -41,7 +41,7 @@ async function show() {
   const found = VIEWS.map(([pattern, title, load]) => ({ match: pattern.exec(path), title, load })).find((view) => view.match);
   mark(path);
   if (!found) {
-    put(root, h("h1", null, "There is no such page"), h("p", null, h("a", { href: "#/jobs" }, "All jobs")));
+    put(root, h("h1", null, "Page not found"), h("p", null, h("a", { href: "#/jobs" }, "All jobs")));
     return;
   }
   document.title = `${found.title} – sci-recon`;
@@ -51,31 +51,31 @@ async function show() {
     await view(root, [...found.match.slice(1), new URLSearchParams(query)], signal);
     if (!signal.aborted) link(true);
   } catch (error) {
-    if (gaveUp(error) || signal.aborted) return;
-    if (unanswered(error)) silent(signal);
+    if (isAborted(error) || signal.aborted) return;
+    if (isUnreachable(error)) silent(signal);
     else if (error.status === 404) missing(error);
     else if (!forbidden(error) && error.status !== 401) root.append(trouble(error));
   }
 }
 
-/** Nothing could be read: it is tried again until something can. */
+/** Shows that the service is unreachable, and retries. */
 function silent(signal) {
   link(false);
-  // The page itself says it.
+  // This view replaces the banner.
   document.getElementById("offline").hidden = true;
   put(root, h("div", { class: "card gate" }, h("h1", null, "The service does not answer"),
-    h("p", null, "It may be starting, or the network is down. Jobs go on without this page."),
+    h("p", null, "It may be starting, or the network may be down. Jobs continue in the meantime."),
     h("div", { class: "row" }, h("button", { type: "button", class: "primary", onclick: show }, "Try again"))));
-  const timer = setTimeout(show, AGAIN);
+  const timer = setTimeout(show, RETRY_MS);
   signal.addEventListener("abort", () => clearTimeout(timer));
 }
 
 function missing(error) {
   clear();
-  put(root, h("div", { class: "card gate" }, h("h1", null, "This is not here"), h("p", null, error.message), h("p", null, h("a", { href: "#/jobs" }, "All jobs"))));
+  put(root, h("div", { class: "card gate" }, h("h1", null, "Not found"), h("p", null, error.message), h("p", null, h("a", { href: "#/jobs" }, "All jobs"))));
 }
 
-/** Marks the entry of the menu that the view belongs to. */
+/** Marks the menu entry of the current view. */
 function mark(path) {
   for (const entry of document.querySelectorAll("#nav a")) {
     const here = path.startsWith(entry.getAttribute("href").slice(1));
@@ -85,7 +85,7 @@ function mark(path) {
 }
 
 addEventListener("signed-out", () => {
-  // Told once, however many requests were refused: what is being typed stays.
+  // Several requests may fail at once. Show the form only once, so that typed text is kept.
   if (document.body.classList.contains("outside")) return;
   clear();
   root.className = "gated";
@@ -99,9 +99,9 @@ addEventListener("signed-out", () => {
 addEventListener("forbidden", ({ detail }) => {
   clear();
   document.title = "Not allowed – sci-recon";
-  put(root, h("div", { class: "card gate" }, h("h1", null, "Your role does not allow this"), h("p", null, `The service says: ${detail}.`),
-    h("p", null, "Ask who runs the service for a token with that role, or sign in with another one."),
-    h("div", { class: "row" }, h("a", { class: "button", href: "#/jobs" }, "All jobs"), h("a", { class: "button", href: "#/account" }, "What I may do"))));
+  put(root, h("div", { class: "card gate" }, h("h1", null, "Your role does not allow this"), h("p", null, `Reason: ${detail}.`),
+    h("p", null, "Ask the administrator for a token with that role, or sign in with another token."),
+    h("div", { class: "row" }, h("a", { class: "button", href: "#/jobs" }, "All jobs"), h("a", { class: "button", href: "#/account" }, "My account"))));
 });
 
 function enter() {
@@ -110,7 +110,7 @@ function enter() {
 }
 
 document.getElementById("skip").addEventListener("click", (event) => {
-  // The address after # names the view.
+  // The fragment names the view, so the link must not change it.
   event.preventDefault();
   root.focus();
 });

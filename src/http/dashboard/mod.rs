@@ -1,8 +1,7 @@
-//! The dashboard: pages for people, carried by the binary and answered compressed.
+//! The dashboard: a web page embedded in the program and sent compressed.
 //!
-//! Plain HTML, CSS and JavaScript modules that use the API like any other client. Nothing comes from
-//! another server and nothing runs that is not one of these files: the policy below says so to the
-//! browser.
+//! It consists of plain HTML, CSS and JavaScript modules that use the API like any other client. The
+//! content security policy below forbids scripts and requests from other servers.
 
 use std::io::Write;
 use std::sync::LazyLock;
@@ -17,7 +16,7 @@ use super::error::{ApiError, Code, Result};
 use super::extract::Params;
 use engine::job::Sha256;
 
-/// What the browser may load and run: our own files, and pictures that a module has fetched.
+/// Content security policy: the browser may load our files, and images that a module has fetched.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
      img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
@@ -50,16 +49,16 @@ const FILES: &[(&str, &[u8])] = &files![
     "format.js",
     "job.js",
     "jobs.js",
-    "keeping.js",
     "live.js",
-    "made.js",
     "movie.js",
     "pane.js",
     "player.js",
+    "provenance.js",
     "report.js",
     "rows.js",
     "signin.js",
     "slice.js",
+    "storage.js",
     "submit.js",
     "system.js",
     "thumb.js",
@@ -94,7 +93,7 @@ static ASSETS: LazyLock<Vec<Asset>> = LazyLock::new(|| FILES.iter().map(asset).c
 
 fn asset(&(name, bytes): &(&'static str, &[u8])) -> Asset {
     let plain = Representation::new(bytes.to_vec());
-    // Writing into memory does not fail; if it did, the file would be sent as it is.
+    // Writing to memory does not fail. If it did, the file would be sent uncompressed.
     let packed = pack(bytes).unwrap_or_else(|_| bytes.to_vec());
     Asset { name, plain, packed: Representation::new(packed) }
 }
@@ -115,7 +114,7 @@ pub(super) async fn file(Params(name): Params<String>, headers: HeaderMap) -> Re
 
 fn send(name: &str, headers: &HeaderMap) -> Result<Response> {
     let asset = ASSETS.iter().find(|asset| asset.name == name).ok_or_else(|| {
-        ApiError::new(Code::NotFound, "the dashboard has no file of this name; it begins at /")
+        ApiError::new(Code::NotFound, "the dashboard has no file with this name; open / instead")
     })?;
     let gzip = takes_gzip(headers);
     let file = if gzip { &asset.packed } else { &asset.plain };
@@ -129,8 +128,7 @@ fn send(name: &str, headers: &HeaderMap) -> Result<Response> {
         fields.insert(name, HeaderValue::from_static(value));
     };
     set(header::CONTENT_TYPE, media_type(name));
-    // Asked for again each time, and answered in a few bytes if nothing has changed: after an
-    // update of the service nobody sees a mixture of old and new modules.
+    // The browser revalidates every file, so it never mixes old and new modules after an update.
     set(header::CACHE_CONTROL, "no-cache");
     set(header::VARY, "accept-encoding");
     set(header::CONTENT_SECURITY_POLICY, POLICY);
@@ -171,7 +169,7 @@ mod tests {
     use axum::http::HeaderMap;
 
     #[test]
-    fn every_module_that_is_imported_is_served_and_every_file_is_listed() {
+    fn imported_modules_are_served_and_all_files_are_listed() {
         let names: Vec<&str> = FILES.iter().map(|(name, _)| *name).collect();
         for (name, bytes) in FILES {
             let text = std::str::from_utf8(bytes).unwrap();
@@ -179,7 +177,7 @@ mod tests {
                 let import = import.split('"').next().unwrap();
                 assert!(names.contains(&import), "{name} imports {import}");
             }
-            // Below a path of a proxy, an absolute address would lead elsewhere.
+            // An absolute address would fail behind a proxy that adds a path prefix.
             assert!(!text.contains("\"/dashboard/") && !text.contains("fetch(\"/"), "{name}");
             for path in text.split("\"dashboard/").skip(1) {
                 let path = path.split('"').next().unwrap();
@@ -194,24 +192,24 @@ mod tests {
     }
 
     #[test]
-    fn text_of_users_never_becomes_markup() {
+    fn no_module_writes_markup_from_strings() {
         for (name, bytes) in FILES.iter().filter(|(name, _)| name.ends_with(".js")) {
             let text = std::str::from_utf8(bytes).unwrap();
             for forbidden in ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write"] {
                 assert!(!text.contains(forbidden), "{name} uses {forbidden}");
             }
-            assert!(text.lines().count() < 400, "{name} wants to be two modules");
+            assert!(text.lines().count() < 400, "{name} has too many lines: split it");
         }
     }
 
     #[test]
-    fn all_files_together_are_small_when_packed() {
+    fn the_compressed_files_stay_below_the_size_limit() {
         let bytes: usize = ASSETS.iter().map(|asset| asset.packed.bytes.len()).sum();
         assert!(bytes < 150_000, "{bytes} bytes");
     }
 
     #[test]
-    fn gzip_is_sent_to_those_who_take_it() {
+    fn gzip_is_sent_only_to_clients_that_accept_it() {
         let takes = |value: &str| {
             takes_gzip(&HeaderMap::from_iter([(
                 "accept-encoding".parse().unwrap(),

@@ -1,15 +1,16 @@
-// A canvas that shows a picture of any size by the tiles that are in sight.
+// A canvas that shows an image of any size, and loads only the visible tiles.
 
 import { h, say } from "./dom.js";
-import { gaveUp, picture } from "./api.js";
+import { isAborted, picture } from "./api.js";
 import { steer } from "./view.js";
 
-const HELD = 500;
+/** Largest number of tiles in the cache, which drops the least recently used. */
+const MAX_TILES = 500;
 const tiles = new Map();
 let waiting = [];
 let busy = 0;
 
-/** A tile's bitmap if it is here; else it is asked for, and `ready` is called when it has come. */
+/** Cached bitmap of a tile. If there is none, requests it and calls `ready` when it is loaded. */
 function tile(url, generation, ready) {
   const key = `${generation} ${url}`;
   const found = tiles.get(key);
@@ -27,7 +28,7 @@ function tile(url, generation, ready) {
   return null;
 }
 
-/** A few at a time, the latest first: who has scrolled on does not wait for what is out of sight. */
+/** Loads six tiles at a time, the latest request first, so that visible tiles precede those scrolled past. */
 function pump() {
   while (busy < 6 && waiting.length > 0) {
     busy += 1;
@@ -43,13 +44,13 @@ async function fetchTile(url, key, entry) {
   try {
     entry.bitmap = await picture(url);
   } catch (error) {
-    // Asked for again at the next drawing, if it is still in sight.
+    // The next drawing requests the tile again if it is still visible.
     tiles.delete(key);
-    if (!gaveUp(error) && error.status !== 404) console.warn(error.message);
+    if (!isAborted(error) && error.status !== 404) console.warn(error.message);
     return;
   }
   for (const [oldest, held] of tiles) {
-    if (tiles.size <= HELD) break;
+    if (tiles.size <= MAX_TILES) break;
     tiles.delete(oldest);
     held.bitmap?.close();
   }
@@ -61,7 +62,7 @@ function url({ base, black, white }, { level, row, column }) {
 }
 
 export class Pane {
-  /** A pane with a title; `view` is where it looks. */
+  /** Creates a pane with a title; `view` holds its position and zoom. */
   constructor(title, view, signal) {
     this.view = view;
     this.title = h("span", null, title);
@@ -86,34 +87,34 @@ export class Pane {
     steer(this.canvas, view, this, signal);
   }
 
-  /** Shows `{base, levels, tile, label}` with a window of contrast. */
+  /** Shows the source `{base, levels, tile, label}` with a contrast window. */
   show(source, black, white) {
     this.source = source && { ...source, black, white };
     if (source) this.canvas.setAttribute("aria-label", source.label);
     this.redraw();
   }
 
-  /** Lays a second picture over the first, right of a share of the width (a wipe) or as a difference; null for none. */
+  /** Overlays a second image as a wipe, right of a fraction of the width, or as a difference; null removes it. */
   lay(over) {
     this.over = over;
     this.moved = true;
     this.redraw();
   }
 
-  /** Marks the picture as what it is: a preview, say. */
+  /** Shows a badge on the image, such as "Preview"; an empty text hides it. */
   brand(text, kind = "") {
     this.badge.hidden = !text;
     this.badge.className = `onpicture ${kind}`;
     say(this.badge, text);
   }
 
-  /** Says why there is nothing to see. */
-  tell(text) {
+  /** Shows a note in place of the image; an empty text hides it. */
+  setNote(text) {
     this.note.hidden = !text;
     say(this.note, text);
   }
 
-  /** What was shown has changed on the service. */
+  /** Discards the cached tiles, because the image has changed on the service. */
   renew() {
     this.generation += 1;
     this.redraw();
@@ -129,7 +130,7 @@ export class Pane {
     this.redraw();
   }
 
-  /** Zoom, and the picture's coordinates at the left and upper border. */
+  /** Zoom, and image coordinates of the left and upper border. */
   place() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const { view } = this;
@@ -155,7 +156,7 @@ export class Pane {
     const by = zoom * scale;
     context.imageSmoothingEnabled = by < 2;
     const target = (x, y, width, height) => {
-      // Rounded to whole pixels, so that neighbours touch.
+      // Round to whole pixels, so that adjacent tiles have no gap.
       const [x0, y0] = [Math.round((x - left) * by), Math.round((y - top) * by)];
       return [x0, y0, Math.round((x + width - left) * by) - x0, Math.round((y + height - top) * by) - y0];
     };
@@ -179,7 +180,7 @@ export class Pane {
     } else {
       context.globalCompositeOperation = "difference";
       this.paint(context, source, target);
-      // Added to itself, it is twice as bright.
+      // Each addition of the canvas to itself doubles the brightness.
       context.globalCompositeOperation = "lighter";
       for (let bright = 1; bright < gain; bright *= 2) context.drawImage(this.canvas, 0, 0);
     }
@@ -201,7 +202,7 @@ export class Pane {
     }
   }
 
-  /** What is known of a missing tile from a coarser level. */
+  /** Draws a missing tile from a coarser level. */
   coarser(context, source, at, target) {
     const size = this.source.tile;
     for (let up = 1; at.level + up <= this.source.levels; up += 1) {
@@ -219,7 +220,7 @@ export class Pane {
     }
   }
 
-  /** The tiles that the pane needs at its zoom. */
+  /** Visible tiles at the current zoom. */
   inSight() {
     const { zoom, left, top } = this.place();
     const scale = this.canvas.width / (this.canvas.clientWidth || 1);
@@ -235,7 +236,7 @@ export class Pane {
     return found;
   }
 
-  /** Asks for the tiles in sight of another picture before it is shown; says whether all are here. */
+  /** Requests the visible tiles of an image before it is shown; true if all are loaded. */
   prepare(source, black, white) {
     if (!this.source) return true;
     const wanted = { ...source, black, white };

@@ -1,36 +1,36 @@
-// Which frame is shown: slider, play at any rate, keys.
+// Selects the frame: slider, playback at any rate, keys.
 
 import { figure } from "./format.js";
 import { h, put, say } from "./dom.js";
 
-/** Frames a second, beyond which no screen shows what is played. */
-const FASTEST = 240;
+/** Highest playback rate in frames per second, the refresh rate of fast screens. */
+const MAX_RATE = 240;
 
-/** A player of `count` frames; `show(frame)` is called with 1 to `count`. */
+/** Player of `count` frames; calls `show(frame)` with 1 to `count`. */
 export class Player {
   constructor(count, signal, show) {
     Object.assign(this, { count, show, frame: 1, playing: false, ahead: () => true, onward: () => false });
     this.slider = h("input", { type: "range", id: "frame", min: 1, max: count, value: 1, "aria-label": "Frame" });
     this.slider.addEventListener("input", () => this.go(Number(this.slider.value)));
     this.button = h("button", { type: "button", id: "play", "aria-pressed": "false", onclick: () => this.toggle() }, "Play");
-    this.rate = h("input", { type: "number", id: "rate", min: 0.1, max: FASTEST, step: "any", value: Math.min(12, Math.max(4, count)) });
+    this.rate = h("input", { type: "number", id: "rate", min: 0.1, max: MAX_RATE, step: "any", value: Math.min(12, Math.max(4, count)) });
     this.rate.addEventListener("input", () => this.pace());
     this.text = h("output", { for: "frame", class: "count" });
     this.loop = h("input", { type: "checkbox", id: "loop", checked: true });
     this.slow = h("span", { class: "muted" });
-    this.true = h("button", { type: "button", class: "small", hidden: true, onclick: () => this.trueSpeed() }, "True speed");
+    this.trueButton = h("button", { type: "button", class: "small", hidden: true, onclick: () => this.trueSpeed() }, "True speed");
     this.element = h("div", { class: "player" },
-      h("div", { class: "row" }, this.button, this.step(-1, "Frame before", "‹"), this.slider, this.step(1, "Next frame", "›"), this.text),
-      h("div", { class: "row" }, h("label", { for: "rate", class: "row muted" }, this.rate, "frames/s"), this.true, this.slow,
+      h("div", { class: "row" }, this.button, this.step(-1, "Previous frame", "‹"), this.slider, this.step(1, "Next frame", "›"), this.text),
+      h("div", { class: "row" }, h("label", { for: "rate", class: "row muted" }, this.rate, "frames/s"), this.trueButton, this.slow,
         h("label", { for: "loop", class: "row muted" }, this.loop, "Loop")));
     signal.addEventListener("abort", () => this.stop(), { once: true });
-    this.tell();
+    this.showPosition();
   }
 
-  /** How many frames a second the scene had; null where the camera's times are not known. */
-  real(rate) {
+  /** Sets the true frame rate of the scene; null if the camera's times are unknown. */
+  setTrueRate(rate) {
     this.actual = rate;
-    this.true.hidden = rate === null || rate > FASTEST;
+    this.trueButton.hidden = rate === null || rate > MAX_RATE;
     this.pace();
   }
 
@@ -40,10 +40,10 @@ export class Player {
     this.play();
   }
 
-  /** Says how slow the motion is. */
+  /** Shows the playback speed relative to real time. */
   pace() {
     const by = this.actual / Number(this.rate.value);
-    const text = by > 1.05 ? `${figure(by, 2)} times slower than it was` : by < 0.95 ? `${figure(1 / by, 2)} times faster than it was` : "as fast as it was";
+    const text = by > 1.05 ? `${figure(by, 2)} times slower than real time` : by < 0.95 ? `${figure(1 / by, 2)} times faster than real time` : "in real time";
     say(this.slow, this.actual && Number.isFinite(by) && by > 0 ? text : "");
   }
 
@@ -53,11 +53,11 @@ export class Player {
 
   go(frame) {
     this.frame = ((frame - 1 + this.count) % this.count) + 1;
-    this.tell();
+    this.showPosition();
     this.show(this.frame);
   }
 
-  tell() {
+  showPosition() {
     this.slider.value = this.frame;
     this.slider.setAttribute("aria-valuetext", `frame ${this.frame} of ${this.count}`);
     say(this.text, `${this.frame} / ${this.count}`);
@@ -70,7 +70,7 @@ export class Player {
 
   play() {
     if (this.playing) return;
-    // From the beginning, if it stands at an end at which it would stop.
+    // At the last frame without a loop, restart from the first.
     if (!this.loop.checked && this.frame === this.count) this.go(1);
     this.playing = true;
     this.mark();
@@ -79,10 +79,10 @@ export class Player {
     this.fps = 0;
     const turn = (now) => {
       if (!this.playing) return;
-      const period = 1000 / Math.min(FASTEST, Math.max(0.1, Number(this.rate.value) || 1));
+      const period = 1000 / Math.min(MAX_RATE, Math.max(0.1, Number(this.rate.value) || 1));
       const steps = Math.floor((now - before) / period);
       if (steps >= 1) {
-        // What is asked for faster than the screen is skipped; what has not come yet is waited for.
+        // Skip frames that the screen is too slow for; wait for frames that are not loaded.
         const next = ((this.frame - 1 + steps) % this.count) + 1;
         if (this.frame - 1 + steps >= this.count && this.onward()) {
           before = now;
@@ -113,7 +113,7 @@ export class Player {
     this.button.setAttribute("aria-pressed", String(this.playing));
   }
 
-  /** Keys that work anywhere in the viewer. */
+  /** Handles keys anywhere in the viewer. */
   keys(element) {
     element.addEventListener("keydown", (event) => {
       if (event.target.matches("input, select, button, a, summary") && event.key !== "k") return;

@@ -1,10 +1,10 @@
-// The report on a calibration: grade, what is wrong and what to do, and how alike the masks are.
+// The report on a calibration: grade, findings with remedies, and correlation of the masks.
 
 import { facts, h, put, s } from "./dom.js";
 import { figure } from "./format.js";
-import { gaveUp, get } from "./api.js";
+import { isAborted, get } from "./api.js";
 
-/** What a check found, each with what to do about it; null where there is nothing. */
+/** List of findings with their remedies; null if there are none. */
 export function findings(found) {
   if (!found?.length) return null;
   const about = (item) => (item.snapshot !== undefined && item.snapshot !== null ? `Snapshot ${item.snapshot}: ` : "");
@@ -13,7 +13,7 @@ export function findings(found) {
     item.remedy && h("p", null, h("b", null, "What to do: "), item.remedy))));
 }
 
-/** The grade of a calibration, when it is known; in a list it is asked for when it comes into sight. */
+/** Grade of a calibration, loaded when the element becomes visible. */
 export function grade(id, signal) {
   const element = h("span", { class: "grade" }, " ");
   const ask = async () => {
@@ -22,7 +22,7 @@ export function grade(id, signal) {
       element.classList.add(found);
       put(element, found, reasons.length > 0 && h("span", { class: "muted" }, ` ${reasons.length} ${reasons.length === 1 ? "finding" : "findings"}`));
     } catch (error) {
-      if (!gaveUp(error)) put(element, h("span", { class: "muted" }, error.code === "not_ready" ? "not graded yet" : "no grade"));
+      if (!isAborted(error)) put(element, h("span", { class: "muted" }, error.code === "not_ready" ? "not graded yet" : "no grade"));
     }
   };
   const watch = new IntersectionObserver((entries) => {
@@ -35,11 +35,11 @@ export function grade(id, signal) {
   return element;
 }
 
-/** A card with the report, as soon as there is one. */
+/** Card with the report, which is loaded when it exists. */
 export function report(item, signal) {
   const body = h("div", null, h("p", { class: "muted" }, "…"));
   const element = h("section", { class: "card", "aria-label": "Report" },
-    h("h2", { class: "row" }, "Are the masks good?", h("span", { class: "grow" }), h("a", { href: `/v1/calibrations/${item.id}/report.html`, target: "_blank", rel: "noopener" }, "To print (new tab)")), body);
+    h("h2", { class: "row" }, "Are the masks good?", h("span", { class: "grow" }), h("a", { href: `/v1/calibrations/${item.id}/report.html`, target: "_blank", rel: "noopener" }, "Printable version (new tab)")), body);
   load(item, body, signal);
   return element;
 }
@@ -50,7 +50,7 @@ async function load(item, body, signal) {
   } catch (error) {
     if (signal.aborted) return;
     put(body, h("p", { class: "muted" }, error.message));
-    // A worker is making it.
+    // A worker is computing the report.
     if (error.code === "not_ready") setTimeout(() => signal.aborted || load(item, body, signal), 2000);
   }
 }
@@ -59,35 +59,35 @@ function show(body, found) {
   const { masks, captures } = found;
   put(body,
     h("p", { class: `judgement ${found.grade}` }, found.grade[0].toUpperCase() + found.grade.slice(1)),
-    findings(found.findings) ?? h("p", { class: "muted" }, "Nothing is wrong with them."),
+    findings(found.findings) ?? h("p", { class: "muted" }, "No problems found."),
     h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)),
     masks.correlation_mean !== null && h("p", { class: "muted" }, meaning(masks)),
     h("details", null, h("summary", null, "All figures"), facts([
-      ["Deviation over the frames", figure(masks.deviation)],
+      ["Standard deviation over the frames", figure(masks.deviation)],
       ["1st to 99th percentile", `${figure(masks.percentile_1)} to ${figure(masks.percentile_99)}`],
       ["Gram diagonal", `${figure(masks.gram[0])} to ${figure(masks.gram[2])}, mean ${figure(masks.gram[1])}`],
       ["Pixels open in all masks", masks.stuck_pixels],
       ["Values at 0", masks.values_at_zero],
-      masks.correlation_mean !== null && ["Correlation of two masks", `${figure(masks.correlation_mean)} in the mean, ${figure(masks.correlation_largest)} at most`],
+      masks.correlation_mean !== null && ["Correlation of two masks", `mean ${figure(masks.correlation_mean)}, maximum ${figure(masks.correlation_largest)}`],
       captures && ["Light throughput", figure(captures.light_throughput)],
       captures && ["Noise of a mask value", figure(captures.noise)],
       captures && ["Dynamic range", captures.dynamic_range_db === null ? "–" : `${figure(captures.dynamic_range_db)} dB`],
-      captures && ["Evenness of the light", figure(captures.illumination_flatness)],
+      captures && ["Evenness of the illumination", figure(captures.illumination_flatness)],
     ])));
 }
 
-/** What the matrix says, for who has never seen one. */
+/** Explanation of the matrix for newcomers. */
 function meaning({ correlation_largest: largest }) {
-  return `Each cell tells how alike two masks are: empty for not at all, full for the same. The diagonal is each mask with itself; all else should be pale. The most alike two are at ${figure(largest)}.`;
+  return `Each cell shows the correlation of two masks, from 0 (empty) to 1 (full). The diagonal is each mask with itself; all other cells should be pale. The largest correlation is ${figure(largest)}.`;
 }
 
-/** The correlation of every two masks: grey at 0, blue above, orange below. */
+/** Correlation matrix of the masks: blue above 0, orange below. */
 function matrix(values) {
   const count = values.length;
   const cell = (value, row, column) => s("rect", {
     x: column, y: row, width: 1.02, height: 1.02, class: value < 0 ? "less" : "more", "fill-opacity": Math.min(1, Math.abs(value)).toFixed(3),
   }, s("title", null, `masks ${row + 1} and ${column + 1}: ${figure(value)}`));
-  // Of long series a picture of the whole matrix, but no element for each of its cells.
+  // Sample long series, so that the matrix has at most 64 x 64 elements.
   const step = Math.max(1, Math.ceil(count / 64));
   const kept = values.filter((_, row) => row % step === 0).map((line) => line.filter((_, column) => column % step === 0));
   return h("figure", null, h("figcaption", { class: "muted" }, step > 1 ? `Correlation of every ${step}th mask` : "Correlation of the masks"),
@@ -95,7 +95,7 @@ function matrix(values) {
       kept.map((line, row) => line.map((value, column) => cell(value, row, column)))));
 }
 
-/** The mean of every mask. */
+/** Bar chart of the mean of each mask. */
 function bars(values) {
   const most = Math.max(...values, 1e-9);
   const [width, height] = [300, 120];

@@ -1,12 +1,13 @@
-// A table that holds only the rows in sight, so that thousands scroll like ten.
+// A table that holds only the visible rows, so that lists of thousands scroll smoothly.
 
 import { h } from "./dom.js";
 
+/** Rows that are kept above and below the visible ones. */
 const SPARE = 10;
 
 /**
- * A table with `columns` (`{title, class, fill(cell, item, before)}`) in a scroller. `show(items,
- * complete)` shows items with an `id`; rows of unchanged items are left alone.
+ * Creates a table with `columns` (`{title, class, fill(cell, item, before)}`) in a scroller. `show(items,
+ * complete)` shows items that have an `id`, and does not touch the rows of unchanged items.
  */
 export function table(caption, columns, scroller, rowHeight) {
   const head = h("tr", { role: "row" }, columns.map((column) => h("th", { scope: "col", role: "columnheader", class: column.class }, column.title)));

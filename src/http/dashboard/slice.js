@@ -1,12 +1,12 @@
-// The x–t slice: one row of the picture through all frames, time going down, in step with the zoom.
+// The x–t slice: one row of the image through all frames, with time downwards, synchronised with the zoom.
 
-import { gaveUp, picture } from "./api.js";
+import { isAborted, picture } from "./api.js";
 import { h } from "./dom.js";
 
 const TILE = 256;
 
 export class Slice {
-  /** `base()` is where the slice's picture is (null for nowhere), `window()` its contrast. */
+  /** `base()` is the URL of the slice's image, or null; `window()` is its contrast window. */
   constructor(view, frames, height, base, window, signal) {
     Object.assign(this, { view, frames, base, window, signal, cells: new Map(), frame: 1, changed: () => {} });
     this.input = h("input", { type: "range", id: "slice", min: 0, max: height - 1, value: Math.floor(height / 2), "aria-label": "Row of the x–t slice" });
@@ -28,7 +28,7 @@ export class Slice {
     return Number(this.input.value);
   }
 
-  /** Forgets what was fetched: another row, or other frames. */
+  /** Discards the loaded tiles after a change of the row or the frames. */
   renew() {
     this.cells = new Map();
     this.asked = "";
@@ -40,7 +40,7 @@ export class Slice {
     this.redraw();
   }
 
-  /** The row as a line on the picture. */
+  /** Draws the row as a line on the image. */
   mark(context, target, scale) {
     if (!this.base()) return;
     const [x, y, width] = target(0, this.row() + 0.5, this.view.width, 0);
@@ -63,7 +63,7 @@ export class Slice {
     });
   }
 
-  /** Fetches what is missing, in pieces of 256 columns at full resolution. */
+  /** Loads missing tiles of 256 columns at full resolution. */
   fetch(base, black, white, first, last) {
     const key = `${base} ${black} ${white}`;
     if (this.asked !== key) {
@@ -81,7 +81,7 @@ export class Slice {
             cells.set(at, bitmap);
             this.redraw();
           })
-          .catch((error) => !gaveUp(error) && cells.delete(at));
+          .catch((error) => !isAborted(error) && cells.delete(at));
       }
     }
   }

@@ -1,15 +1,15 @@
-// A new job in three steps: masks or captures, the measurement, the reconstruction with what it will take.
+// A new job in three steps: calibration, measurement, and reconstruction with an estimate of its cost.
 
 import { announce, calmly, facts, h, put, say } from "./dom.js";
 import { askAbout, askScale, dropZone, problem } from "./drop.js";
 import { bytes, duration, figure } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings } from "./report.js";
-import { create, gaveUp, get, send } from "./api.js";
+import { create, isAborted, get, send } from "./api.js";
 import { given, numberField, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
-const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP of pictures";
+const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
 
 export async function submit(root, [query], signal) {
   const form = { calibration: null, measurement: null };
@@ -29,7 +29,7 @@ export async function submit(root, [query], signal) {
     button.disabled = true;
     try {
       const made = await send("POST", "/v1/jobs", job.request());
-      announce("The job is accepted");
+      announce("Job submitted");
       location.hash = `#/jobs/${made.id}`;
     } catch (error) {
       put(result, problem(error));
@@ -43,7 +43,7 @@ function step(number, title, ...content) {
   return h("section", { class: "card step", "aria-label": title }, h("h2", null, h("span", { class: "stepnumber" }, number), title), content);
 }
 
-/** Buttons of which one is chosen. */
+/** A group of radio buttons. */
 function choice(name, label, options, chosen, changed) {
   const input = ([value, text]) => h("label", { class: "radio" }, h("input", { type: "radio", name, value, checked: value === chosen, onchange: () => changed(value) }), text);
   return h("fieldset", { class: "choice" }, h("legend", null, label), options.map(input));
@@ -60,9 +60,9 @@ function calibrationStep(form, known, wake, wanted, signal) {
   const name = textField("calibration-name", "Name of the calibration", "bench 3, f/8");
   const sensor = h("select", { id: "mosaic" }, SENSORS.map(([value, text]) => h("option", { value }, text)));
   const nameRow = h("div", { class: "fields" }, name.element, h("label", { for: "mosaic" }, "The sensor is", sensor));
-  const told = () => given({ name: name.value(), mosaic: sensor.value || null });
-  const parts = { known: old(known, wanted, use, signal), masks: masks(told, sensor, use, verdict, signal), captures: captures(told, use, verdict, signal) };
-  const options = [known.length > 0 && ["known", "A stored calibration"], ["masks", "Ready masks"], ["captures", "Raw captures"]].filter(Boolean);
+  const settings = () => given({ name: name.value(), mosaic: sensor.value || null });
+  const parts = { known: stored(known, wanted, use, signal), masks: masks(settings, sensor, use, verdict, signal), captures: captures(settings, use, verdict, signal) };
+  const options = [known.length > 0 && ["known", "A stored calibration"], ["masks", "Masks"], ["captures", "Raw captures"]].filter(Boolean);
   const show = (value) => {
     for (const [key, part] of Object.entries(parts)) part.element.hidden = key !== value;
     nameRow.hidden = value === "known";
@@ -76,8 +76,8 @@ function calibrationStep(form, known, wake, wanted, signal) {
   return element;
 }
 
-/** Calibrations that are here, each with a mask, its name and its grade. */
-function old(known, wanted, use, signal) {
+/** Stored calibrations, each with a mask, name and grade. */
+function stored(known, wanted, use, signal) {
   const chosen = () => known.find((item) => item.id === element.querySelector("input:checked")?.value) ?? null;
   const wake = () => use(chosen());
   const option = (item) => h("label", { class: "pickone" }, h("input", { type: "radio", name: "calibration", value: item.id, checked: item.id === wanted, onchange: wake }), ...glance(item, signal));
@@ -85,16 +85,16 @@ function old(known, wanted, use, signal) {
   return { element, wake };
 }
 
-function masks(told, sensor, use, verdict, signal) {
-  // The file that was dropped last, and what was stated of it: its full scale, its axes.
+function masks(settings, sensor, use, verdict, signal) {
+  // The file that was dropped last, with the full scale and axes stated for it.
   let last = null;
   const make = async (sha256, stated) => {
     last = [sha256, stated];
     use(null);
     put(verdict);
     try {
-      const item = await create("/v1/calibrations", { masks: sha256, ...told(), ...stated }, signal);
-      put(verdict, taken(item));
+      const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...stated }, signal);
+      put(verdict, accepted(item));
       use(item);
     } catch (error) {
       const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));
@@ -102,14 +102,14 @@ function masks(told, sensor, use, verdict, signal) {
       put(verdict, problem(error), question);
     }
   };
-  // What is stated later goes with the same file.
+  // A change of the sensor repeats the request with the same file.
   sensor.addEventListener("change", () => last && make(...last).catch((error) => put(verdict, problem(error))));
-  const drop = dropZone("masks", "Calibration set", `one mask a frame: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
+  const drop = dropZone("masks", "Calibration set", `one mask per frame: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
   return { element: drop.element };
 }
 
-function captures(told, use, verdict, signal) {
-  const button = h("button", { type: "button", class: "primary", disabled: true }, "Make the masks");
+function captures(settings, use, verdict, signal) {
+  const button = h("button", { type: "button", class: "primary", disabled: true }, "Compute the masks");
   const found = new Captures(signal, () => (button.disabled = found.missing() !== null));
   button.addEventListener("click", async () => {
     button.disabled = true;
@@ -117,58 +117,58 @@ function captures(told, use, verdict, signal) {
     try {
       const words = h("p", { class: "muted" });
       put(verdict, words);
-      const during = ({ frames, percent }) => say(words, `Masks are being made of ${frames} patterns: ${Math.floor(percent)} %`);
-      const item = await create("/v1/calibrations", { captures: found.value(), ...told() }, signal, during);
-      put(verdict, taken(item));
+      const during = ({ frames, percent }) => say(words, `Computing masks from ${frames} patterns: ${Math.floor(percent)} %`);
+      const item = await create("/v1/calibrations", { captures: found.value(), ...settings() }, signal, during);
+      put(verdict, accepted(item));
       use(item);
     } catch (error) {
-      if (!gaveUp(error)) put(verdict, problem(error));
+      if (!isAborted(error)) put(verdict, problem(error));
     }
     button.disabled = found.missing() !== null;
   });
   const element = h("div", null,
-    h("p", { class: "muted" }, "Captures of a white board, at one exposure: each pattern with the mask; white and black without it. Black with the mask is better where there is one."),
+    h("p", { class: "muted" }, "Captures of a white board, all with the same exposure: one per pattern with the mask, and white and black without it. A black capture with the mask improves the result."),
     found.element, h("div", { class: "row" }, button));
   return { element };
 }
 
-function taken(item) {
+function accepted(item) {
   const dead = item.dead_pixels / (item.height * item.width);
   return [
-    h("p", { class: "good" }, "The calibration is taken."),
+    h("p", { class: "good" }, "The calibration is accepted."),
     facts([
       ["Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
-      ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): nothing is known there`) : "none"],
+      ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
-      ["Report", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "grade and reasons (new tab)")],
+      ["Report", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "grade and findings (new tab)")],
     ]),
   ];
 }
 
-const SEQUENCES = [["", "As the camera’s times tell"], ["contiguous", "One after the other, without a gap"], ["separate", "Each on its own"]];
+const SEQUENCES = [["", "Decided by the camera’s times"], ["contiguous", "Consecutive, without gaps"], ["separate", "Independent"]];
 
 function measurementStep(form, changed, signal) {
   const verdict = h("div", { class: "verdict", "aria-live": "polite" });
-  const wait = h("p", { class: "muted" }, "First choose or make the calibration.");
+  const wait = h("p", { class: "muted" }, "Select or create the calibration first.");
   const name = textField("measurement-name", "Name of the measurement", "shot 12");
-  const [fps, exposure] = [numberField("fps", "Snapshots a second"), numberField("exposure", "Exposure in s")];
+  const [fps, exposure] = [numberField("fps", "Snapshots per second"), numberField("exposure", "Exposure in s")];
   const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
   const darks = [];
   const darkList = h("p", { class: "muted" });
-  const forget = h("button", { type: "button", class: "small", hidden: true, onclick: () => tellDarks([]) }, "Use no darks");
-  const tellDarks = (next) => {
+  const forget = h("button", { type: "button", class: "small", hidden: true, onclick: () => setDarks([]) }, "Remove the dark captures");
+  const setDarks = (next) => {
     darks.splice(0, darks.length, ...next);
-    say(darkList, darks.length ? `Subtracted is the average of ${darks.map((dark) => dark.name).join(", ")}.` : "");
+    say(darkList, darks.length ? `The mean of ${darks.map((dark) => dark.name).join(", ")} is subtracted.` : "");
     forget.hidden = darks.length === 0;
     if (last) make(last, known).catch((error) => put(verdict, problem(error)));
   };
-  // The file that was dropped last, what was stated of it (its full scale, its axes), and which attempt counts.
-  let [last, known, turn] = [null, {}, 0];
+  // The file that was dropped last, the full scale and axes stated for it, and the number of the latest attempt.
+  let [last, known, attempt] = [null, {}, 0];
   const make = async (sha256, stated = {}) => {
-    turn += 1;
-    const mine = turn;
+    attempt += 1;
+    const mine = attempt;
     form.measurement = null;
     changed();
     put(verdict);
@@ -178,11 +178,11 @@ function measurementStep(form, changed, signal) {
     try {
       const asked = { calibration: form.calibration.id, data: sha256, ...given(body), ...(darks.length ? { dark: darks.map((dark) => dark.sha256) } : {}) };
       const item = await create("/v1/measurements", asked, signal);
-      // Something else was chosen meanwhile.
-      if (mine !== turn) return;
+      // A later attempt has replaced this one.
+      if (mine !== attempt) return;
       form.measurement = item;
     } catch (error) {
-      if (mine !== turn) return;
+      if (mine !== attempt) return;
       const question = askAbout(error, stated, again);
       if (!question) {
         last = null;
@@ -195,25 +195,25 @@ function measurementStep(form, changed, signal) {
     put(verdict, fits(form.measurement), doubt);
     changed();
   };
-  // What is stated later goes with the same file: it need not be dropped again.
+  // A change of these fields repeats the request with the same file.
   for (const input of [fps.input, exposure.input, sequence]) {
     input.addEventListener("change", () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
-  const dark = dropZone("darks", "Dark captures", "Optional: with the LCoS all black, at the same exposure", signal, async (blob, file) => {
-    tellDarks([...darks, { sha256: blob.sha256, name: file.name }]);
+  const dark = dropZone("darks", "Dark captures", "Optional: with the LCoS all black and the same exposure", signal, async (blob, file) => {
+    setDarks([...darks, { sha256: blob.sha256, name: file.name }]);
   }, true);
   const inside = h("div", { hidden: true },
     h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Several snapshots are", sequence)),
     h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))));
   const wake = () => {
-    turn += 1;
+    attempt += 1;
     inside.hidden = !form.calibration;
     wait.hidden = !inside.hidden;
     form.measurement = null;
     put(verdict);
-    // The file that was dropped for another calibration is tried with this one.
-    if (form.calibration && last) make(last, scaled).catch((error) => put(verdict, problem(error)));
+    // Try the file that was dropped for another calibration with this one.
+    if (form.calibration && last) make(last, known).catch((error) => put(verdict, problem(error)));
     changed();
   };
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
@@ -222,11 +222,11 @@ function measurementStep(form, changed, signal) {
 function fits(item) {
   const wrong = findings(item.warnings);
   return [
-    h("p", { class: wrong ? "warn" : "good" }, wrong ? "The measurement is taken, but:" : "The measurement fits the calibration."),
+    h("p", { class: wrong ? "warn" : "good" }, wrong ? "The measurement is accepted with warnings:" : "The measurement fits the calibration."),
     wrong,
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
-      item.snapshots > 1 && ["They are", item.sequence === "contiguous" ? "taken one after the other, and reconstructed together where that pays" : "reconstructed each on its own"],
+      item.snapshots > 1 && ["Sequence", item.sequence === "contiguous" ? "consecutive, reconstructed jointly where that reduces the error" : "independent snapshots"],
       ["Full scale", figure(item.full_scale)],
     ]),
   ];
@@ -244,14 +244,14 @@ function jobStep(algorithms, form, signal) {
     const asked = JSON.stringify(request());
     try {
       const found = await send("POST", "/v1/jobs/estimate", request());
-      if (form.measurement && JSON.stringify(request()) === asked) put(estimate, told(found));
+      if (form.measurement && JSON.stringify(request()) === asked) put(estimate, costs(found));
     } catch (error) {
       if (form.measurement) put(estimate, problem(error));
     }
   });
   const renew = () => {
     const item = algorithms.find((found) => found.name === select.value);
-    say(plan, `${item.summary} At most ${item.planned_iterations} iterations on each tile.`);
+    say(plan, `${item.summary} At most ${item.planned_iterations} iterations per tile.`);
     if (!form.measurement) put(estimate);
     ask();
   };
@@ -262,13 +262,13 @@ function jobStep(algorithms, form, signal) {
   return { element, renew, request };
 }
 
-/** What a job would take. */
-function told(found) {
-  const when = found.eta_seconds === null ? "no worker lives: it would wait" : `in up to about ${duration(found.eta_seconds)}`;
+/** Estimated time, computation, memory and disk space of a job. */
+function costs(found) {
+  const when = found.eta_seconds === null ? "not before a worker is running" : `in up to about ${duration(found.eta_seconds)}`;
   return facts([
-    ["Done", `${when}${found.queue_position > 1 ? `, no. ${found.queue_position} in the queue` : ""}`],
-    ["Computing", `up to about ${duration(found.cpu_seconds)} of processor time, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
-    ["Memory", `${bytes(found.worker_memory_bytes)} at most`],
-    ["Disk", `${bytes(found.disk_bytes)} at most`],
+    ["Done", `${when}${found.queue_position > 1 ? `, position ${found.queue_position} in the queue` : ""}`],
+    ["CPU time", `up to about ${duration(found.cpu_seconds)}, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
+    ["Memory", `at most ${bytes(found.worker_memory_bytes)}`],
+    ["Disk", `at most ${bytes(found.disk_bytes)}`],
   ]);
 }

@@ -1,4 +1,4 @@
-// The service itself: workers, device, queue, disk, versions.
+// State of the service: workers, device, queue, disk, versions.
 
 import { facts, h, put } from "./dom.js";
 import { bytes, duration, moment, momentInFull, short } from "./format.js";
@@ -28,20 +28,20 @@ function service(found) {
     ["Device", found.device],
     ["Provider", found.provider],
     ["ONNX Runtime", found.onnxruntime ?? "not used yet"],
-    ["Running for", duration((new Date(found.now) - new Date(found.started_at)) / 1000)],
+    ["Uptime", duration((new Date(found.now) - new Date(found.started_at)) / 1000)],
     ["Largest upload", bytes(found.limits.upload_bytes)],
     ["Memory of a worker", bytes(found.limits.worker_memory_bytes)],
-    ["Contract", h("a", { href: "/openapi.yaml" }, "openapi.yaml")],
-    ["Figures", h("a", { href: "/metrics" }, "metrics for Prometheus")],
+    ["API description", h("a", { href: "/openapi.yaml" }, "openapi.yaml")],
+    ["Metrics", h("a", { href: "/metrics" }, "metrics for Prometheus")],
   ]));
 }
 
 function queue(found) {
   const states = Object.entries(found.jobs).map(([state, count]) => [h("span", { class: `badge ${state}` }, state), h("a", { href: `#/jobs?state=${state}` }, String(count))]);
   return card("Queue", facts([
-    ["Tasks in work", found.queue.running],
-    ["Tasks ready", found.queue.ready],
-    ["Tasks that wait for others", found.queue.blocked],
+    ["Running tasks", found.queue.running],
+    ["Ready tasks", found.queue.ready],
+    ["Blocked tasks", found.queue.blocked],
     ...states,
   ]));
 }
@@ -53,25 +53,25 @@ function disk(found) {
     h("meter", { min: 0, max: size, value: size - free, high: size - 2 * reserved, "aria-label": `${bytes(size - free)} of ${bytes(size)} in use` }),
     facts([
       ["Free", h("span", { class: low ? "warn" : null }, `${bytes(free)} of ${bytes(size)}`)],
-      ["Kept in reserve", bytes(reserved)],
+      ["Reserved", bytes(reserved)],
       ["Stored files", `${found.disk.files}, ${bytes(found.disk.file_bytes)}`],
     ]));
 }
 
 function workers(found) {
   const title = `Workers: ${found.workers.length} of ${found.workers_wanted}`;
-  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker lives: jobs wait."));
+  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait."));
   const row = (worker) => h("tr", null,
     h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version),
     h("td", null, task(worker.task)),
     h("td", { title: momentInFull(worker.started_at) }, moment(worker.started_at)));
-  const heads = ["Worker", "Process", "Version", "Doing", "Since"].map((name) => h("th", { scope: "col" }, name));
+  const heads = ["Worker", "Process", "Version", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
   return card(title, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Workers" },
     h("table", null, h("thead", null, h("tr", null, heads)), h("tbody", null, found.workers.map(row)))));
 }
 
 function task(work) {
-  if (!work) return "waiting";
+  if (!work) return "idle";
   const place = work.tile === null ? "" : ` ${work.tile + 1}`;
   const snapshot = work.snapshot === null ? "" : `, snapshot ${work.snapshot}`;
   if (work.calibration) return h("a", { href: `#/calibrations/${work.calibration}` }, `calibration ${short(work.calibration)}`);

@@ -1,21 +1,21 @@
-// A small picture of a file before anything is known of it: PNG by the browser, npy and plain TIFF read here.
-// Of other files there is none; the service reads them all.
+// Thumbnail of a local file: the browser decodes PNG, this module npy and uncompressed grey TIFF. Other
+// formats have no thumbnail.
 
 const SIDE = 72;
-/** Files above this are not read for a small picture. */
-const MOST = 64 * 2 ** 20;
+/** Largest file in bytes that is read for a thumbnail. */
+const MAX_BYTES = 64 * 2 ** 20;
 
-/** A canvas with the first picture of a file, or null. */
+/** A canvas with the first image of a file, or null. */
 export async function thumb(file) {
   try {
-    if (file.size > MOST) return null;
+    if (file.size > MAX_BYTES) return null;
     const bytes = await file.arrayBuffer();
     const first = new Uint8Array(bytes, 0, Math.min(8, bytes.byteLength));
     if (first[0] === 0x89 && first[1] === 0x50) return drawn(await createImageBitmap(file));
     if (first[0] === 0x93 && first[1] === 0x4e) return grey(npy(bytes));
     if ((first[0] === 0x49 && first[1] === 0x49) || (first[0] === 0x4d && first[1] === 0x4d)) return grey(tiff(bytes));
   } catch {
-    // A picture is a help and no check: what is wrong with the file the service says.
+    // The service reports what is wrong with the file.
   }
   return null;
 }
@@ -32,7 +32,7 @@ function drawn(bitmap) {
   return canvas;
 }
 
-/** Draws `{width, height, at(index)}` from its darkest to its brightest value; grey where all are the same. */
+/** Draws `{width, height, at(index)}` between its smallest and largest value; grey if they are equal. */
 function grey(picture) {
   if (!picture) return null;
   const canvas = canvasOf(picture.width, picture.height);
@@ -59,7 +59,7 @@ function reader(bytes, offset, kind, little) {
   return size && ((index) => view[read](offset + size * index, little));
 }
 
-/** The first picture of an array [..., rows, columns]. */
+/** The first image of an npy array [..., rows, columns]. */
 function npy(bytes) {
   const view = new DataView(bytes);
   const wide = view.getUint8(6) > 1;
@@ -74,7 +74,7 @@ function npy(bytes) {
   return at ? { width, height, at } : null;
 }
 
-/** The first page of a TIFF in grey without compression; null for any other. */
+/** The first page of an uncompressed grey TIFF; null for others. */
 function tiff(bytes) {
   const view = new DataView(bytes);
   const little = view.getUint8(0) === 0x49;

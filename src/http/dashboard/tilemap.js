@@ -1,4 +1,4 @@
-// The tiles of a snapshot: which are done, which run; one of them is chosen for the plot.
+// The tiles of a snapshot with their states, and the convergence plot of a selected tile.
 
 import { convergence } from "./convergence.js";
 import { figure, iterationsOf } from "./format.js";
@@ -25,7 +25,7 @@ export class TileMap {
     const found = await get(`/v1/jobs/${this.job.id}/snapshots/${snapshot}/tiles`, this.signal);
     if (found.items !== this.found) {
       this.found = found.items;
-      // Of the runs that hold the snapshot the one that begins last, whose history is told, too.
+      // Show the run that begins last among those that contain the snapshot; the history is from that run.
       const first = Math.max(...found.items.map((tile) => tile.snapshots.first));
       this.tiles = found.items.filter((tile) => tile.snapshots.first === first);
       this.draw();
@@ -40,7 +40,7 @@ export class TileMap {
     this.history();
   }
 
-  /** The chosen tile, or else the one that runs, or that ended last. */
+  /** The selected tile, or else a running one, or else the one that ended last. */
   current() {
     if (this.chosen !== null) return this.chosen;
     const runs = this.tiles.find((tile) => tile.state === "running" && tile.iterations > 0);
@@ -56,7 +56,7 @@ export class TileMap {
 
   options() {
     const state = (tile) => `${tile.tile + 1} (${tile.state})`;
-    put(this.select, h("option", { value: "" }, "that runs or ended last"), this.tiles.map((tile) => h("option", { value: tile.tile, selected: tile.tile === this.chosen }, state(tile))));
+    put(this.select, h("option", { value: "" }, "running, or ended last"), this.tiles.map((tile) => h("option", { value: tile.tile, selected: tile.tile === this.chosen }, state(tile))));
   }
 
   draw() {
@@ -65,10 +65,10 @@ export class TileMap {
     const done = this.tiles.filter((tile) => tile.state === "done");
     const worst = Math.max(...done.map((tile) => tile.residual ?? 0));
     const run = this.tiles[0]?.snapshots;
-    const together = run?.count > 1 ? ` of snapshots ${run.first} to ${run.first + run.count - 1} together` : "";
+    const together = run?.count > 1 ? ` of snapshots ${run.first} to ${run.first + run.count - 1}, reconstructed jointly,` : "";
     const text = `${done.length} of ${this.tiles.length} tiles${together} are done`;
     const unit = Math.max(width, height) / 100;
-    // Of a mosaic four tiles share a place, each a quarter of it for one pixel of a cell.
+    // With a mosaic, the tiles of the four sub-images cover the same pixels: each gets a quarter of the area.
     const parts = job.shape.mosaic ? 2 : 1;
     const at = (start, length, part) => start + unit / 2 + (part * (length - unit)) / parts;
     const rectangle = (tile) => s("rect", {

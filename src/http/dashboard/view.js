@@ -1,21 +1,22 @@
-// Where one looks: a place and a zoom that several panes share.
+// Position and zoom that several panes share.
 
-const MOST = 64;
+/** Largest zoom in pane pixels per image pixel. */
+const MAX_ZOOM = 64;
 
-/** A place (the picture's pixel in the middle of a pane) and a zoom (pane pixels a picture pixel). */
+/** Position (the image pixel in the middle of a pane) and zoom (pane pixels per image pixel). */
 export class View {
   constructor(height, width) {
     Object.assign(this, { height, width, listeners: new Set() });
     this.fit();
   }
 
-  /** All of the picture; each pane takes the zoom that its size asks for. */
+  /** Shows the whole image: each pane computes the zoom from its size. */
   fit() {
     Object.assign(this, { zoom: null, x: this.width / 2, y: this.height / 2 });
-    this.tell();
+    this.notify();
   }
 
-  tell() {
+  notify() {
     this.listeners.forEach((listener) => listener());
   }
 
@@ -27,18 +28,18 @@ export class View {
   pan(dx, dy) {
     this.x = clamp(this.x + dx, 0, this.width);
     this.y = clamp(this.y + dy, 0, this.height);
-    this.tell();
+    this.notify();
   }
 
-  /** Zooms by a factor from `now` so that the pixel at (x, y) stays where it is. */
+  /** Multiplies the zoom `now` by a factor and keeps the pixel at (x, y) in place. */
   zoomBy(factor, now, x = this.x, y = this.y) {
     const least = 16 / Math.max(this.width, this.height);
-    const next = clamp(now * factor, least, MOST);
+    const next = clamp(now * factor, least, MAX_ZOOM);
     const keep = now / next;
     this.zoom = next;
     this.x = clamp(x + (this.x - x) * keep, 0, this.width);
     this.y = clamp(y + (this.y - y) * keep, 0, this.height);
-    this.tell();
+    this.notify();
   }
 }
 
@@ -46,10 +47,10 @@ function clamp(value, least, most) {
   return Math.min(most, Math.max(least, value));
 }
 
-/** Lets a pane's canvas be dragged, pinched, turned the wheel over and driven by keys. */
+/** Moves and zooms a view by dragging, pinching, the wheel and keys on a canvas. */
 export function steer(canvas, view, pane, signal) {
   const pointers = new Map();
-  // One finger is for the page, unless the picture is all there is.
+  // One finger scrolls the page, except in full screen.
   const idle = () => pointers.size === 1 && [...pointers.values()][0].pointerType === "touch" && !document.fullscreenElement;
   const hold = (event) => event.touches.length > 1 && event.cancelable && event.preventDefault();
   for (const kind of ["touchstart", "touchmove"]) canvas.addEventListener(kind, hold, { signal, passive: false });
@@ -70,7 +71,7 @@ export function steer(canvas, view, pane, signal) {
     if (!before) return;
     const { zoom } = pane.place();
     if (idle()) {
-      // Nothing: the browser scrolls.
+      // The browser scrolls the page.
     } else if (pointers.size === 1) {
       if (view.zoom === null) view.zoom = zoom;
       view.pan((before.clientX - event.clientX) / zoom, (before.clientY - event.clientY) / zoom);

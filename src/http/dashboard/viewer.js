@@ -1,4 +1,4 @@
-// The frames in one large player, and the measurement that they came of, in step.
+// The frames in a large player, synchronised with the measurement.
 
 import { h, say } from "./dom.js";
 import { Contrast } from "./contrast.js";
@@ -6,9 +6,9 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { get, unanswered } from "./api.js";
+import { get, isUnreachable } from "./api.js";
 
-const MODES = [["frame", "Frames"], ["difference", "Difference to the frame before"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
+const MODES = [["frame", "Frames"], ["difference", "Difference from the previous frame"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
 
 export class Viewer {
   constructor(job, signal) {
@@ -21,11 +21,11 @@ export class Viewer {
     this.rightContrast = new Contrast("frames", () => this.showRight());
     this.player = new Player(frames, signal, () => this.showRight());
     this.player.ahead = (frame) => this.mode() === "residual" || this.right.prepare(this.source(frame), ...this.rightContrast.window());
-    // Of a sequence playing goes on from snapshot to snapshot, if asked to.
+    // With this box checked, playback of a sequence continues with the next snapshot.
     this.through = h("input", { type: "checkbox", id: "through" });
     this.player.onward = () => this.through.checked && this.goOn();
-    if (job.snapshots.count > 1) this.player.element.lastChild.append(h("label", { for: "through", class: "row muted" }, this.through, "Through all snapshots"));
-    this.choice = h("select", { id: "mode", "aria-label": "What is shown" }, MODES.map(([value, text]) => h("option", { value }, text)));
+    if (job.snapshots.count > 1) this.player.element.lastChild.append(h("label", { for: "through", class: "row muted" }, this.through, "Play all snapshots"));
+    this.choice = h("select", { id: "mode", "aria-label": "Image" }, MODES.map(([value, text]) => h("option", { value }, text)));
     this.choice.addEventListener("change", () => {
       this.rightContrast.touched = false;
       this.offerRight();
@@ -38,7 +38,7 @@ export class Viewer {
     this.slicing.addEventListener("toggle", () => this.showRight());
     this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.slicing,
       h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
-        h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms, dragging moves. On a touch screen two fingers zoom and move; in full screen one finger moves, too.")));
+        h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.")));
     this.measured = null;
     this.beside = h("section", { class: "card viewer beside", "aria-label": "Measurement" }, this.left.element);
     this.player.keys(this.element);
@@ -56,7 +56,7 @@ export class Viewer {
     full.id = "full";
     if (!document.fullscreenEnabled) full.hidden = true;
     return [small("Zoom out", "−", () => this.nearer(1 / 1.5)), zoom, small("Zoom in", "+", () => this.nearer(1.5)),
-      small("Fit the whole picture", "Fit", () => this.view.fit()), small("1 : 1, one pixel of the screen for one of the picture", "1 : 1", () => this.nearer(null)), full];
+      small("Fit the whole picture", "Fit", () => this.view.fit()), small("1 : 1, one screen pixel per image pixel", "1 : 1", () => this.nearer(null)), full];
   }
 
   mode() {
@@ -68,7 +68,7 @@ export class Viewer {
     this.view.zoomBy(factor ?? 1 / zoom, zoom);
   }
 
-  /** Where the pictures of the snapshot are. */
+  /** URL of the snapshot's images. */
   base() {
     return `/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/pictures`;
   }
@@ -79,18 +79,18 @@ export class Viewer {
 
   name(frame) {
     if (this.mode() === "frame") return `frame-${frame}`;
-    // The first frame has none before it.
     if (this.mode() === "error") return `error-${frame}`;
+    // The first frame has no previous one.
     return this.mode() === "difference" ? `difference-${Math.max(2, frame)}` : "residual";
   }
 
   source(frame) {
     const name = this.name(frame);
-    const label = { frame: `Frame ${frame} of ${this.player.count}`, difference: `Frame ${Math.max(2, frame)} without the one before`, error: `Expected error of frame ${frame}`, residual: "Residual map" }[this.mode()];
+    const label = { frame: `Frame ${frame} of ${this.player.count}`, difference: `Difference of frame ${Math.max(2, frame)} from the previous one`, error: `Expected error of frame ${frame}`, residual: "Residual map" }[this.mode()];
     return { base: `${this.base()}/${name}`, levels: this.levels, tile: this.tile, label };
   }
 
-  /** Has the next snapshot opened, by whoever chooses them; true, as the player then waits for it. */
+  /** Opens the next snapshot by `next`; always true, which makes the player wait for it. */
   goOn() {
     if (!this.waiting) {
       this.waiting = true;
@@ -103,26 +103,26 @@ export class Viewer {
     this.snapshot = snapshot;
     if (this.waiting) this.player.frame = 1;
     this.waiting = false;
-    this.player.tell();
+    this.player.showPosition();
     const base = `/v1/measurements/${this.job.measurement}/pictures/snapshot-${snapshot}`;
     try {
       const spread = await get(`${base}/spread`, this.signal);
       this.measured = { base, levels: spread.levels, tile: spread.tile, label: `Measurement, snapshot ${snapshot}` };
-      this.left.tell("");
+      this.left.setNote("");
       this.leftContrast.offer(spread);
       this.showLeft();
     } catch (error) {
-      // A damaged measurement is no reason not to show the job.
-      if (!error.errors || unanswered(error)) throw error;
+      // Show the job even if its measurement is damaged.
+      if (!error.errors || isUnreachable(error)) throw error;
       this.measured = null;
       this.left.show(null);
-      this.left.tell(error.message);
+      this.left.setNote(error.message);
     }
     this.leftContrast.element.hidden = !this.measured;
     await this.renew();
   }
 
-  /** Looks for frames, or for more of them: tiles appear as they are done. */
+  /** Reloads the frames, in which tiles appear when they are done. */
   async renew() {
     this.spreads.clear();
     this.right.generation += 1;
@@ -130,7 +130,7 @@ export class Viewer {
     await this.offerRight();
   }
 
-  /** Says over the picture how the job stands, where it is not done. */
+  /** Shows the state of an unfinished job on the image. */
   stand(job, written) {
     const { tiles_done: done, tiles_total: total } = job.progress;
     const whole = `${done} of ${total} tiles are done`;
@@ -145,7 +145,7 @@ export class Viewer {
 
   async offerRight() {
     if (this.player.count < 2 && this.mode() === "difference") {
-      this.right.tell("There is one frame only.");
+      this.right.setNote("There is only one frame.");
       return;
     }
     try {
@@ -153,20 +153,20 @@ export class Viewer {
       Object.assign(this, { levels: spread.levels, tile: spread.tile });
       this.rightContrast.offer(spread);
     } catch (error) {
-      if (!error.errors || unanswered(error)) throw error;
+      if (!error.errors || isUnreachable(error)) throw error;
       this.ready = false;
       this.right.show(null);
-      this.right.tell(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "It ended before anything could be shown." : "Nothing can be seen yet. A coarse preview comes first, then the frames tile by tile.");
+      this.right.setNote(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "The job ended before any frame was computed." : "No frames yet. A coarse preview comes first, then the frames tile by tile.");
       this.rightContrast.element.hidden = true;
       return;
     }
     this.ready = true;
     this.rightContrast.element.hidden = false;
-    this.right.tell("");
+    this.right.setNote("");
     this.showRight();
   }
 
-  /** The spread of what is shown, of the middle frame for all of them: one window for a whole film. */
+  /** Loads the range of values; that of the middle frame holds for all frames. */
   async spread() {
     const name = this.name(Math.ceil(this.player.count / 2));
     if (!this.spreads.has(name)) this.spreads.set(name, await get(`${this.base()}/${name}/spread`, this.signal));
@@ -179,7 +179,7 @@ export class Viewer {
 
   showRight() {
     if (!this.ready) return;
-    // The slice is made of frames, whatever the pane shows.
+    // The slice always shows frames, in any mode of the pane.
     if (this.mode() === "frame") this.frameWindow = this.rightContrast.window();
     this.right.show(this.source(this.player.frame), ...this.rightContrast.window());
     this.slice.show(this.player.frame);

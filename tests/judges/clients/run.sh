@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The contract before linters, and clients generated from it: none may find an error, and the generators must
-# not warn. Needs node, npm and Python 3.
+# Checks the contract with linters and client generators: none may report an error, and the generators must not
+# warn. Needs node, npm and Python 3.
 #
 #   tests/judges/clients/run.sh FOLDER     FOLDER keeps the tools for the next run
 set -euo pipefail

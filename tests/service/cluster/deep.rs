@@ -1,26 +1,25 @@
-//! Networks over the network: those that the program carries, and a lab's own, which travels by its hash.
+//! Networks on other machines: those that the program includes, and a lab's network, which is sent
+//! by its hash.
 
 use serde_json::json;
 
 use super::nodes::Nats;
 use super::rounds::rounds;
 use super::{worker, workers};
-use crate::app::TestApp;
+use crate::app::{TestApp, has_onnxruntime};
 use crate::faults::results_of;
 use crate::learned;
 use crate::samples::Scene;
 
 #[tokio::test]
 async fn networks_give_the_same_bytes_on_other_machines() {
-    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
-    if !std::path::Path::new(&library).exists() {
-        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+    if !has_onnxruntime() {
         return;
     }
     let Some(nats) = Nats::start(1) else { return };
     let app = TestApp::with(&["--workers", "2"]).await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
-    // Two tiles: a few passes in all tests, the default schedule with its pilot in `make cluster`.
+    // Two tiles: a few passes here, and in `make cluster` the default schedule with its pilot.
     let mut deep = json!({
         "measurement": measurement, "algorithm": "pnp-tv-fastdvdnet", "snapshots": 0,
         "tile": {"size": 48, "overlap": 16},
@@ -60,7 +59,10 @@ async fn networks_give_the_same_bytes_on_other_machines() {
     assert_eq!(workers(&app).await.len(), 2);
     if let Some(sha256) = own {
         let cached = |folder: &std::path::Path| folder.join("cache").join(&sha256).exists();
-        assert!(both.iter().any(|worker| cached(worker.folder.path())), "it travels by its hash");
+        assert!(
+            both.iter().any(|worker| cached(worker.folder.path())),
+            "the network is sent by its hash"
+        );
     }
     nats.emptied().await;
 }

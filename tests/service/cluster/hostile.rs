@@ -1,4 +1,4 @@
-//! What the credential of one pool may not do to another, over TLS.
+//! Rights of a pool's credential against other pools, over TLS.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -11,14 +11,15 @@ use super::{busy, until, with_iterations, workers};
 use crate::app::TestApp;
 use crate::samples::Scene;
 
-/// The server over TLS, with its own credential.
+/// Starts the server over TLS with its own credential.
 async fn secured(nats: &Nats) -> TestApp {
     let hub = nats.hub();
     TestApp::with(&["--workers", "0", "--nats-creds", hub.to_str().unwrap(), "--ack-wait", "5"])
         .await
 }
 
-/// A client with a worker's credential, and what the message server refuses it.
+/// Connects with a worker's credential; returns the client and the rejections of the message
+/// server.
 async fn intruder(nats: &Nats, pool: &str) -> (Client, Arc<Mutex<Vec<String>>>) {
     let path = nats.credential(pool);
     let text = std::fs::read_to_string(&path).unwrap();
@@ -45,7 +46,7 @@ async fn intruder(nats: &Nats, pool: &str) -> (Client, Arc<Mutex<Vec<String>>>) 
 }
 
 #[tokio::test]
-async fn a_credential_opens_the_subjects_of_its_pool_alone() {
+async fn a_credential_is_limited_to_the_subjects_of_its_pool() {
     let Some(nats) = Nats::secured(1, &[]) else { return };
     let app = secured(&nats).await;
     let _worker = RemoteWorker::with_credential(&nats.credential("a"), &[]);
@@ -56,7 +57,7 @@ async fn a_credential_opens_the_subjects_of_its_pool_alone() {
     let worker = workers(&app).await[0]["id"].as_str().unwrap().to_owned();
     let (client, refused) = intruder(&nats, "b").await;
 
-    // What may be published to nobody but one's own pool's hub: each is refused by name.
+    // Messages that only the pool's workers may publish. Each publication is rejected by name.
     let direct = format!("$JS.API.DIRECT.GET.SCI_IN.{found}");
     let publish = [
         "sci.v1.task.a",
@@ -111,23 +112,23 @@ async fn a_credential_opens_the_subjects_of_its_pool_alone() {
         let _ = client.subscribe(subject).await.unwrap();
         client.flush().await.unwrap();
     }
-    until("all refusals are heard", || async {
+    until("all rejections have arrived", || async {
         refused.lock().unwrap().len() >= publish.len() + wanted.len()
     })
     .await;
-    let said = refused.lock().unwrap().join("\n");
+    let report = refused.lock().unwrap().join("\n");
     for subject in publish {
         let line = format!("publish to \"{}\"", subject.to_lowercase());
-        assert!(said.contains(&line), "{subject} was not refused:\n{said}");
+        assert!(report.contains(&line), "{subject} was not rejected:\n{report}");
         eprintln!("refused: publish to {subject}");
     }
     for subject in wanted {
         let line = format!("subscription to \"{}\"", subject.to_lowercase());
-        assert!(said.contains(&line), "{subject} was not refused:\n{said}");
+        assert!(report.contains(&line), "{subject} was not rejected:\n{report}");
         eprintln!("refused: subscribe to {subject}");
     }
 
-    // What it may say in its own pool's name changes nothing of the other's.
+    // Valid messages in the name of one pool do not affect the other.
     let task = workers(&app).await[0].clone();
     let (task_id, attempt) = running(app.data(), &job).await;
     let before = nats.messages().await;
@@ -141,7 +142,7 @@ async fn a_credential_opens_the_subjects_of_its_pool_alone() {
     let forged =
         json!({"task": task_id, "attempt": attempt, "seq": 1, "delivery": 9, "worker": worker});
     let answer = client.request("sci.v1.begin.b", forged.to_string().into()).await.unwrap();
-    assert_eq!(&answer.payload[..], b"\"over\"", "of another pool");
+    assert_eq!(&answer.payload[..], b"\"over\"", "the attempt belongs to another pool");
     let forged = json!({"worker": worker, "tile": null, "leaves": true});
     client.publish("sci.v1.beat.b", forged.to_string().into()).await.unwrap();
     client.flush().await.unwrap();
@@ -153,7 +154,7 @@ async fn a_credential_opens_the_subjects_of_its_pool_alone() {
     assert_eq!(app.ended(&job).await["state"], "cancelled");
 }
 
-/// A tile that is out, and its attempt.
+/// The identifier and attempt of a tile that a worker holds.
 async fn running(data: &std::path::Path, job: &str) -> (String, i64) {
     use sqlx::Connection;
     let path = data.join("sci-recon.db");
@@ -165,7 +166,7 @@ async fn running(data: &std::path::Path, job: &str) -> (String, i64) {
 }
 
 #[tokio::test]
-async fn a_revoked_credential_is_cut_off() {
+async fn a_revoked_credential_is_disconnected() {
     let Some(nats) = Nats::secured(1, &[]) else { return };
     let app = secured(&nats).await;
     let (kept, lost) = (nats.credential("kept"), nats.credential("lost"));
@@ -182,11 +183,11 @@ async fn a_revoked_credential_is_cut_off() {
     let (client, _) = (nats.client().await, ());
     let mut beats = client.subscribe("sci.v1.beat.lost").await.unwrap();
     client.flush().await.unwrap();
-    // Nothing is heard of it any more: a sign of life comes every five seconds.
+    // A connected worker sends a heartbeat every five seconds. The disconnected one sends none.
     let heard =
         tokio::time::timeout(Duration::from_secs(7), futures_util::StreamExt::next(&mut beats));
-    assert!(heard.await.is_err(), "it still speaks");
-    eprintln!("cut off, as seen {:?} after the revocation began", start.elapsed());
+    assert!(heard.await.is_err(), "the worker still sends heartbeats");
+    eprintln!("disconnected, as seen {:?} after the revocation began", start.elapsed());
     let text = std::fs::read_to_string(&lost).unwrap();
     let again = ConnectOptions::with_credentials(&text)
         .unwrap()
@@ -198,7 +199,7 @@ async fn a_revoked_credential_is_cut_off() {
     let mut third = RemoteWorker::with_credential(&lost, &[]);
     for worker in [&mut second, &mut third] {
         assert_eq!(worker.process.ended(Duration::from_secs(40)), Some(2));
-        assert!(worker.said().contains("refuses the credential"), "{}", worker.said());
+        assert!(worker.log().contains("refuses the credential"), "{}", worker.log());
     }
     let mut check = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     let ran = check.args(["cluster", "check", "--nats-creds"]).arg(&lost).output().unwrap();
@@ -207,16 +208,16 @@ async fn a_revoked_credential_is_cut_off() {
     assert!(first.process.lives());
     let listed = nats.cluster(&["worker", "list"]).unwrap();
     assert!(listed.contains("revoked") && listed.matches(" good ").count() == 1, "{listed}");
-    // The hub forgets a silent worker after fifteen seconds; what a pool without one was sent comes back later.
-    until("the one that was cut off is forgotten", || async { workers(&app).await.len() == 1 })
-        .await;
+    // The hub drops a silent worker after fifteen seconds. Tiles sent to a pool without workers
+    // return later.
+    until("the disconnected worker is dropped", || async { workers(&app).await.len() == 1 }).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&with_iterations(&measurement, 50)).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded", "the other pool works");
 }
 
 #[tokio::test]
-async fn a_check_says_what_is_missing() {
+async fn the_check_command_names_missing_parts() {
     let Some(nats) = Nats::secured(1, &["--no-tls"]) else { return };
     let hub = nats.hub();
     let program = env!("CARGO_BIN_EXE_sci-recon");
@@ -226,20 +227,20 @@ async fn a_check_says_what_is_missing() {
         (ran.status.success(), String::from_utf8(ran.stdout).unwrap())
     };
     let worker = nats.credential("a");
-    let (good, said) = check(&worker);
+    let (good, report) = check(&worker);
     assert!(
-        !good && said.contains("missing welcome") && said.contains("sci-recon serve"),
-        "{said}"
+        !good && report.contains("missing welcome") && report.contains("sci-recon serve"),
+        "{report}"
     );
-    let (good, said) = check(&hub);
+    let (good, report) = check(&hub);
     assert!(
-        good && said.contains("MB/s") && said.contains("clocks") && said.contains("ms"),
-        "{said}"
+        good && report.contains("MB/s") && report.contains("clocks") && report.contains("ms"),
+        "{report}"
     );
     let app = TestApp::with(&["--workers", "0", "--nats-creds", hub.to_str().unwrap()]).await;
-    until("the check of a worker is good", || async {
-        let (good, said) = check(&worker);
-        eprintln!("{said}");
+    until("the check of a worker succeeds", || async {
+        let (good, report) = check(&worker);
+        eprintln!("{report}");
         good
     })
     .await;

@@ -1,4 +1,4 @@
-//! Workers on other machines, over real message servers on ports of this one.
+//! Workers on other machines, simulated by real message servers on local ports.
 
 mod deep;
 mod hostile;
@@ -23,7 +23,7 @@ use crate::app::TestApp;
 use crate::faults::results;
 use crate::samples::Scene;
 
-/// Sixteen tiles of a part of a second each.
+/// Sixteen tiles that take a fraction of a second each.
 fn job(measurement: &str) -> Value {
     with_iterations(measurement, 700)
 }
@@ -39,13 +39,13 @@ fn with_iterations(measurement: &str, iterations: u32) -> Value {
     })
 }
 
-/// What that job gives on this machine alone.
+/// Results of that job without remote workers.
 async fn local() -> &'static BTreeMap<String, String> {
     static RESULTS: OnceCell<BTreeMap<String, String>> = OnceCell::const_new();
     RESULTS.get_or_init(|| alone(job)).await
 }
 
-/// What a job for the measurement of [`Scene::SMALL`] gives on this machine alone.
+/// Results of a job for the measurement of [`Scene::SMALL`] without remote workers.
 async fn alone(job: impl Fn(&str) -> Value) -> BTreeMap<String, String> {
     let app = TestApp::with(&["--workers", "2"]).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
@@ -54,7 +54,7 @@ async fn alone(job: impl Fn(&str) -> Value) -> BTreeMap<String, String> {
     results(&app, &id).await
 }
 
-/// A server whose tiles leave the machine.
+/// Starts a server whose tiles are computed by remote workers.
 async fn served(nats: &Nats, ack_wait: &str) -> TestApp {
     let url = nats.url();
     let nats = ["--workers", "0", "--nats", &url, "--ack-wait", ack_wait];
@@ -66,21 +66,21 @@ fn worker(nats: &Nats, more: &[&str]) -> RemoteWorker {
     RemoteWorker::start(&[&["--nats", url.as_str(), "--pool", "test"], more].concat())
 }
 
-/// A figure of the server.
+/// A metric of the server.
 async fn figure(app: &TestApp, name: &str) -> f64 {
     let text = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
     let line = text.lines().find_map(|line| line.strip_prefix(name));
     line.unwrap_or_else(|| panic!("no figure {name}")).trim().parse().unwrap()
 }
 
-/// The workers on other machines that the server knows.
+/// The remote workers that the server knows.
 async fn workers(app: &TestApp) -> Vec<Value> {
     let system = app.get("/v1/system").await.expect(200).json();
     let all = system["workers"].as_array().unwrap().clone();
     all.into_iter().filter(|worker| !worker["pool"].is_null()).collect()
 }
 
-/// Waits until something holds.
+/// Waits until a condition holds.
 async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> F) {
     let start = Instant::now();
     while !holds().await {
@@ -97,7 +97,7 @@ async fn busy(app: &TestApp) {
 }
 
 #[tokio::test]
-async fn a_job_over_the_network_gives_the_same_bytes() {
+async fn a_job_on_remote_workers_gives_the_same_bytes() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
     let app = served(&nats, "5").await;
@@ -191,7 +191,7 @@ async fn a_worker_that_is_killed_in_a_tile_costs_one_attempt() {
 }
 
 #[tokio::test]
-async fn a_worker_that_is_told_to_end_gives_its_tile_back() {
+async fn a_stopping_worker_returns_its_tile() {
     let Some(nats) = Nats::start(1) else { return };
     let app = served(&nats, "60").await;
     let mut first = worker(&nats, &[]);
@@ -202,8 +202,8 @@ async fn a_worker_that_is_told_to_end_gives_its_tile_back() {
     first.process.signal(Signal::TERM);
     assert_eq!(first.process.ended(Duration::from_secs(5)), Some(0));
     eprintln!("the worker ended after {:?}", start.elapsed());
-    until("the worker is gone from the list", || async { workers(&app).await.is_empty() }).await;
-    // Well before its message would be delivered again.
+    until("the worker is removed from the list", || async { workers(&app).await.is_empty() }).await;
+    // The tile is back long before its message would be redelivered.
     let _second = worker(&nats, &[]);
     busy(&app).await;
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
@@ -211,7 +211,7 @@ async fn a_worker_that_is_told_to_end_gives_its_tile_back() {
 }
 
 #[tokio::test]
-async fn a_server_that_is_killed_finds_its_tiles_again() {
+async fn a_killed_server_recovers_its_tiles() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
     let mut app = served(&nats, "5").await;
@@ -230,7 +230,7 @@ async fn a_server_that_is_killed_finds_its_tiles_again() {
 }
 
 #[tokio::test]
-async fn a_cancel_is_pushed_to_the_worker() {
+async fn a_cancellation_reaches_the_worker() {
     let Some(nats) = Nats::start(1) else { return };
     let app = served(&nats, "5").await;
     let _worker = worker(&nats, &[]);
@@ -243,17 +243,17 @@ async fn a_cancel_is_pushed_to_the_worker() {
     let took = start.elapsed();
     eprintln!("cancelled after {took:?}");
     assert!(took < Duration::from_secs(5), "{took:?}");
-    // The worker is free for the next one.
+    // The worker is free for the next job.
     let next = app.submit(&with_iterations(&measurement, 50)).await;
     assert_eq!(app.ended(&next).await["state"], "succeeded");
     nats.emptied().await;
 }
 
 #[tokio::test]
-async fn a_worker_of_another_version_is_refused_with_both() {
+async fn a_worker_of_another_version_is_rejected_with_both_versions() {
     let Some(nats) = Nats::start(1) else { return };
     let client = nats.client().await;
-    // What a worker of this version says.
+    // The greeting of a worker of this version.
     let mut hellos = client.subscribe("sci.v1.hello.test").await.unwrap();
     let mut waiting = worker(&nats, &[]);
     let hello = futures_util::StreamExt::next(&mut hellos).await.unwrap();
@@ -271,11 +271,11 @@ async fn a_worker_of_another_version_is_refused_with_both() {
         String::from_utf8(answer.unwrap().payload.to_vec()).unwrap()
     };
     assert!(refused.contains("0.0.7") && refused.contains(env!("CARGO_PKG_VERSION")), "{refused}");
-    // The worker that waited comes in, ...
-    until("the worker comes in", || async { workers(&app).await.len() == 1 }).await;
-    assert!(waiting.process.lives());
+    // The waiting worker is accepted ...
+    until("the worker is accepted", || async { workers(&app).await.len() == 1 }).await;
+    assert!(waiting.process.is_running());
     drop(app);
-    // ... and one that is refused ends with the reason.
+    // ... and a rejected one ends with the reason.
     let mut hellos = client.subscribe("sci.v1.hello.other").await.unwrap();
     let url = nats.url();
     let mut unwelcome = RemoteWorker::start(&["--nats", &url, "--pool", "other"]);
@@ -283,11 +283,11 @@ async fn a_worker_of_another_version_is_refused_with_both() {
     client.publish(asked.reply.unwrap(), refused.into()).await.unwrap();
     client.flush().await.unwrap();
     assert_eq!(unwelcome.process.ended(Duration::from_secs(10)), Some(2));
-    assert!(unwelcome.said().contains("0.0.7"), "{}", unwelcome.said());
+    assert!(unwelcome.log().contains("0.0.7"), "{}", unwelcome.log());
 }
 
 #[tokio::test]
-async fn a_tile_that_fails_on_every_worker_fails_its_job_with_the_reason() {
+async fn a_tile_that_fails_on_every_worker_fails_its_job() {
     let Some(nats) = Nats::start(1) else { return };
     let app = served(&nats, "5").await;
     let _worker = worker(&nats, &["--onnxruntime", "/nowhere/lib.so"]);
@@ -302,20 +302,20 @@ async fn a_tile_that_fails_on_every_worker_fails_its_job_with_the_reason() {
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
     assert!(error.contains("lib.so") && !error.contains("/nowhere"), "{error}");
-    // The worker lives and does what it can.
+    // The worker is still running and does other tasks.
     let next = app.submit(&with_iterations(&measurement, 50)).await;
     assert_eq!(app.ended(&next).await["state"], "succeeded");
     nats.emptied().await;
 }
 
 #[tokio::test]
-async fn a_tile_that_kills_its_workers_is_given_up_with_the_reason() {
+async fn a_tile_that_kills_its_workers_is_abandoned() {
     let Some(nats) = Nats::start(1) else { return };
     let folder = tempfile::tempdir().unwrap();
     let library = crate::hangs::library(folder.path(), "abort();");
     // The worker runs as somebody else.
     std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
-    // Far longer than the test: nobody waits for a silent worker.
+    // Far longer than the test, so no tile is redelivered because of silence.
     let app = served(&nats, "600").await;
     let mut worker = worker(&nats, &["--onnxruntime", library.to_str().unwrap()]);
     let (_, measurement) = app.scene(&Scene::SMALL).await;
@@ -329,19 +329,20 @@ async fn a_tile_that_kills_its_workers_is_given_up_with_the_reason() {
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
     assert!(error.contains("SIGABRT") && error.contains("(3 attempts)"), "{error}");
-    // A process that is killed from outside is replaced, too, and its tile taken up again at once. One long tile: a
-    // process that dies between two tiles, before it has noted the next, leaves that to `--ack-wait`.
+    // A process killed from outside is also replaced, and its tile is taken up again at once. The
+    // job has one long tile: a process that dies between two tiles leaves the next one to
+    // `ack_wait`.
     let mut job = with_iterations(&measurement, 3000);
     job["tile"] = json!({"size": 64, "overlap": 8});
     let job = app.submit(&job).await;
     busy(&app).await;
     rustix::process::kill_process(worker.inner().unwrap(), Signal::KILL).unwrap();
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    assert!(worker.process.lives());
+    assert!(worker.process.is_running());
 }
 
 #[tokio::test]
-async fn a_worker_without_work_ends_and_one_cache_serves_the_next() {
+async fn an_idle_worker_ends_and_its_cache_serves_the_next() {
     let Some(nats) = Nats::start(1) else { return };
     let app = served(&nats, "5").await;
     let mut first = worker(&nats, &["--exit-when-idle", "2"]);

@@ -1,5 +1,5 @@
-//! What a new user does: the commands of docs/CLUSTER.md, word for word, with the server in one network
-//! namespace, and the worker, as another user, in another.
+//! The commands of docs/CLUSTER.md, run verbatim with the server in one network namespace, and the
+//! worker in another as another user.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -9,9 +9,10 @@ use serde_json::{Value, json};
 
 use super::nodes;
 use super::{job, local};
+use crate::app::has_programs;
 use crate::samples::Scene;
 
-/// The commands under "Run workers on another PC": those of the server's machine, and of another one.
+/// The commands under "Run workers on another PC" for the server's machine and for another one.
 fn recipe() -> [String; 2] {
     let text = std::fs::read_to_string("docs/CLUSTER.md").unwrap();
     let (_, text) = text.split_once("## Run workers on another PC").unwrap();
@@ -19,7 +20,7 @@ fn recipe() -> [String; 2] {
     std::array::from_fn(|_| blocks.next().unwrap().to_owned())
 }
 
-/// Two network namespaces with a cable between them; they go when this is dropped.
+/// Two network namespaces connected by a cable; they are removed when this is dropped.
 struct Machines {
     names: [String; 2],
     folder: tempfile::TempDir,
@@ -36,7 +37,7 @@ fn ip(line: &str) -> Result<(), String> {
 }
 
 impl Machines {
-    /// None, in words, where namespaces can't be had.
+    /// None, after a message, if this machine allows no namespaces.
     fn new() -> Option<Self> {
         if !rustix::process::getuid().is_root() {
             eprintln!("SKIPPED: network namespaces need root");
@@ -59,7 +60,7 @@ impl Machines {
         for name in &self.names {
             ip(&format!("netns add {name}"))?;
             ip(&format!("-n {name} link set lo up"))?;
-            // Inside, this stands for /etc/hosts.
+            // In the namespace, this file replaces /etc/hosts.
             let folder = Path::new("/etc/netns").join(name);
             std::fs::create_dir_all(&folder).map_err(|error| error.to_string())?;
             let hosts = "127.0.0.1 localhost\n10.213.7.1 server.lab\n";
@@ -73,7 +74,7 @@ impl Machines {
         Ok(())
     }
 
-    /// A command line on one of the machines, with `bin` in front of the path.
+    /// A command line on one of the machines, with `bin` first in the path.
     fn shell(&self, machine: usize, text: &str) -> Command {
         let mut command = Command::new("ip");
         let path = format!("{}:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", self.bin().display());
@@ -95,7 +96,7 @@ impl Machines {
         self.shell(0, &line).current_dir(self.folder.path()).output().unwrap()
     }
 
-    /// An answer of the API, which the server's machine alone reaches.
+    /// An answer of the API, which only the server's machine can reach.
     fn api(&self, path: &str, body: Option<&Value>) -> Value {
         let url = format!("http://127.0.0.1:8080{path}");
         let ran = match body {
@@ -119,7 +120,7 @@ impl Machines {
 impl Drop for Machines {
     fn drop(&mut self) {
         for name in &self.names {
-            // All that runs there; by number, and of these namespaces alone.
+            // Ends all processes of these namespaces, by their identifiers.
             let listed = Command::new("ip").args(["netns", "pids", name]).output();
             let listed = listed.map(|ran| String::from_utf8_lossy(&ran.stdout).into_owned());
             for pid in listed.unwrap_or_default().split_whitespace() {
@@ -138,21 +139,18 @@ impl Drop for Machines {
 }
 
 #[tokio::test]
-async fn the_recipe_works_between_two_machines() {
+async fn the_documented_commands_work_between_two_machines() {
     if nodes::server().is_none() {
         return;
     }
-    if ["curl", "setpriv"].iter().any(|tool| Command::new(tool).arg("--version").output().is_err())
-    {
-        eprintln!("SKIPPED: curl or setpriv is not there");
+    if !has_programs(&["curl", "setpriv"], "curl util-linux") {
         return;
     }
     let expected = local().await;
     let Some(mut machines) = Machines::new() else { return };
     let [server, worker] = recipe();
 
-    // 1. The server's machine. The local process alone computes nothing of the tiles here, so that they
-    // must come from the other machine.
+    // The server's machine computes no tiles here, so they must come from the other machine.
     let home = machines.folder.path().join("home");
     std::fs::create_dir(&home).unwrap();
     let server = server.replace("sci-recon serve ", "sci-recon serve --workers 0 ");
@@ -161,44 +159,49 @@ async fn the_recipe_works_between_two_machines() {
     let mut shell = machines.shell(0, &format!("set -e\n{server}\nwait"));
     shell.current_dir(&home).env("HOME", &home).stderr(log.try_clone().unwrap()).stdout(log);
     machines.started.push(shell.spawn().unwrap());
-    let said = || std::fs::read_to_string(machines.folder.path().join("server.log")).unwrap();
+    let server_log = || std::fs::read_to_string(machines.folder.path().join("server.log")).unwrap();
     let credential = home.join("default.creds");
-    wait("the credential is there", || credential.exists(), &said);
+    wait("the credential exists", || credential.exists(), &server_log);
     wait(
         "the server answers",
         || machines.curl("-f http://127.0.0.1:8080/livez").status.success(),
-        &said,
+        &server_log,
     );
     let ready = || machines.api("/readyz", None);
-    wait("the server has found NATS", || ready()["ready"] == true, &said);
+    wait("the server has connected to NATS", || ready()["ready"] == true, &server_log);
 
-    // 2. Another machine: a copy of the program and of the credential, somebody else's rights, and folders of
-    // its own.
+    // The other machine has a copy of the program and the credential, another user's rights, and
+    // other folders.
     let other = tempfile::tempdir().unwrap();
     std::fs::copy(&credential, other.path().join("default.creds")).unwrap();
     for path in [other.path().to_owned(), other.path().join("default.creds")] {
-        std::os::unix::fs::chown(path, Some(nodes::NOBODY), Some(nodes::NOBODY)).unwrap();
+        std::os::unix::fs::chown(
+            path,
+            Some(nodes::UNPRIVILEGED_UID),
+            Some(nodes::UNPRIVILEGED_UID),
+        )
+        .unwrap();
     }
     let script = other.path().join("recipe.sh");
     std::fs::write(&script, format!("set -e\n{worker}")).unwrap();
     let line = format!(
         "mount -t tmpfs -o mode=1777 tmpfs /var/tmp && \
          exec setpriv --reuid {0} --regid {0} --clear-groups sh {1}",
-        nodes::NOBODY,
+        nodes::UNPRIVILEGED_UID,
         script.display()
     );
     let log = std::fs::File::create(other.path().join("log")).unwrap();
     let mut shell = machines.shell(1, &line);
     shell.current_dir(other.path()).stderr(log.try_clone().unwrap()).stdout(log);
     machines.started.push(shell.spawn().unwrap());
-    let heard = || std::fs::read_to_string(other.path().join("log")).unwrap() + &said();
+    let heard = || std::fs::read_to_string(other.path().join("log")).unwrap() + &server_log();
     let there = || {
         let system = machines.api("/v1/system", None);
         system["workers"].as_array().unwrap().iter().any(|worker| worker["pool"] == "default")
     };
-    wait("the worker is there", there, &heard);
+    wait("the worker is connected", there, &heard);
 
-    // 3. A job, whose frames are those of one machine.
+    // A job that gives the same frames as on one machine.
     let masks = machines.upload(&Scene::SMALL.masks());
     let calibration = machines.api("/v1/calibrations", Some(&json!({"masks": masks})));
     let data = machines.upload(&Scene::SMALL.snapshots());
@@ -222,13 +225,13 @@ async fn the_recipe_works_between_two_machines() {
     assert_eq!(found, *expected);
 }
 
-fn wait(what: &str, mut holds: impl FnMut() -> bool, said: &impl Fn() -> String) {
+fn wait(what: &str, mut holds: impl FnMut() -> bool, log: &impl Fn() -> String) {
     let start = Instant::now();
     while !holds() {
         assert!(
             start.elapsed() < Duration::from_secs(60),
             "not within a minute: {what}\n{}",
-            said()
+            log()
         );
         std::thread::sleep(Duration::from_millis(100));
     }

@@ -1,4 +1,4 @@
-//! Message servers and workers for the tests, as processes of their own.
+//! Message servers and workers for the tests, as separate processes.
 
 use std::io::Write;
 use std::net::{TcpListener, TcpStream};
@@ -12,6 +12,8 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
+use crate::app::skip;
+
 /// Free ports of this machine.
 fn ports(count: usize) -> Vec<u16> {
     let open: Vec<TcpListener> =
@@ -19,13 +21,13 @@ fn ports(count: usize) -> Vec<u16> {
     open.iter().map(|listener| listener.local_addr().unwrap().port()).collect()
 }
 
-/// nats-server: `NATS_SERVER`, or the one that is installed; none if there is none.
+/// Path of nats-server: `NATS_SERVER`, or the installed one; none after [`skip`].
 pub fn server() -> Option<PathBuf> {
     let named = std::env::var_os("NATS_SERVER").map(PathBuf::from);
     let places = ["/usr/sbin/nats-server", "/usr/local/bin/nats-server", "/usr/bin/nats-server"];
     let found = named.or_else(|| places.map(PathBuf::from).into_iter().find(|path| path.exists()));
     if found.is_none() {
-        eprintln!("SKIPPED: there is no nats-server (Debian: apt-get install nats-server)");
+        skip("nats-server is not installed: run `apt-get install nats-server`, or set NATS_SERVER");
     }
     found
 }
@@ -43,21 +45,21 @@ impl Process {
     }
 
     pub fn signal(&self, signal: Signal) {
-        // It may have ended.
+        // The process may have ended already.
         let _ = kill_process(self.pid(), signal);
     }
 
-    /// SIGKILL.
+    /// Sends SIGKILL.
     pub fn kill(&mut self) {
         let _ = self.0.kill();
         self.0.wait().unwrap();
     }
 
-    pub fn lives(&mut self) -> bool {
+    pub fn is_running(&mut self) -> bool {
         self.0.try_wait().unwrap().is_none()
     }
 
-    /// Waits for its end; the exit code.
+    /// Waits for the process to end; returns its exit code.
     pub fn ended(&mut self, within: Duration) -> Option<i32> {
         let start = Instant::now();
         while start.elapsed() < within {
@@ -66,7 +68,7 @@ impl Process {
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        panic!("it does not end within {within:?}");
+        panic!("the process does not end within {within:?}");
     }
 }
 
@@ -77,21 +79,21 @@ impl Drop for Process {
     }
 }
 
-/// A message server of one node or three.
+/// A message server with one or three nodes.
 pub struct Nats {
     program: PathBuf,
     folder: TempDir,
-    /// Where nodes keep their messages.
+    /// Storage folders of the nodes.
     stores: PathBuf,
     configurations: Vec<PathBuf>,
-    /// True if it asks for credentials.
+    /// True if the server requires credentials.
     secured: bool,
     pub ports: Vec<u16>,
     pub nodes: Vec<Option<Process>>,
 }
 
 impl Nats {
-    /// None if there is no nats-server.
+    /// Starts the nodes; none without nats-server.
     pub fn start(count: usize) -> Option<Self> {
         let program = server()?;
         let folder = tempfile::tempdir().unwrap();
@@ -120,7 +122,7 @@ impl Nats {
         Some(Self::run(program, folder, stores, configurations, ports.to_vec(), false))
     }
 
-    /// With the configuration that `sci-recon cluster init` writes; none if there is no nats-server.
+    /// Starts the nodes with the configuration of `sci-recon cluster`; none without nats-server.
     pub fn secured(count: usize, more: &[&str]) -> Option<Self> {
         let program = server()?;
         let folder = tempfile::tempdir().unwrap();
@@ -135,7 +137,7 @@ impl Nats {
         let mut ports = Vec::new();
         while ports.len() < count {
             let port = self::ports(1)[0];
-            // Nodes meet each other 2000 above.
+            // Nodes connect to each other on ports that are 2000 higher.
             if port < 60_000 && TcpListener::bind(("127.0.0.1", port + 2000)).is_ok() {
                 line.extend(["--node".into(), format!("127.0.0.1:{port}")]);
                 ports.push(port);
@@ -148,10 +150,10 @@ impl Nats {
             .output()
             .unwrap();
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        let said = String::from_utf8(made.stdout).unwrap();
-        let lines = said.lines().filter_map(|line| line.strip_prefix("nats-server -c "));
+        let listing = String::from_utf8(made.stdout).unwrap();
+        let lines = listing.lines().filter_map(|line| line.strip_prefix("nats-server -c "));
         let configurations: Vec<PathBuf> = lines.map(PathBuf::from).collect();
-        assert_eq!(configurations.len(), count, "{said}");
+        assert_eq!(configurations.len(), count, "{listing}");
         Some(Self::run(program, folder, stores, configurations, ports, true))
     }
 
@@ -181,7 +183,7 @@ impl Nats {
         self.keys().join("hub.creds")
     }
 
-    /// What `sci-recon cluster` prints for these arguments.
+    /// Output of `sci-recon cluster` with these arguments.
     pub fn cluster(&self, arguments: &[&str]) -> Result<String, String> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         let ran = command.arg("cluster").args(arguments).arg("--keys").arg(self.keys()).output();
@@ -190,7 +192,7 @@ impl Nats {
         if ran.status.success() { Ok(text(ran.stdout)) } else { Err(text(ran.stderr)) }
     }
 
-    /// A credential for workers of a pool, in a file that everybody may read.
+    /// A credential for workers of a pool, in a file that every user may read.
     pub fn credential(&self, pool: &str) -> PathBuf {
         let path = self.folder.path().join(format!("{pool}.creds"));
         self.cluster(&["worker", "create", "--pool", pool, "--out", path.to_str().unwrap()])
@@ -198,7 +200,7 @@ impl Nats {
         path
     }
 
-    /// SIGKILL.
+    /// Sends SIGKILL to a node.
     pub fn end(&mut self, n: usize) {
         if let Some(mut node) = self.nodes[n].take() {
             node.kill();
@@ -211,7 +213,7 @@ impl Nats {
         }
     }
 
-    /// Removes all messages of a node that does not run.
+    /// Removes all messages of a stopped node.
     pub fn wipe(&self, n: usize) {
         let several = self.nodes.len() > 1;
         let store = match (self.secured, several) {
@@ -232,7 +234,7 @@ impl Nats {
         digits.parse::<usize>().map_or(0, |n| (n - 1) % self.nodes.len())
     }
 
-    /// Writes something else over a chunk that is stored.
+    /// Overwrites a stored chunk.
     pub async fn corrupt(&self, stream: &str) {
         use futures_util::TryStreamExt;
         let client = self.client().await;
@@ -251,7 +253,7 @@ impl Nats {
             }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
-        eprintln!("nothing was in {stream} to be corrupted");
+        eprintln!("{stream} has no chunk to corrupt");
     }
 
     /// Removes all messages of a stream.
@@ -260,7 +262,7 @@ impl Nats {
         context.get_stream(stream).await.unwrap().purge().await.unwrap();
     }
 
-    /// Starts a node, on the disk that it had.
+    /// Starts a node on its existing storage.
     pub fn begin(&mut self, n: usize) {
         let log = std::fs::File::create(self.folder.path().join(format!("n{n}.log"))).unwrap();
         let child = Command::new(&self.program)
@@ -299,7 +301,7 @@ impl Nats {
         options.connect(urls).await.unwrap()
     }
 
-    /// The subject of a message in a stream, once there is one.
+    /// The subject of a message in a stream, when there is one.
     pub async fn subject_in(&self, stream: &str) -> String {
         use futures_util::TryStreamExt;
         let context = async_nats::jetstream::new(self.client().await);
@@ -314,12 +316,12 @@ impl Nats {
         }
     }
 
-    /// Messages in each stream.
+    /// Number of messages in each stream.
     pub async fn messages(&self) -> Vec<(String, u64)> {
         let context = async_nats::jetstream::new(self.client().await);
         let mut found = Vec::new();
         for name in ["SCI_TASKS", "SCI_EVENTS", "SCI_IN", "SCI_OUT"] {
-            // A cluster may be about to choose a leader.
+            // A cluster may be electing a leader.
             let stream = context.get_stream(name).await;
             let count = stream.map_or(1, |stream| stream.cached_info().state.messages);
             found.push((name.to_owned(), count));
@@ -327,10 +329,10 @@ impl Nats {
         found
     }
 
-    /// What it says of the streams of tiles and events and of their consumers.
+    /// State of the streams of tiles and events and of their consumers.
     pub async fn state(&self) -> String {
         let client = self.client().await;
-        let mut said = String::new();
+        let mut state = String::new();
         for (stream, consumer) in [("SCI_TASKS", "test"), ("SCI_EVENTS", "hub-test")] {
             for subject in [
                 format!("$JS.API.STREAM.INFO.{stream}"),
@@ -339,10 +341,10 @@ impl Nats {
                 let answer = client.request(subject.clone(), "".into()).await;
                 let answer =
                     answer.map(|answer| String::from_utf8_lossy(&answer.payload).into_owned());
-                said += &format!("{subject}: {answer:?}\n");
+                state += &format!("{subject}: {answer:?}\n");
             }
         }
-        said
+        state
     }
 
     /// Waits until all streams are empty.
@@ -361,7 +363,7 @@ impl Nats {
     }
 }
 
-/// The program, where others than root may run it.
+/// The program, in a place where other users may run it.
 pub fn program() -> &'static Path {
     static COPY: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
     let (_, path) = COPY.get_or_init(|| {
@@ -375,8 +377,8 @@ pub fn program() -> &'static Path {
     path
 }
 
-/// Somebody without rights to anything.
-pub const NOBODY: u32 = 65_534;
+/// A user without rights to any file.
+pub const UNPRIVILEGED_UID: u32 = 65_534;
 
 /// The environment of every container: the ENV lines of the image.
 fn image_environment() -> Vec<(String, String)> {
@@ -403,12 +405,13 @@ impl RemoteWorker {
         Self::within(&[], arguments)
     }
 
-    /// With a credential, of which it gets a copy of its own.
+    /// Starts a worker with a copy of a credential.
     pub fn with_credential(credential: &Path, arguments: &[&str]) -> Self {
         let own = tempfile::NamedTempFile::new().unwrap();
         std::fs::copy(credential, own.path()).unwrap();
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(own.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+            std::os::unix::fs::chown(own.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID))
+                .unwrap();
         }
         let path = own.path().to_str().unwrap().to_owned();
         let mut worker = Self::within(&[], &[&["--nats-creds", path.as_str()], arguments].concat());
@@ -416,7 +419,7 @@ impl RemoteWorker {
         worker
     }
 
-    /// Under the command in front of it, such as one that sets limits.
+    /// Starts a worker under another command, such as one that sets limits.
     pub fn within(before: &[&str], arguments: &[&str]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let log = folder.path().join("log");
@@ -439,14 +442,15 @@ impl RemoteWorker {
             command.env("ORT_DYLIB_PATH", library);
         }
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(folder.path(), Some(NOBODY), Some(NOBODY)).unwrap();
-            command.uid(NOBODY).gid(NOBODY);
+            std::os::unix::fs::chown(folder.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID))
+                .unwrap();
+            command.uid(UNPRIVILEGED_UID).gid(UNPRIVILEGED_UID);
         }
         let process = Process(command.spawn().unwrap());
         Self { process, folder, log, credential: None }
     }
 
-    /// The process that computes, under the one that watches over it.
+    /// The computing process, a child of the supervisor.
     pub fn inner(&self) -> Option<Pid> {
         let path = format!("/proc/{}/task", self.process.pid().as_raw_nonzero());
         let threads: Vec<_> = std::fs::read_dir(path).ok()?.flatten().collect();
@@ -457,10 +461,10 @@ impl RemoteWorker {
         Pid::from_raw(all.split_whitespace().next()?.parse().ok()?)
     }
 
-    /// SIGKILL for all of it, as when its machine is gone.
+    /// Kills both processes with SIGKILL, like a failure of the machine.
     pub fn kill(&mut self) {
         let inner = self.inner();
-        // Nobody is to hear of the other's death.
+        // Stop both first, so that neither reacts to the other's death.
         self.process.signal(Signal::STOP);
         if let Some(inner) = inner {
             let _ = kill_process(inner, Signal::KILL);
@@ -468,7 +472,7 @@ impl RemoteWorker {
         self.process.kill();
     }
 
-    /// A signal for both processes.
+    /// Sends a signal to both processes.
     pub fn signal(&self, signal: Signal) {
         self.process.signal(signal);
         if let Some(inner) = self.inner() {
@@ -476,13 +480,13 @@ impl RemoteWorker {
         }
     }
 
-    /// Bytes in its cache.
+    /// Size of its cache in bytes.
     pub fn cached(&self) -> u64 {
         let Ok(entries) = std::fs::read_dir(self.folder.path().join("cache")) else { return 0 };
         entries.flatten().filter_map(|entry| entry.metadata().ok()).map(|facts| facts.len()).sum()
     }
 
-    /// The most bytes that it has had resident.
+    /// Peak resident memory in bytes.
     pub fn peak_memory(&self) -> u64 {
         let Some(inner) = self.inner() else { return 0 };
         let path = format!("/proc/{}/status", inner.as_raw_nonzero());
@@ -492,7 +496,7 @@ impl RemoteWorker {
         kib.unwrap_or(0) * 1024
     }
 
-    pub fn said(&self) -> String {
+    pub fn log(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap()
     }
 }
@@ -500,7 +504,7 @@ impl RemoteWorker {
 impl Drop for RemoteWorker {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            let _ = std::io::stderr().write_all(self.said().as_bytes());
+            let _ = std::io::stderr().write_all(self.log().as_bytes());
         }
     }
 }

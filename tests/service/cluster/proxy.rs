@@ -1,4 +1,4 @@
-//! A network between a worker and the message server that can be slow, and can freeze.
+//! A network between a worker and the message server that can be slow or freeze.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -8,7 +8,7 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Hands on what comes to a port of its own, after a delay.
+/// Forwards connections with a delay.
 pub struct Proxy {
     pub port: u16,
     frozen: Arc<AtomicBool>,
@@ -20,7 +20,7 @@ impl Proxy {
         let port = listener.local_addr().unwrap().port();
         let frozen = Arc::new(AtomicBool::new(false));
         let shared = frozen.clone();
-        // They end with the process, or with their connections.
+        // The threads end with the process or their connections.
         thread::spawn(move || {
             for from in listener.incoming().flatten() {
                 let Ok(to) = TcpStream::connect(("127.0.0.1", to)) else { continue };
@@ -31,7 +31,7 @@ impl Proxy {
         Self { port, frozen }
     }
 
-    /// Nothing passes any more, and no connection ends; or it goes on.
+    /// Stops or resumes forwarding without closing connections.
     pub fn freeze(&self, frozen: bool) {
         self.frozen.store(frozen, Ordering::Relaxed);
     }

@@ -1,4 +1,4 @@
-//! `make cluster`: jobs whose workers, servers, message servers, network and files fail at random
+//! `make cluster`: jobs while workers, servers, message servers, network and files fail at random
 //! moments. A short version runs with all tests.
 
 use std::collections::BTreeMap;
@@ -14,30 +14,31 @@ use serde_json::{Value, json};
 use super::nodes::{Nats, RemoteWorker};
 use super::proxy::Proxy;
 use super::{figure, workers};
-use crate::app::TestApp;
+use crate::app::{TestApp, has_onnxruntime};
 use crate::samples::Scene;
 
-/// Bytes that a worker's cache may hold, and that a worker may have resident.
+/// Limits in bytes of a worker's cache and of its resident memory.
 const CACHE: u64 = 24 << 20;
 const MEMORY: u64 = 1 << 30;
 
-/// What is to be computed: the schedule `rounds` has tiles of about five seconds (`make cluster`), or
-/// of one (all tests).
+/// The job and its faults. In `make cluster` a tile takes about five seconds, in all tests one
+/// second.
 #[derive(Debug, Clone, Copy)]
 struct Plan {
     scene: Scene,
     tile: u32,
-    /// Of gap-tv; none for the default algorithm with its own schedule.
+    /// Iterations of gap-tv; none for the default algorithm and schedule.
     iterations: Option<u32>,
-    /// Seconds of silence after which another worker gets a tile.
+    /// Seconds of silence after which a tile is redelivered.
     ack_wait: u64,
-    /// How long a worker is suspended or cut off, the quorum is lost, and the stream's leader is down.
+    /// Duration of a worker's suspension or isolation, of a lost quorum, and of the leader's
+    /// failure.
     silence: Duration,
     no_quorum: Duration,
     leaderless: Duration,
-    /// The longest pause before a fault, in milliseconds.
+    /// Longest pause before a fault in milliseconds.
     pause: u64,
-    /// The longest that a round may take.
+    /// Longest duration of a round.
     limit: Duration,
 }
 
@@ -116,13 +117,13 @@ impl Fault {
     ];
 }
 
-/// A cluster at work, and what it has been through.
+/// A running cluster, and its counters and random numbers.
 struct Ground {
     plan: Plan,
     app: TestApp,
     nats: Nats,
     workers: Vec<RemoteWorker>,
-    /// Before the first worker.
+    /// Stands between the first worker and the message server.
     proxy: Proxy,
     credential: std::path::PathBuf,
     random: ChaCha8Rng,
@@ -168,7 +169,7 @@ impl Ground {
         RemoteWorker::with_credential(&self.credential, &["--nats", &url, "--cache-bytes", &cache])
     }
 
-    /// What workers hold, against their bounds.
+    /// Compares the workers' cache and memory with their limits.
     fn look(&mut self) {
         for worker in &self.workers {
             let cached = worker.cached();
@@ -179,7 +180,7 @@ impl Ground {
         }
     }
 
-    /// Figures of a server are gone with it.
+    /// Reads the metrics of a server before its end.
     async fn note_figures(&mut self) {
         for name in ["redelivered", "refused", "repaired"] {
             let value = figure(&self.app, &format!("sci_recon_cluster_{name}_total")).await;
@@ -227,7 +228,7 @@ impl Ground {
                 self.nats.end(node);
                 self.nats.wipe(node);
                 self.nats.begin(node);
-                // The next fault should not hit before the others have filled it again.
+                // The cluster must be complete again before the next fault.
                 tokio::time::sleep(Duration::from_secs(if nodes > 1 { 5 } else { 0 })).await;
             }
             Fault::InputCorrupted => self.nats.corrupt("SCI_IN").await,
@@ -235,7 +236,7 @@ impl Ground {
         }
     }
 
-    /// One job with all faults at random moments.
+    /// Runs one job with all faults at random moments.
     async fn round(&mut self, measurement: &str, faults: &[Fault]) -> String {
         let start = Instant::now();
         let id = self.app.submit(&self.plan.job(measurement)).await;
@@ -272,7 +273,7 @@ impl Ground {
     }
 }
 
-/// As `make cluster` says; none for the short version.
+/// Number of rounds from `SCI_RECON_CLUSTER_ROUNDS`; none in the short version.
 pub fn rounds() -> Option<u32> {
     std::env::var("SCI_RECON_CLUSTER_ROUNDS").ok().map(|text| text.parse().unwrap())
 }
@@ -298,7 +299,7 @@ async fn local(plan: &Plan) -> BTreeMap<String, String> {
     frames(&app, &job).await
 }
 
-/// The service's records, to read.
+/// Opens the service's database for reading.
 pub async fn database(data: &Path) -> sqlx::SqliteConnection {
     use sqlx::Connection;
     let path = data.join("sci-recon.db");
@@ -306,7 +307,7 @@ pub async fn database(data: &Path) -> sqlx::SqliteConnection {
     sqlx::SqliteConnection::connect_with(&options).await.unwrap()
 }
 
-/// Tiles that were not accepted once, by the records.
+/// Number of tiles in the database that were not accepted exactly once.
 async fn not_once(data: &Path, job: &str) -> i64 {
     use sqlx::Row;
     let mut connection = database(data).await;
@@ -367,9 +368,7 @@ async fn faults_of_all_kinds_change_nothing_with_three_nodes() {
 #[tokio::test]
 #[ignore = "part of `make cluster`"]
 async fn faults_of_all_kinds_change_nothing_in_the_default_schedule() {
-    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
-    if !Path::new(&library).exists() {
-        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+    if !has_onnxruntime() {
         return;
     }
     rounds_by(Plan::DEEP, "cluster_deep", (3, Duration::ZERO), 1, &Fault::ALL).await;

@@ -1,6 +1,6 @@
-//! What the hand-over costs, and how far it carries. Where workers are simulated, they speak the whole
-//! protocol over a connection of their own each, sleep instead of computing, and send a tile's masks for its
-//! frames: what is measured is hub, store and message server, never a solver.
+//! The cost of handing tiles over, and its limits. Simulated workers speak the whole protocol, each
+//! over one connection. They sleep in place of computing and send a tile's masks as its frames, so
+//! that only hub, store and message server are measured.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -15,13 +15,13 @@ use sqlx::Row;
 use super::nodes::{Nats, RemoteWorker};
 use super::rounds::{database, rounds};
 use super::{served, until, with_iterations, worker};
-use crate::app::TestApp;
+use crate::app::{TestApp, has_onnxruntime};
 use crate::samples::Scene;
 
-/// How long a simulated worker waits for an answer.
+/// Time for which a simulated worker waits for an answer.
 const ANSWER: Duration = Duration::from_secs(5);
 
-/// CPU seconds of a process, and of those of its children that have ended.
+/// CPU seconds of a process and its ended children.
 fn cpu(pid: u32) -> f64 {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     let (_, fields) = stat.rsplit_once(')').unwrap_or_default();
@@ -31,25 +31,25 @@ fn cpu(pid: u32) -> f64 {
     ticks / rustix::param::clock_ticks_per_second() as f64
 }
 
-/// CPU seconds of what hands tiles over: the server, and the message server.
+/// CPU seconds of the server and the message server, which hand tiles over.
 fn handing_over(app: &TestApp, nats: &Nats) -> (f64, f64) {
     (cpu(app.pid()), nats.nodes.iter().flatten().map(|node| cpu(node.id())).sum())
 }
 
-/// What all simulated workers share.
+/// State that all simulated workers share.
 #[derive(Default)]
 struct Crowd {
     url: String,
-    /// What a real worker says of its program, and of a tile that it has done.
+    /// The greeting of a real worker, and its report of a tile.
     program: Value,
     end: Value,
-    /// How long a tile takes.
+    /// Duration of a tile.
     length: Mutex<Duration>,
     stop: AtomicBool,
-    /// Requests that were not answered in time.
+    /// Requests without an answer in time.
     late: AtomicU64,
     done: AtomicU64,
-    /// From the end of a tile to the beginning of the next.
+    /// Times between the end of a tile and the start of the next.
     pauses: Mutex<Vec<Duration>>,
 }
 
@@ -61,7 +61,7 @@ struct Simulated {
 }
 
 impl Crowd {
-    /// Learns from a real worker what the others are to say.
+    /// Records the messages of a real worker.
     async fn learn(nats: &Nats, app: &TestApp) -> Self {
         let client = nats.client().await;
         let mut hellos = client.subscribe("sci.v1.hello.test").await.unwrap();
@@ -102,7 +102,7 @@ impl Simulated {
             .unwrap();
     }
 
-    /// Does something until it is answered in time, and counts how often it was not.
+    /// Repeats a request until it is answered in time, and counts the failures.
     async fn in_time<T, E, F>(&self, mut what: impl FnMut() -> F) -> T
     where
         F: Future<Output = Result<T, E>>,
@@ -124,7 +124,8 @@ impl Simulated {
     }
 
     async fn work(self) {
-        let _told = self.client.subscribe(format!("sci.v1.tell.test.{}", self.id)).await.unwrap();
+        let _subscription =
+            self.client.subscribe(format!("sci.v1.tell.test.{}", self.id)).await.unwrap();
         let hello = json!({"worker": self.id, "host": "simulated", "pid": 1, "device": "none",
             "program": self.crowd.program});
         let welcome = self.ask("hello", &hello).await;
@@ -132,7 +133,7 @@ impl Simulated {
         let idle = json!({"worker": self.id, "tile": null, "leaves": false});
         let (mut signed, mut free) = (Instant::now(), None);
         while !self.stopped() {
-            // As a worker does: one tile, asked for in rounds of five seconds.
+            // Like a worker, request one tile at a time in rounds of five seconds.
             let consumer = self
                 .in_time(|| {
                     self.context.get_consumer_from_stream::<
@@ -158,7 +159,7 @@ impl Simulated {
         self.client.flush().await.unwrap();
     }
 
-    /// Does a tile; false if the message was of no use.
+    /// Computes a tile; false if the message was not usable.
     async fn tile(&self, message: &Message, ack_wait: Duration, free: Option<Instant>) -> bool {
         let task: Value = serde_json::from_slice(&message.payload).unwrap();
         let (seq, delivery) = {
@@ -180,16 +181,16 @@ impl Simulated {
         let masks = self.input(&task["masks"]).await;
         let snapshots = self.input(&task["snapshots"]).await;
         let start = Instant::now();
-        let (mut told, mut kept) = (start, start);
+        let (mut reported, mut kept) = (start, start);
         let length = *self.crowd.length.lock().unwrap();
         while start.elapsed() < length {
             let left = length.saturating_sub(start.elapsed());
             tokio::time::sleep(left.min(Duration::from_millis(500))).await;
-            if told.elapsed() > Duration::from_secs(1) {
+            if reported.elapsed() > Duration::from_secs(1) {
                 let tile = json!({"task": task["task"], "attempt": attempt,
                     "progress": self.crowd.end["progress"], "history": null});
                 self.say("beat", json!({"worker": self.id, "tile": tile, "leaves": false})).await;
-                told = Instant::now();
+                reported = Instant::now();
             }
             if kept.elapsed() > ack_wait / 6 {
                 self.in_time(|| message.double_ack_with(AckKind::Progress)).await;
@@ -209,7 +210,7 @@ impl Simulated {
         true
     }
 
-    /// Publishes into a stream.
+    /// Publishes to a stream.
     async fn stored(&self, subject: String, bytes: bytes::Bytes) {
         self.in_time(|| async {
             let sent = self.context.publish(subject.clone(), bytes.clone()).await;
@@ -218,7 +219,7 @@ impl Simulated {
         .await;
     }
 
-    /// A small input, which is one chunk.
+    /// A small input that fits in one chunk.
     async fn input(&self, input: &Value) -> bytes::Bytes {
         let subject = format!("sci.v1.in.test.{}.0", input["sha256"].as_str().unwrap());
         let stream = self.context.get_stream_no_info("SCI_IN").await.unwrap();
@@ -252,7 +253,7 @@ fn percentile(times: &[Duration], of_hundred: usize) -> f64 {
     times.get(at - 1).map_or(0.0, Duration::as_secs_f64) * 1e3
 }
 
-/// One job of simulated tiles, and what its hand-over took.
+/// Runs a job of simulated tiles, and measures the hand-over.
 async fn simulate(
     app: &TestApp,
     nats: &Nats,
@@ -286,7 +287,7 @@ async fn simulate(
     pauses.sort();
     let per_tile = |spent: f64| (spent / total as f64 * 1e6).round() / 1e3;
     let round = |value: f64| (value * 10.0).round() / 10.0;
-    // So many a second there would be, if the hand-over took no time.
+    // Tiles per second if the hand-over took no time.
     let wanted = workers as f64 / length.as_secs_f64();
     app.ended(&job).await;
     json!({
@@ -313,11 +314,11 @@ async fn crowd_of(
             tokio::time::sleep(Duration::from_millis(200)).await;
         }
     }
-    until("all are there", || async { super::workers(app).await.len() >= to }).await;
+    until("all workers are connected", || async { super::workers(app).await.len() >= to }).await;
     all
 }
 
-/// The soft limit on open files: each simulated worker has a connection.
+/// Raises the soft limit on open files, because each simulated worker has a connection.
 fn open_many_files() {
     use rustix::process::{Resource, getrlimit, setrlimit};
     let mut limit = getrlimit(Resource::Nofile);
@@ -325,9 +326,9 @@ fn open_many_files() {
     setrlimit(Resource::Nofile, limit).unwrap();
 }
 
-/// Fewer in the short version, which all tests have.
+/// The short version in all tests has fewer workers.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn idle_workers_by_the_hundred_take_tiny_tiles_without_a_late_answer() {
+async fn many_idle_workers_take_small_tiles_in_time() {
     let Some(nats) = Nats::start(1) else { return };
     open_many_files();
     let (workers, tiles) = if rounds().is_some() { (500, 2000) } else { (60, 200) };
@@ -353,7 +354,7 @@ async fn idle_workers_by_the_hundred_take_tiny_tiles_without_a_late_answer() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "part of `make cluster`"]
-async fn a_simulation_of_a_thousand_workers_shows_where_the_limit_is() {
+async fn a_thousand_simulated_workers_show_the_limit() {
     let Some(nats) = Nats::start(1) else { return };
     open_many_files();
     let app = served(&nats, "30").await;
@@ -362,7 +363,7 @@ async fn a_simulation_of_a_thousand_workers_shows_where_the_limit_is() {
     for workers in [10, 100, 300, 1000] {
         all.extend(crowd_of(&app, &crowd, (there, workers)).await);
         there = workers;
-        // Four tiles for each, of so many seconds.
+        // Four tiles per worker, of this duration.
         for length in [10, 2] {
             let plan = (4 * workers, Duration::from_secs(length));
             let line = simulate(&app, &nats, &crowd, workers, plan).await;
@@ -375,13 +376,14 @@ async fn a_simulation_of_a_thousand_workers_shows_where_the_limit_is() {
     futures_util::future::join_all(all).await;
 }
 
-/// CPU seconds of a worker: of the process that computes, and of the one that watches over it.
+/// CPU seconds of a worker's computing process and its supervisor.
 fn cpu_of_worker(worker: &RemoteWorker) -> f64 {
     let inner = worker.inner().map_or(0, |pid| pid.as_raw_nonzero().get().unsigned_abs());
     cpu(worker.process.id()) + cpu(inner)
 }
 
-/// Whether the server's own process works on a job's pilot or preview, which are the solver's, too.
+/// True if the server's local process computes a job's pilot or preview, which belong to the
+/// solver.
 async fn solves_at_home(records: &mut sqlx::SqliteConnection, job: &str) -> bool {
     let row = sqlx::query(
         "SELECT count(*) AS n FROM tasks
@@ -390,8 +392,8 @@ async fn solves_at_home(records: &mut sqlx::SqliteConnection, job: &str) -> bool
     row.bind(job).fetch_one(records).await.unwrap().get::<i64, _>("n") > 0
 }
 
-/// What a job costs in CPU seconds: (server and its own process, message server, workers, of which tiles;
-/// of the first what is the solver's).
+/// CPU seconds of a job: server with its local process, message server, workers, their tiles, and
+/// the solver's part of the first.
 async fn cost(app: &TestApp, nats: &Nats, workers: &[RemoteWorker], body: &Value) -> [f64; 5] {
     let local = |app: &TestApp| -> f64 {
         app.workers().iter().map(|pid| cpu(pid.as_raw_nonzero().get().unsigned_abs())).sum()
@@ -425,21 +427,19 @@ async fn cost(app: &TestApp, nats: &Nats, workers: &[RemoteWorker], body: &Value
     [after.0 - before.0, after.1 - before.1, after.2 - before.2, tiles, home]
 }
 
-/// A deep job over the network, and what of it is not the solver's. The part of a tile that is spent on its
-/// inputs is known from a job whose tiles do next to nothing.
+/// A deep job on remote workers, and the share that is not spent in the solver. A job with almost
+/// no computation shows the cost of a tile's inputs.
 #[tokio::test]
 #[ignore = "part of `make cluster`"]
-async fn little_of_a_deep_job_is_not_the_solvers() {
-    let library = std::env::var("ORT_DYLIB_PATH").unwrap_or_default();
-    if !std::path::Path::new(&library).exists() {
-        eprintln!("SKIPPED: there is no libonnxruntime at {library:?}; `make runtime` fetches it");
+async fn little_time_of_a_deep_job_is_spent_outside_the_solver() {
+    if !has_onnxruntime() {
         return;
     }
     let Some(nats) = Nats::start(1) else { return };
     let app = served(&nats, "30").await;
     let workers = [worker(&nats, &[]), worker(&nats, &[])];
-    until("both are there", || async { super::workers(&app).await.len() == 2 }).await;
-    // 1. Nothing to do.
+    until("both workers are connected", || async { super::workers(&app).await.len() == 2 }).await;
+    // Measure the idle cost.
     tokio::time::sleep(Duration::from_secs(5)).await;
     const IDLE: u64 = 60;
     let before = workers.each_ref().map(cpu_of_worker);
@@ -447,7 +447,7 @@ async fn little_of_a_deep_job_is_not_the_solvers() {
     let after = workers.each_ref().map(cpu_of_worker);
     let idle = after.iter().zip(before).map(|(after, before)| (after - before) / IDLE as f64);
     let idle = idle.fold(0.0, f64::max);
-    // 2. Next to nothing, and the default schedule, or one of fewer deep passes.
+    // Almost no computation, then the default schedule or one with fewer deep passes.
     let scene = Scene { frames: 10, height: 1024, width: 1024, snapshots: 1 };
     let (_, measurement) = app.scene(&scene).await;
     let nothing = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
@@ -463,7 +463,7 @@ async fn little_of_a_deep_job_is_not_the_solvers() {
         cost(&app, &nats, &workers, &nothing).await;
     let [server, nats_cpu, all, tiles, home] = cost(&app, &nats, &workers, &deep).await;
     let whole = server + nats_cpu + all;
-    // Of the workers what no tile has on its account, and the inputs, which are.
+    // Time of the workers outside tiles, and for their inputs.
     let outside = (server - home) + nats_cpu + (all - tiles) + base_tiles;
     let share = outside / whole;
     let ok = share <= 0.02 && idle < 0.002;

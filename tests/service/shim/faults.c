@@ -1,13 +1,13 @@
-/* Stands between a program and the kernel (LD_PRELOAD) and lets things go wrong when a test says so.
+/* Causes faults on request of a test, by interposing (LD_PRELOAD) between a program and the C library.
  *
- * FAULT_PROGRAM  the first argument of the programs that are meant: serve or worker
- * FAULT_AT       the number of the file operation that goes wrong, from 1
- * FAULT_KIND     kill: the process dies before the operation; stop: it is suspended; full: it and the
- *                next writes of the process fail for want of space
- * FAULT_TOKEN    a file of one byte; the process that sets it to 1 has the fault, so that there is one
- * FAULT_FULL     a file; as long as it is there, nothing can be written
- * FAULT_SLOW     a file; as long as it is there, regular files are read at FAULT_RATE bytes a second
- * FAULT_CLOCK    a file of 8 bytes, seconds that the wall clock is off
+ * FAULT_PROGRAM  first argument of the affected programs: serve or worker
+ * FAULT_AT       number of the file operation with the fault, from 1
+ * FAULT_KIND     kill: the process dies before the operation; stop: it is suspended; full: this and the
+ *                next writes of the process fail with ENOSPC
+ * FAULT_TOKEN    a file of one byte; only the process that sets it to 1 has the fault
+ * FAULT_FULL     a file; while it exists, all writes fail with ENOSPC
+ * FAULT_SLOW     a file; while it exists, regular files are read at FAULT_RATE bytes per second
+ * FAULT_CLOCK    a file of 8 bytes with the offset of the wall clock in seconds
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -32,7 +32,7 @@ static double rate = 1e6;
 static volatile char *token;
 static volatile long long *skew;
 
-static int meant(const char *program) {
+static int is_affected(const char *program) {
     char line[256] = {0};
     int file = open("/proc/self/cmdline", O_RDONLY);
     if (file < 0) return 0;
@@ -46,7 +46,7 @@ __attribute__((constructor)) static void begin(void) {
     const char *program = getenv("FAULT_PROGRAM"), *number = getenv("FAULT_AT");
     const char *kind = getenv("FAULT_KIND"), *clock = getenv("FAULT_CLOCK");
     if (getenv("FAULT_TOKEN")) {
-        /* Open from the start: later the program may give up the right to. */
+        /* Open the file now, because the program may drop the right to open it later. */
         int file = open(getenv("FAULT_TOKEN"), O_RDWR);
         void *page = mmap(NULL, 1, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
         if (page != MAP_FAILED) token = page;
@@ -57,7 +57,7 @@ __attribute__((constructor)) static void begin(void) {
     if (getenv("FAULT_RATE")) rate = atof(getenv("FAULT_RATE"));
     kind_full = kind && strcmp(kind, "full") == 0;
     kind_stop = kind && strcmp(kind, "stop") == 0;
-    if (number && program && meant(program)) at = atol(number);
+    if (number && program && is_affected(program)) at = atol(number);
     if (clock) {
         int file = open(clock, O_RDONLY);
         void *page = mmap(NULL, 8, PROT_READ, MAP_SHARED, file, 0);
@@ -71,7 +71,7 @@ static int regular(int file) {
     return fstat(file, &about) == 0 && S_ISREG(about.st_mode);
 }
 
-/* True if this operation must fail for want of space. */
+/* True if this operation must fail with ENOSPC. */
 static int fault(int writes) {
     if (writes && full && access(full, F_OK) == 0) return 1;
     if (at < 0) return 0;

@@ -1,11 +1,11 @@
-// What this browser remembers: filters of the list, and which true frames belong to a job.
+// Data stored in the browser: saved filters, the true frames of jobs, and the selected lab.
 
-/** What was kept under a name, or else `otherwise`. */
+/** Value stored under a name, or `otherwise`. */
 export function recall(name, otherwise) {
   try {
     return JSON.parse(localStorage.getItem(`sci-recon ${name}`)) ?? otherwise;
   } catch {
-    // Storage may be shut off; nothing depends on it.
+    // Storage may be disabled; nothing depends on it.
     return otherwise;
   }
 }
@@ -14,12 +14,12 @@ export function remember(name, value) {
   try {
     localStorage.setItem(`sci-recon ${name}`, JSON.stringify(value));
   } catch {
-    // As above.
+    // Storage may be disabled; nothing depends on it.
   }
 }
 
-/** The lab whose data are shown in this tab, if it is not one's own. */
-export function lookedAfter() {
+/** The lab that this tab shows, or null for the token's lab. */
+export function selectedLab() {
   try {
     return sessionStorage.getItem("sci-recon lab");
   } catch {
@@ -27,16 +27,17 @@ export function lookedAfter() {
   }
 }
 
-export function lookAfter(lab) {
+export function selectLab(lab) {
   try {
     if (lab) sessionStorage.setItem("sci-recon lab", lab);
     else sessionStorage.removeItem("sci-recon lab");
   } catch {
-    // As above.
+    // Storage may be disabled; nothing depends on it.
   }
 }
 
-const HELD = 200;
+/** Jobs for which true frames are remembered. */
+const MAX_TRUTHS = 200;
 
 /** The true frames of a job: `{sha256, name, snapshot}`, or null. */
 export function truthOf(job) {
@@ -45,5 +46,5 @@ export function truthOf(job) {
 
 export function keepTruth(job, truth) {
   const others = recall("truths", []).filter((entry) => entry.job !== job);
-  remember("truths", [{ job, truth }, ...others].slice(0, HELD));
+  remember("truths", [{ job, truth }, ...others].slice(0, MAX_TRUTHS));
 }

@@ -1,9 +1,9 @@
-// How it was made: one card in place of many, the manifest behind it.
+// The card "How it was made": plan, cost and decisions, and the full manifest.
 
 import { announce, facts, h, place, put, say } from "./dom.js";
 import { bytes, duration, figure, iterationsOf, momentInFull, shapeOf } from "./format.js";
 
-/** The card; `show` adds what the manifest of a snapshot tells. */
+/** The card; `show` adds the data of a snapshot's manifest. */
 export class Made {
   constructor(job, signal) {
     Object.assign(this, { job, signal });
@@ -15,11 +15,11 @@ export class Made {
     const { job } = this;
     return facts([
       ["Frames", shapeOf(job)],
-      job.snapshots.count > 1 && ["Snapshots", job.run.length > 1 ? `together in runs of up to ${job.run.length}` : "each alone"],
+      job.snapshots.count > 1 && ["Snapshots", job.run.length > 1 ? `jointly, in runs of up to ${job.run.length}` : "independently"],
       ["Algorithm", job.algorithm],
-      job.schedule.stages.length > 0 && ["Planned", `at most ${iterationsOf(job.schedule)} iterations on each tile: ${stages(job.schedule)}`],
+      job.schedule.stages.length > 0 && ["Planned", `at most ${iterationsOf(job.schedule)} iterations per tile: ${stages(job.schedule)}`],
       job.shape.mosaic && ["Colour", `sensor ${job.shape.mosaic.toUpperCase()}: four sub-images, then demosaicked (Malvar, He and Cutler)`],
-      ["Tiles", `${job.tile.size} pixels${job.shape.mosaic ? " of a sub-image" : ""}, ${job.tile.overlap} shared`],
+      ["Tiles", `${job.tile.size} pixels${job.shape.mosaic ? " of a sub-image" : ""}, overlap ${job.tile.overlap}`],
       job.priority !== 0 && ["Priority", job.priority],
       ["Calibration", h("a", { href: `#/calibrations/${job.calibration}` }, h("code", null, job.calibration))],
       ["Measurement", h("code", null, job.measurement)],
@@ -28,7 +28,7 @@ export class Made {
     ]);
   }
 
-  /** With the manifest of a snapshot, or the error that came for it, and where it is. */
+  /** Shows a snapshot's manifest, or the error of its request; `href` is its URL. */
   show(job, manifest, href) {
     if (job.state !== "succeeded") return;
     if (manifest.error) {
@@ -42,70 +42,70 @@ export class Made {
       ...pilot(content),
       ...joints(content),
       ["White level", figure(content.scale.white)],
-      ["Computing", `${duration(run.cpu_seconds)} of processor time${run.provider ? `, ${run.provider}` : ""}`],
+      ["CPU time", `${duration(run.cpu_seconds)}${run.provider ? `, ${run.provider}` : ""}`],
       ["Memory", bytes(run.peak_rss_bytes)],
       ["Residual ‖y − Hx‖ / ‖y‖", figure(content.summary.residual)],
     ]), h("p", { class: "muted" }, RESIDUAL),
-    h("details", null, h("summary", null, "Manifest: all of it"),
+    h("details", null, h("summary", null, "Full manifest"),
       h("div", { class: "row" }, h("a", { class: "button small", href, download: `${job.id}-manifest.json` }, "Download")),
       h("pre", { tabindex: 0 }, JSON.stringify(manifest, null, 2))));
   }
 }
 
-const RESIDUAL = "The residual tells how well the frames explain the measurement, not how good they are: many wrong videos explain it as well. A large one is a sign of wrong masks; a smaller one is not a better video.";
+const RESIDUAL = "The residual shows how well the frames explain the measurement, not how good they are: many wrong videos explain it equally well. A large residual indicates wrong masks; a smaller one does not indicate a better video.";
 
 function stages(schedule) {
   return schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ");
 }
 
-/** What the tiles did of what the job planned. */
+/** Iterations run on each tile, compared with the plan. */
 export function ran(job, content) {
   const { summary, schedule } = content;
   const [planned, decided] = [iterationsOf(job.schedule), iterationsOf(schedule)];
-  if (decided === 0) return "one pass of the model on each tile";
+  if (decided === 0) return "one pass of the model per tile";
   if (summary.stop_reason === "converged") {
-    // Of the nonlocal prior's iterations the manifest keeps no count.
+    // The manifest does not count the iterations of the nonlocal prior.
     const counted = !schedule.stages.some((stage) => stage.prior === "nonlocal");
-    return counted ? `${summary.tv_iterations + summary.denoiser_passes} of at most ${planned} iterations on each tile, then it had converged` : `converged within ${decided} iterations on each tile`;
+    return counted ? `${summary.tv_iterations + summary.denoiser_passes} of at most ${planned} iterations per tile, until convergence` : `converged within ${decided} iterations per tile`;
   }
-  return `${decided} of at most ${planned} iterations on each tile${decided < planned ? "; the pilot found that the others would not pay" : ""}`;
+  return `${decided} of at most ${planned} iterations per tile${decided < planned ? "; the pilot predicted no gain from the others" : ""}`;
 }
 
-/** The networks by name; "none" where there was none. */
+/** Names and hashes of the networks, or "none". */
 export function networks(content) {
   return content.models.map((model) => `${model.name}, ${model.sha256.slice(0, 12)}…`).join("; ") || "none";
 }
 
-/** What the pilot decided of the stages of an adaptive schedule, and why. */
+/** The pilot's decisions on the stages of an adaptive schedule, with their reasons. */
 function pilot(content) {
-  const why = { "max-iterations": "all that were planned", converged: "later ones raise the error", diverged: "later ones diverge" };
+  const why = { "max-iterations": "as planned", converged: "more would raise the error", diverged: "more would diverge" };
   const row = (stage) => {
     const decided = [
       why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
-      stage.planned_temporal_shrinkage > 0 && `shrinkage along time ${stage.temporal_shrinkage > 0 ? figure(stage.temporal_shrinkage) : "left out"}`,
-      stage.rest_shrinkage != null && (stage.rest_everywhere ? `as all is at rest ${figure(stage.rest_shrinkage)}` : `where nothing moves ${figure(stage.rest_shrinkage)}`),
-      stage.planned_static_variance && `static variance ${stage.static_variance ?? "left out"}`,
+      stage.planned_temporal_shrinkage > 0 && `temporal shrinkage ${stage.temporal_shrinkage > 0 ? figure(stage.temporal_shrinkage) : "omitted"}`,
+      stage.rest_shrinkage != null && `shrinkage ${figure(stage.rest_shrinkage)} ${stage.rest_everywhere ? "because the scene is static" : "in static regions"}`,
+      stage.planned_static_variance && `static variance ${stage.static_variance ?? "omitted"}`,
       stage.gamma != null && `noise term ${stage.gamma}`,
-      stage.planned_temporal_weight > 0 && `total variation along time ${stage.temporal_weight > 0 ? "kept" : "left out"}`,
+      stage.planned_temporal_weight > 0 && `temporal total variation ${stage.temporal_weight > 0 ? "kept" : "omitted"}`,
     ].filter(Boolean);
-    const error = `error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`;
+    const error = `hold-out error ${figure(stage.error_before)} to ${figure(stage.error_after)}`;
     return decided.length > 0 && [`Pilot, ${stage.prior}`, [...decided, error].join(", ")];
   };
   return (content.pilot?.stages ?? []).map(row).filter(Boolean);
 }
 
-/** Which snapshots were reconstructed together, and why not others. */
+/** Snapshots that were reconstructed jointly, and the hold-out errors behind the decision. */
 function joints(content) {
-  const held = (content.runs ?? []).filter(([first, last]) => last > first && first <= content.snapshot && content.snapshot <= last);
-  const near = (content.pilot?.joints ?? []).filter((joint) => joint.after === content.snapshot || joint.after + 1 === content.snapshot);
+  const containing = (content.runs ?? []).filter(([first, last]) => last > first && first <= content.snapshot && content.snapshot <= last);
+  const adjacent = (content.pilot?.joints ?? []).filter((joint) => joint.after === content.snapshot || joint.after + 1 === content.snapshot);
   const row = (joint) => {
-    const error = `error at held-out pixels ${figure(joint.error_alone)} alone, ${figure(joint.error_together)} together`;
-    return [`Snapshots ${joint.after}, ${joint.after + 1}`, `${joint.together ? "together" : "apart"}, ${error}`];
+    const error = `hold-out error ${figure(joint.error_alone)} separately, ${figure(joint.error_together)} jointly`;
+    return [`Snapshots ${joint.after}, ${joint.after + 1}`, `${joint.together ? "joint" : "separate"}, ${error}`];
   };
-  return [...(held.length ? [["Runs", held.map(([first, last]) => `${first} to ${last}`).join("; ")]] : []), ...near.map(row)];
+  return [...(containing.length ? [["Runs", containing.map(([first, last]) => `${first} to ${last}`).join("; ")]] : []), ...adjacent.map(row)];
 }
 
-/** The line that asks for the same job again. */
+/** The command that submits the same job again. */
 function repeat(found) {
   const last = found.snapshots.first + found.snapshots.count - 1;
   const body = {
@@ -118,15 +118,15 @@ function repeat(found) {
     priority: found.priority,
     label: found.label,
   };
-  // A label may hold quotes, which the shell would take for its own.
+  // Escape single quotes in labels for the shell.
   const json = JSON.stringify(body).replaceAll("'", "'\\''");
   const text = `curl -sS ${new URL(place("/v1/jobs"), document.baseURI)} --json '${json}'`;
   const copy = h("button", { type: "button", class: "small" }, "Copy");
   copy.addEventListener("click", async () => {
     await navigator.clipboard.writeText(text);
     say(copy, "Copied");
-    announce("The line is copied");
+    announce("Command copied");
   });
   if (!navigator.clipboard) copy.hidden = true;
-  return h("details", null, h("summary", null, "Ask for it again"), h("pre", { tabindex: 0, class: "line" }, text), copy);
+  return h("details", null, h("summary", null, "Repeat this job"), h("pre", { tabindex: 0, class: "line" }, text), copy);
 }
