@@ -205,7 +205,7 @@ async fn a_revoked_credential_is_disconnected() {
     let ran = check.args(["cluster", "check", "--nats-creds"]).arg(&lost).output().unwrap();
     let said = String::from_utf8(ran.stderr).unwrap();
     assert!(ran.status.code() == Some(2) && said.contains("authorization violation"), "{said}");
-    assert!(first.process.lives());
+    assert!(first.process.is_running());
     let listed = nats.cluster(&["worker", "list"]).unwrap();
     assert!(listed.contains("revoked") && listed.matches(" good ").count() == 1, "{listed}");
     // The hub drops a silent worker after fifteen seconds. Tiles sent to a pool without workers
