@@ -20,6 +20,18 @@ export class Checks {
     if (!condition) throw new Error(`check failed: ${text}`);
   }
 
+  /** Repeats `read` until its value satisfies `holds`, for at most ten seconds, and checks it; returns the value. */
+  async until(read, holds, text) {
+    const start = performance.now();
+    let value = await read();
+    while (!holds(value) && performance.now() - start < 10_000) {
+      await new Promise((resolve) => setTimeout(resolve, 50));
+      value = await read();
+    }
+    this.that(holds(value), `${text}: ${JSON.stringify(value)}`);
+    return value;
+  }
+
   /** Measures the time of a step. */
   async step(name, run) {
     const start = performance.now();

@@ -80,8 +80,7 @@ export async function colour(page, checks, scene) {
   await page.waitForSelector(".downloads a >> text=Mosaic (npy)");
   checks.that((await page.$$(".tile")).length === 4, "each of the four sub-images is a tile");
   checks.that(/red/.test(await page.textContent(".tile title")), "a tile names its colour");
-  await page.waitForTimeout(600);
-  const share = await page.evaluate(() => {
+  const share = () => page.evaluate(() => {
     const canvas = document.querySelector("[aria-label=Frames] .sight canvas");
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
     let red = 0;
@@ -90,7 +89,7 @@ export async function colour(page, checks, scene) {
     }
     return red / (data.length / 4);
   });
-  checks.that(share > 0.01 && share < 0.1, `only the square is red: ${share}`);
+  await checks.until(share, (share) => share > 0.01 && share < 0.1, "only the square is red");
   await checks.look(page, "colour");
 }
 
@@ -130,21 +129,27 @@ export function brightness(page, pane = 1) {
   }, pane);
 }
 
+/** Acts, and waits until a pane shows another image, which must not be black. */
+async function shows(page, checks, pane, act, text) {
+  const picture = () => page.$$eval(".viewer .sight canvas", (panes, pane) => panes[pane].toDataURL(), pane);
+  const before = await picture();
+  await act();
+  const read = async () => ({ ...(await brightness(page, pane)), changed: (await picture()) !== before });
+  await checks.until(read, ({ left, right, changed }) => changed && left + right > 1, text);
+}
+
 const PICTURE = "[aria-label=Frames] .sight canvas";
 
 const frame = (page) => page.$eval("#frame", (slider) => Number(slider.value));
 
 /** Uses the viewer: frames, playback, keys, zoom and maps. */
 export async function view(page, checks, frames) {
-  await page.waitForTimeout(1200);
-  const first = await brightness(page);
+  await checks.until(() => brightness(page), ({ left, right }) => left > right, "the bright square starts on the left");
   await page.$eval("#frame", (slider, last) => {
     slider.value = last;
     slider.dispatchEvent(new Event("input"));
   }, frames);
-  await page.waitForTimeout(1200);
-  const last = await brightness(page);
-  checks.that(first.left > first.right && last.right > last.left, `the bright square moves from left to right: ${JSON.stringify([first, last])}`);
+  await checks.until(() => brightness(page), ({ left, right }) => right > left, "the bright square moves to the right");
 
   // Load all frames before the rate is measured.
   await page.fill("#rate", "20");
@@ -179,22 +184,18 @@ export async function view(page, checks, frames) {
   const box = await (await page.$(PICTURE)).boundingBox();
   await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
   for (let turn = 0; turn < 6; turn += 1) await page.mouse.wheel(0, -200);
-  await page.waitForTimeout(1500);
-  const zoom = Number.parseInt(await page.textContent("#zoom"), 10);
-  checks.that(zoom > 300, `the wheel zooms: ${zoom} %`);
-  const zoomed = await pictures();
-  checks.that(zoomed.every((picture, pane) => picture !== whole[pane]), "both panes zoom together");
+  const zoom = async () => Number.parseInt(await page.textContent("#zoom"), 10);
+  await checks.until(zoom, (percent) => percent > 300, "the wheel zooms, in per cent");
+  const zoomed = async () => (await pictures()).map((picture, pane) => picture !== whole[pane]);
+  await checks.until(zoomed, (changes) => changes.every(Boolean), "both panes zoom together");
   await checks.look(page, "job-zoomed");
   await page.mouse.down();
   await page.mouse.move(box.x + box.width / 2 + 80, box.y + box.height / 2 + 20, { steps: 4 });
   await page.mouse.up();
   await page.keyboard.press("0");
-  await page.waitForTimeout(400);
+  await page.waitForSelector("#zoom:text-is('fit')");
   for (const mode of ["difference", "residual"]) {
-    await page.selectOption("#mode", mode);
-    await page.waitForTimeout(800);
-    const shown = await brightness(page);
-    checks.that(shown.left + shown.right > 1, `the ${mode} map shows something`);
+    await shows(page, checks, 1, () => page.selectOption("#mode", mode), `the ${mode} map shows something`);
     await checks.look(page, `job-${mode}`);
   }
   await page.selectOption("#mode", "frame");
@@ -245,9 +246,7 @@ export async function compare(page, checks, labels, truth) {
   await checks.look(page, "chosen");
   await page.click("#compare");
   await page.waitForSelector(".figures");
-  await page.waitForTimeout(1200);
-  const [one, other] = [await brightness(page, 0), await brightness(page, 1)];
-  checks.that(one.left > 1 && other.left > 1, "both panes show frames");
+  for (const pane of [0, 1]) await checks.until(() => brightness(page, pane), ({ left }) => left > 1, `pane ${pane} shows frames`);
   await page.setInputFiles("#truth", { name: "truth.npy", mimeType: "application/octet-stream", buffer: truth });
   await page.waitForSelector(".quality");
   const psnr = await page.$$eval(".quality:has-text('PSNR') td", (cells) => cells.map((cell) => Number.parseFloat(cell.textContent)));
@@ -256,21 +255,18 @@ export async function compare(page, checks, labels, truth) {
   checks.that(groups[0] === "differs" && groups[1] === "same", `rows that differ come first: ${groups}`);
   await checks.look(page, "compare");
   const picture = () => page.$eval(".sight canvas", (canvas) => canvas.toDataURL());
+  const whole = await picture();
   await page.click("#wipe");
-  await page.waitForTimeout(600);
+  await checks.until(async () => (await picture()) !== whole, Boolean, "the wipe overlays the other job");
   const middle = await picture();
   const handle = await (await page.$(".handle")).boundingBox();
   await page.mouse.move(handle.x + 16, handle.y + 40);
   await page.mouse.down();
   await page.mouse.move(handle.x - 150, handle.y + 40, { steps: 3 });
   await page.mouse.up();
-  await page.waitForTimeout(300);
-  checks.that((await picture()) !== middle && (await page.inputValue("#wipe-at")) < 450, "the wipe follows the pointer");
+  await checks.until(async () => (await picture()) !== middle && (await page.inputValue("#wipe-at")) < 450, Boolean, "the wipe follows the pointer");
   await checks.look(page, "compare-wipe");
-  await page.click("#difference");
-  await page.waitForTimeout(600);
-  const shown = await brightness(page, 0);
-  checks.that(shown.left + shown.right > 1, "the difference shows something");
+  await shows(page, checks, 0, () => page.click("#difference"), "the difference shows something");
   await checks.look(page, "compare-difference");
   await page.click("#flicker");
   await page.fill("#flicker-rate", "10");
@@ -319,10 +315,7 @@ export async function judged(page, checks, url, id) {
   checks.that((await page.textContent(".judgement")).length > 3, "the verdict has words, too");
   const expected = Number.parseFloat(await page.textContent(".quality:has-text('expected') b"));
   checks.that(Math.abs(expected - psnr) < 8, `the expected PSNR is close to the true one: ${expected}`);
-  await page.selectOption("#mode", "error");
-  await page.waitForTimeout(800);
-  const shown = await brightness(page);
-  checks.that(shown.left + shown.right > 1, "the map of the expected error shows something");
+  await shows(page, checks, 1, () => page.selectOption("#mode", "error"), "the map of the expected error shows something");
   await checks.look(page, "job-error");
   await page.selectOption("#mode", "frame");
   const before = await frame(page);

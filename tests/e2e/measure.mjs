@@ -22,14 +22,13 @@ export async function visit(browser, checks, url) {
   await page.waitForSelector(".list td a");
   const paint = await page.evaluate(() => performance.getEntriesByName("first-contentful-paint")[0]?.startTime);
   // Open every view once, which loads all modules.
-  for (const view of ["#/new", "#/calibrations", "#/system"]) {
+  for (const [view, part] of [["#/new", ".steps"], ["#/calibrations", ".calibration"], ["#/system", "section[aria-label=Queue]"]]) {
     await page.goto(`${url}/${view}`);
-    await page.waitForTimeout(400);
+    await page.waitForSelector(part);
   }
   await page.goto(`${url}/#/jobs`);
   await page.click(".list td a");
   await page.waitForSelector(".viewer");
-  await page.waitForTimeout(400);
   await context.close();
   return { bytes, files: files.size, paint: Math.round(paint) };
 }

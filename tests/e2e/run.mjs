@@ -76,7 +76,6 @@ async function views(page, service) {
   await checks.look(page, "jobs");
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("table");
-  await page.waitForTimeout(600);
   await checks.look(page, "system");
   await page.goto(`${service.url}/#/calibrations`);
   await page.click(".calibration >> nth=0");

@@ -131,8 +131,7 @@ export async function phone(browser, checks, url, job) {
   await touch("touchStart", [[x, y]]);
   for (let step = 1; step <= 8; step += 1) await touch("touchMove", [[x, y - 15 * step]]);
   await touch("touchEnd", []);
-  await page.waitForTimeout(500);
-  checks.that((await top()) > before + 40, `a swipe over the image scrolls the page: ${before} to ${await top()}`);
+  await checks.until(top, (now) => now > before + 40, `a swipe over the image scrolls the page from ${before}`);
   checks.that((await zoom()) === "fit", "a swipe does not zoom the image");
   const held = await top();
   await page.$eval("[aria-label=Frames] .sight", (sight) => sight.scrollIntoView({ block: "center" }));
@@ -141,8 +140,7 @@ export async function phone(browser, checks, url, job) {
   await touch("touchStart", [[x - 30, y], [x + 30, y]]);
   for (let step = 1; step <= 8; step += 1) await touch("touchMove", [[x - 30 - 8 * step, y], [x + 30 + 8 * step, y]]);
   await touch("touchEnd", []);
-  await page.waitForTimeout(500);
-  checks.that(Number.parseInt(await zoom(), 10) > 80, `two fingers zoom the image: ${await zoom()}`);
+  await checks.until(zoom, (text) => Number.parseInt(text, 10) > 80, "two fingers zoom the image");
   checks.that(Math.abs((await top()) - still) < 5, `zooming does not scroll the page: ${still} (${held})`);
   await context.close();
 }
