@@ -349,5 +349,5 @@ async fn what_can_be_no_mosaic_is_refused_and_captures_have_one_too() {
         "none",
     ]);
     let text = String::from_utf8_lossy(&refusal.stderr).into_owned();
-    assert!(refusal.status.code() == Some(2) && text.contains("no colours"), "{text}");
+    assert!(refusal.status.code() == Some(2) && text.contains("not in colour"), "{text}");
 }
