@@ -179,7 +179,7 @@ fn schedules_are_printed_as_they_are_read() {
         (&"tv".into(), &5.into())
     );
     let message = refused(&["schedule", "--schedule", &file, "--algorithm", "gap-tv"]);
-    assert!(message.contains("gap-tv has no stages of nonlocal"), "{message}");
+    assert!(message.contains("gap-tv does not support the prior nonlocal"), "{message}");
 }
 
 #[test]
