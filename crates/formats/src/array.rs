@@ -81,8 +81,8 @@ impl<R: Restart> Samples for RawSamples<R> {
     }
 }
 
-/// Reads an array as a stack of frames. If the frames of a pixel are adjacent in the file, each pass over the file extracts
-/// several frames.
+/// Reads an array as a stack of frames. If the frames of a pixel are adjacent in the file, each pass over the file
+/// extracts several frames.
 pub(super) struct ArrayReader<S> {
     samples: S,
     info: StackInfo,
@@ -96,8 +96,8 @@ pub(super) struct ArrayReader<S> {
 
 /// Size of the extracted frames in bytes. More are extracted if [`MAX_PASSES`] requires it.
 const BUFFER_BYTES: usize = if cfg!(test) { 200 } else { 64 << 20 };
-/// Largest number of passes over a file. The buffer is therefore at most a sixteenth of an array, or 512 MiB with the default
-/// limits, above [`BUFFER_BYTES`].
+/// Largest number of passes over a file. The buffer is therefore at most a sixteenth of an array, or 512 MiB with the
+/// default limits, above [`BUFFER_BYTES`].
 const MAX_PASSES: usize = 16;
 /// Number of bytes that are read at a time, but at least one line of pixels with all their frames.
 const BLOCK_BYTES: usize = if cfg!(test) { 100 } else { 1 << 20 };

@@ -134,8 +134,8 @@ impl Expected {
         }
     }
 
-    /// The stated order or, without one, the only common order that fits what is known. If none fits, transposed pictures of
-    /// the right size are accepted; otherwise the usual order is assumed, and its sizes are checked later.
+    /// The stated order or, without one, the only common order that fits what is known. If none fits, transposed
+    /// pictures of the right size are accepted; otherwise the usual order is assumed, and its sizes are checked later.
     fn order(&self, format: Format, writer: Writer, shape: [u64; 3]) -> Result<Axes> {
         let usual = writer.orders()[0];
         let fits: Vec<Axes> =

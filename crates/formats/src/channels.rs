@@ -1,5 +1,5 @@
-//! The channels of frames. Colour frames are arrays \[row, 3 column\] with red, green and blue of each pixel in adjacent
-//! columns.
+//! The channels of frames. Colour frames are arrays \[row, 3 column\] with red, green and blue of each pixel in
+//! adjacent columns.
 
 /// The channels of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -6,8 +6,8 @@ use super::open::open;
 use super::{Format, FrameReader, Limits, npy, png};
 use crate::error::Result;
 
-/// Opens a colour clip: npy (frame, row, column, 3) in C order, or an RGB PNG with 8 or 16 bits per channel. Its frames, and
-/// their stated width, are three times as wide as the picture. `None` if the file is not in colour.
+/// Opens a colour clip: npy (frame, row, column, 3) in C order, or an RGB PNG with 8 or 16 bits per channel. Its
+/// frames, and their stated width, are three times as wide as the picture. `None` if the file is not in colour.
 ///
 /// Errors: as [`super::open_stack`].
 pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Box<dyn FrameReader + Send>>> {

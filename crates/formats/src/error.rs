@@ -10,8 +10,8 @@ pub type Result<T, E = FormatError> = std::result::Result<T, E>;
 /// The reason why a file could not be read, written or accepted.
 ///
 /// [`FormatError::Io`] and [`FormatError::Internal`] are failures of the machine or of this program. All other variants
-/// describe a problem of the file; see [`FormatError::is_callers_fault`]. Messages contain no paths, because a server must
-/// not reveal its folders. Frames, rows and columns are counted from 0.
+/// describe a problem of the file; see [`FormatError::is_callers_fault`]. Messages contain no paths, because a server
+/// must not reveal its folders. Frames, rows and columns are counted from 0.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // the messages describe the fields
 pub enum FormatError {
@@ -67,13 +67,14 @@ pub enum FormatError {
     FullScale(f32),
     /// A value is NaN or infinite.
     #[error(
-        "{subject}: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}; all values must be finite"
+        "{subject}: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}; all values \
+         must be finite"
     )]
     NotFinite { subject: &'static str, value: f32, frame: usize, row: usize, column: usize },
     /// A mask value exceeds the full scale.
     #[error(
-        "masks: the largest value is {largest} (frame {frame}, row {row}, column {column}, counted from 0), above the full scale \
-         {full_scale}: state as `full_scale` the stored value that means fully open"
+        "masks: the largest value is {largest} (frame {frame}, row {row}, column {column}, counted from 0), above the \
+         full scale {full_scale}: state as `full_scale` the stored value that means fully open"
     )]
     AboveFullScale { largest: f32, frame: usize, row: usize, column: usize, full_scale: f32 },
     /// All masks are closed everywhere.

@@ -108,8 +108,8 @@ pub(super) fn describe(head: &[u8]) -> String {
     format!("it starts with the bytes {}", start.join(" "))
 }
 
-/// True if the first bytes are those of a MATLAB level 4 file. The format has no signature. It starts with the type, the
-/// numbers of rows and columns, a flag for imaginary parts, the length of the name, and the name.
+/// True if the first bytes are those of a MATLAB level 4 file. The format has no signature. It starts with the type,
+/// the numbers of rows and columns, a flag for imaginary parts, the length of the name, and the name.
 fn is_level_4(head: &[u8]) -> bool {
     let Some((header, rest)) = head.split_first_chunk::<20>() else { return false };
     let (words, _) = header.as_chunks::<4>();

@@ -1,7 +1,7 @@
 //! Reads one array of an HDF5 file (MATLAB level 7.3, h5py and others) frame by frame.
 //!
-//! Most files have the axes (frame, row, column) or (row, column). MATLAB writes its axes, usually (row, column, frame), in
-//! reverse, so its frames are stored as (column, row).
+//! Most files have the axes (frame, row, column) or (row, column). MATLAB writes its axes, usually (row, column,
+//! frame), in reverse, so its frames are stored as (column, row).
 //!
 //! The crate `hdf5-reader` is pure Rust and reads only the given file. A binding to libhdf5 would follow references to
 //! external files, so an upload could read files of the server. Ranges are read and not mapped, so a file that is

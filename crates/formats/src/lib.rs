@@ -1,8 +1,8 @@
 //! File formats: converts files to arrays and back, within [`Limits`].
 //!
 //! Input files ([`open_stack`], [`mat`]) are untrusted. Every claim of a header is checked against the limits and the
-//! length of the file before memory is allocated. Stacks are read one frame at a time. [`validate`] scales raw frames, and
-//! refuses invalid masks and measurements. Output formats are EXR, npy, PNG, BigTIFF, movies, and prepared arrays
+//! length of the file before memory is allocated. Stacks are read one frame at a time. [`validate`] scales raw frames,
+//! and refuses invalid masks and measurements. Output formats are EXR, npy, PNG, BigTIFF, movies, and prepared arrays
 //! ([`planar`]).
 //!
 //! Arrays are f32 with the axes (frame, row, column). See [`Channels`] for colour frames.

@@ -20,8 +20,8 @@ pub struct Limits {
 }
 
 impl Default for Limits {
-    /// 8 GiB, 4096 frames, sides of 8192 pixels, 2^31 voxels. That is enough for 200 snapshots of 3200x3200 pixels, and one
-    /// frame takes less than 0.8 GiB of memory.
+    /// 8 GiB, 4096 frames, sides of 8192 pixels, 2^31 voxels. That is enough for 200 snapshots of 3200x3200 pixels, and
+    /// one frame takes less than 0.8 GiB of memory.
     fn default() -> Self {
         Self { max_file_bytes: 8 << 30, max_frames: 4096, max_side: 8192, max_voxels: 1 << 31 }
     }

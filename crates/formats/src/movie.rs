@@ -1,8 +1,8 @@
 //! Writes movies: AV1 in MP4, which browsers and VLC play.
 //!
-//! Grey movies use AV1's main profile (4:2:0, neutral chroma planes), which every decoder supports. Colour movies have full
-//! chroma resolution (4:4:4, high profile). Levels follow BT.709, from 16 to 235. With these quantizers every frame has a
-//! PSNR above 40 dB, even noise.
+//! Grey movies use AV1's main profile (4:2:0, neutral chroma planes), which every decoder supports. Colour movies have
+//! full chroma resolution (4:4:4, high profile). Levels follow BT.709, from 16 to 235. With these quantizers every
+//! frame has a PSNR above 40 dB, even noise.
 
 use std::io::{Seek, SeekFrom, Write};
 use std::num::NonZeroU32;
@@ -24,13 +24,13 @@ use super::{Channels, FormatError};
 
 /// Playback rate in frames per second. It is slow enough to watch a burst of frames.
 pub const FPS: u32 = 10;
-/// Number of frames between key frames, at which a player can start. Each group has a new encoder, which keeps the frames
-/// of the group in memory.
+/// Number of frames between key frames, at which a player can start. Each group has a new encoder, which keeps the
+/// frames of the group in memory.
 const GROUP_FRAMES: usize = 32;
 /// AV1 quantizer index of grey movies.
 const GREY_QUANTIZER: usize = 40;
-/// AV1 quantizer index of colour movies. It is lower, because the conversion amplifies errors in red and blue. Noise has a
-/// PSNR of 41 dB.
+/// AV1 quantizer index of colour movies. It is lower, because the conversion amplifies errors in red and blue. Noise
+/// has a PSNR of 41 dB.
 const COLOUR_QUANTIZER: usize = 16;
 /// rav1e's fastest preset. Slower ones hardly reduce the size of noisy frames.
 const SPEED: u8 = 10;
@@ -250,8 +250,8 @@ fn entry((height, width): (usize, usize), encoder: &Context<u8>) -> Result<Av01B
     })
 }
 
-/// The sequence header at the start of a key frame's packet: an OBU header of one byte, a length below 128 in one byte, and
-/// the content.
+/// The sequence header at the start of a key frame's packet: an OBU header of one byte, a length below 128 in one byte,
+/// and the content.
 fn sequence_header(packet: &[u8]) -> &[u8] {
     const SEQUENCE_HEADER: u8 = 0x0a;
     match packet {

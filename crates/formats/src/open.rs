@@ -51,8 +51,8 @@ pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + 
 /// Opens a stack of frames like [`open_stack`], or one array of a .mat, HDF5 or npz file. For MATLAB files
 /// [`StackInfo::default_full_scale`] is [`SceneArray::default_full_scale`].
 ///
-/// Errors: as [`open_stack`]; [`FormatError::MissingArray`], [`FormatError::NoNames`], [`FormatError::AxesAmbiguous`] and
-/// [`FormatError::NoAxes`].
+/// Errors: as [`open_stack`]; [`FormatError::MissingArray`], [`FormatError::NoNames`], [`FormatError::AxesAmbiguous`]
+/// and [`FormatError::NoAxes`].
 pub fn open_array<'a>(
     path: &Path,
     wanted: impl Into<Wanted<'a>>,

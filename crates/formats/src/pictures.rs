@@ -13,7 +13,8 @@ use super::tiff;
 use super::{Format, FormatError, FrameReader, Limits, StackInfo};
 use crate::error::Result;
 
-/// Largest size of a picture, which is read into memory as a whole: a frame of the largest sides in 16 bits, with a margin.
+/// Largest size of a picture, which is read into memory as a whole: a frame of the largest sides in 16 bits, with a
+/// margin.
 const MAX_PICTURE_BYTES: u64 = 160 << 20;
 
 /// Reads the pictures of an archive as frames.
@@ -153,8 +154,8 @@ fn in_order(format: Format, members: Vec<Member>) -> Result<Vec<Member>> {
     Ok(numbered.into_iter().map(|(_, member)| member).collect())
 }
 
-/// Splits a file name into the part before its last number, the number, and the part after it. Digits of the extension do
-/// not count.
+/// Splits a file name into the part before its last number, the number, and the part after it. Digits of the extension
+/// do not count.
 fn split(name: &str) -> Option<(&str, u64, &str)> {
     let stem = name.rfind('.').unwrap_or(name.len());
     let end = name[..stem].rfind(|c: char| c.is_ascii_digit())? + 1;

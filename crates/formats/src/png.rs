@@ -127,8 +127,8 @@ fn row_bytes(info: &StackInfo) -> usize {
 }
 
 /// Writes a 16-bit PNG for display, and replaces an existing file. Values are mapped linearly from \[black, white\] to
-/// \[0, 65535\] and clipped; NaN becomes 0. `frame` has the axes (row, column), with all channels of a pixel in adjacent
-/// columns.
+/// \[0, 65535\] and clipped; NaN becomes 0. `frame` has the axes (row, column), with all channels of a pixel in
+/// adjacent columns.
 ///
 /// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
 pub fn write_u16(
@@ -142,8 +142,8 @@ pub fn write_u16(
     encode_u16(BufWriter::new(file), frame, channels, (black, white))
 }
 
-/// Encodes an 8-bit PNG for display. Values are mapped linearly from \[black, white\] to \[0, 255\] and clipped; NaN becomes
-/// 0. `frame` has the axes (row, column), with all channels of a pixel in adjacent columns.
+/// Encodes an 8-bit PNG for display. Values are mapped linearly from \[black, white\] to \[0, 255\] and clipped; NaN
+/// becomes 0. `frame` has the axes (row, column), with all channels of a pixel in adjacent columns.
 ///
 /// Errors: [`FormatError::Internal`] unless `black < white`, both finite, and for a frame without pixels.
 pub fn encode_u8(

@@ -57,8 +57,8 @@ pub(super) fn frame(height: usize, width: usize, samples: Vec<f32>) -> Result<Ar
     })
 }
 
-/// Converts an I/O error of a reader. Decompressors report invalid data as I/O errors, too; only errors of the operating
-/// system have a number.
+/// Converts an I/O error of a reader. Decompressors report invalid data as I/O errors, too; only errors of the
+/// operating system have a number.
 pub(super) fn read_error(format: Format, source: io::Error) -> FormatError {
     if source.raw_os_error().is_some() {
         return FormatError::Io { action: "read the file", source };

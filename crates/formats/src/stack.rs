@@ -58,8 +58,8 @@ impl SampleType {
         }
     }
 
-    /// The full scale if none is stated: the largest value of unsigned integers of 8 and 16 bits, which cameras and pictures
-    /// use, and 1 for floats and booleans. Other integers have no common scale.
+    /// The full scale if none is stated: the largest value of unsigned integers of 8 and 16 bits, which cameras and
+    /// pictures use, and 1 for floats and booleans. Other integers have no common scale.
     pub fn default_full_scale(self) -> Option<FullScale> {
         match self {
             Self::U8 => Some(FullScale(255.0)),

@@ -1,7 +1,7 @@
 //! Lists the members of an uncompressed tar archive.
 //!
-//! This module parses the headers, because the crate `tar` reads names of any length into memory. A header is a block of
-//! 512 bytes with few fields.
+//! This module parses the headers, because the crate `tar` reads names of any length into memory. A header is a block
+//! of 512 bytes with few fields.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -78,8 +78,8 @@ fn read_metadata(file: &File, member: &Member) -> Result<Vec<u8>> {
     read(file, member.start, member.size)
 }
 
-/// The name of the next member in an extended header, which has lines of `LENGTH KEY=VALUE`. Errors: a header that changes
-/// the size.
+/// The name of the next member in an extended header, which has lines of `LENGTH KEY=VALUE`. Errors: a header that
+/// changes the size.
 fn extended_name(bytes: &[u8]) -> Result<Option<String>> {
     let mut name = None;
     for line in bytes.split(|byte| *byte == b'\n') {

@@ -35,9 +35,9 @@ const SUPPORTED_COMPRESSIONS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, 32773];
 /// Upper bound of the expansion of all compressions. LZW reaches at most 2560 bytes per compressed byte.
 const MAX_EXPANSION: u64 = 4096;
 
-/// Opens a TIFF file of `length` bytes. Its pages are frames of one size and type, or all frames follow one page header, as
-/// ImageJ writes them above 4 GB. All headers are checked against the limits, the length and each other. Pixels are not
-/// read.
+/// Opens a TIFF file of `length` bytes. Its pages are frames of one size and type, or all frames follow one page
+/// header, as ImageJ writes them above 4 GB. All headers are checked against the limits, the length and each other.
+/// Pixels are not read.
 pub(super) fn open<R: Read + Seek + Send + 'static>(
     mut file: R,
     length: u64,

@@ -1,4 +1,5 @@
-//! Converts raw frames to masks and measurements: applies the full scale, and refuses invalid values. Nothing is guessed.
+//! Converts raw frames to masks and measurements: applies the full scale, and refuses invalid values. Nothing is
+//! guessed.
 
 use ndarray::{Array2, ArrayView2};
 
@@ -30,8 +31,8 @@ struct Located {
 
 /// Reads all masks, passes each one (row, column) on `[0,1]` to `sink`, and returns the statistics.
 ///
-/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]. After the last mask, so that the message can
-/// contain the largest value: [`FormatError::AboveFullScale`], [`FormatError::AllMasksZero`] and
+/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]. After the last mask, so that the message
+/// can contain the largest value: [`FormatError::AboveFullScale`], [`FormatError::AllMasksZero`] and
 /// [`FormatError::MaskFrameZero`]. After an error the output of the sink is invalid.
 pub fn check_masks(
     reader: &mut dyn FrameReader,
@@ -97,10 +98,11 @@ pub fn check_masks(
     }
 }
 
-/// Reads all snapshots, and passes each one (row, column) divided by the full scale to `sink`. Values may have any sign.
+/// Reads all snapshots, and passes each one (row, column) divided by the full scale to `sink`. Values may have any
+/// sign.
 ///
-/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::SnapshotZero`]. After an error
-/// the output of the sink is invalid.
+/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::SnapshotZero`]. After an
+/// error the output of the sink is invalid.
 pub fn check_snapshots(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,

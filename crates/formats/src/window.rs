@@ -12,8 +12,8 @@ use crate::error::Result;
 
 const SAMPLE_BYTES: u64 = 4;
 
-/// A file with little-endian f32 samples in the order (frame, row, column) after a header. Reads are positional, so threads
-/// can share it.
+/// A file with little-endian f32 samples in the order (frame, row, column) after a header. Reads are positional, so
+/// threads can share it.
 #[derive(Debug)]
 pub struct WindowReader {
     file: File,

@@ -34,8 +34,8 @@ struct Directory {
     bytes: u64,
 }
 
-/// Returns all members except folders. Errors: a damaged or too long directory; encrypted members, or ones compressed by
-/// another method than Deflate; members outside the file, or longer than Deflate can expand.
+/// Returns all members except folders. Errors: a damaged or too long directory; encrypted members, or ones compressed
+/// by another method than Deflate; members outside the file, or longer than Deflate can expand.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     let directory = directory(file, length)?;
     if directory.bytes > MAX_DIRECTORY_BYTES {

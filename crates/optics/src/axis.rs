@@ -37,8 +37,8 @@ pub(super) struct Axis {
 }
 
 impl Axis {
-    /// The axis of `pixels` sensor pixels, `ratio` of them per mask pixel. The first one lies at mask coordinate `offset`.
-    /// The mask is seen through `cells` and blurred with a standard deviation of `blur` mask pixels.
+    /// The axis of `pixels` sensor pixels, `ratio` of them per mask pixel. The first one lies at mask coordinate
+    /// `offset`. The mask is seen through `cells` and blurred with a standard deviation of `blur` mask pixels.
     pub(super) fn new(cells: &[Cell], pixels: usize, ratio: f64, offset: f64, blur: f64) -> Self {
         // 1. Split the start of each sensor pixel into a whole mask pixel and a phase.
         let mut phases = BTreeMap::new();
@@ -91,8 +91,9 @@ impl Axis {
     }
 }
 
-/// Share of a sensor pixel's light through a cell that passes the mask below `x`, for a pixel from 0 to `pixel`. It is the
-/// cumulative distribution of a uniform position in the pixel, plus a uniform shift within the cell, plus Gaussian blur.
+/// Share of a sensor pixel's light through a cell that passes the mask below `x`, for a pixel from 0 to `pixel`. It is
+/// the cumulative distribution of a uniform position in the pixel, plus a uniform shift within the cell, plus Gaussian
+/// blur.
 fn share_below(x: f64, pixel: f64, cell: Cell, blur: f64) -> f64 {
     let span = cell.to - cell.from;
     if span > 0.0 {

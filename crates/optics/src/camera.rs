@@ -21,8 +21,8 @@ pub struct Camera {
     pub black_level: f64,
     /// Stray light and leakage through the closed LCoS, as a share of the full well.
     pub background: f64,
-    /// Exposure of the calibration: the share of the full well that a white board fills through the open aperture without
-    /// a mask.
+    /// Exposure of the calibration: the share of the full well that a white board fills through the open aperture
+    /// without a mask.
     pub calibration_exposure: f64,
     /// Exposure of one frame of the measurement, defined like `calibration_exposure`.
     pub measurement_exposure: f64,
@@ -124,8 +124,8 @@ fn impossible(error: &dyn std::fmt::Display) -> OpticsError {
     OpticsError::Pattern(format!("the light on the sensor can't be simulated: {error}"))
 }
 
-/// Relative illumination \[H,W\] of a sensor with vignetting: 1 in the centre, and less by the share `vignetting` in the
-/// corners. The loss grows with the square of the distance from the centre.
+/// Relative illumination \[H,W\] of a sensor with vignetting: 1 in the centre, and less by the share `vignetting` in
+/// the corners. The loss grows with the square of the distance from the centre.
 ///
 /// Errors: [`OpticsError::Parameter`] for a share outside \[0,1).
 pub fn illumination((height, width): (usize, usize), vignetting: f64) -> Result<Array2<f32>> {

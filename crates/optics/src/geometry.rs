@@ -2,8 +2,8 @@
 
 use super::{OpticsError, Result};
 
-/// The hybrid coded aperture: an LCoS in the aperture of a 4f system, a lithography mask in front of its image plane, and a
-/// relay to the sensor. The defaults are those of the paper's simulation.
+/// The hybrid coded aperture: an LCoS in the aperture of a 4f system, a lithography mask in front of its image plane,
+/// and a relay to the sensor. The defaults are those of the paper's simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Geometry {
     /// Rows of the LCoS, in pixels.
@@ -98,8 +98,8 @@ impl Geometry {
         Ok(())
     }
 
-    /// Shift of the projected mask, in mask pixels, when the opening moves by one LCoS pixel: mask distance x LCoS pitch /
-    /// focal length.
+    /// Shift of the projected mask, in mask pixels, when the opening moves by one LCoS pixel: mask distance x LCoS
+    /// pitch / focal length.
     pub fn shift_per_lcos_pixel(&self) -> f64 {
         let shift_um = self.mask_distance_um * self.lcos_pitch_um / (self.focal_length_mm * 1000.0);
         shift_um / self.mask_pitch_um

@@ -345,8 +345,8 @@ fn phases(image: ArrayView2<'_, f32>) -> [f64; 4] {
     means.map(|value| value - means.iter().sum::<f64>() / 4.0)
 }
 
-/// The largest phase difference that the masks do not explain. The standard error comes from the scatter between strips:
-/// a mosaic has the same sign everywhere, whereas the texture of a scene changes sign.
+/// The largest phase difference that the masks do not explain. The standard error comes from the scatter between
+/// strips: a mosaic has the same sign everywhere, whereas the texture of a scene changes sign.
 fn phase_difference(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> PhaseDifference {
     let count = strips.len() as f64;
     let difference = |phase: usize| {

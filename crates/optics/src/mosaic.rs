@@ -67,8 +67,8 @@ impl Mosaic {
         }
     }
 
-    /// Samples a colour frame \[H, 3 W\] through the mosaic, which gives \[H,W\]. `(row, column)` is the position of the
-    /// first pixel in the mosaic.
+    /// Samples a colour frame \[H, 3 W\] through the mosaic, which gives \[H,W\]. `(row, column)` is the position of
+    /// the first pixel in the mosaic.
     pub fn sample(
         self,
         colours: ArrayView2<'_, f32>,
@@ -80,8 +80,8 @@ impl Mosaic {
         })
     }
 
-    /// Demosaicks a raw frame \[H,W\] into a colour frame \[H, 3 W\]. `(row, column)` is the position of the first pixel in
-    /// the mosaic.
+    /// Demosaicks a raw frame \[H,W\] into a colour frame \[H, 3 W\]. `(row, column)` is the position of the first
+    /// pixel in the mosaic.
     ///
     /// Measured samples are kept. The frame is mirrored at its edges. Frames with fewer than 2 rows or columns become
     /// grey.
@@ -131,8 +131,8 @@ impl Mosaic {
     }
 }
 
-/// Index of the pixel at `place` on an axis that is padded by [`MARGIN`] mirrored pixels. Mirroring about the edge pixel
-/// keeps the phase of the mosaic.
+/// Index of the pixel at `place` on an axis that is padded by [`MARGIN`] mirrored pixels. Mirroring about the edge
+/// pixel keeps the phase of the mosaic.
 fn mirrored(place: usize, length: usize) -> usize {
     let period = 2 * (length - 1);
     // The added multiple of the period keeps the value above 0.

@@ -54,8 +54,8 @@ pub struct Multiplexing {
 impl Multiplexing {
     /// Draws `frames` patterns of `apertures` sub-apertures until their matrix has the required rank.
     ///
-    /// Errors: [`OpticsError::Parameter`] or [`OpticsError::Pattern`] for impossible options, [`OpticsError::Rank`] if no
-    /// draw has the required rank.
+    /// Errors: [`OpticsError::Parameter`] or [`OpticsError::Pattern`] for impossible options, [`OpticsError::Rank`] if
+    /// no draw has the required rank.
     pub fn random(frames: usize, apertures: usize, draw: Draw, rng: &mut impl Rng) -> Result<Self> {
         let wanted = draw.required_rank(frames, apertures)?;
         let Draw { open, tries, .. } = draw;

@@ -45,8 +45,8 @@ pub enum ExpectedOrder {
 }
 
 impl ExpectedOrder {
-    /// Agreement between the masks' correlations \[B,B\] and the expected ones, at most 1, if pattern `order[k]` was shown
-    /// in frame k. `None` if all correlations are equal.
+    /// Agreement between the masks' correlations \[B,B\] and the expected ones, at most 1, if pattern `order[k]` was
+    /// shown in frame k. `None` if all correlations are equal.
     fn agreement(&self, correlation: ArrayView2<'_, f64>, order: &[usize]) -> Option<f64> {
         match self {
             Self::Overlap(expected) => agreement(correlation, expected.view(), order),
@@ -145,8 +145,8 @@ pub fn reordering(
     convincing.then_some(Reordering { swaps, before, after })
 }
 
-/// Correlation, over all pairs of masks, between actual and expected mask correlations if pattern `order[k]` was shown in
-/// frame k. `None` if either is the same for all pairs.
+/// Correlation, over all pairs of masks, between actual and expected mask correlations if pattern `order[k]` was shown
+/// in frame k. `None` if either is the same for all pairs.
 fn agreement(
     correlation: ArrayView2<'_, f64>,
     expected: ArrayView2<'_, f64>,

@@ -1,5 +1,5 @@
-//! Aperture patterns \[B, rows, columns\]: the transmission on \[0,1\] of each cell of the LCoS in each frame. The cells
-//! divide the LCoS evenly.
+//! Aperture patterns \[B, rows, columns\]: the transmission on \[0,1\] of each cell of the LCoS in each frame. The
+//! cells divide the LCoS evenly.
 
 use ndarray::{Array3, ArrayView3};
 use rand::Rng;
@@ -98,7 +98,8 @@ impl Default for Circle {
 impl Circle {
     /// Patterns \[frames, rows, columns\], each turned by 360/`frames` degrees from the previous one.
     ///
-    /// Errors: [`OpticsError::Parameter`] for an impossible circle, [`OpticsError::Pattern`] for one that leaves the LCoS.
+    /// Errors: [`OpticsError::Parameter`] for an impossible circle, [`OpticsError::Pattern`] for one that leaves the
+    /// LCoS.
     pub fn patterns(self, frames: usize, geometry: &Geometry) -> Result<Array3<f32>> {
         geometry.check()?;
         check_size(frames, geometry.lcos_rows, geometry.lcos_columns)?;
@@ -167,8 +168,8 @@ impl Circle {
 
 /// Checks patterns \[B, rows, columns\] for `frames` frames.
 ///
-/// Errors: [`OpticsError::Pattern`] for another number of patterns, for values outside \[0,1\], and for a pattern that is
-/// closed everywhere.
+/// Errors: [`OpticsError::Pattern`] for another number of patterns, for values outside \[0,1\], and for a pattern that
+/// is closed everywhere.
 pub fn check_patterns(patterns: ArrayView3<'_, f32>, frames: usize) -> Result<()> {
     let (count, rows, columns) = patterns.dim();
     check_size(frames, rows, columns)?;

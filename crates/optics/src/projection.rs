@@ -31,8 +31,8 @@ pub enum Method {
 
 /// Projects patterns of aperture cells to masks on the sensor.
 ///
-/// A ray through the aperture at u that reaches the image plane at x crosses the lithography mask, at a distance d before
-/// the image plane, at `x + d u / f`.
+/// A ray through the aperture at u that reaches the image plane at x crosses the lithography mask, at a distance d
+/// before the image plane, at `x + d u / f`.
 #[derive(Debug)]
 pub struct Projector {
     rows: Axis,
@@ -41,8 +41,8 @@ pub struct Projector {
 }
 
 impl Projector {
-    /// A projector from patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of `sensor` (rows, columns)
-    /// pixels.
+    /// A projector from patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of `sensor` (rows,
+    /// columns) pixels.
     ///
     /// Errors: [`OpticsError::Parameter`] for an impossible geometry or size, [`OpticsError::Pattern`] if neighbouring
     /// cells shift the mask by less than half a pixel with [`Placement::WholePixels`].

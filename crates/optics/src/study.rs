@@ -219,8 +219,8 @@ fn percentile(histogram: &[u64], share: f64) -> f32 {
     bin.unwrap_or(0) as f32 / (BINS - 1) as f32
 }
 
-/// Uniformity of an illumination \[H,W\]: the smallest over the largest block mean, where the image is divided into 16x16
-/// blocks. Pixels at 0 are ignored. `None` if all pixels are 0.
+/// Uniformity of an illumination \[H,W\]: the smallest over the largest block mean, where the image is divided into
+/// 16x16 blocks. Pixels at 0 are ignored. `None` if all pixels are 0.
 pub fn flatness(illumination: &ndarray::ArrayView2<'_, f32>) -> Option<f64> {
     let (height, width) = illumination.dim();
     let side = |length: usize| length.div_ceil(16).max(1);

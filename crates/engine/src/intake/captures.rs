@@ -56,8 +56,8 @@ pub struct Report {
 
 /// Computes masks \[B,H,W\] on \[0,1\] from captures, and reports on them.
 ///
-/// The masks' scale is known only after the last one, so they are first written to `scratch`, an existing file. Then the
-/// normalised masks go to the writer that `open` returns. Returns the report and the output of the writer.
+/// The masks' scale is known only after the last one, so they are first written to `scratch`, an existing file. Then
+/// the normalised masks go to the writer that `open` returns. Returns the report and the output of the writer.
 ///
 /// Errors: unreadable or unusable captures or patterns; I/O; [`IntakeError::Stopped`]; those of `open`.
 pub fn calibrate<W: Write>(
@@ -96,11 +96,11 @@ pub struct Plan {
     pub seconds: f64,
 }
 
-/// Plans a calibration from the headers of its captures. All must have one size, and averaging them must not take longer
-/// than [`MAX_CALIBRATION_SECONDS`].
+/// Plans a calibration from the headers of its captures. All must have one size, and averaging them must not take
+/// longer than [`MAX_CALIBRATION_SECONDS`].
 ///
-/// Errors: [`IntakeError::Format`] for unreadable files; [`IntakeError::Size`] for files that differ in size, or too many
-/// captures. Places are JSON pointers into the request.
+/// Errors: [`IntakeError::Format`] for unreadable files; [`IntakeError::Size`] for files that differ in size, or too
+/// many captures. Places are JSON pointers into the request.
 pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
     let (mut first, mut captured) = (None, 0);
     for (place, paths) in files.lists() {
@@ -111,8 +111,8 @@ pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
             let (height, width) = *first.get_or_insert((info.height, info.width));
             if (info.height, info.width) != (height, width) {
                 let detail = format!(
-                    "this capture is {}x{} (rows x columns), but the earlier ones are {height}x{width}: all captures must have \
-                     the same size",
+                    "this capture is {}x{} (rows x columns), but the earlier ones are {height}x{width}: all captures \
+                     must have the same size",
                     info.height, info.width
                 );
                 return Err(IntakeError::Size { place, detail });
@@ -188,7 +188,8 @@ fn average_masks(
     if scale <= 0.0 {
         return Err(IntakeError::content(
             "patterns",
-            &"no pattern is brighter than the dark frames: check that the light was on and that the LCoS showed the patterns",
+            &"no pattern is brighter than the dark frames: check that the light was on and that the LCoS showed the \
+              patterns",
         ));
     }
     let figures = CaptureFigures::new(&calibrator, patterns);
@@ -261,8 +262,8 @@ fn write_scaled<W: Write>(
     Ok(to.finish()?)
 }
 
-/// Checks masks and reports on them. `captured` is given for masks from captures, `patterns` if the intended patterns are
-/// known.
+/// Checks masks and reports on them. `captured` is given for masks from captures, `patterns` if the intended patterns
+/// are known.
 fn report_on(
     figures: &MaskFigures,
     captured: Option<&Captured>,
@@ -311,7 +312,8 @@ fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<
     Ok(Some(patterns))
 }
 
-/// Encodes a map \[H,W\] as a PNG of at most [`PICTURE_SIDE`] pixels: block means, from black at 0 to white at the largest.
+/// Encodes a map \[H,W\] as a PNG of at most [`PICTURE_SIDE`] pixels: block means, from black at 0 to white at the
+/// largest.
 fn picture(map: &Array2<f32>) -> Result<Vec<u8>, FormatError> {
     let (height, width) = map.dim();
     let side = height.max(width).div_ceil(PICTURE_SIDE).max(1);

@@ -45,9 +45,9 @@ pub struct Passed {
 
 /// Reads masks and passes each one \[H,W\] on \[0,1\] to `sink`.
 ///
-/// Errors: [`IntakeError::Size`] for more than [`MAX_MASKS`] masks; [`IntakeError::Format`] for unreadable files, values
-/// outside the scale and masks without an open pixel, and for errors of `sink`. After an error the output of `sink` is
-/// invalid.
+/// Errors: [`IntakeError::Size`] for more than [`MAX_MASKS`] masks; [`IntakeError::Format`] for unreadable files,
+/// values outside the scale and masks without an open pixel, and for errors of `sink`. After an error the output of
+/// `sink` is invalid.
 pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
@@ -71,7 +71,8 @@ fn check_count(opened: &Opened) -> Result<()> {
     Err(IntakeError::Size { place: opened.name.clone(), detail })
 }
 
-/// Reads a measurement, subtracts the dark frames, divides by the full scale, and passes each snapshot \[H,W\] to `sink`.
+/// Reads a measurement, subtracts the dark frames, divides by the full scale, and passes each snapshot \[H,W\] to
+/// `sink`.
 ///
 /// Errors: [`IntakeError::Size`] for dark frames of another size; [`IntakeError::Format`] for unreadable files and
 /// snapshots that are 0 everywhere, and for errors of `sink`. After an error the output of `sink` is invalid.
@@ -107,8 +108,8 @@ fn average_dark(
         let info = *opened.map_err(IntakeError::format(place(index)))?.info();
         if (info.height, info.width) != (height, width) {
             let detail = format!(
-                "the dark frames are {}x{} (rows x columns), but the measurement is {height}x{width}: both must have the same \
-                 size",
+                "the dark frames are {}x{} (rows x columns), but the measurement is {height}x{width}: both must have \
+                 the same size",
                 info.height, info.width
             );
             return Err(IntakeError::Size { place: place(index), detail });
@@ -149,9 +150,9 @@ impl FrameReader for DarkCorrected {
     }
 }
 
-/// Checks up to [`SNAPSHOTS`] snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only the
-/// first green sub-image is checked. `saturated` is the share of saturated pixels of each snapshot; `dark_subtracted` is
-/// true if dark frames were subtracted.
+/// Checks up to [`SNAPSHOTS`] snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
+/// the first green sub-image is checked. `saturated` is the share of saturated pixels of each snapshot;
+/// `dark_subtracted` is true if dark frames were subtracted.
 ///
 /// Errors: files that can't be read.
 pub fn judge(

@@ -4,8 +4,8 @@ use formats::FormatError;
 
 pub type Result<T, E = IntakeError> = std::result::Result<T, E>;
 
-/// The reason why a file or its content is refused. `place` names the file: a JSON pointer into the request, or a name with
-/// a path. It is empty if there is only one file.
+/// The reason why a file or its content is refused. `place` names the file: a JSON pointer into the request, or a name
+/// with a path. It is empty if there is only one file.
 #[derive(Debug, thiserror::Error)]
 pub enum IntakeError {
     /// The file can't be read, or its content is invalid.

@@ -73,8 +73,8 @@ impl<'a> Source<'a> {
 
     /// Opens the file.
     ///
-    /// Errors: [`IntakeError::Format`] if the file is missing, unsupported or larger than the limits, if it does not have
-    /// the array, if several orders of its axes fit, or if the full scale is unknown.
+    /// Errors: [`IntakeError::Format`] if the file is missing, unsupported or larger than the limits, if it does not
+    /// have the array, if several orders of its axes fit, or if the full scale is unknown.
     pub fn open(&self) -> Result<Opened> {
         let max_frames = (self.array == SceneArray::Masks).then_some(MAX_MASKS);
         let expected = Expected { axes: self.axes, max_frames, size: self.size };
@@ -83,7 +83,8 @@ impl<'a> Source<'a> {
         self.with_full_scale(opened.map_err(IntakeError::format(&self.name))?)
     }
 
-    /// Opens a colour clip with frames \[H,3W\], which interleave red, green and blue. `None` if the file is not in colour.
+    /// Opens a colour clip with frames \[H,3W\], which interleave red, green and blue. `None` if the file is not in
+    /// colour.
     ///
     /// Errors: as [`Self::open`].
     pub fn open_colours(&self) -> Result<Option<Opened>> {

@@ -34,8 +34,8 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     Ok(Scaled { array: stack.into_array()?, full_scale, axes })
 }
 
-/// Reads and checks the snapshots \[S,H,W\] from `first` to `last`, both included, or to the end for `None`. Returns them
-/// with the total number of snapshots.
+/// Reads and checks the snapshots \[S,H,W\] from `first` to `last`, both included, or to the end for `None`. Returns
+/// them with the total number of snapshots.
 ///
 /// Errors: as [`measurement`]; [`IntakeError::Content`] for snapshots that do not exist.
 pub fn read_snapshots(
@@ -110,8 +110,8 @@ pub fn read_truth(
     Ok(Some((truth.slice(s![first..first + needed, .., ..]).to_owned(), channels)))
 }
 
-/// Reads frames \[T,H,W\], divided by the full scale, from a file, or from a folder of PNG pictures in the order of their
-/// names.
+/// Reads frames \[T,H,W\], divided by the full scale, from a file, or from a folder of PNG pictures in the order of
+/// their names.
 ///
 /// Errors: as [`Source::open`]; [`IntakeError::Content`] for values that are not finite, and for pictures of different
 /// sizes.

@@ -9,8 +9,8 @@ use crate::job::{
 /// Side of a cell of the drawn correlation matrix, in pixels.
 const CELL: usize = 16;
 
-/// Renders a report; `title` names the calibration. The page refers to pictures in `maps/` and to the style sheet of the
-/// service. It is readable without the style sheet.
+/// Renders a report; `title` names the calibration. The page refers to pictures in `maps/` and to the style sheet of
+/// the service. It is readable without the style sheet.
 pub fn report_page(title: &str, report: &CalibrationReport) -> String {
     let page = html! {
         (DOCTYPE)

@@ -100,8 +100,8 @@ impl Algorithm {
         }
     }
 
-    /// Explains why a schedule does not belong to this algorithm; `None` if it does. The name of an algorithm must match
-    /// what its stages do.
+    /// Explains why a schedule does not belong to this algorithm; `None` if it does. The name of an algorithm must
+    /// match what its stages do.
     pub fn misfit(self, schedule: &Schedule) -> Option<String> {
         let priors = self.priors();
         let unsupported = schedule.stages.iter().find(|stage| !priors.contains(&stage.prior))?;

@@ -33,8 +33,8 @@ impl SnapshotRange {
     }
 }
 
-/// Size and overlap of tiles in pixels; see [`reconstruction::tile::TilePlan::new`]. Behind a mosaic they count pixels of a
-/// sub-image.
+/// Size and overlap of tiles in pixels; see [`reconstruction::tile::TilePlan::new`]. Behind a mosaic they count pixels
+/// of a sub-image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TileSpec {
@@ -65,8 +65,8 @@ pub enum Sequence {
 }
 
 impl Sequence {
-    /// The default for snapshots of `frames` frames, from the frame rate and the exposure time of the camera: separate if
-    /// the pause between two exposures is longer than a frame.
+    /// The default for snapshots of `frames` frames, from the frame rate and the exposure time of the camera: separate
+    /// if the pause between two exposures is longer than a frame.
     pub fn from_camera(camera_fps: Option<f64>, exposure_s: Option<f64>, frames: usize) -> Self {
         match (camera_fps, exposure_s) {
             (Some(fps), Some(exposure)) if 1.0 / fps - exposure > exposure / frames as f64 => {
@@ -118,8 +118,8 @@ impl Default for RunSpec {
     }
 }
 
-/// Largest number of voxels in a tile of a run: that of a snapshot of 30 frames with the default size. Sequences therefore
-/// take no more memory than large snapshots.
+/// Largest number of voxels in a tile of a run: that of a snapshot of 30 frames with the default size. Sequences
+/// therefore take no more memory than large snapshots.
 const RUN_VOXELS: usize = 30 * 320 * 320;
 /// Runs of at least this length do not need smaller tiles.
 const SUFFICIENT_LENGTH: u32 = 4;

@@ -34,8 +34,8 @@ pub enum TaskKind {
     Prepare,
     /// Reconstructs one snapshot coarsely, for display until its tiles are done.
     Preview { snapshot: u32 },
-    /// Decides the iterations of an adaptive schedule, and which neighbouring snapshots are reconstructed together. Tiles
-    /// wait for it.
+    /// Decides the iterations of an adaptive schedule, and which neighbouring snapshots are reconstructed together.
+    /// Tiles wait for it.
     Pilot,
     /// Reconstructs one tile of a run of snapshots.
     Tile {
@@ -252,8 +252,8 @@ pub struct TaskProgress {
     pub iterations: u32,
     /// Number of finished passes of the deep denoiser.
     pub passes: u32,
-    /// Finished share of the planned cost, on \[0,1\]; see [`super::Schedule::share_done`]. One deep pass costs as much as
-    /// thousands of TV iterations.
+    /// Finished share of the planned cost, on \[0,1\]; see [`super::Schedule::share_done`]. One deep pass costs as much
+    /// as thousands of TV iterations.
     pub fraction: f64,
 }
 

@@ -195,8 +195,8 @@ impl fmt::Display for Timestamp {
     }
 }
 
-/// Replaces each absolute path in a text by its last component. Error messages stay useful, and do not reveal the folders
-/// of the service.
+/// Replaces each absolute path in a text by its last component. Error messages stay useful, and do not reveal the
+/// folders of the service.
 pub fn without_paths(text: &str) -> String {
     let mut clean = String::with_capacity(text.len());
     let mut rest = text;

@@ -1,4 +1,5 @@
-//! The predicted quality of a result without ground truth: PSNR with an interval, a grade, and a map of the expected error.
+//! The predicted quality of a result without ground truth: PSNR with an interval, a grade, and a map of the expected
+//! error.
 
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
@@ -17,7 +18,8 @@ use reconstruction::tile::TilePlan;
 pub struct TileAssessment {
     /// Number of block rows and block columns.
     size: (usize, usize),
-    /// Expected PSNR of each block \[S B, rows, columns\] on the unit scale of the solver, in steps of 0.25 dB from 0 dB.
+    /// Expected PSNR of each block \[S B, rows, columns\] on the unit scale of the solver, in steps of 0.25 dB from 0
+    /// dB.
     #[serde(with = "hex::serde")]
     levels: Vec<u8>,
     /// Largest motion in pixels per frame.
@@ -34,8 +36,8 @@ const LEVELS_PER_DB: f32 = 4.0;
 const DARK: u8 = u8::MAX;
 
 impl TileAssessment {
-    /// Assesses a tile from the schedule that solved it, the pilot's evidence, and the white level of the scene. `None` for
-    /// schedules for which the model is not fitted. A tile without light has frames of 0 and no expected error.
+    /// Assesses a tile from the schedule that solved it, the pilot's evidence, and the white level of the scene. `None`
+    /// for schedules for which the model is not fitted. A tile without light has frames of 0 and no expected error.
     pub fn of(
         outcome: &Outcome,
         (schedule, evidence, white): (&Schedule, Option<&Evidence>, f32),
@@ -87,8 +89,8 @@ const GOOD_DB: f64 = 28.0;
 /// Frames are graded bad if the upper end of the interval is below this PSNR in dB.
 const BAD_DB: f64 = 22.0;
 
-/// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each with
-/// the assessments of its tiles in the plan's order. `None` if a tile has none, or if no tile has light.
+/// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
+/// with the assessments of its tiles in the plan's order. `None` if a tile has none, or if no tile has light.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
@@ -221,8 +223,8 @@ fn reasons(
     reasons
 }
 
-/// Motion, in pixels per frame, above which frames may be smoother than the scene. A motion of 4 is estimated as at most
-/// 5.3, one of 10 as 7 to 14 (`research/NOTEBOOK.md`).
+/// Motion, in pixels per frame, above which frames may be smoother than the scene. A motion of 4 is estimated as at
+/// most 5.3, one of 10 as 7 to 14 (`research/NOTEBOOK.md`).
 const FAST_MOTION: f32 = 6.0;
 
 fn fast_motion(motion: f32) -> Option<Finding> {

@@ -56,8 +56,8 @@ pub struct Recipe {
     pub camera: (Option<f64>, Option<f64>),
 }
 
-/// Serialises size and overlap, and the positions of the tiles as \[row, column, height, width\] in the plan's order. Behind a
-/// mosaic the size counts pixels of a sub-image, and four tiles, one of each sub-image, share a position.
+/// Serialises size and overlap, and the positions of the tiles as \[row, column, height, width\] in the plan's order.
+/// Behind a mosaic the size counts pixels of a sub-image, and four tiles, one of each sub-image, share a position.
 fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::Error> {
     #[derive(Serialize)]
     struct Record {
@@ -99,9 +99,9 @@ impl Recipe {
         self.warnings.iter().filter(|warning| concerns(warning)).cloned().collect()
     }
 
-    /// Predicts the quality of a snapshot, given by its index in the measurement. `shares` has the runs that contain it,
-    /// each with the assessments of its tiles in the plan's order. `None` behind a mosaic, for which the model is not
-    /// fitted.
+    /// Predicts the quality of a snapshot, given by its index in the measurement. `shares` has the runs that contain
+    /// it, each with the assessments of its tiles in the plan's order. `None` behind a mosaic, for which the model is
+    /// not fitted.
     pub fn expected(
         &self,
         snapshot: usize,
@@ -219,8 +219,8 @@ pub struct Inputs {
     pub measurement_axes: Option<String>,
 }
 
-/// All factors between stored values and the unit scale of the solver. Frames are on the scale of the measurement divided
-/// by its full scale: the white level is undone. The full scale of the masks defines a mask value of 1.
+/// All factors between stored values and the unit scale of the solver. Frames are on the scale of the measurement
+/// divided by its full scale: the white level is undone. The full scale of the masks defines a mask value of 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ScaleRecord {
     /// Stored mask value that means 1.
@@ -245,8 +245,8 @@ pub struct CameraRecord {
 impl CameraRecord {
     /// The timing of the `frames` frames of a snapshot; `None` if neither frame rate nor exposure time is known.
     ///
-    /// The masks divide the exposure evenly. An unknown exposure time is assumed to fill the period of the camera. Without
-    /// a frame rate only the frames of snapshot 0 have times.
+    /// The masks divide the exposure evenly. An unknown exposure time is assumed to fill the period of the camera.
+    /// Without a frame rate only the frames of snapshot 0 have times.
     pub fn new(
         (fps, exposure_s): (Option<f64>, Option<f64>),
         snapshot: usize,

@@ -1,7 +1,7 @@
 //! The steps from snapshots to frames: white level, pilot, tiles, blending, and the files of a result.
 //!
-//! The command line and the workers share these steps, so both give the same frames. The steps work on arrays and files,
-//! and know neither the store nor the queue.
+//! The command line and the workers share these steps, so both give the same frames. The steps work on arrays and
+//! files, and know neither the store nor the queue.
 
 pub mod arrays;
 pub mod assessment;

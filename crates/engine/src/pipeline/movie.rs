@@ -28,8 +28,8 @@ pub struct MovieTask {
     pub clips: Vec<(PathBuf, Sha256)>,
 }
 
-/// Writes the movie to `path`, an existing empty file. Pictures with sides above [`crate::job::MOVIE_SIDE`] are averaged
-/// over blocks. One frame at a time is in memory.
+/// Writes the movie to `path`, an existing empty file. Pictures with sides above [`crate::job::MOVIE_SIDE`] are
+/// averaged over blocks. One frame at a time is in memory.
 ///
 /// Errors: [`PipelineError::Result`] if a file is damaged; I/O; a stop by the monitor.
 pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {

@@ -49,7 +49,8 @@ const FASTDVDNET_GRAY_INT8: Model = Model {
     ],
 };
 
-/// The encoder whose features the quality model uses. It can't be replaced, because the model is fitted to its features.
+/// The encoder whose features the quality model uses. It can't be replaced, because the model is fitted to its
+/// features.
 const FASTDVDNET_GRAY_ENCODER: &[u8] =
     include_bytes!("../../../../models/fastdvdnet-gray-encoder/model.onnx");
 
@@ -121,7 +122,8 @@ impl ModelFile {
 
     /// Reads the file.
     ///
-    /// Errors: [`NetworkError::Model`] if it can't be read, [`NetworkError::Damaged`] if it does not have the recorded hash.
+    /// Errors: [`NetworkError::Model`] if it can't be read, [`NetworkError::Damaged`] if it does not have the recorded
+    /// hash.
     pub fn content(&self) -> Result<Vec<u8>, NetworkError> {
         let bytes = read(&self.path)?;
         let actual = Sha256::of(&bytes);
@@ -343,8 +345,8 @@ fn existing(path: &Path) -> Option<PathBuf> {
     path.is_file().then(|| path.to_path_buf())
 }
 
-/// The version in the symbol versions of a libonnxruntime, such as `1.31.1`. The build information from its API contains
-/// only a commit.
+/// The version in the symbol versions of a libonnxruntime, such as `1.31.1`. The build information from its API
+/// contains only a commit.
 fn version_in(library: &[u8]) -> Option<String> {
     const MARK: &[u8] = b"\0VERS_";
     let start = library.windows(MARK.len()).position(|window| window == MARK)?;

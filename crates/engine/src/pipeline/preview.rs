@@ -9,8 +9,8 @@ use crate::job::{SceneShape, TaskStage};
 use reconstruction::preview::{self, Blocks};
 use reconstruction::tile::Window;
 
-/// Coarse frames \[B,h,w\] of a snapshot, on the scale of the measurement. Small snapshots keep their size; large ones have
-/// one pixel per block. Frames behind a mosaic are raw mosaics.
+/// Coarse frames \[B,h,w\] of a snapshot, on the scale of the measurement. Small snapshots keep their size; large ones
+/// have one pixel per block. Frames behind a mosaic are raw mosaics.
 ///
 /// Errors: those of reading and of the solver; a stop by the monitor.
 pub fn frames(

@@ -18,8 +18,8 @@ pub struct FrameQuality {
 }
 
 impl FrameQuality {
-    /// Compares frame `k` (counted from 0) with its truth, both \[H,W\] on \[0,1\]. Colour frames are \[H,3W\]: the PSNR is
-    /// over all samples, the SSIM is the mean of the three channels.
+    /// Compares frame `k` (counted from 0) with its truth, both \[H,W\] on \[0,1\]. Colour frames are \[H,3W\]: the
+    /// PSNR is over all samples, the SSIM is the mean of the three channels.
     ///
     /// Errors: [`ReconError::Shape`] if the sizes differ.
     pub fn of(
@@ -52,8 +52,8 @@ pub struct Quality {
 }
 
 impl Quality {
-    /// Compares frames \[H,W\], or colour frames \[H,3W\], with the truth \[B,H,W\] or \[B,H,3W\]. `frame` returns a frame by
-    /// its index.
+    /// Compares frames \[H,W\], or colour frames \[H,3W\], with the truth \[B,H,W\] or \[B,H,3W\]. `frame` returns a
+    /// frame by its index.
     pub fn compare(
         frame: impl Fn(usize) -> Array2<f32>,
         truth: ArrayView3<'_, f32>,

@@ -27,8 +27,8 @@ pub struct TileInput {
 }
 
 impl TileInput {
-    /// Returns the operator of one snapshot, and the measurement divided by the white level: `sum_k C_k x_k` with frames x
-    /// on \[0,1\]. `None` if no mask lets light through, for example in a corner outside a round aperture.
+    /// Returns the operator of one snapshot, and the measurement divided by the white level: `sum_k C_k x_k` with
+    /// frames x on \[0,1\]. `None` if no mask lets light through, for example in a corner outside a round aperture.
     ///
     /// Errors: [`ReconError::Parameter`] for an invalid white level, [`ReconError::Shape`] for pieces outside the run.
     pub(super) fn on_unit_scale(
@@ -57,9 +57,9 @@ impl TileInput {
         Ok(Some((op, self.y / self.white)))
     }
 
-    /// Solves the pieces of the tile one after another on the unit scale, and scales the frames back by the white level.
-    /// `solve` gets the range of each piece on \[0,1\], as a share of all the work. A tile without light has frames of 0 and
-    /// no iterations.
+    /// Solves the pieces of the tile one after another on the unit scale, and scales the frames back by the white
+    /// level. `solve` gets the range of each piece on \[0,1\], as a share of all the work. A tile without light has
+    /// frames of 0 and no iterations.
     fn solve_pieces<F>(self, mut solve: F) -> Result<Outcome, ReconError>
     where
         F: FnMut(&SensingOperator, ArrayView3<'_, f32>, Range<f64>) -> Result<Outcome, ReconError>,

@@ -112,7 +112,8 @@ pub fn write_manifest(folder: &Path, manifest: &impl Serialize) -> Result<Result
     Ok(file)
 }
 
-/// Checks that a folder can receive a result: it has a manifest of this program, or no files with the names of a result.
+/// Checks that a folder can receive a result: it has a manifest of this program, or no files with the names of a
+/// result.
 ///
 /// Errors: [`PipelineError::Foreign`].
 pub fn check_output(folder: &Path) -> Result<()> {
@@ -129,8 +130,8 @@ pub fn check_output(folder: &Path) -> Result<()> {
     }
 }
 
-/// Moves the result in `new` to `folder`, where it replaces an earlier result. Other files in `folder` are kept. Both folders
-/// must be on one file system.
+/// Moves the result in `new` to `folder`, where it replaces an earlier result. Other files in `folder` are kept. Both
+/// folders must be on one file system.
 ///
 /// Errors: those of [`check_output`]; [`PipelineError::File`] if a file can't be moved.
 pub fn replace_result(new: &Path, folder: &Path) -> Result<()> {

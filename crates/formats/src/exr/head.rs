@@ -10,8 +10,8 @@ const MULTI_PART: u8 = 0x10;
 /// The part of a file before the chunk tables.
 pub(super) struct Head {
     prologue: [u8; PROLOGUE_BYTES],
-    /// The attributes of each part. An attribute starts with its name and a zero byte, its type and a zero byte, and its
-    /// size in four bytes.
+    /// The attributes of each part. An attribute starts with its name and a zero byte, its type and a zero byte, and
+    /// its size in four bytes.
     pub(super) parts: Vec<Vec<Vec<u8>>>,
 }
 

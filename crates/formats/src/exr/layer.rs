@@ -33,8 +33,8 @@ pub struct Layered {
 }
 
 impl Layered {
-    /// Reads the head of a stack of this shape (frames, rows, columns) from [`super::write_stack`], and plans the stack with an
-    /// additional channel of 32-bit floats. Its name must sort after those of the other channels.
+    /// Reads the head of a stack of this shape (frames, rows, columns) from [`super::write_stack`], and plans the stack
+    /// with an additional channel of 32-bit floats. Its name must sort after those of the other channels.
     ///
     /// Errors: I/O; [`FormatError::Internal`] for a file with another layout.
     pub fn read(

@@ -14,7 +14,8 @@ pub use write::{Attributes, write_frame, write_stack};
 
 use super::Channels;
 
-/// Names of the channels in OpenEXR in their stored, alphabetical order, each with its index among the values of a pixel.
+/// Names of the channels in OpenEXR in their stored, alphabetical order, each with its index among the values of a
+/// pixel.
 fn names(channels: Channels) -> &'static [(&'static str, usize)] {
     match channels {
         Channels::Grey => &[("Y", 0)],

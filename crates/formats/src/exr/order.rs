@@ -1,7 +1,7 @@
 //! Sorts the attributes of an EXR file by name, so that equal frames give equal files.
 //!
-//! The EXR crate writes attributes in the order of a hash map, which differs between processes. Readers ignore the order,
-//! and sorting does not change any size, so the headers are sorted in place.
+//! The EXR crate writes attributes in the order of a hash map, which differs between processes. Readers ignore the
+//! order, and sorting does not change any size, so the headers are sorted in place.
 
 use std::fs::File;
 use std::io::{self, BufReader, Seek, Write};

@@ -20,15 +20,15 @@ use super::{FRAME_TIME, names};
 use crate::error::Result;
 use crate::{Channels, FormatError};
 
-/// Frames are not compressed, because the low bits of reconstructed floats are noise. On a camera clip with a little added
-/// noise, ZIP saves 3 % and takes about 0.2 s per megapixel, no compression 0.02 s.
+/// Frames are not compressed, because the low bits of reconstructed floats are noise. On a camera clip with a little
+/// added noise, ZIP saves 3 % and takes about 0.2 s per megapixel, no compression 0.02 s.
 const COMPRESSION: Compression = Compression::Uncompressed;
 
 /// The attributes of a frame.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Attributes {
-    /// Names and values of string attributes (provenance). Names have up to 255 bytes and differ from those that OpenEXR
-    /// defines. Values are UTF-8.
+    /// Names and values of string attributes (provenance). Names have up to 255 bytes and differ from those that
+    /// OpenEXR defines. Values are UTF-8.
     pub texts: Vec<(String, String)>,
     /// Time of the frame in seconds after the start of the sequence: `frameTime` (double).
     pub frame_time_s: Option<f64>,

@@ -162,8 +162,8 @@ impl<R: BufRead> Content<R> {
         Ok(())
     }
 
-    /// Reads the type and the size of the next part of the array. A small part is packed into the tag, which shows as a type
-    /// above 65535.
+    /// Reads the type and the size of the next part of the array. A small part is packed into the tag, which shows as a
+    /// type above 65535.
     pub(super) fn tag(&mut self) -> Result<(u32, u32)> {
         let mut tag = [0; TAG_BYTES as usize];
         self.fill(&mut tag)?;

@@ -1,8 +1,8 @@
-//! MATLAB level 5 files, the format of the public benchmark scenes, with the arrays `mask`, `meas` and `orig`. Level 7.3
-//! files are HDF5 (`hdf5.rs`).
+//! MATLAB level 5 files, the format of the public benchmark scenes, with the arrays `mask`, `meas` and `orig`. Level
+//! 7.3 files are HDF5 (`hdf5.rs`).
 //!
-//! In MATLAB the frame axis usually comes last, here it comes first. MATLAB stores arrays column by column, so such a frame
-//! is contiguous and can be read separately.
+//! In MATLAB the frame axis usually comes last, here it comes first. MATLAB stores arrays column by column, so such a
+//! frame is contiguous and can be read separately.
 //!
 //! This module parses the files, because the crate `matfile` decompresses arrays without a limit, keeps all of them in
 //! memory, silently skips damaged ones, and can panic on hostile sizes. The tests use that crate as a reference.
@@ -24,8 +24,8 @@ use super::scene::list;
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
-/// Opens the array with this name. Errors: [`FormatError::MissingArray`]; damaged files; [`FormatError::Unsupported`] for
-/// other classes than double, single, logical and integers; [`FormatError::OverLimit`].
+/// Opens the array with this name. Errors: [`FormatError::MissingArray`]; damaged files; [`FormatError::Unsupported`]
+/// for other classes than double, single, logical and integers; [`FormatError::OverLimit`].
 pub(super) fn open(
     file: File,
     length: u64,

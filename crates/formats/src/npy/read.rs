@@ -13,8 +13,8 @@ use crate::samples::{self, ByteOrder};
 use crate::{Channels, Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
 /// Opens an npy stack for reading windows. It must have the layout in which this program writes frames: little-endian
-/// float32 in C order, with the shape (frame, row, column) or (frame, row, column, 3). Frames of the latter are three times
-/// as wide.
+/// float32 in C order, with the shape (frame, row, column) or (frame, row, column, 3). Frames of the latter are three
+/// times as wide.
 ///
 /// Errors: those of reading a header; [`FormatError::Unsupported`] for another layout.
 pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {

@@ -11,8 +11,8 @@ use crate::format::NPY_MAGIC;
 use crate::samples::StackWriter;
 use crate::{Channels, FormatError};
 
-/// The header of an npy file with the shape (frame, row, column), or (frame, row, column, 3) for colours, of little-endian
-/// float32.
+/// The header of an npy file with the shape (frame, row, column), or (frame, row, column, 3) for colours, of
+/// little-endian float32.
 pub fn stack_header((frames, height, width): (usize, usize, usize), channels: Channels) -> Vec<u8> {
     header(&match channels {
         Channels::Grey => format!("({frames}, {height}, {width})"),
@@ -79,8 +79,8 @@ pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<()> {
     Ok(())
 }
 
-/// Writes `count` frames (row, column) from `frame` as little-endian uint16 with the shape (frame, row, column), and replaces
-/// an existing file. One frame at a time is in memory.
+/// Writes `count` frames (row, column) from `frame` as little-endian uint16 with the shape (frame, row, column), and
+/// replaces an existing file. One frame at a time is in memory.
 ///
 /// Errors: those of `frame`; I/O; [`FormatError::Internal`] for a frame of another size.
 pub fn write_u16<E: From<FormatError>>(

@@ -1,7 +1,7 @@
 //! Checks the page headers of a TIFF before the decoder reads them.
 //!
-//! The `tiff` crate allocates memory for as many values as an entry claims, up to a limit that must be as large as a frame.
-//! This module checks each claim against the length of the file first.
+//! The `tiff` crate allocates memory for as many values as an entry claims, up to a limit that must be as large as a
+//! frame. This module checks each claim against the length of the file first.
 
 use std::collections::HashSet;
 use std::io::{Read, Seek, SeekFrom};

@@ -9,8 +9,8 @@ fn random(size: (usize, usize), seed: u64) -> Array2<f32> {
     Array2::from_shape_simple_fn(size, || rng.random::<f32>())
 }
 
-/// Position, in micrometres along one axis, at which a ray crosses the mask plane, by ray transfer matrices. The ray goes
-/// from height `aperture` in the front focal plane of the lens to height `image` in its back focal plane.
+/// Position, in micrometres along one axis, at which a ray crosses the mask plane, by ray transfer matrices. The ray
+/// goes from height `aperture` in the front focal plane of the lens to height `image` in its back focal plane.
 fn crossing_at_mask(geometry: &Geometry, aperture: f64, image: f64) -> f64 {
     let focal = geometry.focal_length_mm * 1000.0;
     let travel = |(height, slope): (f64, f64), length: f64| (height + slope * length, slope);
