@@ -147,7 +147,7 @@ fn defective_pixels(figures: &MaskFigures) -> Vec<Finding> {
             "{:.2} % of the pixels are dark in every mask and can't be reconstructed",
             dead * 100.0
         );
-        findings.push(Finding::new(FindingCode::DeadPixels, detail).grave_if(dead > 0.05));
+        findings.push(Finding::new(FindingCode::DeadPixels, detail).escalate_if(dead > 0.05));
     }
     let stuck = figures.stuck_pixels as f64 / pixels;
     if stuck > 0.001 && figures.frame_means.len() > 1 {
@@ -266,7 +266,7 @@ pub fn judge_captures(figures: &CaptureFigures) -> Vec<Finding> {
             figures.denominator_not_positive * 100.0,
             figures.denominator_too_dark * 100.0
         );
-        findings.push(Finding::new(FindingCode::DarkIllumination, detail).grave_if(lost > 0.05));
+        findings.push(Finding::new(FindingCode::DarkIllumination, detail).escalate_if(lost > 0.05));
     }
     findings.extend(wrong_dark(figures));
     if let Some(flatness) = figures.flatness.filter(|flatness| *flatness < 0.5) {
@@ -307,7 +307,7 @@ fn saturation(figures: &CaptureFigures) -> Vec<Finding> {
             "{:.2} % of the pixels of the white image are saturated: masks are too bright there",
             share * 100.0
         );
-        findings.push(Finding::new(FindingCode::SaturatedWhite, detail).grave_if(share > 0.01));
+        findings.push(Finding::new(FindingCode::SaturatedWhite, detail).escalate_if(share > 0.01));
     }
     let frames =
         figures.patterns_where(|pattern| pattern.saturated.is_some_and(|share| share > 0.001));
@@ -331,8 +331,9 @@ fn wrong_dark(figures: &CaptureFigures) -> Vec<Finding> {
              noise, in up to {:.1} % of the pixels",
             largest * 100.0
         );
-        findings
-            .push(Finding::new(FindingCode::WrongDark, detail).with_frames(frames).grave_if(true));
+        findings.push(
+            Finding::new(FindingCode::WrongDark, detail).with_frames(frames).escalate_if(true),
+        );
     }
     let (white, black) = (figures.white_level, figures.black_level);
     if let Some(with_mask) = figures.black_with_mask_level
@@ -342,7 +343,7 @@ fn wrong_dark(figures: &CaptureFigures) -> Vec<Finding> {
             "`black_with_mask` (mean {with_mask:.1}) is brighter than `black` (mean {black:.1}), although a mask only \
              removes light; the mean of `white` is {white:.1}"
         );
-        findings.push(Finding::new(FindingCode::WrongDark, detail).grave_if(true));
+        findings.push(Finding::new(FindingCode::WrongDark, detail).escalate_if(true));
     }
     findings
 }

@@ -359,8 +359,8 @@ impl Finding {
     }
 
     /// Raises the severity to the worst one of the code if the case is grave.
-    pub(super) fn grave_if(self, grave: bool) -> Self {
-        let severity = if grave { self.code.entry().worst } else { self.severity };
+    pub(super) fn escalate_if(self, is_grave: bool) -> Self {
+        let severity = if is_grave { self.code.entry().worst } else { self.severity };
         Self { severity, ..self }
     }
 

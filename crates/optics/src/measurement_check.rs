@@ -452,7 +452,7 @@ pub fn judge_measurement(
             "{:.2} % of the pixels are saturated: frames are too dark there",
             share * 100.0
         );
-        findings.push(Finding::new(FindingCode::Saturated, detail).grave_if(share > 0.01));
+        findings.push(Finding::new(FindingCode::Saturated, detail).escalate_if(share > 0.01));
     }
     let negative = figures.negative_area;
     if negative > 0.01 {
@@ -465,7 +465,7 @@ pub fn judge_measurement(
             "{:.1} % of the image is below 0 by more than noise: {cause}",
             negative * 100.0
         );
-        findings.push(Finding::new(FindingCode::Negative, detail).grave_if(negative > 0.1));
+        findings.push(Finding::new(FindingCode::Negative, detail).escalate_if(negative > 0.1));
     }
     // Without a correct fit the other figures are meaningless, so the checks end at the first of these two.
     if let Some(finding) = shifted_masks(figures).or_else(|| foreign_masks(figures)) {
@@ -556,7 +556,7 @@ fn unexplained_light(figures: &MeasurementFigures, dark_subtracted: bool) -> Opt
             (FindingCode::NegativeOffset, ": too much was subtracted before the upload")
         }
     };
-    Some(Finding::new(code, observation + cause).grave_if(share.abs() > 0.15))
+    Some(Finding::new(code, observation + cause).escalate_if(share.abs() > 0.15))
 }
 
 /// A mean brightness that does not fit the full scale.

@@ -90,7 +90,7 @@ fn refused(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn plain_and_compressed_scenes_are_read_like_by_matfile() {
+fn plain_and_compressed_scenes_match_matfile() {
     let masks = ramp((3, 4, 5), 2);
     let measurements = ramp((2, 4, 5), 1000);
     let truth = ramp((6, 4, 5), 256);
