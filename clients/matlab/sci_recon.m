@@ -45,7 +45,7 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
   taken = ready(o, '/v1/measurements/', taken);
   for k = 1:numel(taken.warnings)
     found = element(taken.warnings, k);
-    warning(['sci_recon:' found.code], '%s %s', found.detail, found.remedy);
+    warning(['sci_recon:' found.code], '%s. What to do: %s.', found.detail, found.remedy);
   end
 
   job = request(o, 'POST', '/v1/jobs', ...

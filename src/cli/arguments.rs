@@ -66,7 +66,7 @@ impl ScheduleArguments {
                 serde_json::from_str(&text).map_err(|error| refused(&error))?
             }
         };
-        let faults = InvalidField::of_schedule(&schedule);
+        let faults = InvalidField::schedule_errors(&schedule);
         if !faults.is_empty() {
             let line = |fault: InvalidField| format!("{}: {}", fault.pointer, fault.detail);
             let lines: Vec<String> = faults.into_iter().map(line).collect();
@@ -224,6 +224,6 @@ mod tests {
         let sigma = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5}]}"#;
         assert!(message("pnp-tv-fastdvdnet", sigma).contains("/stages/0/sigma"));
         let deep = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5, "sigma": [0.2, 0.1]}]}"#;
-        assert!(message("gap-tv", deep).contains("ask for pnp-fastdvdnet"));
+        assert!(message("gap-tv", deep).contains("use the algorithm pnp-fastdvdnet"));
     }
 }

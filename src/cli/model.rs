@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::CliError;
 use crate::cli::error::Result;
-use engine::job::{Algorithm, Cut, Schedule, Sequence, TileSpec};
+use engine::job::{Algorithm, Cut, CutRequest, Schedule, Sequence, TileSpec};
 use engine::pipeline::networks::{ModelFile, ModelRecord, NetworkSource};
 use reconstruction::learned::{Interface, PictureSize};
 
@@ -47,8 +47,11 @@ pub fn cut(
     let fixed = model.map(|model| model.size(dim)).transpose()? == Some(PictureSize::Fixed);
     let usual = if fixed { TileSpec::whole(height, width) } else { algorithm.default_tile() };
     let (size, overlap) = (tile.unwrap_or(usual.size), overlap.unwrap_or(usual.overlap));
-    let asked = fixed || tile.is_some();
-    let cut = Cut::new(sequence, schedule, (TileSpec { size, overlap }, asked), dim)?;
+    let (sequence, snapshots) = sequence;
+    let tile_is_fixed = fixed || tile.is_some();
+    let tile = TileSpec { size, overlap };
+    let request = CutRequest { sequence, snapshots, size: dim, tile, tile_is_fixed };
+    let cut = Cut::new(request, schedule)?;
     if fixed && cut.tiles(height, width)?.len() > 1 {
         return Err(CliError::Input(format!(
             "the network takes pictures of {height}x{width} pixels only, so they can't be cut into \

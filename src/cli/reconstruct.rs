@@ -184,10 +184,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let seen = |index| solved.frame(&sequence, input.first + index / frames, index % frames);
     let compare = |(truth, channels): &(Array3<f32>, Channels)| {
         let frame = |index| match (arguments.mosaic, channels) {
-            (Some(mosaic), Channels::Rgb) => mosaic.colours(seen(index).view(), (0, 0)),
+            (Some(mosaic), Channels::Rgb) => mosaic.demosaick(seen(index).view(), (0, 0)),
             _ => seen(index),
         };
-        Quality::of_frames(frame, truth.view(), *channels)
+        Quality::compare(frame, truth.view(), *channels)
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
     let recipe = input.recipe(&setup, white, &solved)?;
@@ -198,7 +198,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let expected: Vec<_> = input.snapshots().map(expected).collect();
     let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
     let all = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
-    report.assessment = Assessment::of_all(all);
+    report.assessment = Assessment::combined(all);
     for (snapshot, folder) in folders {
         let tiles = solved.records(&sequence, snapshot);
         let expected = expected.get(snapshot - input.first).cloned().flatten();

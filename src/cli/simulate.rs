@@ -128,7 +128,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Some(mosaic) => {
             let mut seen = Array3::zeros((used, height, width));
             for (mut seen, truth) in seen.outer_iter_mut().zip(truth.outer_iter()) {
-                seen.assign(&mosaic.seen(truth, (0, 0)));
+                seen.assign(&mosaic.sample(truth, (0, 0)));
             }
             seen
         }

@@ -276,7 +276,7 @@ fn facts(
     frames: usize,
     warnings: Vec<Finding>,
 ) -> NewMeasurement {
-    let told = Sequence::told_by(request.camera_fps, request.exposure_s, frames);
+    let told = Sequence::from_camera(request.camera_fps, request.exposure_s, frames);
     NewMeasurement {
         name: request.name,
         calibration: request.calibration,

@@ -91,7 +91,7 @@ fn compare(
         let frame = result.read_window(k..k + 1, 0..height, 0..result.info().width)?;
         let mut frame = frame.index_axis_move(Axis(0), 0);
         if let (Channels::Grey, Some(mosaic)) = (channels, mosaic) {
-            frame = mosaic.seen(frame.view(), (0, 0));
+            frame = mosaic.sample(frame.view(), (0, 0));
         }
         let quality = FrameQuality::of(k, frame.view(), truth.view(), channels);
         quality.map_err(|error| ApiError::internal(&error))

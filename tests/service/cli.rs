@@ -179,7 +179,7 @@ fn schedules_are_printed_in_the_format_that_is_read() {
         (&"tv".into(), &5.into())
     );
     let message = rejection(&["schedule", "--schedule", &file, "--algorithm", "gap-tv"]);
-    assert!(message.contains("gap-tv has no stages of nonlocal"), "{message}");
+    assert!(message.contains("gap-tv does not support the prior nonlocal"), "{message}");
 }
 
 #[test]

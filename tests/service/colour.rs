@@ -345,5 +345,5 @@ async fn an_invalid_mosaic_is_rejected_and_captures_can_have_one() {
         "none",
     ]);
     let text = String::from_utf8_lossy(&refusal.stderr).into_owned();
-    assert!(refusal.status.code() == Some(2) && text.contains("no colours"), "{text}");
+    assert!(refusal.status.code() == Some(2) && text.contains("not in colour"), "{text}");
 }

@@ -1,7 +1,7 @@
-//! What happens to a job, from files to video: no SQL, no HTTP.
+//! The processing of jobs from files to video, without SQL and HTTP.
 //!
-//! A [`job`] says what is to be done: identifiers, validated requests, states and their legal steps. [`intake`]
-//! turns a lab's files into checked arrays. The [`pipeline`] reconstructs them tile by tile and writes the results.
+//! [`job`] is the data model: identifiers, validated requests, states and their transitions. [`intake`] reads and
+//! checks the files of a lab. [`pipeline`] reconstructs them tile by tile and writes the results.
 
 pub mod intake;
 pub mod job;

@@ -1,6 +1,6 @@
-//! The shipped networks, run by ONNX Runtime through the denoisers of the reconstruction.
+//! Runs the embedded networks with ONNX Runtime through the denoisers of the reconstruction.
 
-#![allow(clippy::unwrap_used)] // helpers of tests
+#![allow(clippy::unwrap_used)] // test helpers
 
 use std::path::PathBuf;
 
@@ -23,7 +23,7 @@ fn library() -> Option<PathBuf> {
     library
 }
 
-fn network(which: Network) -> Option<ClipDenoiser> {
+fn load(which: Network) -> Option<ClipDenoiser> {
     let runtime = Runtime::open(&library()?, Device::Cpu).unwrap();
     let files: Vec<_> = networks::carried(which).files.iter().map(|(_, file)| *file).collect();
     Some(ClipDenoiser::load(&runtime, which, &files).unwrap())
@@ -43,8 +43,8 @@ fn mean_square(a: &Array3<f32>, b: &Array3<f32>) -> f32 {
 }
 
 #[test]
-fn noise_falls_for_any_size_and_any_number_of_frames() {
-    let Some(mut network) = network(Network::FastDvdNet) else { return };
+fn noise_is_reduced_for_any_size_and_number_of_frames() {
+    let Some(mut network) = load(Network::FastDvdNet) else { return };
     for (frames, height, width) in [(1, 32, 32), (2, 33, 46), (7, 50, 31)] {
         let (clean, mut video) = noisy(frames, height, width);
         let before = mean_square(&video, &clean);
@@ -55,9 +55,9 @@ fn noise_falls_for_any_size_and_any_number_of_frames() {
 }
 
 #[test]
-fn a_frame_does_not_depend_on_how_the_clip_is_chunked() {
-    let Some(mut network) = network(Network::FastDvdNet) else { return };
-    // 300x300: two frames at once; the middle of 9 depends on its 4 neighbours alone.
+fn frames_do_not_depend_on_the_batches_of_the_clip() {
+    let Some(mut network) = load(Network::FastDvdNet) else { return };
+    // At 300x300 a batch has two frames. The middle one of 9 frames depends only on its 4 neighbours.
     let (_, video) = noisy(9, 300, 300);
     let mut long = video.clone();
     network.denoise(&mut long, 0.1).unwrap();
@@ -67,19 +67,19 @@ fn a_frame_does_not_depend_on_how_the_clip_is_chunked() {
 }
 
 #[test]
-fn the_encoder_tells_of_each_block_and_of_no_other_frames_than_those_beside() {
+fn encoder_features_depend_only_on_nearby_blocks_and_frames() {
     let Some(library) = library() else { return };
     let source = NetworkSource::new(Some(library), Device::Cpu);
     let mut networks = WarmNetworks::new(source);
     let mut encode =
         |frames: ArrayView3<'_, f32>| networks.encoder().unwrap().unwrap().encode(frames).unwrap();
     let (clean, noisy) = noisy(9, 300, 290);
-    let seen = encode(noisy.view());
-    assert_eq!(seen.dim(), (CHANNELS, 9, 19, 19));
+    let features = encode(noisy.view());
+    assert_eq!(features.dim(), (CHANNELS, 9, 19, 19));
     let alone = encode(noisy.slice(s![3..6, .., ..]));
-    let difference = &seen.slice(s![.., 4, .., ..]) - &alone.slice(s![.., 1, .., ..]);
+    let difference = &features.slice(s![.., 4, .., ..]) - &alone.slice(s![.., 1, .., ..]);
     assert!(difference.iter().all(|d| d.abs() < 1e-5));
-    // What reaches a block lies within 40 pixels of it.
+    // The receptive field of a block extends at most 40 pixels beyond it.
     let mut half = clean.clone();
     half.slice_mut(s![.., .., ..128]).assign(&noisy.slice(s![.., .., ..128]));
     let change = (&encode(half.view()) - &encode(clean.view())).mapv(f32::abs);
@@ -88,9 +88,9 @@ fn the_encoder_tells_of_each_block_and_of_no_other_frames_than_those_beside() {
 }
 
 #[test]
-fn eight_bits_change_little() {
+fn quantization_to_8_bits_changes_little() {
     let (Some(mut exact), Some(mut quick)) =
-        (network(Network::FastDvdNet), network(Network::FastDvdNetInt8))
+        (load(Network::FastDvdNet), load(Network::FastDvdNetInt8))
     else {
         return;
     };
@@ -99,7 +99,7 @@ fn eight_bits_change_little() {
     exact.denoise(&mut frames, 0.1).unwrap();
     quick.denoise(&mut other, 0.1).unwrap();
     let (error, change) = (mean_square(&frames, &clean), mean_square(&frames, &other));
-    assert!(change > 0.0, "these are the same weights");
-    // 12 % is measured: its steps are wide enough for lights far above the white (models/fastdvdnet-gray-int8/README.md).
+    assert!(change > 0.0, "both networks have the same weights");
+    // Measured: 12 %. The quantization range includes lights far above white (models/fastdvdnet-gray-int8/README.md).
     assert!(change < 0.2 * error, "{change} where the network's own error is {error}");
 }

@@ -1,4 +1,4 @@
-//! Arrays in any order of their axes, read frame by frame.
+//! Reads arrays with any order of axes frame by frame.
 
 use std::io::{self, Read, Seek};
 use std::ops::Range;
@@ -10,23 +10,23 @@ use super::samples::{self, ByteOrder};
 use super::{Format, FrameReader, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
-/// The samples of an array as numbers, in the order in which they are stored.
+/// The samples of an array in the order in which they are stored.
 pub(super) trait Samples {
-    /// Goes back to the first one.
+    /// Returns to the first sample.
     fn rewind(&mut self) -> Result<()>;
 
-    /// The next `count` samples: those of whole entries of the axis that varies slowest.
+    /// Reads the next `count` samples, which are whole entries of the slowest axis.
     fn read(&mut self, count: usize) -> Result<Vec<f32>>;
 
-    /// Checks what follows the last sample.
+    /// Checks the end of the data after the last sample.
     fn finish(&mut self) -> Result<()> {
         Ok(())
     }
 }
 
-/// Bytes that can be read again from the start: of a file, or of a member of an archive.
+/// A source of bytes that can be read again from the start.
 pub(super) trait Restart: Read + Send {
-    /// Goes back to the first byte.
+    /// Returns to the first byte.
     fn restart(&mut self) -> io::Result<()>;
 }
 
@@ -36,10 +36,10 @@ impl<R: Read + Seek + Send> Restart for R {
     }
 }
 
-/// Samples as they lie in memory, behind a header.
+/// Uncompressed samples after a header.
 pub(super) struct RawSamples<R> {
     file: R,
-    /// Where they begin.
+    /// Offset of the first sample.
     start: u64,
     sample: SampleType,
     order: ByteOrder,
@@ -47,7 +47,7 @@ pub(super) struct RawSamples<R> {
 }
 
 impl<R: Restart> RawSamples<R> {
-    /// Of a file that stands at the first one, which is at byte `start`.
+    /// Samples of a file that is positioned at the first one, at byte `start`.
     pub(super) fn new(
         file: R,
         start: u64,
@@ -75,32 +75,34 @@ impl<R: Restart> Samples for RawSamples<R> {
     }
 
     fn finish(&mut self) -> Result<()> {
-        // At the end of a member its checksum is looked at.
+        // Reading to the end of an archive member checks its checksum.
         let rest = self.file.read(&mut [0]);
         rest.map(drop).map_err(|error| samples::read_error(self.format, error))
     }
 }
 
-/// An array as a stack of frames. Where the frames of a pixel lie together, several frames are kept of each pass
-/// over the file.
+/// Reads an array as a stack of frames. If the frames of a pixel are adjacent in the file, each pass over the file
+/// extracts several frames.
 pub(super) struct ArrayReader<S> {
     samples: S,
     info: StackInfo,
     layout: Layout,
     next: usize,
-    kept: Vec<f32>,
-    /// The first frame that is kept, and the one behind the last.
+    /// Frames that the last pass has extracted.
+    buffer: Vec<f32>,
+    /// Indices of these frames.
     range: Range<usize>,
 }
 
-/// Bytes of the frames that are kept, unless more are needed for [`MOST_PASSES`].
-const KEPT_BYTES: usize = if cfg!(test) { 200 } else { 64 << 20 };
-/// Passes over a file. So at most a sixteenth of an array is kept, 512 MiB with the default limits.
-const MOST_PASSES: usize = 16;
-/// Bytes that are read at a time, unless a line of pixels with all their frames takes more.
+/// Size of the extracted frames in bytes. More are extracted if [`MAX_PASSES`] requires it.
+const BUFFER_BYTES: usize = if cfg!(test) { 200 } else { 64 << 20 };
+/// Largest number of passes over a file. The buffer is therefore at most a sixteenth of an array, or 512 MiB with the
+/// default limits, above [`BUFFER_BYTES`].
+const MAX_PASSES: usize = 16;
+/// Number of bytes that are read at a time, but at least one line of pixels with all their frames.
 const BLOCK_BYTES: usize = if cfg!(test) { 100 } else { 1 << 20 };
 
-/// What an arranged array is as a stack. Errors: sizes beyond the limits.
+/// The stack that an array represents. Errors: [`FormatError`](super::FormatError) for sizes beyond the limits.
 pub(super) fn info(
     format: Format,
     sample: SampleType,
@@ -115,20 +117,20 @@ pub(super) fn info(
 }
 
 impl<S: Samples> ArrayReader<S> {
-    /// Of samples that stand at the first one.
+    /// A reader of samples that are positioned at the first one.
     pub(super) fn new(samples: S, info: StackInfo, layout: Layout) -> Self {
-        Self { samples, info, layout, next: 0, kept: Vec::new(), range: 0..0 }
+        Self { samples, info, layout, next: 0, buffer: Vec::new(), range: 0..0 }
     }
 
-    /// Reads the array from the front and keeps frames from this one on.
-    fn gather(&mut self, first: usize) -> Result<()> {
+    /// Makes a pass over the array, and extracts frames from `first` on.
+    fn extract(&mut self, first: usize) -> Result<()> {
         let StackInfo { frames, height, width, .. } = self.info;
         let (pixels, by_columns) = (height * width, self.layout.by_columns);
-        let count = (KEPT_BYTES / (pixels * size_of::<f32>()))
-            .max(frames.div_ceil(MOST_PASSES))
+        let count = (BUFFER_BYTES / (pixels * size_of::<f32>()))
+            .max(frames.div_ceil(MAX_PASSES))
             .clamp(1, frames - first);
-        self.kept.clear();
-        self.kept.resize(count * pixels, 0.0);
+        self.buffer.clear();
+        self.buffer.resize(count * pixels, 0.0);
         self.range = first..first + count;
         self.samples.rewind()?;
         let (lines, line) = if by_columns { (width, height) } else { (height, width) };
@@ -140,7 +142,7 @@ impl<S: Samples> ArrayReader<S> {
                 let pixel =
                     if by_columns { place % height * width + place / height } else { place };
                 for (frame, value) in values[self.range.clone()].iter().enumerate() {
-                    self.kept[frame * pixels + pixel] = *value;
+                    self.buffer[frame * pixels + pixel] = *value;
                 }
             }
         }
@@ -162,9 +164,9 @@ impl<S: Samples> FrameReader for ArrayReader<S> {
         self.next += 1;
         if self.layout.interleaved {
             if !self.range.contains(&frame) {
-                self.gather(frame)?;
+                self.extract(frame)?;
             }
-            let values = &self.kept[(frame - self.range.start) * pixels..][..pixels];
+            let values = &self.buffer[(frame - self.range.start) * pixels..][..pixels];
             return samples::frame(height, width, values.to_vec()).map(Some);
         }
         let values = self.samples.read(pixels)?;

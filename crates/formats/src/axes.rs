@@ -1,4 +1,4 @@
-//! The order of an array's axes: stated, told by the format, or found from the sizes that are known.
+//! The order of the axes of an array: stated by the user, or inferred from the format and known sizes.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, VariantNames};
@@ -6,8 +6,7 @@ use strum::{Display, EnumString, VariantNames};
 use super::{Format, FormatError};
 use crate::error::Result;
 
-/// The order of the axes of an array, as the program that wrote it shows them: of HDF5 files as h5py does,
-/// of MATLAB's as MATLAB does.
+/// The order of the axes of an array, as shown by h5py for HDF5 files and by MATLAB for its files.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Display, EnumString, VariantNames,
 )]
@@ -20,27 +19,27 @@ pub enum Axes {
     RowColumnFrame,
     /// \[column, row, frame\].
     ColumnRowFrame,
-    /// \[frame, column, row\]: what MATLAB's `h5write` makes of \[row, column, frame\].
+    /// \[frame, column, row\], which MATLAB's `h5write` produces from \[row, column, frame\].
     FrameColumnRow,
 }
 
-/// No camera has fewer rows or columns.
-const LEAST_SIDE: u64 = 32;
-/// No camera's picture is longer than so many times its other side.
-const MOST_ASPECT: u64 = 8;
+/// Smallest plausible number of rows or columns of a camera.
+const MIN_SIDE: u64 = 32;
+/// Largest plausible aspect ratio of a camera.
+const MAX_ASPECT: u64 = 8;
 
-/// What is known of a stack before its file is opened.
+/// Prior knowledge about a stack, before its file is opened.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Expected {
-    /// The order that was stated.
+    /// The stated order.
     pub axes: Option<Axes>,
-    /// The most frames there can be.
-    pub most_frames: Option<usize>,
+    /// Largest possible number of frames.
+    pub max_frames: Option<usize>,
     /// Rows and columns of a frame.
     pub size: Option<(usize, usize)>,
 }
 
-/// Who wrote an array: how its shape is told, and which orders people use there.
+/// The program family that wrote an array. It determines how the shape is stored, and which orders are common.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Writer {
     /// The last axis varies fastest.
@@ -51,23 +50,23 @@ pub(super) enum Writer {
     Matlab,
 }
 
-/// How the samples of a stack lie one after another.
+/// The order of the samples of a stack in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
-    /// All frames of a pixel lie together; otherwise all pixels of a frame.
+    /// True if all frames of a pixel are adjacent; false if all pixels of a frame are.
     pub(super) interleaved: bool,
-    /// Pixels go column by column; otherwise row by row.
+    /// True if pixels are stored column by column; false for row by row.
     pub(super) by_columns: bool,
 }
 
-/// A shape whose axes are known.
+/// A shape with known axes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Arranged {
     pub(super) frames: u64,
     pub(super) height: u64,
     pub(super) width: u64,
     pub(super) layout: Layout,
-    /// None for an array of two dimensions.
+    /// Order of the axes; `None` for two dimensions, unless stated.
     pub(super) axes: Option<Axes>,
 }
 
@@ -84,9 +83,8 @@ impl Axes {
 }
 
 impl Writer {
-    /// The orders that people use, the usual one first. In MATLAB a matrix is \[row, column\].
-    /// [`Axes::FrameColumnRow`] is not among them: turned pictures of a size that nobody knows are no worse
-    /// than others.
+    /// The common orders, the most common one first. In MATLAB a matrix is \[row, column\]. [`Axes::FrameColumnRow`] is
+    /// absent, because transposed pictures can be recognised only by a known size.
     fn orders(self) -> &'static [Axes] {
         use Axes::{ColumnRowFrame, FrameRowColumn, RowColumnFrame};
         match self {
@@ -95,6 +93,7 @@ impl Writer {
         }
     }
 
+    /// The order of the samples in the file for this order of axes.
     fn layout(self, axes: Axes) -> Layout {
         let (interleaved, by_columns) = match (axes, self == Self::Rows) {
             (Axes::FrameRowColumn, true) | (Axes::ColumnRowFrame, false) => (false, false),
@@ -107,7 +106,8 @@ impl Writer {
 }
 
 impl Expected {
-    /// The axes of an array of this shape; none unless it has two or three dimensions.
+    /// Determines the axes of an array of this shape; `None` unless it has two or three dimensions.
+    ///
     /// Errors: [`FormatError::AxesAmbiguous`].
     pub(super) fn arrange(
         &self,
@@ -116,9 +116,10 @@ impl Expected {
     ) -> Result<Option<Arranged>> {
         match *shape {
             [first, second] => {
-                let turned = matches!(self.axes, Some(Axes::ColumnRowFrame | Axes::FrameColumnRow));
-                let (height, width) = if turned { (second, first) } else { (first, second) };
-                let by_columns = turned == (writer == Writer::Rows);
+                let transposed =
+                    matches!(self.axes, Some(Axes::ColumnRowFrame | Axes::FrameColumnRow));
+                let (height, width) = if transposed { (second, first) } else { (first, second) };
+                let by_columns = transposed == (writer == Writer::Rows);
                 let layout = Layout { interleaved: false, by_columns };
                 Ok(Some(Arranged { frames: 1, height, width, layout, axes: self.axes }))
             }
@@ -133,8 +134,8 @@ impl Expected {
         }
     }
 
-    /// The order that was stated; else the one that fits what is known; if none does, that of turned pictures of
-    /// the right size, or the usual one, whose sizes are refused elsewhere.
+    /// The stated order or, without one, the only common order that fits what is known. If none fits, transposed
+    /// pictures of the right size are accepted; otherwise the usual order is assumed, and its sizes are checked later.
     fn order(&self, format: Format, writer: Writer, shape: [u64; 3]) -> Result<Axes> {
         let usual = writer.orders()[0];
         let fits: Vec<Axes> =
@@ -142,12 +143,12 @@ impl Expected {
         match (self.axes, &*fits) {
             (Some(stated), _) => Ok(stated),
             (None, [only]) => Ok(*only),
-            (None, [_, _, ..]) if self.knows() => {
-                let told = |axes: &Axes| {
+            (None, [_, _, ..]) if self.is_constrained() => {
+                let describe = |axes: &Axes| {
                     let (frames, height, width) = axes.sizes(shape);
                     format!("{axes} ({frames} of {height}x{width})")
                 };
-                let fits: Vec<String> = fits.iter().map(told).collect();
+                let fits: Vec<String> = fits.iter().map(describe).collect();
                 Err(FormatError::AxesAmbiguous { format, shape, fits: fits.join(", ") })
             }
             (None, []) if self.size.is_some() && self.fits(Axes::FrameColumnRow.sizes(shape)) => {
@@ -157,19 +158,21 @@ impl Expected {
         }
     }
 
-    fn knows(&self) -> bool {
-        self.most_frames.is_some() || self.size.is_some()
+    /// True if anything is known that excludes some orders.
+    fn is_constrained(&self) -> bool {
+        self.max_frames.is_some() || self.size.is_some()
     }
 
     fn fits(&self, (frames, height, width): (u64, u64, u64)) -> bool {
-        let few = self.most_frames.is_none_or(|most| frames <= most as u64);
-        few && match self.size {
-            Some((rows, columns)) => (height, width) == (rows as u64, columns as u64),
-            None => {
-                let (short, long) = (height.min(width), height.max(width));
-                short >= LEAST_SIDE && long <= short.saturating_mul(MOST_ASPECT)
+        let count_fits = self.max_frames.is_none_or(|max| frames <= max as u64);
+        count_fits
+            && match self.size {
+                Some((rows, columns)) => (height, width) == (rows as u64, columns as u64),
+                None => {
+                    let (short, long) = (height.min(width), height.max(width));
+                    short >= MIN_SIDE && long <= short.saturating_mul(MAX_ASPECT)
+                }
             }
-        }
     }
 }
 
@@ -178,9 +181,9 @@ mod tests {
     use super::{Axes, Expected, Writer};
     use crate::{Format, FormatError};
 
-    const MASKS: Expected = Expected { axes: None, most_frames: Some(64), size: None };
+    const MASKS: Expected = Expected { axes: None, max_frames: Some(64), size: None };
 
-    fn of(expected: Expected, writer: Writer, shape: [u64; 3]) -> Result<Axes, String> {
+    fn infer(expected: Expected, writer: Writer, shape: [u64; 3]) -> Result<Axes, String> {
         expected.order(Format::Npy, writer, shape).map_err(|error| match error {
             FormatError::AxesAmbiguous { fits, .. } => fits,
             other => panic!("{other}"),
@@ -188,41 +191,40 @@ mod tests {
     }
 
     #[test]
-    fn one_order_that_fits_is_taken() {
+    fn the_only_fitting_order_is_used() {
         use Axes::{ColumnRowFrame, FrameColumnRow, FrameRowColumn, RowColumnFrame};
-        assert_eq!(of(MASKS, Writer::Rows, [8, 256, 256]), Ok(FrameRowColumn));
-        assert_eq!(of(MASKS, Writer::Rows, [8, 48, 64]), Ok(FrameRowColumn));
-        assert_eq!(of(MASKS, Writer::Matlab, [256, 256, 8]), Ok(RowColumnFrame));
-        assert_eq!(of(MASKS, Writer::Matlab, [8, 256, 256]), Ok(FrameRowColumn));
-        let of_480x640 = Expected { size: Some((480, 640)), ..Expected::default() };
+        assert_eq!(infer(MASKS, Writer::Rows, [8, 256, 256]), Ok(FrameRowColumn));
+        assert_eq!(infer(MASKS, Writer::Rows, [8, 48, 64]), Ok(FrameRowColumn));
+        assert_eq!(infer(MASKS, Writer::Matlab, [256, 256, 8]), Ok(RowColumnFrame));
+        assert_eq!(infer(MASKS, Writer::Matlab, [8, 256, 256]), Ok(FrameRowColumn));
+        let vga = Expected { size: Some((480, 640)), ..Expected::default() };
         for (shape, axes) in [
             ([5, 480, 640], FrameRowColumn),
             ([480, 640, 5], RowColumnFrame),
             ([640, 480, 5], ColumnRowFrame),
             ([5, 640, 480], FrameColumnRow),
-            // More than a sensor's worth of snapshots, which are few enough for the limits.
             ([480, 640, 640], RowColumnFrame),
         ] {
-            assert_eq!(of(of_480x640, Writer::Rows, shape), Ok(axes), "{shape:?}");
+            assert_eq!(infer(vga, Writer::Rows, shape), Ok(axes), "{shape:?}");
         }
-        // None fits: the sizes are refused, not the axes.
-        assert_eq!(of(of_480x640, Writer::Rows, [640, 5, 480]), Ok(FrameRowColumn));
-        assert_eq!(of(MASKS, Writer::Rows, [3, 4, 5]), Ok(FrameRowColumn));
-        assert_eq!(of(MASKS, Writer::Matlab, [500, 400, 300]), Ok(RowColumnFrame));
+        // No order fits: the usual one is assumed, and later checks refuse the sizes.
+        assert_eq!(infer(vga, Writer::Rows, [640, 5, 480]), Ok(FrameRowColumn));
+        assert_eq!(infer(MASKS, Writer::Rows, [3, 4, 5]), Ok(FrameRowColumn));
+        assert_eq!(infer(MASKS, Writer::Matlab, [500, 400, 300]), Ok(RowColumnFrame));
         // Nothing is known.
-        assert_eq!(of(Expected::default(), Writer::Rows, [256, 256, 8]), Ok(FrameRowColumn));
+        assert_eq!(infer(Expected::default(), Writer::Rows, [256, 256, 8]), Ok(FrameRowColumn));
     }
 
     #[test]
-    fn several_that_fit_are_listed() {
-        let fits = of(MASKS, Writer::Rows, [480, 640, 8]).unwrap_err();
+    fn several_fitting_orders_are_listed() {
+        let fits = infer(MASKS, Writer::Rows, [480, 640, 8]).unwrap_err();
         assert_eq!(fits, "row-column-frame (8 of 480x640), column-row-frame (8 of 640x480)");
-        let fits = of(MASKS, Writer::Matlab, [40, 48, 64]).unwrap_err();
+        let fits = infer(MASKS, Writer::Matlab, [40, 48, 64]).unwrap_err();
         assert_eq!(fits, "row-column-frame (64 of 40x48), frame-row-column (40 of 48x64)");
         let square = Expected { size: Some((256, 256)), ..Expected::default() };
-        assert!(of(square, Writer::Rows, [256, 256, 256]).unwrap_err().starts_with("frame-row"));
-        assert!(of(square, Writer::Fortran, [256, 256, 9]).is_err());
+        assert!(infer(square, Writer::Rows, [256, 256, 256]).unwrap_err().starts_with("frame-row"));
+        assert!(infer(square, Writer::Fortran, [256, 256, 9]).is_err());
         let stated = Expected { axes: Some(Axes::RowColumnFrame), ..MASKS };
-        assert_eq!(of(stated, Writer::Rows, [480, 640, 8]), Ok(Axes::RowColumnFrame));
+        assert_eq!(infer(stated, Writer::Rows, [480, 640, 8]), Ok(Axes::RowColumnFrame));
     }
 }

@@ -1,17 +1,17 @@
-//! What a pixel of a frame has. Rows of colour frames have red, green and blue of each pixel, one after the other:
-//! they are arrays \[row, 3 column\].
+//! The channels of frames. Colour frames are arrays \[row, 3 column\] with red, green and blue of each pixel in
+//! adjacent columns.
 
-/// What a pixel of a frame has.
+/// The channels of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Channels {
-    /// One value.
+    /// One value per pixel.
     Grey,
-    /// Red, green and blue.
+    /// Red, green and blue of each pixel.
     Rgb,
 }
 
 impl Channels {
-    /// Values of a pixel.
+    /// Number of values per pixel.
     pub const fn count(self) -> usize {
         match self {
             Self::Grey => 1,

@@ -1,4 +1,4 @@
-//! Clips of colours, in the files that hold them.
+//! Opens colour clips.
 
 use std::path::Path;
 
@@ -6,10 +6,10 @@ use super::open::open;
 use super::{Format, FrameReader, Limits, npy, png};
 use crate::error::Result;
 
-/// Opens a clip of colours: npy of (frame, row, column, 3) in C order, or one PNG with 8 or 16 bits of red, green
-/// and blue. Its frames, and the width that they are told to have, are three times as wide as the picture. None
-/// if the file is of another kind: it may be a grey one.
-/// Errors: whatever is wrong with the file; see [`super::open_stack`].
+/// Opens a colour clip: npy (frame, row, column, 3) in C order, or an RGB PNG with 8 or 16 bits per channel. Its
+/// frames, and their stated width, are three times as wide as the picture. `None` if the file is not in colour.
+///
+/// Errors: as [`super::open_stack`].
 pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Box<dyn FrameReader + Send>>> {
     let (file, length, format) = open(path)?;
     limits.check_file(format, length)?;
@@ -35,7 +35,7 @@ mod tests {
     use crate::{Channels, Limits, collect, npy, open_stack, png};
 
     #[test]
-    fn clips_of_colours_are_told_from_grey_ones() {
+    fn colour_clips_are_distinguished_from_grey_ones() {
         let frames = Array3::from_shape_fn((2, 3, 12), |(k, i, j)| (k * 36 + i * 12 + j) as f32);
         let path = tempfile::NamedTempFile::new().unwrap();
         npy::write_colours(path.path(), frames.view()).unwrap();

@@ -1,100 +1,99 @@
-//! What can be wrong with a file or with the values in it.
+//! Errors of files and of the values in them.
 
 use std::io;
 
 use super::Format;
 
-/// What the functions of this folder give.
+/// The result type of this crate.
 pub type Result<T, E = FormatError> = std::result::Result<T, E>;
 
-/// Why a file could not be read, written or accepted.
+/// The reason why a file could not be read, written or accepted.
 ///
-/// Only [`FormatError::Io`] and [`FormatError::Internal`] are ours; everything else says what is
-/// wrong with the file that somebody gave us (see [`FormatError::is_callers_fault`]). Messages name
-/// no path: the caller knows which file it meant, and a server must not show its own layout.
-/// Frames, rows and columns count from 0.
+/// [`FormatError::Io`] and [`FormatError::Internal`] are failures of the machine or of this program. All other variants
+/// describe a problem of the file; see [`FormatError::is_callers_fault`]. Messages contain no paths, because a server
+/// must not reveal its folders. Frames, rows and columns are counted from 0.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // the messages say what the fields are
+#[allow(missing_docs)] // the messages describe the fields
 pub enum FormatError {
     /// The operating system refused a read or a write.
-    #[error("cannot {action}: {source}")]
+    #[error("can't {action}: {source}")]
     Io { action: &'static str, source: io::Error },
-    /// A call that breaks the rules of this module (a window outside the stack, a frame of the wrong size).
-    #[error("internal error in the use of a file format: {0}")]
+    /// An incorrect call, such as a window outside the stack, or a frame of the wrong size.
+    #[error("internal error: {0}")]
     Internal(String),
-    /// The first bytes belong to none of the formats that can be read.
-    #[error("the file is in no format that is read here: {found}; accepted are {accepted}")]
+    /// The file is in none of the supported formats.
+    #[error("the file format is not supported: {found}; supported formats are {accepted}")]
     UnknownFormat { found: String, accepted: &'static str },
-    /// The format is known but not this kind of content.
-    #[error("{format} file: found {found}; accepted: {accepted}")]
+    /// The format is supported, but not this kind of content.
+    #[error("this content of the {format} file is not supported: {found}; supported: {accepted}")]
     Unsupported { format: Format, found: String, accepted: &'static str },
-    /// The file is shorter than its header says.
+    /// The file is shorter than its header states.
     #[error(
-        "{format} file is cut short: its header promises {promised}, but the file holds {present}"
+        "the {format} file is cut short: its header promises {promised}, but the file contains {present}"
     )]
     Truncated { format: Format, promised: String, present: String },
-    /// The bytes contradict the format's rules or themselves.
-    #[error("{format} file is malformed: {problem}")]
+    /// The content violates the rules of the format, or is inconsistent.
+    #[error("the {format} file is malformed: {problem}")]
     Malformed { format: Format, problem: String },
-    /// The content is larger than this installation accepts ([`super::Limits`]).
-    #[error("{format} file is too large: {what} is {value}, the limit is {limit}")]
+    /// The content exceeds the [`super::Limits`].
+    #[error("the {format} file is too large: {what} is {value}, but the limit is {limit}")]
     OverLimit { format: Format, what: &'static str, value: u64, limit: u64 },
-    /// A file of several arrays without the one that was asked for.
-    #[error("{format} file has no array named '{name}'; it holds {present}")]
+    /// The file does not have the requested array.
+    #[error("the {format} file has no array named '{name}'; it contains {present}")]
     MissingArray { format: Format, name: String, present: String },
-    /// A picture of an archive that is no frame.
+    /// A picture of an archive is not a valid frame.
     #[error("{name}: {source}")]
     Member { name: String, source: Box<FormatError> },
-    /// An array was named, in a file that holds one without a name.
-    #[error("the file holds one array without a name: leave array out")]
+    /// An array name was stated for a file with one array without a name.
+    #[error("the file contains one array, which has no name: omit `array`")]
     NoNames,
-    /// An array whose frames may lie along several of its axes.
+    /// Several orders of the axes are possible.
     #[error(
-        "{format} file: the array [{}, {}, {}] may be {fits}: state axes, the one that is right{}",
-        shape[0], shape[1], shape[2], turning(*format)
+        "the order of the axes is ambiguous: the array [{}, {}, {}] of the {format} file may be {fits}: state the \
+         correct one as `axes`{}",
+        shape[0], shape[1], shape[2], conversion_hint(*format)
     )]
     AxesAmbiguous { format: Format, shape: [u64; 3], fits: String },
-    /// The axes of pictures were stated as something else than they are.
-    #[error("{0} has pictures of rows and columns, one for each frame: leave axes out")]
+    /// An order of axes was stated for pictures, whose order is fixed.
+    #[error("a {0} file contains pictures, which always have rows and columns: omit `axes`")]
     NoAxes(Format),
-    /// Integers of a type that has no scale of its own, and none was stated.
+    /// The data type has no default full scale, and none was stated.
     #[error(
-        "the samples are {0}, which has no full scale of its own: state full_scale, the stored number that means 1"
+        "the samples are {0}, which has no default full scale: state `full_scale`, the stored value that means 1"
     )]
     FullScaleNeeded(String),
-    /// A full scale that is no finite positive number.
-    #[error("full_scale must be a finite number above 0, not {0}")]
+    /// The full scale is not a finite positive number.
+    #[error("full_scale is {0}; it must be a finite number above 0")]
     FullScale(f32),
-    /// NaN or an infinity.
+    /// A value is NaN or infinite.
     #[error(
-        "{subject}: {value} at frame {frame}, row {row}, column {column} (counted from 0); every value must be finite"
+        "{subject}: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}; all values \
+         must be finite"
     )]
     NotFinite { subject: &'static str, value: f32, frame: usize, row: usize, column: usize },
-    /// A mask value above the full scale.
+    /// A mask value exceeds the full scale.
     #[error(
-        "masks: the largest value is {largest} (frame {frame}, row {row}, column {column}, counted from 0), above the full scale {full_scale}; \
-         masks must lie in [0, full_scale]: state the full_scale that means fully open"
+        "masks: the largest value is {largest} (frame {frame}, row {row}, column {column}, counted from 0), above the \
+         full scale {full_scale}: state as `full_scale` the stored value that means fully open"
     )]
     AboveFullScale { largest: f32, frame: usize, row: usize, column: usize, full_scale: f32 },
-    /// No mask lets any light through.
-    #[error(
-        "masks: no value is above 0 in any of the {frames} frames; a calibration needs open pixels"
-    )]
+    /// All masks are closed everywhere.
+    #[error("masks: no value is above 0 in any of the {frames} frames; masks need open pixels")]
     AllMasksZero { frames: usize },
-    /// One mask lets no light through.
+    /// One mask is closed everywhere.
     #[error(
         "masks: frame {frame} of {frames} (counted from 0) has no value above 0; every mask needs open pixels"
     )]
     MaskFrameZero { frame: usize, frames: usize },
-    /// A snapshot without any signal.
+    /// A snapshot is zero everywhere.
     #[error(
-        "measurement: snapshot {snapshot} of {snapshots} (counted from 0) is zero everywhere; there is nothing to reconstruct"
+        "measurement: snapshot {snapshot} of {snapshots} (counted from 0) is zero everywhere: there is nothing to reconstruct"
     )]
     SnapshotZero { snapshot: usize, snapshots: usize },
 }
 
 impl FormatError {
-    /// A short stable name of the kind of error, for machines.
+    /// A stable identifier of the error, for programs.
     pub fn code(&self) -> &'static str {
         match self {
             Self::Io { .. } => "io",
@@ -117,12 +116,12 @@ impl FormatError {
         }
     }
 
-    /// True when the file (or the stated scale) is to blame, false when the machine or this program is.
+    /// True for problems of the file or of the stated options; false for failures of the machine or of this program.
     pub fn is_callers_fault(&self) -> bool {
         !matches!(self, Self::Io { .. } | Self::Internal(_))
     }
 
-    /// True if the disk is full or a quota is used up.
+    /// True if the disk is full or a quota is exhausted.
     pub fn is_disk_full(&self) -> bool {
         use io::ErrorKind::{QuotaExceeded, StorageFull};
         matches!(self, Self::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
@@ -132,17 +131,17 @@ impl FormatError {
         Self::Malformed { format, problem: problem.into() }
     }
 
-    /// For `map_err` on I/O: `.map_err(FormatError::io("read the frame"))`.
+    /// Converts an I/O error, for use with `map_err`: `.map_err(FormatError::io("read the frame"))`.
     pub fn io(action: &'static str) -> impl FnOnce(io::Error) -> Self {
         move |source| Self::Io { action, source }
     }
 }
 
-/// How an array is saved in another order.
-fn turning(format: Format) -> &'static str {
+/// How to convert the array to another order.
+fn conversion_hint(format: Format) -> &'static str {
     match format {
         Format::Npy => {
-            ", or save [row, column, frame] as [frame, row, column]: python -c \"import numpy; \
+            ", or convert [row, column, frame] to [frame, row, column]: python -c \"import numpy; \
              numpy.save('out.npy', numpy.moveaxis(numpy.load('in.npy'), -1, 0))\""
         }
         _ => "",

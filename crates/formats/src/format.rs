@@ -1,56 +1,56 @@
-//! The formats, told apart by the first bytes of a file.
+//! File formats, and their detection by the first bytes of a file.
 
 use strum::Display;
 
-/// The first bytes of every npy file.
+/// Signature of npy files.
 pub(super) const NPY_MAGIC: &[u8] = b"\x93NUMPY";
-/// The first bytes of an HDF5 file that begins without a block of its writer's.
+/// Signature of HDF5 files without a user block.
 const HDF5_MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
-/// The first bytes of our own prepared arrays.
+/// Signature of prepared arrays.
 pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 
-/// As many first bytes tell all formats.
+/// Number of first bytes that identify all formats.
 pub(super) const HEAD_BYTES: u64 = 512;
-/// Where the signature of a tar archive stands, and what it begins with.
+/// Offset and start of the signature of a tar archive.
 const TAR_MAGIC: (usize, &[u8]) = (257, b"ustar");
 
-/// A file format that is read or written here.
+/// A file format that this crate reads or writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
 pub enum Format {
-    /// NumPy's array file.
+    /// NumPy array.
     #[strum(serialize = "npy")]
     Npy,
-    /// TIFF and BigTIFF, one frame a page.
+    /// TIFF and BigTIFF, one frame per page.
     #[strum(serialize = "TIFF")]
     Tiff,
     /// PNG, one frame.
     #[strum(serialize = "PNG")]
     Png,
-    /// MATLAB's level 5 array file.
+    /// MATLAB level 5 file.
     #[strum(serialize = ".mat")]
     Mat,
-    /// HDF5, and MATLAB's level 7.3 array file, which is HDF5.
+    /// HDF5, which includes MATLAB level 7.3 files.
     #[strum(serialize = "HDF5")]
     Hdf5,
-    /// A ZIP archive: of numbered pictures, or [`Format::Npz`].
+    /// ZIP archive of numbered pictures.
     #[strum(serialize = "ZIP")]
     Zip,
-    /// A ZIP archive of npy files.
+    /// ZIP archive of npy files.
     #[strum(serialize = "npz")]
     Npz,
-    /// A tar archive of numbered pictures.
+    /// Tar archive of numbered pictures.
     #[strum(serialize = "tar")]
     Tar,
     /// OpenEXR.
     #[strum(serialize = "EXR")]
     Exr,
-    /// Our own prepared arrays ([`super::planar`]).
+    /// Prepared array of this program ([`super::planar`]).
     #[strum(serialize = "planar")]
     Planar,
 }
 
 impl Format {
-    /// The format whose signature these first bytes ([`HEAD_BYTES`] suffice) carry. An npz is a ZIP here.
+    /// Determines the format from the first [`HEAD_BYTES`] of a file. An npz file is reported as ZIP.
     pub(super) fn sniff(head: &[u8]) -> Option<Self> {
         const BIG_ENDIAN_MAT: &[u8] = &[1, 0, b'M', b'I'];
         const LITTLE_ENDIAN_MAT: &[u8] = &[0, 1, b'I', b'M'];
@@ -82,37 +82,38 @@ impl Format {
     }
 }
 
-/// What a file of an unknown format begins with.
+/// Describes a file of an unsupported format by its first bytes.
 pub(super) fn describe(head: &[u8]) -> String {
     if head.starts_with(b"\x1f\x8b") {
-        return "it is packed by gzip (python -c \"import gzip, shutil; \
-                shutil.copyfileobj(gzip.open('in.gz'), open('out', 'wb'))\" unpacks it)"
+        return "it is compressed with gzip (to decompress it: python -c \"import gzip, shutil; \
+                shutil.copyfileobj(gzip.open('in.gz'), open('out', 'wb'))\")"
             .to_owned();
     }
     if head.starts_with(b"GIF8") || head.starts_with(b"BM") {
-        return "it is a GIF or BMP (python -c \"import numpy; from PIL import Image, ImageSequence; \
+        return "it is a GIF or BMP (to convert its grey values: python -c \"import numpy; from PIL import Image, ImageSequence; \
                 numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
-                ImageSequence.Iterator(Image.open('in.gif'))])\" saves its grey values)"
+                ImageSequence.Iterator(Image.open('in.gif'))])\")"
             .to_owned();
     }
     if head.starts_with(b"\xff\xd8\xff") {
-        return "it is a JPEG, which changes the values it stores".to_owned();
+        return "it is a JPEG, which is lossy: save the pictures as PNG, TIFF or npy instead"
+            .to_owned();
     }
     if is_level_4(head) {
-        return "it is a MATLAB file of level 4 (python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+        return "it is a MATLAB level 4 file (to convert it: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
                 scipy.io.loadmat('in.mat')['mask'])\")"
             .to_owned();
     }
     let start: Vec<String> = head.iter().take(8).map(|b| format!("{b:02x}")).collect();
-    format!("it begins with the bytes {}", start.join(" "))
+    format!("it starts with the bytes {}", start.join(" "))
 }
 
-/// Whether a file begins as MATLAB's level 4 does, which has no signature: with the kind of numbers, rows, columns,
-/// whether there are imaginary parts, and the length of a name, which follows.
+/// True if the first bytes are those of a MATLAB level 4 file. The format has no signature. It starts with the type,
+/// the numbers of rows and columns, a flag for imaginary parts, the length of the name, and the name.
 fn is_level_4(head: &[u8]) -> bool {
     let Some((header, rest)) = head.split_first_chunk::<20>() else { return false };
     let (words, _) = header.as_chunks::<4>();
-    // The thousands of the kind tell the order of bytes: 0 for little-endian, 1 for big-endian.
+    // The thousands digit of the type is the byte order: 0 for little-endian, 1 for big-endian.
     [(u32::from_le_bytes as fn([u8; 4]) -> u32, 0), (u32::from_be_bytes, 1000)].iter().any(
         |(number, kinds)| {
             let [kind, rows, columns, imaginary, length] =

@@ -1,11 +1,11 @@
-//! HDF5: MATLAB's level 7.3, h5py and others. One array of a file, frame by frame.
+//! Reads one array of an HDF5 file (MATLAB level 7.3, h5py and others) frame by frame.
 //!
-//! What is no MATLAB file usually has the axes (frame, row, column) or (row, column). MATLAB writes its axes, usually
-//! (row, column, frame), in reverse, so there a frame comes as (column, row).
+//! Most files have the axes (frame, row, column) or (row, column). MATLAB writes its axes, usually (row, column,
+//! frame), in reverse, so its frames are stored as (column, row).
 //!
-//! `hdf5-reader` is pure Rust and reads this file alone: a binding to libhdf5 would follow references to external
-//! files, so that an upload could read the server's. Ranges are read, not mapped: a file that is cut while it is
-//! read is an error, not a signal.
+//! The crate `hdf5-reader` is pure Rust and reads only the given file. A binding to libhdf5 would follow references to
+//! external files, so an upload could read files of the server. Ranges are read and not mapped, so a file that is
+//! truncated while it is read gives an error and not a signal.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -24,22 +24,22 @@ use super::scene::{SceneArray, list};
 use super::{Format, FormatError, FrameReader, Limits, SampleType};
 use crate::error::Result;
 
-/// Chunks that a frame touches are decoded once for all frames they hold, and kept so long. A file whose frames need
-/// more would be decoded again for each frame.
+/// Size of the cache of decoded chunks, in bytes. If the chunks of a frame fit, each chunk is decoded once for all its
+/// frames.
 const CHUNK_CACHE_BYTES: usize = 128 << 20;
 
-/// The numbers of one array of an HDF5 file.
+/// The samples of one array of an HDF5 file.
 struct Hdf5Samples {
     dataset: Dataset,
-    /// Numbers of one entry of the first axis; of all of them in an array of two dimensions.
-    entry: usize,
-    /// The next entry.
+    /// Number of samples per entry of the first axis; all samples for an array of two dimensions.
+    entry_samples: usize,
+    /// Index of the next entry.
     next: u64,
-    truth: bool,
+    is_bool: bool,
 }
 
-/// Opens the array of `file` with this name, which is what `array` says. Errors: no HDF5; no such array; too large;
-/// another type; [`FormatError::AxesAmbiguous`].
+/// Opens the array with this name; `array` is its role. Errors: malformed files; [`FormatError::MissingArray`];
+/// [`FormatError::OverLimit`]; [`FormatError::Unsupported`]; [`FormatError::AxesAmbiguous`].
 pub(super) fn open(
     file: File,
     (array, name, expected): (SceneArray, &str, &Expected),
@@ -56,10 +56,10 @@ pub(super) fn open(
     let dataset = match file.dataset(name) {
         Ok(dataset) => dataset,
         Err(Error::Io(source)) => return Err(error(Error::Io(source))),
-        Err(other) if names.iter().any(|there| there == name) => {
+        Err(other) if names.iter().any(|present| present == name) => {
             return Err(error(other));
         }
-        Err(_) if groups.iter().any(|there| there == name) => {
+        Err(_) if groups.iter().any(|present| present == name) => {
             return Err(unsupported(GROUP.to_owned()));
         }
         Err(_) => {
@@ -69,7 +69,7 @@ pub(super) fn open(
     };
     let class = dataset.attribute("MATLAB_class").ok();
     let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
-    let sample = match (stored(dataset.dtype()), class.as_deref()) {
+    let sample = match (sample_type(dataset.dtype()), class.as_deref()) {
         (Some((SampleType::U8, _)), Some("logical")) => SampleType::Bool,
         (Some(_), Some("char")) => return Err(unsupported("text".to_owned())),
         (Some((sample, _)), _) => sample,
@@ -91,8 +91,9 @@ pub(super) fn open(
         [first, _, _] => usize::try_from(first).unwrap_or(usize::MAX),
         _ => 1,
     };
-    let entry = info.frames * info.height * info.width / entries;
-    let samples = Hdf5Samples { dataset, entry, next: 0, truth: sample == SampleType::Bool };
+    let entry_samples = info.frames * info.height * info.width / entries;
+    let is_bool = sample == SampleType::Bool;
+    let samples = Hdf5Samples { dataset, entry_samples, next: 0, is_bool };
     Ok(Box::new(ArrayReader::new(samples, info, arranged.layout)))
 }
 
@@ -106,20 +107,20 @@ impl Samples for Hdf5Samples {
         let all = SliceInfoElem::Slice { start: 0, end: u64::MAX, step: 1 };
         let mut selections = vec![all; self.dataset.ndim()];
         if let [first, _, _] = &mut *selections {
-            let (start, end) = (self.next, self.next + (count / self.entry) as u64);
+            let (start, end) = (self.next, self.next + (count / self.entry_samples) as u64);
             *first = SliceInfoElem::Slice { start, end, step: 1 };
             self.next = end;
         }
         let values = self.dataset.read_slice::<Value>(&SliceInfo { selections }).map_err(error)?;
         let mut values: Vec<f32> = values.into_iter().map(|Value(value)| value).collect();
-        if self.truth {
+        if self.is_bool {
             values.iter_mut().for_each(|value| *value = f32::from(u8::from(*value != 0.0)));
         }
         Ok(values)
     }
 }
 
-/// A sample of any type that is accepted, as float32.
+/// A sample of any accepted type, converted to float32.
 #[derive(Clone)]
 struct Value(f32);
 
@@ -134,8 +135,8 @@ impl H5Type for Value {
     }
 
     fn element_size(dtype: &Datatype) -> usize {
-        // A type that is not accepted is refused before anything is read.
-        stored(dtype).map_or(1, |(sample, _)| sample.bytes())
+        // Unsupported types are refused before anything is read.
+        sample_type(dtype).map_or(1, |(sample, _)| sample.bytes())
     }
 
     fn decode_vec(
@@ -143,14 +144,14 @@ impl H5Type for Value {
         dtype: &Datatype,
         count: usize,
     ) -> Option<hdf5_reader::error::Result<Vec<Self>>> {
-        let (sample, order) = stored(dtype)?;
+        let (sample, order) = sample_type(dtype)?;
         let bytes = raw.get(..count.checked_mul(sample.bytes())?)?;
         Some(Ok(samples::decode(bytes, sample, order).into_iter().map(Value).collect()))
     }
 }
 
-/// How numbers of a type are stored, if they are accepted.
-fn stored(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
+/// The data type and byte order of samples; `None` for unsupported types.
+fn sample_type(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
     let (sample, order) = match dtype {
         Datatype::FixedPoint { size, signed, byte_order } => {
             let sample = match (size, signed) {
@@ -175,9 +176,9 @@ fn stored(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
             };
             (sample, byte_order)
         }
-        // h5py's truth values: an enumeration of FALSE and TRUE.
+        // h5py stores booleans as an enumeration of FALSE and TRUE.
         Datatype::Enum { base, members } if members.len() == 2 => {
-            return match stored(base)? {
+            return match sample_type(base)? {
                 (SampleType::I8 | SampleType::U8, order) => Some((SampleType::Bool, order)),
                 _ => None,
             };
@@ -191,16 +192,16 @@ fn stored(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
     Some((sample, order))
 }
 
-/// What people call the types that are refused.
+/// The common name of an unsupported type, with a conversion if there is one.
 fn describe(dtype: &Datatype) -> String {
     let name = match dtype {
         Datatype::String { .. } | Datatype::VarLen { .. } => "text",
         Datatype::Compound { .. } => {
-            "records, perhaps complex numbers (absolute values: python -c \"import h5py, numpy; \
+            "records, perhaps complex numbers (to convert to absolute values: python -c \"import h5py, numpy; \
              numpy.save('out.npy', numpy.abs(h5py.File('in.h5')['mask'][()]))\")"
         }
         Datatype::Reference { .. } => {
-            "references, perhaps a cell array (of a frame each: python -c \"import h5py, numpy; f = \
+            "references, perhaps a cell array (to convert cells with one frame each: python -c \"import h5py, numpy; f = \
              h5py.File('in.mat'); numpy.save('out.npy', [f[cell][()].T for cell in f['mask'][()].ravel()])\")"
         }
         Datatype::Enum { .. } => "an enumeration",
@@ -209,7 +210,7 @@ fn describe(dtype: &Datatype) -> String {
     name.to_owned()
 }
 
-/// Refuses chunks of which those that one entry of the first axis touches don't fit into the cache.
+/// Checks that all chunks of one entry of the first axis fit into the cache.
 fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     let Some(chunk) = dataset.chunks() else { return Ok(()) };
     let ([.., height, width], Some(depth)) = (dataset.shape(), chunk.first()) else {
@@ -227,18 +228,18 @@ fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     }
     Err(FormatError::OverLimit {
         format: Format::Hdf5,
-        what: "the size of the chunks that hold one entry of the first axis (save with chunks of one each, in \
-               h5py chunks=(1, height, width))",
+        what: "the size in bytes of the chunks for one entry of the first axis (save the array with one entry per chunk, \
+               in h5py chunks=(1, height, width))",
         value: bytes,
         limit: CHUNK_CACHE_BYTES as u64,
     })
 }
 
-/// What MATLAB makes of a struct.
-const GROUP: &str = "a group, perhaps a struct (its first field: python -c \"import h5py, numpy; s = \
+/// Description of a group, as which MATLAB stores a struct.
+const GROUP: &str = "a group, perhaps a struct (to convert its first field: python -c \"import h5py, numpy; s = \
      h5py.File('in.mat')['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0][()].T, -1, 0))\")";
 
-/// An array of pictures along several axes.
+/// The error for an array with more than three dimensions.
 fn many_axes(count: usize, writer: Writer) -> FormatError {
     let line = match writer {
         Writer::Matlab => {
@@ -251,7 +252,7 @@ fn many_axes(count: usize, writer: Writer) -> FormatError {
     };
     let line = format!("python -c \"import h5py, numpy; {line}\"");
     unsupported(format!(
-        "an array of {count} dimensions (all pictures, one after the other: {line})"
+        "an array of {count} dimensions (to convert it to a stack of pictures: {line})"
     ))
 }
 
@@ -259,7 +260,7 @@ fn unsupported(found: String) -> FormatError {
     FormatError::Unsupported {
         format: Format::Hdf5,
         found,
-        accepted: "integers and floats of 8 to 64 bits and truth values, in 2 or 3 dimensions",
+        accepted: "integers and floats of 8 to 64 bits and booleans, in 2 or 3 dimensions",
     }
 }
 
@@ -274,7 +275,7 @@ fn error(error: Error) -> FormatError {
         other => FormatError::malformed(
             Format::Hdf5,
             format!(
-                "{other} (if h5py reads it: python -c \"import h5py, numpy; numpy.save('out.npy', \
+                "{other} (to convert it with h5py: python -c \"import h5py, numpy; numpy.save('out.npy', \
                  h5py.File('in.h5')['mask'][()])\")"
             ),
         ),

@@ -1,12 +1,11 @@
-//! Bytes and files to arrays and back, within [`Limits`].
+//! File formats: converts files to arrays and back, within [`Limits`].
 //!
-//! Inputs ([`open_stack`], [`mat`]) come from strangers: every claim of a header is checked against
-//! the limits and the file's real length before memory is taken, and stacks are read one frame at
-//! a time. [`validate`] brings raw frames onto their scale and refuses what cannot be a mask or a
-//! measurement. Outputs are EXR, npy, PNG, BigTIFF, movies and prepared arrays ([`planar`]).
+//! Input files ([`open_stack`], [`mat`]) are untrusted. Every claim of a header is checked against the limits and the
+//! length of the file before memory is allocated. Stacks are read one frame at a time. [`validate`] scales raw frames,
+//! and refuses invalid masks and measurements. Output formats are EXR, npy, PNG, BigTIFF, movies, and prepared arrays
+//! ([`planar`]).
 //!
-//! Arrays are f32 with axes (frame, row, column); see [`Channels`] for those of
-//! colours.
+//! Arrays are f32 with the axes (frame, row, column). See [`Channels`] for colour frames.
 
 #![warn(missing_docs)]
 

@@ -1,40 +1,39 @@
-//! How large a file may be. Checked before anything is allocated.
+//! Limits for the size of files, which are checked before memory is allocated.
 
 use super::{Format, FormatError, StackInfo};
 use crate::error::Result;
 
-/// The largest files and stacks that are read.
+/// The largest accepted files and stacks.
 ///
-/// A header is only a claim: each decoder checks the claim against these limits and against the
-/// file's real length before it allocates.
+/// A header is only a claim. Each decoder checks it against these limits and the length of the file before it allocates
+/// memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Length of the file in bytes.
+    /// Largest length of a file in bytes.
     pub max_file_bytes: u64,
-    /// Frames (masks, snapshots) in one file.
+    /// Largest number of frames (masks, snapshots) in a file.
     pub max_frames: usize,
-    /// Height and width in pixels.
+    /// Largest height and width in pixels.
     pub max_side: usize,
-    /// Frames x height x width.
+    /// Largest number of voxels: frames x height x width.
     pub max_voxels: u64,
 }
 
 impl Default for Limits {
-    /// 8 GiB, 4096 frames, 8192 pixels a side, 2^31 voxels: a 3200x3200 camera's day fits, and one
-    /// frame in memory stays below 0.8 GiB.
+    /// 8 GiB, 4096 frames, sides of 8192 pixels, 2^31 voxels. That is enough for 200 snapshots of 3200x3200 pixels, and
+    /// one frame takes less than 0.8 GiB of memory.
     fn default() -> Self {
         Self { max_file_bytes: 8 << 30, max_frames: 4096, max_side: 8192, max_voxels: 1 << 31 }
     }
 }
 
 impl Limits {
-    /// Checks the length of a file. Errors: [`FormatError::OverLimit`].
+    /// Checks the length of a file in bytes. Errors: [`FormatError::OverLimit`].
     pub(super) fn check_file(&self, format: Format, bytes: u64) -> Result<()> {
-        within(format, "the file's length in bytes", bytes, self.max_file_bytes)
+        check(format, "the length of the file in bytes", bytes, self.max_file_bytes)
     }
 
-    /// Checks a claimed shape. Errors: [`FormatError::OverLimit`], or [`FormatError::Malformed`]
-    /// when an axis is empty.
+    /// Checks a claimed shape. Errors: [`FormatError::OverLimit`]; [`FormatError::Malformed`] for an empty axis.
     pub(super) fn check_shape(
         &self,
         format: Format,
@@ -49,12 +48,12 @@ impl Limits {
             ));
         }
         let side = self.max_side as u64;
-        within(format, "the number of frames", frames, self.max_frames as u64)?;
-        within(format, "the height in pixels", height, side)?;
-        within(format, "the width in pixels", width, side)?;
-        // Cannot overflow for sane limits, but limits are settings.
+        check(format, "the number of frames", frames, self.max_frames as u64)?;
+        check(format, "the height in pixels", height, side)?;
+        check(format, "the width in pixels", width, side)?;
+        // Saturates, because limits are configurable.
         let voxels = frames.saturating_mul(height).saturating_mul(width);
-        within(format, "frames x height x width", voxels, self.max_voxels)
+        check(format, "frames x height x width", voxels, self.max_voxels)
     }
 
     pub(super) fn check_info(&self, info: &StackInfo) -> Result<()> {
@@ -62,9 +61,9 @@ impl Limits {
     }
 }
 
-fn within(format: Format, what: &'static str, value: u64, limit: u64) -> Result<()> {
+fn check(format: Format, quantity: &'static str, value: u64, limit: u64) -> Result<()> {
     if value > limit {
-        return Err(FormatError::OverLimit { format, what, value, limit });
+        return Err(FormatError::OverLimit { format, what: quantity, value, limit });
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! A member of an archive: where it lies, and its bytes.
+//! Members of archives: their position, and their decompressed content.
 
 use std::fs::File;
 use std::io::{self, BufReader, ErrorKind, Read};
@@ -12,39 +12,39 @@ use super::array::Restart;
 use super::{Format, FormatError};
 use crate::error::Result;
 
-/// Deflate expands a byte to at most 1032.
+/// Largest expansion of Deflate in bytes per compressed byte.
 const MAX_EXPANSION: u64 = 1032;
 
-/// How the bytes of a member lie in the archive.
+/// The compression of a member.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Packing {
     Stored,
     Deflated,
 }
 
-/// Where a member lies, and what the archive says of it. Its name is shown and compared, and never used as a path.
+/// The description of a member. Its name is never used as a path.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Member {
     pub(super) name: String,
-    /// Its first byte in the archive.
+    /// Offset of the content in the archive.
     pub(super) start: u64,
-    /// Bytes in the archive.
+    /// Compressed length in bytes.
     pub(super) stored: u64,
-    /// Bytes of the member itself.
+    /// Decompressed length in bytes.
     pub(super) size: u64,
     pub(super) packing: Packing,
-    /// The checksum of these, where the archive has it.
+    /// CRC-32 of the decompressed content, if the archive has one.
     pub(super) crc: Option<u32>,
 }
 
 impl Member {
-    /// Checks that it lies in an archive of this length and can be as long as it claims.
+    /// Checks that the member is inside an archive of this length, and can have its claimed length.
     pub(super) fn checked(self, format: Format, length: u64) -> Result<Self> {
         let end = self.start.saturating_add(self.stored);
         if end > length {
             return Err(FormatError::Truncated {
                 format,
-                promised: format!("{} at bytes {} to {end}", shown(&self.name), self.start),
+                promised: format!("{} at bytes {} to {end}", quoted(&self.name), self.start),
                 present: format!("{length} bytes in all"),
             });
         }
@@ -55,7 +55,7 @@ impl Member {
         if !possible {
             return Err(FormatError::Truncated {
                 format,
-                promised: format!("{} of {} bytes", shown(&self.name), self.size),
+                promised: format!("{} of {} bytes", quoted(&self.name), self.size),
                 present: format!("{} bytes of it", self.stored),
             });
         }
@@ -63,12 +63,12 @@ impl Member {
     }
 }
 
-/// The bytes of a member, never more or fewer than it claims; at their end the checksum is looked at.
+/// Reads the decompressed content of a member. The length must be as claimed, and the checksum is verified at the end.
 pub(super) struct MemberReader {
     archive: Arc<File>,
     member: Member,
     source: Source,
-    left: u64,
+    remaining: u64,
     crc: Crc,
 }
 
@@ -77,17 +77,17 @@ enum Source {
     Deflated(DeflateDecoder<BufReader<Section>>),
 }
 
-/// A part of a file, read at its places, so that others may read the file too.
+/// A section of a file. Reads are positional, so readers can share the file.
 struct Section {
     file: Arc<File>,
-    at: u64,
+    position: u64,
     end: u64,
 }
 
 impl Source {
-    fn of(file: &Arc<File>, member: &Member) -> Self {
-        let (file, at) = (Arc::clone(file), member.start);
-        let section = Section { file, at, end: at + member.stored };
+    fn new(file: &Arc<File>, member: &Member) -> Self {
+        let (file, position) = (Arc::clone(file), member.start);
+        let section = Section { file, position, end: position + member.stored };
         match member.packing {
             Packing::Stored => Self::Stored(section),
             Packing::Deflated => Self::Deflated(DeflateDecoder::new(BufReader::new(section))),
@@ -97,14 +97,14 @@ impl Source {
 
 impl MemberReader {
     pub(super) fn new(archive: Arc<File>, member: Member) -> Self {
-        let (source, left) = (Source::of(&archive, &member), member.size);
-        Self { archive, member, source, left, crc: Crc::new() }
+        let (source, remaining) = (Source::new(&archive, &member), member.size);
+        Self { archive, member, source, remaining, crc: Crc::new() }
     }
 
     fn check_end(&mut self) -> io::Result<()> {
-        let name = shown(&self.member.name);
+        let name = quoted(&self.member.name);
         if self.source.read(&mut [0])? != 0 {
-            return Err(invalid(format!("{name} has more bytes than its size tells")));
+            return Err(invalid(format!("{name} has more bytes than its size states")));
         }
         match self.member.crc {
             Some(crc) if crc != self.crc.sum() => {
@@ -117,24 +117,24 @@ impl MemberReader {
 
 impl Read for MemberReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        if self.left == 0 && !buffer.is_empty() {
+        if self.remaining == 0 && !buffer.is_empty() {
             return self.check_end().map(|()| 0);
         }
-        let most = buffer.len().min(usize::try_from(self.left).unwrap_or(usize::MAX));
-        let count = self.source.read(&mut buffer[..most])?;
-        if count == 0 && most > 0 {
+        let limit = buffer.len().min(usize::try_from(self.remaining).unwrap_or(usize::MAX));
+        let count = self.source.read(&mut buffer[..limit])?;
+        if count == 0 && limit > 0 {
             return Err(ErrorKind::UnexpectedEof.into());
         }
         self.crc.update(&buffer[..count]);
-        self.left -= count as u64;
+        self.remaining -= count as u64;
         Ok(count)
     }
 }
 
 impl Restart for MemberReader {
     fn restart(&mut self) -> io::Result<()> {
-        self.source = Source::of(&self.archive, &self.member);
-        self.left = self.member.size;
+        self.source = Source::new(&self.archive, &self.member);
+        self.remaining = self.member.size;
         self.crc = Crc::new();
         Ok(())
     }
@@ -151,16 +151,16 @@ impl Read for Source {
 
 impl Read for Section {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let left = usize::try_from(self.end - self.at).unwrap_or(usize::MAX);
-        let most = buffer.len().min(left);
-        let count = self.file.read_at(&mut buffer[..most], self.at)?;
-        self.at += count as u64;
+        let remaining = usize::try_from(self.end - self.position).unwrap_or(usize::MAX);
+        let limit = buffer.len().min(remaining);
+        let count = self.file.read_at(&mut buffer[..limit], self.position)?;
+        self.position += count as u64;
         Ok(count)
     }
 }
 
-/// A name for a message, bounded in length.
-pub(super) fn shown(name: &str) -> String {
+/// Quotes a name for a message, up to a limit.
+pub(super) fn quoted(name: &str) -> String {
     let short: String = name.chars().take(80).collect();
     format!("'{}'", short.escape_debug())
 }

@@ -1,8 +1,8 @@
-//! Frames as a movie for players: AV1 in MP4, as browsers and VLC play it.
+//! Writes movies: AV1 in MP4, which browsers and VLC play.
 //!
-//! Grey is AV1's main profile (4:2:0, both chroma planes empty), which every decoder knows; colours are kept for
-//! each pixel (4:4:4, high profile). BT.709, levels 16 to 235. The quantizers are such that every frame
-//! comes back above 40 dB, though it be noise.
+//! Grey movies use AV1's main profile (4:2:0, neutral chroma planes), which every decoder supports. Colour movies have
+//! full chroma resolution (4:4:4, high profile). Levels follow BT.709, from 16 to 235. With these quantizers every
+//! frame has a PSNR above 40 dB, even noise.
 
 use std::io::{Seek, SeekFrom, Write};
 use std::num::NonZeroU32;
@@ -22,56 +22,59 @@ use shiguredo_mp4::{BoxSize, BoxType, Decode, TrackKind, Utf8String};
 use super::error::Result;
 use super::{Channels, FormatError};
 
-/// Frames of a second as movies are played: slow enough to see what a burst of frames shows.
+/// Playback rate in frames per second. It is slow enough to watch a burst of frames.
 pub const FPS: u32 = 10;
-/// A player can begin at every so many frames. The encoder, which keeps the frames since the last beginning,
-/// is a new one for each.
-const GROUP: usize = 32;
-/// AV1's quantizer index for grey, and for colours, whose errors come back larger in red and blue (measured on
-/// noise: 41 dB).
-const QUANTIZERS: (usize, usize) = (40, 16);
-/// rav1e's fastest preset: slower ones make files of noisy frames hardly smaller.
+/// Number of frames between key frames, at which a player can start. Each group has a new encoder, which keeps the
+/// frames of the group in memory.
+const GROUP_FRAMES: usize = 32;
+/// AV1 quantizer index of grey movies.
+const GREY_QUANTIZER: usize = 40;
+/// AV1 quantizer index of colour movies. It is lower, because the conversion amplifies errors in red and blue. Noise
+/// has a PSNR of 41 dB.
+const COLOUR_QUANTIZER: usize = 16;
+/// rav1e's fastest preset. Slower ones hardly reduce the size of noisy frames.
 const SPEED: u8 = 10;
-/// What begins each packet of the encoder, and has no place in MP4.
+/// Start of each packet of the encoder, which MP4 omits.
 const TEMPORAL_DELIMITER: &[u8] = &[0x12, 0];
 /// The codes of BT.709 for primaries, transfer and matrix.
 const BT709: [u16; 3] = [1; 3];
 
-/// What a movie is of.
+/// The description of a movie.
 #[derive(Debug, Clone, Copy)]
 pub struct Clip<'a> {
-    /// Frames, rows, columns.
+    /// Numbers of frames, rows and columns.
     pub shape: (usize, usize, usize),
-    /// What a pixel has.
+    /// Channels of the frames.
     pub channels: Channels,
-    /// What is told of the track.
+    /// Name of the video track.
     pub title: &'a str,
 }
 
-/// A movie that is being written.
+/// Writes a movie frame by frame.
 pub struct MovieWriter<W> {
-    to: W,
-    /// Where the next packet goes.
+    output: W,
+    /// Offset of the next packet.
     position: u64,
     muxer: Mp4FileMuxer,
     settings: EncoderConfig,
     encoder: Context<u8>,
-    /// Frames that the encoder has got.
-    held: usize,
-    /// Until the first packet, which completes it.
+    /// Number of frames of the current group.
+    group_frames: usize,
+    /// Description of the track. The first packet completes it.
     entry: Option<Av01Box>,
     clip: (usize, usize, usize),
     channels: Channels,
 }
 
-/// Begins a movie. `to` must be empty and is written from its start.
+/// Starts a movie at the beginning of `output`, which must be empty.
+///
 /// Errors: I/O; [`FormatError::Internal`] for a size that can't be encoded.
-pub fn writer<W: Write + Seek>(mut to: W, clip: &Clip<'_>) -> Result<MovieWriter<W>> {
+pub fn writer<W: Write + Seek>(mut output: W, clip: &Clip<'_>) -> Result<MovieWriter<W>> {
     let (frames, height, width) = clip.shape;
     let settings = settings((height, width), clip.channels);
     let encoder = encoder(&settings)?;
     let muxer = Mp4FileMuxer::with_options(Mp4FileMuxerOptions {
-        // The index in front of the frames: a browser plays before it has all.
+        // The index precedes the frames, so browsers can play before the download is complete.
         reserved_moov_box_size: estimate_maximum_moov_box_size(&[frames]) + clip.title.len(),
         video_track: TrackMetadata {
             name: Utf8String::new(clip.title).unwrap_or_default(),
@@ -81,61 +84,78 @@ pub fn writer<W: Write + Seek>(mut to: W, clip: &Clip<'_>) -> Result<MovieWriter
     })
     .map_err(internal)?;
     let head = muxer.initial_boxes_bytes();
-    to.write_all(head).map_err(FormatError::io("write the movie"))?;
+    output.write_all(head).map_err(FormatError::io("write the movie"))?;
     let position = head.len() as u64;
     let entry = Some(entry((height, width), &encoder)?);
     let (clip, channels) = (clip.shape, clip.channels);
-    Ok(MovieWriter { to, position, muxer, settings, encoder, held: 0, entry, clip, channels })
+    let group_frames = 0;
+    Ok(MovieWriter {
+        output,
+        position,
+        muxer,
+        settings,
+        encoder,
+        group_frames,
+        entry,
+        clip,
+        channels,
+    })
 }
 
 impl<W: Write + Seek> MovieWriter<W> {
-    /// Adds a frame \[row, column\] of levels from 0 to 255, of colours \[row, 3 column\].
+    /// Adds a frame \[row, column\], or \[row, 3 column\] for colours, with levels from 0 to 255.
+    ///
     /// Errors: I/O; [`FormatError::Internal`] for a frame of another size.
     pub fn write_frame(&mut self, frame: ArrayView2<'_, u8>) -> Result<()> {
         let (_, height, width) = self.clip;
         if frame.dim() != (height, width * self.channels.count()) {
-            let text = format!("a frame {:?} of a movie of {height}x{width}", frame.dim());
+            let text =
+                format!("a frame {:?} does not fit a movie of {height}x{width}", frame.dim());
             return Err(FormatError::Internal(text));
         }
-        if self.held == GROUP {
+        if self.group_frames == GROUP_FRAMES {
             self.end_group()?;
             self.encoder = encoder(&self.settings)?;
         }
         let mut planes = self.encoder.new_frame();
-        for (plane, levels) in planes.planes.iter_mut().zip(planes_of(frame, self.channels)) {
+        for (plane, levels) in planes.planes.iter_mut().zip(to_planes(frame, self.channels)) {
             if levels.is_empty() {
-                plane.data.fill(NO_COLOUR);
+                plane.data.fill(NEUTRAL_CHROMA);
             } else {
                 plane.copy_from_raw_u8(&levels, width, 1);
             }
         }
         self.encoder.send_frame(planes).map_err(internal)?;
-        self.held += 1;
-        self.take_packets()
+        self.group_frames += 1;
+        self.write_packets()
     }
 
-    /// Writes what is left; gives what was written to, at its end.
+    /// Writes the remaining packets and the index, and returns the output, positioned at its end.
+    ///
+    /// Errors: I/O.
     pub fn finish(mut self) -> Result<W> {
         self.end_group()?;
         let boxes = self.muxer.finalize().map_err(internal)?;
         for (offset, bytes) in boxes.offset_and_bytes_pairs() {
-            let written =
-                self.to.seek(SeekFrom::Start(offset)).and_then(|_| self.to.write_all(bytes));
+            let written = self
+                .output
+                .seek(SeekFrom::Start(offset))
+                .and_then(|_| self.output.write_all(bytes));
             written.map_err(FormatError::io("write the movie"))?;
         }
-        let ended = self.to.seek(SeekFrom::End(0)).and_then(|_| self.to.flush());
-        ended.map_err(FormatError::io("write the movie"))?;
-        Ok(self.to)
+        let flushed = self.output.seek(SeekFrom::End(0)).and_then(|_| self.output.flush());
+        flushed.map_err(FormatError::io("write the movie"))?;
+        Ok(self.output)
     }
 
     fn end_group(&mut self) -> Result<()> {
         self.encoder.flush();
-        self.held = 0;
-        self.take_packets()
+        self.group_frames = 0;
+        self.write_packets()
     }
 
-    /// Writes the packets that are ready.
-    fn take_packets(&mut self) -> Result<()> {
+    /// Writes the packets that the encoder has finished.
+    fn write_packets(&mut self) -> Result<()> {
         loop {
             match self.encoder.receive_packet() {
                 Ok(packet) => {
@@ -150,7 +170,7 @@ impl<W: Write + Seek> MovieWriter<W> {
 
     fn write_packet(&mut self, packet: &[u8], keyframe: bool) -> Result<()> {
         let data = packet.strip_prefix(TEMPORAL_DELIMITER).unwrap_or(packet);
-        self.to.write_all(data).map_err(FormatError::io("write the movie"))?;
+        self.output.write_all(data).map_err(FormatError::io("write the movie"))?;
         let sample_entry = self.entry.take().map(|mut entry| {
             entry.av1c_box.config_obus = sequence_header(data).to_vec();
             SampleEntry::Av01(entry)
@@ -176,8 +196,8 @@ fn settings((height, width): (usize, usize), channels: Channels) -> EncoderConfi
     (settings.height, settings.width) = (height, width);
     settings.time_base = Rational::new(1, FPS.into());
     (settings.chroma_sampling, settings.quantizer) = match channels {
-        Channels::Grey => (ChromaSampling::Cs420, QUANTIZERS.0),
-        Channels::Rgb => (ChromaSampling::Cs444, QUANTIZERS.1),
+        Channels::Grey => (ChromaSampling::Cs420, GREY_QUANTIZER),
+        Channels::Rgb => (ChromaSampling::Cs444, COLOUR_QUANTIZER),
     };
     settings.pixel_range = PixelRange::Limited;
     settings.color_description = Some(ColorDescription {
@@ -186,20 +206,20 @@ fn settings((height, width): (usize, usize), channels: Channels) -> EncoderConfi
         matrix_coefficients: MatrixCoefficients::BT709,
     });
     settings.tune = Tune::Psnr;
-    // Frames in their order, one packet each, and none that is held back.
+    // One packet per frame, in order, without delay.
     settings.low_latency = true;
     settings.speed_settings.rdo_lookahead_frames = 1;
-    settings.set_key_frame_interval(GROUP as u64, GROUP as u64);
+    settings.set_key_frame_interval(GROUP_FRAMES as u64, GROUP_FRAMES as u64);
     settings
 }
 
 fn encoder(settings: &EncoderConfig) -> Result<Context<u8>> {
-    // One worker, one core: other tasks have the others.
+    // A worker uses one core; the others are for other tasks.
     let config = Config::new().with_encoder_config(settings.clone()).with_threads(1);
     config.new_context().map_err(internal)
 }
 
-/// What MP4 tells of the frames.
+/// The description of the video track in MP4.
 fn entry((height, width): (usize, usize), encoder: &Context<u8>) -> Result<Av01Box> {
     let side = |side: usize| u16::try_from(side).map_err(internal);
     let content = encoder.container_sequence_header();
@@ -208,7 +228,7 @@ fn entry((height, width): (usize, usize), encoder: &Context<u8>) -> Result<Av01B
     av1c.extend(content);
     let mut colours = b"nclx".to_vec();
     colours.extend(BT709.iter().flat_map(|code| code.to_be_bytes()));
-    // Not the full range of levels.
+    // Limited range of levels.
     colours.push(0);
     Ok(Av01Box {
         visual: VisualSampleEntryFields {
@@ -230,8 +250,8 @@ fn entry((height, width): (usize, usize), encoder: &Context<u8>) -> Result<Av01B
     })
 }
 
-/// The header of the sequence, with which a packet begins that needs none before it: its own header (a byte), its
-/// length (below 128: a byte), and so many bytes.
+/// The sequence header at the start of a key frame's packet: an OBU header of one byte, a length below 128 in one byte,
+/// and the content.
 fn sequence_header(packet: &[u8]) -> &[u8] {
     const SEQUENCE_HEADER: u8 = 0x0a;
     match packet {
@@ -242,13 +262,13 @@ fn sequence_header(packet: &[u8]) -> &[u8] {
     }
 }
 
-/// The level of a chroma plane without colours.
-const NO_COLOUR: u8 = 128;
+/// The level of chroma planes without colour.
+const NEUTRAL_CHROMA: u8 = 128;
 
-/// Luma and both chroma planes of a frame (BT.709); those of grey are empty.
-fn planes_of(frame: ArrayView2<'_, u8>, channels: Channels) -> [Vec<u8>; 3] {
+/// Converts a frame to a luma and two chroma planes (BT.709). The chroma planes of a grey frame are empty.
+fn to_planes(frame: ArrayView2<'_, u8>, channels: Channels) -> [Vec<u8>; 3] {
     let luma = |y: f32| (16.0 + 219.0 / 255.0 * y).round() as u8;
-    let chroma = |c: f32| (f32::from(NO_COLOUR) + 224.0 / 255.0 * c).round() as u8;
+    let chroma = |c: f32| (f32::from(NEUTRAL_CHROMA) + 224.0 / 255.0 * c).round() as u8;
     match channels {
         Channels::Grey => {
             [frame.iter().map(|&level| luma(level.into())).collect(), Vec::new(), Vec::new()]
@@ -280,7 +300,7 @@ mod tests {
     use shiguredo_mp4::boxes::SampleEntry;
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-    use super::{Clip, FPS, GROUP, planes_of, writer};
+    use super::{Clip, FPS, GROUP_FRAMES, to_planes, writer};
     use crate::{Channels, FormatError};
 
     fn movie(frames: usize, (height, width): (usize, usize), channels: Channels) -> Vec<u8> {
@@ -295,15 +315,15 @@ mod tests {
     }
 
     #[test]
-    fn the_index_comes_first_and_every_frame_is_in_it() {
+    fn the_index_precedes_the_frames_and_is_complete() {
         // Odd sides, and more than one group.
-        let frames = GROUP + 3;
+        let frames = GROUP_FRAMES + 3;
         let bytes = movie(frames, (33, 47), Channels::Grey);
         let place = |name: &[u8]| bytes.windows(4).position(|window| window == name);
         assert!(place(b"moov") < place(b"mdat"));
         let mut demuxer = Mp4FileDemuxer::new();
         demuxer.handle_input(Input { position: 0, data: &bytes });
-        let mut begins = Vec::new();
+        let mut is_key = Vec::new();
         let mut end = 0;
         while let Some(sample) = demuxer.next_sample().unwrap() {
             assert_eq!((sample.duration, sample.track.timescale.get()), (1, FPS));
@@ -311,12 +331,12 @@ mod tests {
                 assert_eq!((entry.visual.height, entry.visual.width), (33, 47));
                 assert!(!entry.av1c_box.config_obus.is_empty());
             }
-            begins.push(sample.keyframe);
+            is_key.push(sample.keyframe);
             end = sample.data_offset as usize + sample.data_size;
         }
-        assert_eq!((begins.len(), end), (frames, bytes.len()));
-        let keys: Vec<_> = (0..frames).filter(|&k| begins[k]).collect();
-        assert_eq!(keys, [0, GROUP]);
+        assert_eq!((is_key.len(), end), (frames, bytes.len()));
+        let keys: Vec<_> = (0..frames).filter(|&k| is_key[k]).collect();
+        assert_eq!(keys, [0, GROUP_FRAMES]);
     }
 
     #[test]
@@ -328,11 +348,11 @@ mod tests {
     }
 
     #[test]
-    fn white_black_and_the_primaries_have_the_levels_of_bt709() {
-        let grey = planes_of(ndarray::array![[0, 255]].view(), Channels::Grey);
+    fn levels_follow_bt709() {
+        let grey = to_planes(ndarray::array![[0, 255]].view(), Channels::Grey);
         assert_eq!(grey[0], [16, 235]);
         let pixels = ndarray::array![[255, 255, 255, 255, 0, 0, 0, 255, 0, 0, 0, 255]];
-        let [luma, blue, red] = planes_of(pixels.view(), Channels::Rgb);
+        let [luma, blue, red] = to_planes(pixels.view(), Channels::Rgb);
         // ITU-R BT.709, table 3.
         assert_eq!(luma, [235, 63, 173, 32]);
         assert_eq!(blue, [128, 102, 42, 240]);

@@ -1,4 +1,4 @@
-//! NumPy's archives of several arrays: a ZIP whose members are npy files.
+//! npz: NumPy's archive of several arrays, a ZIP of npy files.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -10,11 +10,12 @@ use super::scene::{SceneArray, list};
 use super::{Format, FormatError, FrameReader, Limits};
 use crate::error::Result;
 
-/// What the name of each member ends with.
+/// Extension of all members.
 pub(super) const EXTENSION: &str = ".npy";
 
-/// Opens the array of this name; without one the only array, or the one with the usual name of `array`.
-/// Errors: [`FormatError::MissingArray`], and those of npy files.
+/// Opens the array with this name. For `None`, opens the only array, or the one with a usual name of `array`.
+///
+/// Errors: [`FormatError::MissingArray`]; those of npy files.
 pub(super) fn open(
     archive: Arc<File>,
     members: Vec<Member>,
@@ -25,18 +26,18 @@ pub(super) fn open(
         .into_iter()
         .filter_map(|member| Some((member.name.strip_suffix(EXTENSION)?.to_owned(), member)))
         .collect();
-    let named = |wanted: &str| arrays.iter().position(|(name, _)| name == wanted);
-    let found = match name {
-        Some(name) => named(name),
+    let position = |requested: &str| arrays.iter().position(|(name, _)| name == requested);
+    let index = match name {
+        Some(name) => position(name),
         None if arrays.len() == 1 => Some(0),
-        None => array.names().iter().find_map(|name| named(name)),
+        None => array.names().iter().find_map(|name| position(name)),
     };
-    let Some(found) = found else {
+    let Some(index) = index else {
         let names: Vec<String> = arrays.into_iter().map(|(name, _)| name).collect();
         let (format, name) = (Format::Npz, name.unwrap_or(array.name()).to_owned());
         return Err(FormatError::MissingArray { format, name, present: list(&names) });
     };
-    let (_, member) = arrays.swap_remove(found);
+    let (_, member) = arrays.swap_remove(index);
     let length = member.size;
     limits.check_file(Format::Npz, length)?;
     let reader = MemberReader::new(archive, member);

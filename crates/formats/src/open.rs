@@ -1,4 +1,4 @@
-//! Files of any format as stacks of frames.
+//! Opens files of any supported format as stacks of frames.
 
 use std::fs::File;
 use std::io::{Read, Seek};
@@ -19,14 +19,14 @@ use crate::error::Result;
 const ACCEPTED: &str =
     "npy, npz, TIFF, PNG (1, 8 or 16 bit grey), .mat, HDF5, and a ZIP or tar of numbered pictures";
 
-/// Which array of a file is meant if it has several, and what is known of it.
+/// Selects an array of a file, with prior knowledge about its shape.
 #[derive(Debug, Clone, Copy)]
 pub struct Wanted<'a> {
-    /// What the array is.
+    /// The role of the array in the scene.
     pub array: SceneArray,
-    /// What it is called there; none for [`SceneArray::name`].
+    /// Name of the array in the file; `None` for [`SceneArray::name`].
     pub name: Option<&'a str>,
-    /// What is known of it.
+    /// Prior knowledge about its shape.
     pub expected: Expected,
 }
 
@@ -36,18 +36,23 @@ impl From<SceneArray> for Wanted<'_> {
     }
 }
 
-/// Opens a stack of frames. The format is told by the file's first bytes, never by its name.
+/// Opens a stack of frames. The first bytes of the file determine the format, not its name.
 ///
-/// npy: (frame, row, column) or (row, column) of integers, floats or bool. TIFF and
-/// BigTIFF: pages of one size and type, grey, uint8, uint16 or float32. PNG: one grey frame of 1, 8
-/// or 16 bit. ZIP and tar: numbered pictures. Errors say what is wrong with the file; see [`FormatError`].
+/// - npy, or npz with one array: (frame, row, column) or (row, column) of integers, floats or bool
+/// - TIFF and BigTIFF: grey pages of one size and type
+/// - PNG: one grey frame of 1, 8 or 16 bits
+/// - ZIP and tar: numbered pictures
+///
+/// Errors: [`FormatError`].
 pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
     open_any(path, None, limits)
 }
 
-/// The same, or one array of a file of several: .mat, HDF5, npz. [`StackInfo::default_full_scale`] of MATLAB's files is
-/// [`SceneArray::default_full_scale`]. Errors: also [`FormatError::MissingArray`], [`FormatError::NoNames`],
-/// [`FormatError::AxesAmbiguous`] and [`FormatError::NoAxes`].
+/// Opens a stack of frames like [`open_stack`], or one array of a .mat, HDF5 or npz file. For MATLAB files
+/// [`StackInfo::default_full_scale`] is [`SceneArray::default_full_scale`].
+///
+/// Errors: as [`open_stack`]; [`FormatError::MissingArray`], [`FormatError::NoNames`], [`FormatError::AxesAmbiguous`]
+/// and [`FormatError::NoAxes`].
 pub fn open_array<'a>(
     path: &Path,
     wanted: impl Into<Wanted<'a>>,
@@ -87,9 +92,9 @@ fn open_any(
             let members = (format, tar::members(&file, length)?);
             Box::new(Pictures::open(Arc::new(file), members, limits)?)
         }
-        Format::Mat | Format::Hdf5 => return Err(several(format)),
+        Format::Mat | Format::Hdf5 => return Err(several_arrays(format)),
         Format::Exr => {
-            let found = "it is an EXR file (channel Y of each part: python -c \"import numpy, OpenEXR; f = \
+            let found = "it is an EXR file (to convert channel Y of each part: python -c \"import numpy, OpenEXR; f = \
                          OpenEXR.File('in.exr', separate_channels=True); numpy.save('out.npy', \
                          [part.channels['Y'].pixels for part in f.parts])\")";
             return Err(FormatError::UnknownFormat { found: found.to_owned(), accepted: ACCEPTED });
@@ -101,10 +106,10 @@ fn open_any(
             });
         }
     };
-    of_pictures(reader, &expected)
+    check_picture_axes(reader, &expected)
 }
 
-/// A ZIP of arrays, or of pictures.
+/// Opens a ZIP of arrays or of pictures.
 fn open_zip(
     file: File,
     length: u64,
@@ -121,18 +126,18 @@ fn open_zip(
             let only = (SceneArray::Truth, None, &Expected::default());
             npz::open(Arc::new(file), members, only, limits)
         }
-        None if arrays > 1 => Err(several(Format::Npz)),
+        None if arrays > 1 => Err(several_arrays(Format::Npz)),
         Some(Wanted { name: Some(_), .. }) => Err(FormatError::NoNames),
         _ => {
             let pictures = Pictures::open(Arc::new(file), (Format::Zip, members), limits)?;
             let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
-            of_pictures(Box::new(pictures), &expected)
+            check_picture_axes(Box::new(pictures), &expected)
         }
     }
 }
 
-/// A stack of pictures, whose axes are known. Errors: [`FormatError::NoAxes`].
-fn of_pictures(
+/// Returns a reader of pictures unless other axes are stated. Errors: [`FormatError::NoAxes`].
+fn check_picture_axes(
     reader: Box<dyn FrameReader + Send>,
     expected: &Expected,
 ) -> Result<Box<dyn FrameReader + Send>> {
@@ -142,25 +147,27 @@ fn of_pictures(
     }
 }
 
-fn several(format: Format) -> FormatError {
+fn several_arrays(format: Format) -> FormatError {
     FormatError::Unsupported {
         format,
         found: "a scene of several arrays".to_owned(),
-        accepted: "one stack a file here; name the file as a scene",
+        accepted: "one array per file; pass a file of several arrays as a scene",
     }
 }
 
-/// Reads a whole stack into memory, axes (frame, row, column), values as stored.
+/// Reads a whole stack (frame, row, column) into memory. Values are as stored. Use [`open_stack`] for large files.
 ///
-/// For files that are known to be small; large ones are read with [`open_stack`].
+/// Errors: [`FormatError`].
 pub fn read_stack(path: &Path, limits: &Limits) -> Result<(StackInfo, Array3<f32>)> {
     collect(&mut *open_stack(path, limits)?)
 }
 
-/// Reads the remaining frames of a reader into one array.
+/// Reads the remaining frames of a reader into one array (frame, row, column).
+///
+/// Errors: those of the reader.
 pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Array3<f32>)> {
     let info = *reader.info();
-    // Grown frame by frame: a compressed file may promise far more than it then delivers.
+    // The array grows frame by frame, because a compressed file may claim more than it contains.
     let mut values = Vec::new();
     let mut frames = 0;
     while let Some(frame) = reader.next_frame()? {
@@ -172,13 +179,13 @@ pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Arra
     Ok((info, stack))
 }
 
-/// Opens a file and tells its length and format.
+/// Opens a file, and determines its length and format.
 pub(super) fn open(path: &Path) -> Result<(File, u64, Format)> {
     let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
     let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
     let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };
     if !metadata.is_file() {
-        return Err(unknown("it is no regular file".to_owned()));
+        return Err(unknown("it is not a regular file".to_owned()));
     }
     if metadata.len() == 0 {
         return Err(unknown("it is empty".to_owned()));

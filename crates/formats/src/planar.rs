@@ -1,9 +1,8 @@
-//! Prepared arrays: raw f32 frames behind a small header, from which a window is read without
-//! reading the rest.
+//! Prepared arrays: raw f32 frames after a small header. Windows can be read without reading the rest.
 //!
-//! Layout, all little-endian: the magic `SCIPLNR\0`, then u32 version (1), frames, height, width,
-//! then two reserved u32 (zero), then the samples as f32 in the order (frame, row, column).
-//! Whoever writes such a file makes it appear at once (temporary file, fsync, rename).
+//! The layout is little-endian: the magic `SCIPLNR\0`; version (1), frames, height and width as u32; two reserved u32
+//! (zero); the samples as f32 in the order (frame, row, column). Writers must publish such a file atomically (temporary
+//! file, fsync, rename).
 
 use std::fs::File;
 use std::io::Write;
@@ -22,8 +21,10 @@ const VERSION: u32 = 1;
 const HEADER_BYTES: u64 = 32;
 const SAMPLE_BYTES: u64 = 4;
 
-/// Writes the header of a prepared array; the frames come next. `to` should be buffered; it only ever
-/// moves forward, so it may hash what passes.
+/// Writes the header of a prepared array, and returns a writer for its frames. `to` should be buffered. It is written
+/// sequentially, so it can hash the content.
+///
+/// Errors: I/O; [`FormatError::Internal`] for an axis longer than 32 bits allow.
 pub fn writer<W: Write>(
     mut to: W,
     frames: usize,
@@ -33,8 +34,8 @@ pub fn writer<W: Write>(
     let mut header = PLANAR_MAGIC.to_vec();
     header.extend(VERSION.to_le_bytes());
     for axis in [frames, height, width] {
-        let axis =
-            u32::try_from(axis).map_err(|_| FormatError::Internal(format!("an axis of {axis}")))?;
+        let axis = u32::try_from(axis)
+            .map_err(|_| FormatError::Internal(format!("an axis of length {axis} is too long")))?;
         header.extend(axis.to_le_bytes());
     }
     header.extend([0; 8]);
@@ -42,19 +43,21 @@ pub fn writer<W: Write>(
     Ok(StackWriter::new(to, frames, height, width))
 }
 
-/// Bytes of a prepared array of this shape.
+/// Size of the file of a prepared array, in bytes.
 pub fn bytes(info: &StackInfo) -> u64 {
     HEADER_BYTES + info.voxels() * SAMPLE_BYTES
 }
 
-/// An open prepared array. Reads at positions, so it may be shared between threads.
+/// An open prepared array. Reads are positional, so threads can share it.
 #[derive(Debug)]
 pub struct Reader {
     windows: WindowReader,
 }
 
 impl Reader {
-    /// Opens `path` and checks its header against the limits and the file's length.
+    /// Opens a prepared array, and checks its header against the limits and the length of the file.
+    ///
+    /// Errors: [`FormatError`].
     pub fn open(path: &Path, limits: &Limits) -> Result<Self> {
         let file = File::open(path).map_err(FormatError::io("open the prepared array"))?;
         let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
@@ -63,7 +66,9 @@ impl Reader {
         if length < HEADER_BYTES {
             return Err(FormatError::malformed(
                 Format::Planar,
-                format!("{length} bytes are less than a header of {HEADER_BYTES}"),
+                format!(
+                    "the file has {length} bytes, fewer than its header of {HEADER_BYTES} bytes"
+                ),
             ));
         }
         file.read_exact_at(&mut header, 0).map_err(FormatError::io("read the header"))?;
@@ -87,19 +92,19 @@ impl Reader {
         Ok(Self { windows: WindowReader::new(file, info, HEADER_BYTES) })
     }
 
-    /// Shape and type (always float32 on the scale that the writer chose).
+    /// The description of the array. Samples are always float32.
     pub fn info(&self) -> &StackInfo {
         self.windows.info()
     }
 
-    /// The same without the format's name, for those who read windows of several formats.
+    /// The underlying reader of windows, which is common to several formats.
     pub fn into_windows(self) -> WindowReader {
         self.windows
     }
 
-    /// Reads a window; the result has the axes (frame, row, column) of the ranges.
+    /// Reads a window (frame, row, column).
     ///
-    /// Errors: I/O, or [`FormatError::Internal`] for a window that is not inside the stack.
+    /// Errors: I/O; [`FormatError::Internal`] for a window outside the stack.
     pub fn read_window(
         &self,
         frames: Range<usize>,
@@ -120,7 +125,7 @@ impl Reader {
     }
 }
 
-/// Opens `path` and reads one window; see [`Reader::read_window`].
+/// Opens a prepared array, and reads one window; see [`Reader::read_window`].
 pub fn read_window(
     path: &Path,
     frames: Range<usize>,

@@ -1,4 +1,4 @@
-//! PNG: one frame in, frames of 8 or 16 bits out.
+//! PNG: reads one frame, and writes frames of 8 or 16 bits.
 
 use std::fs::File;
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, Write};
@@ -14,21 +14,21 @@ use super::samples::{self, ByteOrder};
 use super::{Channels, Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
-/// Deflate expands a byte to at most 1032.
+/// Largest expansion of Deflate in bytes per compressed byte.
 const MAX_EXPANSION: u64 = 1032;
 
-/// Room for the decoder's own buffers and for chunks that are not pixels.
+/// Memory for the buffers of the decoder, and for chunks other than pixels.
 const DECODER_BYTES: usize = 16 << 20;
 
-/// A PNG, a stack of one frame.
+/// Reads a PNG as a stack of one frame.
 pub(super) struct PngReader<R: Read + Seek> {
     decoder: Option<::png::Reader<BufReader<R>>>,
     info: StackInfo,
 }
 
 impl<R: Read + Seek> PngReader<R> {
-    /// Reads the header of `file` (`length` bytes long) and checks it against the limits and the
-    /// length. Gamma and colour profiles are not applied: the stored numbers count.
+    /// Opens a grey PNG of `length` bytes, and checks its header against the limits and the length. Gamma and colour
+    /// profiles are ignored.
     pub(super) fn open(file: R, length: u64, limits: &Limits) -> Result<Self> {
         let mut decoder = decoder(file);
         let header = decoder.read_header_info().map_err(decoding_error)?;
@@ -41,7 +41,7 @@ impl<R: Read + Seek> PngReader<R> {
         Self::new(decoder, (sample, Channels::Grey), length, limits)
     }
 
-    /// The same of a picture of red, green and blue; none for a grey one.
+    /// Opens an RGB PNG; `None` for a PNG in other colours.
     pub(super) fn open_colours(file: R, length: u64, limits: &Limits) -> Result<Option<Self>> {
         let mut decoder = decoder(file);
         let header = decoder.read_header_info().map_err(decoding_error)?;
@@ -77,7 +77,7 @@ impl<R: Read + Seek> PngReader<R> {
             return Err(FormatError::Unsupported {
                 format: Format::Png,
                 found: "an animation".to_owned(),
-                accepted: "one image (all of them as one array: python -c \"import numpy; from PIL import Image, \
+                accepted: "one image (to convert all frames: python -c \"import numpy; from PIL import Image, \
                            ImageSequence; numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
                            ImageSequence.Iterator(Image.open('in.png'))])\")",
             });
@@ -86,7 +86,7 @@ impl<R: Read + Seek> PngReader<R> {
     }
 }
 
-/// Of stored numbers as they are.
+/// A decoder that returns the stored values.
 fn decoder<R: Read + Seek>(file: R) -> Decoder<BufReader<R>> {
     let limits = DecoderLimits { bytes: DECODER_BYTES };
     let mut decoder = Decoder::new_with_limits(BufReader::new(file), limits);
@@ -117,7 +117,7 @@ impl<R: Read + Seek> FrameReader for PngReader<R> {
     }
 }
 
-/// Bytes of a stored row: of one bit a pixel, rows begin at whole bytes.
+/// Number of bytes of a stored row. Rows of 1-bit pixels start at whole bytes.
 fn row_bytes(info: &StackInfo) -> usize {
     if info.sample == SampleType::Bool {
         info.width.div_ceil(8)
@@ -126,9 +126,9 @@ fn row_bytes(info: &StackInfo) -> usize {
     }
 }
 
-/// Writes (or overwrites) `path` with a 16-bit PNG for looking at: `black` becomes 0, `white`
-/// 65535, linear between, clipped outside; NaN becomes 0. `frame` has the axes (row, column), and for each pixel
-/// as many values as there are channels.
+/// Writes a 16-bit PNG for display, and replaces an existing file. Values are mapped linearly from \[black, white\] to
+/// \[0, 65535\] and clipped; NaN becomes 0. `frame` has the axes (row, column), with all channels of a pixel in
+/// adjacent columns.
 ///
 /// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
 pub fn write_u16(
@@ -142,11 +142,10 @@ pub fn write_u16(
     encode_u16(BufWriter::new(file), frame, channels, (black, white))
 }
 
-/// An 8-bit PNG for looking at: `black` becomes 0, `white` 255, linear between, clipped
-/// outside; NaN becomes 0. `frame` has the axes (row, column), and for each pixel as many values as there are
-/// channels.
-/// Errors: [`FormatError::Internal`] unless `black < white`, both finite, or for a frame without
-/// pixels.
+/// Encodes an 8-bit PNG for display. Values are mapped linearly from \[black, white\] to \[0, 255\] and clipped; NaN
+/// becomes 0. `frame` has the axes (row, column), with all channels of a pixel in adjacent columns.
+///
+/// Errors: [`FormatError::Internal`] unless `black < white`, both finite, and for a frame without pixels.
 pub fn encode_u8(
     frame: ArrayView2<'_, f32>,
     channels: Channels,
@@ -159,7 +158,7 @@ pub fn encode_u8(
     Ok(png)
 }
 
-/// What a value becomes in pictures of 8 bits for looking at: see [`encode_u8`].
+/// The mapping of values to 8-bit levels that [`encode_u8`] uses.
 pub fn level_u8(black: f32, white: f32) -> impl Fn(&f32) -> u8 {
     let factor = 255.0 / (white - black);
     move |value| ((value - black) * factor).round() as u8
@@ -185,7 +184,9 @@ fn encode(
     bytes: &[u8],
 ) -> Result<()> {
     if !(black.is_finite() && white.is_finite() && black < white) {
-        return Err(FormatError::Internal(format!("PNG levels from {black} to {white}")));
+        return Err(FormatError::Internal(format!(
+            "a PNG has black {black} and white {white}; black must be below white"
+        )));
     }
     let width = samples / channels.count();
     let [height, width] = [height, width].map(|n| u32::try_from(n).unwrap_or(0));
@@ -195,7 +196,7 @@ fn encode(
         Channels::Rgb => ColorType::Rgb,
     });
     encoder.set_depth(depth);
-    // The low bits are noise: more effort buys little.
+    // Higher levels gain little, because the low bits are noise.
     encoder.set_compression(Compression::Fast);
     let mut png = encoder.write_header().map_err(encoding_error)?;
     png.write_image_data(bytes).map_err(encoding_error)?;
@@ -206,7 +207,7 @@ fn unsupported(found: String) -> FormatError {
     FormatError::Unsupported {
         format: Format::Png,
         found,
-        accepted: "Grayscale without alpha, One, Eight or Sixteen bit, one image (grey of a colour picture: \
+        accepted: "Grayscale without alpha, One, Eight or Sixteen bit, one image (to convert a colour picture to grey: \
                    python -c \"from PIL import Image; Image.open('in.png').convert('L').save('out.png')\")",
     }
 }

@@ -1,4 +1,4 @@
-//! Samples as bytes: from any accepted type to f32, and from f32 to little-endian bytes.
+//! Conversion of samples: from bytes of any accepted type to f32, and from f32 to little-endian bytes.
 
 use std::io::{self, ErrorKind, Write};
 
@@ -8,14 +8,14 @@ use ndarray::{Array2, ArrayView2};
 use super::{Format, FormatError, SampleType};
 use crate::error::Result;
 
-/// The order of the bytes of a sample.
+/// The byte order of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ByteOrder {
     Little,
     Big,
 }
 
-/// Decodes whole samples; a remainder shorter than a sample is ignored by construction of the callers.
+/// Decodes samples to f32. An incomplete last sample is ignored.
 pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<f32> {
     use ByteOrder::{Big, Little};
     match (sample, order) {
@@ -43,13 +43,13 @@ pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<
     }
 }
 
-/// Converts whole samples of N bytes.
+/// Converts each sample of N bytes.
 pub(super) fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f32) -> Vec<f32> {
     let (samples, _) = bytes.as_chunks::<N>();
     samples.iter().map(|&sample| convert(sample)).collect()
 }
 
-/// A frame from its samples in row order.
+/// A frame (row, column) from its samples in row order.
 pub(super) fn frame(height: usize, width: usize, samples: Vec<f32>) -> Result<Array2<f32>> {
     let count = samples.len();
     Array2::from_shape_vec((height, width), samples).map_err(|_| {
@@ -57,8 +57,8 @@ pub(super) fn frame(height: usize, width: usize, samples: Vec<f32>) -> Result<Ar
     })
 }
 
-/// Why bytes could not be read. Decompressors report bad data as I/O errors too: only the system's own carry a
-/// number.
+/// Converts an I/O error of a reader. Decompressors report invalid data as I/O errors, too; only errors of the
+/// operating system have a number.
 pub(super) fn read_error(format: Format, source: io::Error) -> FormatError {
     if source.raw_os_error().is_some() {
         return FormatError::Io { action: "read the file", source };
@@ -66,15 +66,15 @@ pub(super) fn read_error(format: Format, source: io::Error) -> FormatError {
     match source.kind() {
         ErrorKind::UnexpectedEof => FormatError::Truncated {
             format,
-            promised: "more numbers".to_owned(),
+            promised: "more samples".to_owned(),
             present: "no more bytes".to_owned(),
         },
         _ => FormatError::malformed(format, format!("compressed data: {source}")),
     }
 }
 
-/// Writes the f32 frames of a stack one after another as little-endian rows, behind a header that
-/// [`super::planar::writer`] or [`super::npy::writer`] has written.
+/// Writes the frames of a stack as little-endian f32, after a header from [`super::planar::writer`] or
+/// [`super::npy::writer`].
 #[derive(Debug)]
 pub struct StackWriter<W> {
     writer: W,
@@ -90,11 +90,13 @@ impl<W: Write> StackWriter<W> {
         Self { writer, frames, height, width, written: 0, row: Vec::with_capacity(width * 4) }
     }
 
-    /// Appends one frame (row, column). Errors: I/O, or a frame of another size or one too many.
+    /// Appends one frame (row, column).
+    ///
+    /// Errors: I/O; [`FormatError::Internal`] for a frame of another size, or one too many.
     pub fn write_frame(&mut self, frame: ArrayView2<'_, f32>) -> Result<()> {
         if frame.dim() != (self.height, self.width) || self.written == self.frames {
             return Err(FormatError::Internal(format!(
-                "frame {} of size {:?} written to a stack of {} frames of {}x{}",
+                "frame {} of size {:?} does not fit a stack of {} frames of {}x{}",
                 self.written,
                 frame.dim(),
                 self.frames,
@@ -116,11 +118,13 @@ impl<W: Write> StackWriter<W> {
         Ok(())
     }
 
-    /// Flushes and hands the writer back. Errors: I/O, or frames that are missing.
+    /// Flushes and returns the writer.
+    ///
+    /// Errors: I/O; [`FormatError::Internal`] if frames are missing.
     pub fn finish(mut self) -> Result<W> {
         if self.written != self.frames {
             return Err(FormatError::Internal(format!(
-                "{} of {} frames written",
+                "only {} of {} frames were written",
                 self.written, self.frames
             )));
         }

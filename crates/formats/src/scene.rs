@@ -1,4 +1,4 @@
-//! The arrays of a scene, in files that hold several: .mat, HDF5 and npz.
+//! The arrays of a scene in files with several arrays: .mat, HDF5 and npz.
 
 use super::FullScale;
 
@@ -14,7 +14,7 @@ pub enum SceneArray {
 }
 
 impl SceneArray {
-    /// The name of the array in the file.
+    /// The usual name of the array in a file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Masks => "mask",
@@ -23,7 +23,7 @@ impl SceneArray {
         }
     }
 
-    /// The names that are looked for in an archive of NumPy's, where `orig` is called `frames`, too.
+    /// The accepted names in an npz archive, where `orig` may be called `frames`.
     pub(super) fn names(self) -> &'static [&'static str] {
         match self {
             Self::Masks => &["mask"],
@@ -32,7 +32,7 @@ impl SceneArray {
         }
     }
 
-    /// What means 1.0 in this array unless stated, whatever its type.
+    /// The full scale of this array in a MATLAB file if none is stated, for all data types.
     pub fn default_full_scale(self) -> FullScale {
         match self {
             Self::Masks => FullScale::ONE,
@@ -41,11 +41,12 @@ impl SceneArray {
     }
 }
 
-/// Names for a message, bounded in number.
+/// Lists names for a message, up to a limit.
 pub(super) fn list(names: &[String]) -> String {
-    const SHOWN: usize = 20;
-    let quoted: Vec<String> = names.iter().take(SHOWN).map(|name| format!("'{name}'")).collect();
-    match (quoted.is_empty(), names.len().saturating_sub(SHOWN)) {
+    const MAX_NAMES: usize = 20;
+    let quoted: Vec<String> =
+        names.iter().take(MAX_NAMES).map(|name| format!("'{name}'")).collect();
+    match (quoted.is_empty(), names.len().saturating_sub(MAX_NAMES)) {
         (true, _) => "no arrays".to_owned(),
         (false, 0) => quoted.join(", "),
         (false, more) => format!("{} and {more} more", quoted.join(", ")),

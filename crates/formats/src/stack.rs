@@ -1,4 +1,4 @@
-//! What a stack of frames is, whatever file it lies in.
+//! Stacks of frames, independent of the file format.
 
 use ndarray::Array2;
 
@@ -6,10 +6,10 @@ use super::{Axes, Format, FormatError};
 use crate::error::Result;
 use strum::Display;
 
-/// How one sample is stored in a file, by NumPy's names.
+/// The data type of stored samples. `Display` gives the name in NumPy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
 pub enum SampleType {
-    /// One byte, 0 or 1.
+    /// Boolean in one byte, 0 or 1.
     #[strum(serialize = "bool")]
     Bool,
     /// Unsigned 8 bit.
@@ -18,7 +18,7 @@ pub enum SampleType {
     /// Unsigned 16 bit.
     #[strum(serialize = "uint16")]
     U16,
-    /// Unsigned 32 bit; this and wider integers are rounded to 24 binary digits when read.
+    /// Unsigned 32 bit. Integers of 32 and 64 bits are rounded to 24 bits when read.
     #[strum(serialize = "uint32")]
     U32,
     /// Unsigned 64 bit.
@@ -42,13 +42,13 @@ pub enum SampleType {
     /// 32-bit float.
     #[strum(serialize = "float32")]
     F32,
-    /// 64-bit float, rounded to 32 bit when read.
+    /// 64-bit float, rounded to 32 bits when read.
     #[strum(serialize = "float64")]
     F64,
 }
 
 impl SampleType {
-    /// Bytes a sample.
+    /// Number of bytes per sample.
     pub fn bytes(self) -> usize {
         match self {
             Self::Bool | Self::U8 | Self::I8 => 1,
@@ -58,9 +58,8 @@ impl SampleType {
         }
     }
 
-    /// What means 1.0 where nobody states a full scale: the type's maximum for unsigned integers of 8
-    /// and 16 bits, in which cameras and pictures count, and 1 for floats and truth values. Other integers
-    /// have none: what programs store in them has no common scale.
+    /// The full scale if none is stated: the largest value of unsigned integers of 8 and 16 bits, which cameras and
+    /// pictures use, and 1 for floats and booleans. Other integers have no common scale.
     pub fn default_full_scale(self) -> Option<FullScale> {
         match self {
             Self::U8 => Some(FullScale(255.0)),
@@ -71,19 +70,19 @@ impl SampleType {
     }
 }
 
-/// The value of the stored numbers that means 1.0. Finite and above 0.
+/// The stored value that means 1.0. It is finite and above 0.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
 pub struct FullScale(f32);
 
 impl FullScale {
-    /// Numbers that are on `[0,1]` already.
+    /// The full scale of values on `[0,1]`.
     pub const ONE: Self = Self(1.0);
-    /// Eight-bit grey values, the community's .mat scenes.
+    /// The full scale of 8-bit grey values, as in the public .mat scenes.
     pub const EIGHT_BIT: Self = Self(255.0);
 
-    /// Errors: [`FormatError::FullScale`] for NaN, infinities, zero, negative and subnormal numbers.
+    /// Errors: [`FormatError::FullScale`] for NaN, infinities, zero, negative and subnormal values.
     pub fn new(value: f32) -> Result<Self> {
-        // A subnormal scale would turn every ordinary value into an infinity.
+        // Division by a subnormal scale would give infinities.
         if value.is_normal() && value > 0.0 {
             Ok(Self(value))
         } else {
@@ -91,34 +90,34 @@ impl FullScale {
         }
     }
 
-    /// The number itself.
+    /// The value as a float.
     pub fn value(self) -> f32 {
         self.0
     }
 }
 
-/// What a file says about its stack; a two-dimensional file has one frame.
+/// The description of a stack. A two-dimensional array has one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StackInfo {
-    /// Frames (masks, snapshots), at least 1.
+    /// Number of frames (masks, snapshots), at least 1.
     pub frames: usize,
     /// Rows of a frame.
     pub height: usize,
     /// Columns of a frame.
     pub width: usize,
-    /// How the samples are stored.
+    /// Data type of the samples.
     pub sample: SampleType,
-    /// The file's format.
+    /// File format.
     pub format: Format,
-    /// The order of the array's axes; none for pictures and arrays of two dimensions, where there is no question.
+    /// Order of the axes; `None` for pictures and two-dimensional arrays, where it is clear.
     pub axes: Option<Axes>,
-    /// What means 1.0 unless stated: [`SampleType::default_full_scale`], but 255 for the meas and
-    /// orig arrays of a .mat scene, whatever their type.
+    /// The full scale if none is stated: [`SampleType::default_full_scale`], except for .mat scenes, where it is
+    /// [`SceneArray::default_full_scale`](super::mat::SceneArray::default_full_scale).
     pub default_full_scale: Option<FullScale>,
 }
 
 impl StackInfo {
-    /// An info with the sample type's own full scale.
+    /// A description with the default full scale of the data type, and without axes.
     pub(super) fn new(
         format: Format,
         sample: SampleType,
@@ -137,20 +136,20 @@ impl StackInfo {
         }
     }
 
-    /// Frames x height x width.
+    /// Number of voxels: frames x height x width.
     pub fn voxels(&self) -> u64 {
         (self.frames as u64).saturating_mul(self.height as u64).saturating_mul(self.width as u64)
     }
 }
 
-/// A stack of frames that is read one frame at a time, so that memory holds one frame.
+/// A stack that is read one frame at a time.
 pub trait FrameReader {
-    /// The shape and type, known before the first frame is read.
+    /// The description of the stack, which is known before the first frame is read.
     fn info(&self) -> &StackInfo;
 
-    /// The next frame (row, column) as stored, not scaled; `None` after the last.
+    /// Returns the next frame (row, column) as stored, without scaling; `None` after the last one.
     ///
-    /// Errors: whatever is wrong with this frame's bytes. After an error the reader is spent.
+    /// Errors: an invalid frame. The reader can't be used after an error.
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>>;
 }
 

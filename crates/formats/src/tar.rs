@@ -1,55 +1,56 @@
-//! The members of a tar archive that is not compressed.
+//! Lists the members of an uncompressed tar archive.
 //!
-//! The headers are read here: they are blocks of 512 bytes with few fields, and the crate `tar` reads names of any
-//! length into memory.
+//! This module parses the headers, because the crate `tar` reads names of any length into memory. A header is a block
+//! of 512 bytes with few fields.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 
-use super::member::{Member, Packing, shown};
+use super::member::{Member, Packing, quoted};
 use super::{Format, FormatError};
 use crate::error::Result;
 
+/// Size of headers, and alignment of members, in bytes.
 const BLOCK: u64 = 512;
-/// Where the signature stands in a header, and that of headers which split a name.
+/// Offset of the signature in a header, and the signature of headers that split a name in two fields.
 const MAGIC: (usize, &[u8]) = (257, b"ustar\0");
-/// Members that are looked at; those that are no frames among them.
+/// Largest number of members, including those that are not frames.
 const MAX_MEMBERS: usize = 16_384;
-/// Of a name that has a member of its own.
+/// Longest name that is stored in a separate member.
 const MAX_NAME_BYTES: u64 = 1 << 16;
 
-/// All members that are regular files. Errors: a damaged header; members that lie outside the file; sparse files.
+/// Returns all members that are regular files. Errors: a damaged header; members outside the file; sparse files.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
-    let (mut at, mut members, mut seen) = (0, Vec::new(), 0);
+    let (mut offset, mut members, mut count) = (0, Vec::new(), 0);
     let mut long_name = None;
-    while at + BLOCK <= length {
-        let head = read(file, at, BLOCK)?;
+    while offset + BLOCK <= length {
+        let head = read(file, offset, BLOCK)?;
         if head.iter().all(|byte| *byte == 0) {
             break;
         }
-        seen += 1;
-        if seen > MAX_MEMBERS {
-            return Err(malformed(format!("more than {MAX_MEMBERS} members")));
+        count += 1;
+        if count > MAX_MEMBERS {
+            return Err(malformed(format!("the archive has more than {MAX_MEMBERS} members")));
         }
-        check_sum(&head, at)?;
-        let (start, size) = (at + BLOCK, number(&head[124..136])?);
+        verify_checksum(&head, offset)?;
+        let (start, size) = (offset + BLOCK, number(&head[124..136])?);
         let name = long_name.take().unwrap_or_else(|| name(&head));
         let (stored, packing) = (size, Packing::Stored);
         let member = Member { name, start, stored, size, packing, crc: None };
         let member = member.checked(Format::Tar, length)?;
-        at = start + size.next_multiple_of(BLOCK);
+        offset = start + size.next_multiple_of(BLOCK);
         match head[156] {
             0 | b'0' | b'7' => members.push(member),
-            b'L' => long_name = Some(text(&attached(file, &member)?)),
-            b'x' => long_name = extended(&attached(file, &member)?)?,
-            // Folders and links, and what holds for the archive as a whole.
+            b'L' => long_name = Some(text(&read_metadata(file, &member)?)),
+            b'x' => long_name = extended_name(&read_metadata(file, &member)?)?,
+            // Folders, links, and metadata of the whole archive.
             b'1'..=b'6' | b'g' | b'K' => {}
             other => {
                 return Err(FormatError::Unsupported {
                     format: Format::Tar,
                     found: format!(
                         "{} of the kind '{}'",
-                        shown(&member.name),
+                        quoted(&member.name),
                         other.escape_ascii()
                     ),
                     accepted: "regular files",
@@ -60,7 +61,7 @@ pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     Ok(members)
 }
 
-/// The name in a header, with the folders before it.
+/// The name in a header, including folders.
 fn name(head: &[u8]) -> String {
     let (name, prefix) = (text(&head[..100]), text(&head[345..500]));
     if prefix.is_empty() || !head[MAGIC.0..].starts_with(MAGIC.1) {
@@ -69,23 +70,26 @@ fn name(head: &[u8]) -> String {
     format!("{prefix}/{name}")
 }
 
-/// The bytes of a member that tells of the next one.
-fn attached(file: &File, member: &Member) -> Result<Vec<u8>> {
+/// Reads a member with metadata of the next one.
+fn read_metadata(file: &File, member: &Member) -> Result<Vec<u8>> {
     if member.size > MAX_NAME_BYTES {
-        return Err(malformed(format!("a name of {} bytes", member.size)));
+        return Err(malformed(format!("a member has a name of {} bytes", member.size)));
     }
     read(file, member.start, member.size)
 }
 
-/// The name that an extended header (`LENGTH KEY=VALUE` in lines) gives the next member. Errors: another size.
-fn extended(bytes: &[u8]) -> Result<Option<String>> {
+/// The name of the next member in an extended header, which has lines of `LENGTH KEY=VALUE`. Errors: a header that
+/// changes the size.
+fn extended_name(bytes: &[u8]) -> Result<Option<String>> {
     let mut name = None;
     for line in bytes.split(|byte| *byte == b'\n') {
         let line = String::from_utf8_lossy(line);
         match line.split_once(' ').and_then(|(_, pair)| pair.split_once('=')) {
             Some(("path", path)) => name = Some(path.to_owned()),
             Some((key, _)) if key == "size" || key.starts_with("GNU.sparse") => {
-                return Err(malformed(format!("a member whose {key} is told apart")));
+                return Err(malformed(format!(
+                    "an extended header sets {key}, which is not supported"
+                )));
             }
             _ => {}
         }
@@ -93,21 +97,21 @@ fn extended(bytes: &[u8]) -> Result<Option<String>> {
     Ok(name)
 }
 
-/// The sum of all bytes of a header, its own field taken as spaces.
-fn check_sum(head: &[u8], at: u64) -> Result<()> {
+/// Verifies the checksum of a header: the sum of all bytes, with spaces in the place of the checksum.
+fn verify_checksum(head: &[u8], offset: u64) -> Result<()> {
     let sum: u64 = head.iter().map(|byte| u64::from(*byte)).sum();
     let field: u64 = head[148..156].iter().map(|byte| u64::from(*byte)).sum();
     if number(&head[148..156]).ok() == Some(sum - field + 8 * u64::from(b' ')) {
         return Ok(());
     }
-    Err(malformed(format!("the header at byte {at} is damaged")))
+    Err(malformed(format!("the header at byte {offset} is damaged")))
 }
 
-/// An octal number, padded with spaces or zero bytes.
+/// Parses an octal number that is padded with spaces or zero bytes.
 fn number(field: &[u8]) -> Result<u64> {
     let digits = text(field);
     u64::from_str_radix(digits.trim(), 8)
-        .map_err(|_| malformed(format!("'{}' is no octal number", digits.escape_default())))
+        .map_err(|_| malformed(format!("'{}' is not an octal number", digits.escape_default())))
 }
 
 /// The text before the first zero byte.

@@ -1,4 +1,4 @@
-//! Small files for the tests of the decoders.
+//! Helpers for the tests of the decoders.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use super::{
     open_stack, read_stack,
 };
 
-/// A file that another program has written; `make.py` beside it says how.
+/// A file from another program. `make.py` in the same folder writes it.
 pub(super) fn sample(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/formats").join(name)
 }
@@ -32,21 +32,21 @@ pub(super) fn open(bytes: &[u8]) -> Result<Box<dyn FrameReader + Send>, FormatEr
     open_stack(file(bytes).path(), &Limits::default())
 }
 
-/// Whole numbers 0, 1, 2, ... below `modulus`, in the order (frame, row, column).
+/// A stack with the values 0, 1, 2, ... modulo `modulus`, in the order (frame, row, column).
 pub(super) fn ramp(shape: (usize, usize, usize), modulus: usize) -> Array3<f32> {
     let count = shape.0 * shape.1 * shape.2;
     let values = (0..count).map(|v| (v % modulus) as f32).collect();
     Array3::from_shape_vec(shape, values).unwrap()
 }
 
-/// The message of the error that opening or reading must give; it must be the file's fault.
+/// The message of the error that reading must give. The error must blame the file.
 pub(super) fn refusal(bytes: &[u8]) -> String {
     let error = read(bytes).expect_err("this file must be refused");
     assert!(error.is_callers_fault(), "{error:?}");
     error.to_string()
 }
 
-/// Asserts that a message names all of these.
+/// Asserts that a message contains all parts.
 #[track_caller]
 pub(super) fn assert_names(message: &str, parts: &[&str]) {
     for part in parts {
@@ -54,19 +54,19 @@ pub(super) fn assert_names(message: &str, parts: &[&str]) {
     }
 }
 
-/// Reads a damaged file: any result is right, but a read must end, and what it blames is the file.
+/// Reads a damaged file. Any values are acceptable, but an error must blame the file.
 pub(super) fn survive(bytes: &[u8]) {
     if let Err(error) = read(bytes) {
         assert!(error.is_callers_fault(), "{error:?}");
     }
 }
 
-/// Bits of all values, so that NaN compares equal to itself.
+/// The bits of all values per frame, so that NaN equals itself.
 pub(super) fn bits(stack: &Array3<f32>) -> Vec<Vec<u32>> {
     stack.axis_iter(Axis(0)).map(|f| f.iter().map(|v| v.to_bits()).collect()).collect()
 }
 
-/// A stack (frame, row, column) as arrays of every order of axes.
+/// A stack (frame, row, column) as arrays with each order of axes.
 pub(super) fn every_order(stack: &Array3<f32>) -> [(Axes, ArrayView3<'_, f32>); 4] {
     [
         (Axes::FrameRowColumn, stack.view()),
@@ -76,7 +76,7 @@ pub(super) fn every_order(stack: &Array3<f32>) -> [(Axes, ArrayView3<'_, f32>); 
     ]
 }
 
-/// The array `mask` of a file, or its only one, whose axes are stated, and how it was read.
+/// Reads the array `mask` of a file, or its only array, with stated axes. Returns the axes that were used.
 pub(super) fn read_as(path: &Path, axes: Axes) -> Result<(Option<Axes>, Array3<f32>), FormatError> {
     let expected = Expected { axes: Some(axes), ..Expected::default() };
     let wanted = Wanted { expected, ..SceneArray::Masks.into() };

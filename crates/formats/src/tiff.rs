@@ -1,4 +1,4 @@
-//! TIFF and BigTIFF stacks: one grey frame a page, read page by page.
+//! Reads TIFF and BigTIFF stacks with one grey frame per page.
 
 mod directory;
 
@@ -15,28 +15,29 @@ use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, sam
 use crate::error::Result;
 use directory::{Pages, malformed};
 
-const ACCEPTED_SAMPLES: &str = "one grey sample a pixel (BlackIsZero): unsigned 1, 8 or 16 bit, or 32- or 64-bit float (other numbers: \
+const ACCEPTED_SAMPLES: &str = "one grey sample per pixel (BlackIsZero): unsigned 1, 8 or 16 bit, or 32- or 64-bit float (to convert others: \
      python -c \"import numpy, tifffile; numpy.save('out.npy', tifffile.imread('in.tif'))\")";
-const ACCEPTED_COLOUR: &str = "grey, BlackIsZero (grey of colours: python -c \"import numpy, tifffile; a = tifffile.imread('in.tif'); \
+const ACCEPTED_COLOUR: &str = "grey, BlackIsZero (to convert colours to grey: python -c \"import numpy, tifffile; a = tifffile.imread('in.tif'); \
      tifffile.imwrite('out.tif', (a[..., :3] @ numpy.array([.299, .587, .114])).round().astype(a.dtype))\")";
-const ACCEPTED_WHITE: &str = "BlackIsZero (of whole numbers: python -c \"import tifffile; \
+const ACCEPTED_WHITE: &str = "BlackIsZero (to convert integers: python -c \"import tifffile; \
      tifffile.imwrite('out.tif', ~tifffile.imread('in.tif'), photometric='minisblack')\")";
-const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits (python -c \"import numpy; from PIL import Image, \
+const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits (to convert it: python -c \"import numpy; from PIL import Image, \
      ImageSequence; numpy.save('out.npy', [numpy.array(page) for page in \
      ImageSequence.Iterator(Image.open('in.tif'))])\")";
-const ACCEPTED_BEHIND: &str = "images of 8, 16 or 32 bits that are not compressed, one behind the other, or one \
-     page a frame";
+const ACCEPTED_IMAGEJ: &str =
+    "contiguous images of 8, 16 or 32 bits that are not compressed, or one page per frame";
 
-/// TIFF's numbers for the lossless compressions that are read.
+/// TIFF's number for no compression.
 const UNCOMPRESSED: u16 = 1;
-const LOSSLESS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, 32773];
+/// TIFF's numbers for the supported compressions, all of them lossless.
+const SUPPORTED_COMPRESSIONS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, 32773];
 
-/// No compression of TIFF expands more: LZW reaches 2560 bytes a byte at the very most.
+/// Upper bound of the expansion of all compressions. LZW reaches at most 2560 bytes per compressed byte.
 const MAX_EXPANSION: u64 = 4096;
 
-/// Opens a TIFF file of `length` bytes, whose pages are frames of one size and type, or whose frames stand behind one
-/// page header, as ImageJ writes them above 4 GB. Checks all headers against the limits, the length and each
-/// other; pixels are not read.
+/// Opens a TIFF file of `length` bytes. Its pages are frames of one size and type, or all frames follow one page
+/// header, as ImageJ writes them above 4 GB. All headers are checked against the limits, the length and each other.
+/// Pixels are not read.
 pub(super) fn open<R: Read + Seek + Send + 'static>(
     mut file: R,
     length: u64,
@@ -44,35 +45,34 @@ pub(super) fn open<R: Read + Seek + Send + 'static>(
 ) -> Result<Box<dyn FrameReader + Send>> {
     let pages = directory::count_pages(&mut file, length, limits)?;
     file.rewind().map_err(FormatError::io("read the TIFF"))?;
-    match pages.behind {
-        Some(frames) => Ok(Box::new(behind(file, (frames, pages), length, limits)?)),
+    match pages.imagej_frames {
+        Some(frames) => Ok(Box::new(open_imagej(file, (frames, pages), length, limits)?)),
         None => Ok(Box::new(TiffReader::open(file, pages.count, length, limits)?)),
     }
 }
 
-/// A file that a decoder has looked at, from its first byte.
-struct Whole<R: Read + Seek>(Decoder<BufReader<R>>);
+/// The file of a decoder, read from its first byte.
+struct DecoderFile<R: Read + Seek>(Decoder<BufReader<R>>);
 
-impl<R: Read + Seek> Read for Whole<R> {
+impl<R: Read + Seek> Read for DecoderFile<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         self.0.inner().read(buffer)
     }
 }
 
-impl<R: Read + Seek + Send> Restart for Whole<R> {
+impl<R: Read + Seek + Send> Restart for DecoderFile<R> {
     fn restart(&mut self) -> io::Result<()> {
         self.0.inner().rewind()
     }
 }
 
-/// ImageJ's stacks of more than 4 GB: the pixels of the first frame stand where its page says, those of the others
-/// behind them.
-fn behind<R: Read + Seek + Send>(
+/// Opens an ImageJ stack of more than 4 GB. Its page header describes the first frame; all other frames follow it.
+fn open_imagej<R: Read + Seek + Send>(
     file: R,
     (frames, pages): (u64, Pages),
     length: u64,
     limits: &Limits,
-) -> Result<ArrayReader<RawSamples<Whole<R>>>> {
+) -> Result<ArrayReader<RawSamples<DecoderFile<R>>>> {
     let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
     let first = read_page(&mut decoder, 0, length, limits)?;
     limits.check_shape(Format::Tiff, frames, first.height as u64, first.width as u64)?;
@@ -80,15 +80,17 @@ fn behind<R: Read + Seek + Send>(
     let compression: Option<u16> =
         decoder.find_tag_unsigned(Tag::Compression).map_err(|e| in_page(0, e))?;
     let ranges = chunk_ranges(&mut decoder, 0)?;
-    let together = ranges.windows(2).all(|pair| pair[0].0 + pair[0].1 == pair[1].0);
+    let contiguous = ranges.windows(2).all(|pair| pair[0].0 + pair[0].1 == pair[1].0);
     let plain = compression.unwrap_or(UNCOMPRESSED) == UNCOMPRESSED
         && decoder.get_chunk_type() == ChunkType::Strip
         && first.sample != SampleType::Bool;
-    let (true, true, Some((start, _))) = (plain, together, ranges.first()) else {
+    let (true, true, Some((start, _))) = (plain, contiguous, ranges.first()) else {
         return Err(FormatError::Unsupported {
             format: Format::Tiff,
-            found: format!("an ImageJ stack of {frames} images behind one page header, packed"),
-            accepted: ACCEPTED_BEHIND,
+            found: format!(
+                "an ImageJ stack of {frames} images after one page header, compressed or not contiguous"
+            ),
+            accepted: ACCEPTED_IMAGEJ,
         });
     };
     let bytes = info.voxels() * info.sample.bytes() as u64;
@@ -102,13 +104,14 @@ fn behind<R: Read + Seek + Send>(
             present: format!("{length} bytes in all"),
         });
     }
-    let place = decoder.inner().seek(SeekFrom::Start(*start));
-    place.map_err(FormatError::io("read the TIFF"))?;
-    let samples = RawSamples::new(Whole(decoder), *start, (info.sample, pages.order), Format::Tiff);
+    let seek = decoder.inner().seek(SeekFrom::Start(*start));
+    seek.map_err(FormatError::io("read the TIFF"))?;
+    let file = DecoderFile(decoder);
+    let samples = RawSamples::new(file, *start, (info.sample, pages.order), Format::Tiff);
     Ok(ArrayReader::new(samples, info, Layout { interleaved: false, by_columns: false }))
 }
 
-/// A TIFF file whose pages are frames of one size and type.
+/// Reads a TIFF file whose pages are frames of one size and type.
 struct TiffReader<R: Read + Seek> {
     decoder: Decoder<BufReader<R>>,
     info: StackInfo,
@@ -125,7 +128,7 @@ impl<R: Read + Seek> TiffReader<R> {
             if page != first {
                 return Err(malformed(format!(
                     "page {number} is {}x{} {}, but page 0 is {}x{} {} (counted from 0); \
-                     all pages must be alike (without those of another size: python -c \"import numpy, tifffile; \
+                     all pages must have the same size and type (to drop the others: python -c \"import numpy, tifffile; \
                      p = tifffile.TiffFile('in.tif').pages; numpy.save('out.npy', [a.asarray() for a in p if \
                      a.shape == p[0].shape])\")",
                     page.height, page.width, page.sample, first.height, first.width, first.sample
@@ -135,7 +138,7 @@ impl<R: Read + Seek> TiffReader<R> {
         let info = StackInfo { frames, ..first };
         limits.check_info(&info)?;
         let mut decoder_limits = DecoderLimits::default();
-        // The decoder counts the values of a page header against this limit too.
+        // The decoder also counts the values of a page header against this limit.
         let frame_bytes = info.height * info.width * info.sample.bytes();
         decoder_limits.decoding_buffer_size = decoder_limits.decoding_buffer_size.max(frame_bytes);
         decoder_limits.intermediate_buffer_size = usize::try_from(length).unwrap_or(usize::MAX);
@@ -163,20 +166,24 @@ impl<R: Read + Seek> FrameReader for TiffReader<R> {
             DecodingResult::U16(values) => values.into_iter().map(f32::from).collect(),
             DecodingResult::F32(values) => values,
             DecodingResult::F64(values) => values.into_iter().map(|value| value as f32).collect(),
-            _ => return Err(FormatError::Internal(format!("samples of TIFF page {page}"))),
+            _ => {
+                return Err(FormatError::Internal(format!(
+                    "TIFF page {page} has unexpected samples"
+                )));
+            }
         };
         samples::frame(self.info.height, self.info.width, values).map(Some)
     }
 }
 
-/// Rows of single bits, the first one in the highest place; each row begins with a byte.
+/// Unpacks rows of single bits, most significant bit first. Each row starts at a whole byte.
 fn bits(bytes: &[u8], width: usize) -> Vec<f32> {
     let rows = bytes.chunks_exact(width.div_ceil(8).max(1));
     let bit = |row: &[u8], column: usize| f32::from(row[column / 8] >> (7 - column % 8) & 1);
     rows.flat_map(|row| (0..width).map(move |column| bit(row, column))).collect()
 }
 
-/// Checks the header of the page that the decoder stands on; the result has one frame.
+/// Checks the header of the current page of the decoder. The result has one frame.
 fn read_page<R: Read + Seek>(
     decoder: &mut Decoder<BufReader<R>>,
     page: usize,
@@ -237,7 +244,7 @@ fn sample_type<R: Read + Seek>(
     }
 }
 
-/// Checks that the strips or tiles of a page lie in the file and can hold the page.
+/// Checks that the strips or tiles of a page are inside the file, and can contain the page.
 fn check_chunks<R: Read + Seek>(
     decoder: &mut Decoder<BufReader<R>>,
     page: usize,
@@ -249,14 +256,14 @@ fn check_chunks<R: Read + Seek>(
         .find_tag_unsigned(Tag::Compression)
         .map_err(|e| in_page(page, e))?
         .unwrap_or(UNCOMPRESSED);
-    if !LOSSLESS.contains(&compression) {
+    if !SUPPORTED_COMPRESSIONS.contains(&compression) {
         return Err(FormatError::Unsupported {
             format: Format::Tiff,
             found: format!("compression number {compression} (page {page})"),
             accepted: ACCEPTED_COMPRESSION,
         });
     }
-    // The decoder makes room for a row of a tile, and skips what lies outside the page.
+    // The decoder allocates memory for a row of a tile, including the part outside the page.
     let (chunk_width, _) = decoder.chunk_dimensions();
     if u64::from(chunk_width) > 2 * limits.max_side as u64 {
         return Err(malformed(format!("page {page} has tiles of width {chunk_width}")));
@@ -307,13 +314,13 @@ fn chunk_ranges<R: Read + Seek>(
         (Some(offsets), Some(counts)) if offsets.len() == counts.len() => {
             Ok(offsets.into_iter().zip(counts).collect())
         }
-        _ => Err(malformed(format!("page {page} does not say where its pixels lie"))),
+        _ => Err(malformed(format!("page {page} does not state the position of its pixels"))),
     }
 }
 
 fn in_page(page: usize, error: TiffError) -> FormatError {
     match error {
-        // Decompressors report bad data as I/O errors too: only the system's own carry a number.
+        // Decompressors report invalid data as I/O errors, too; only errors of the operating system have a number.
         TiffError::IoError(source) if source.raw_os_error().is_some() => {
             FormatError::Io { action: "read the TIFF page", source }
         }
@@ -324,9 +331,9 @@ fn in_page(page: usize, error: TiffError) -> FormatError {
                 present: "only a part of it".to_owned(),
             }
         }
-        TiffError::UnsupportedError(what) => FormatError::Unsupported {
+        TiffError::UnsupportedError(feature) => FormatError::Unsupported {
             format: Format::Tiff,
-            found: format!("page {page}: {what}"),
+            found: format!("page {page}: {feature}"),
             accepted: ACCEPTED_SAMPLES,
         },
         other => malformed(format!("page {page}: {other}")),

@@ -1,26 +1,26 @@
-//! From raw frames to masks and measurements: the scale that somebody stated is applied, and what
-//! cannot be a mask or a measurement is refused. Nothing is guessed.
+//! Converts raw frames to masks and measurements: applies the full scale, and refuses invalid values. Nothing is
+//! guessed.
 
 use ndarray::{Array2, ArrayView2};
 
 use super::{FormatError, FrameReader, FullScale, StackInfo};
 use crate::error::Result;
 
-/// Masks may exceed 1 by this much (rounding of their own normalisation); they are set to 1 then.
+/// Masks may exceed 1 by this much, due to rounding in their normalisation. Such values are set to 1.
 const TOLERANCE: f32 = 1e-6;
 
-/// What was seen in a set of masks. Values on the scale `[0,1]`.
+/// Statistics of masks on `[0,1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaskStatistics {
-    /// Pixels whose sum of squares over the masks is 0: nothing can be known there.
+    /// Number of pixels with a sum of squares of 0 over the masks, which can't be reconstructed.
     pub dead_pixels: u64,
-    /// Values below 0 (dark subtraction makes them) that were set to 0.
+    /// Number of values below 0, for example from dark subtraction, that were set to 0.
     pub clipped_negative: u64,
     /// Mean over all masks and pixels.
     pub mean: f64,
 }
 
-/// A value as stored, and where it is.
+/// A stored value and its position.
 #[derive(Debug, Clone, Copy)]
 struct Located {
     value: f32,
@@ -29,18 +29,18 @@ struct Located {
     column: usize,
 }
 
-/// Reads all masks, hands each one scaled to `[0,1]` to `sink`, and tells the statistics.
+/// Reads all masks, passes each one (row, column) on `[0,1]` to `sink`, and returns the statistics.
 ///
-/// Errors: those of the reader and the sink; NaN or infinite values; and at the end (so that
-/// the message can name the largest value of all) values above the full scale, masks without
-/// an open pixel. After an error what the sink received must be thrown away.
+/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]. After the last mask, so that the message
+/// can contain the largest value: [`FormatError::AboveFullScale`], [`FormatError::AllMasksZero`] and
+/// [`FormatError::MaskFrameZero`]. After an error the output of the sink is invalid.
 pub fn check_masks(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
     mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<()>,
 ) -> Result<MaskStatistics> {
     let (info, scale) = (*reader.info(), full_scale.value());
-    // True where some mask so far is open (its square is above 0).
+    // True where the square of a mask is above 0.
     let mut open = Array2::from_elem((info.height, info.width), false);
     let (mut clipped_negative, mut sum) = (0, 0.0);
     let mut largest = Located { value: 0.0, frame: 0, row: 0, column: 0 };
@@ -64,7 +64,7 @@ pub fn check_masks(
             for (value, open) in values.iter_mut().zip(open.iter_mut()) {
                 let scaled = *value / scale;
                 clipped_negative += u64::from(scaled < 0.0);
-                // A rounding above 1 becomes 1; anything more is refused at the end.
+                // Values above 1 by more than rounding are refused at the end.
                 *value = scaled.clamp(0.0, 1.0);
                 *open |= *value * *value > 0.0;
                 sum += f64::from(*value);
@@ -98,10 +98,11 @@ pub fn check_masks(
     }
 }
 
-/// Reads all snapshots and hands each one divided by the full scale to `sink`. Values of any sign pass.
+/// Reads all snapshots, and passes each one (row, column) divided by the full scale to `sink`. Values may have any
+/// sign.
 ///
-/// Errors: those of the reader and the sink; NaN or infinite values; a snapshot that is zero
-/// everywhere. After an error what the sink received must be thrown away.
+/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::SnapshotZero`]. After an
+/// error the output of the sink is invalid.
 pub fn check_snapshots(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
@@ -111,17 +112,17 @@ pub fn check_snapshots(
     let mut snapshots = 0;
     while let Some(mut snapshot) = reader.next_frame()? {
         check_size(&info, snapshots, &snapshot)?;
-        let mut any = false;
+        let mut has_signal = false;
         for ((row, column), value) in snapshot.indexed_iter_mut() {
             let scaled = *value / scale;
-            // A small full scale can push a finite value out of range: that is the same trouble.
+            // A small full scale may turn a finite value into an infinity.
             if !scaled.is_finite() {
                 return Err(not_finite("measurement", *value, snapshots, row, column));
             }
-            any |= scaled != 0.0;
+            has_signal |= scaled != 0.0;
             *value = scaled;
         }
-        if !any {
+        if !has_signal {
             return Err(FormatError::SnapshotZero { snapshot: snapshots, snapshots: info.frames });
         }
         snapshots += 1;
@@ -145,7 +146,7 @@ fn check_size(info: &StackInfo, next: usize, frame: &Array2<f32>) -> Result<()> 
         return Ok(());
     }
     Err(FormatError::Internal(format!(
-        "frame {next} of size {:?} in a check of {} frames of {}x{}",
+        "frame {next} has the size {:?}, but the stack has {} frames of {}x{}",
         frame.dim(),
         info.frames,
         info.height,
@@ -153,11 +154,11 @@ fn check_size(info: &StackInfo, next: usize, frame: &Array2<f32>) -> Result<()> 
     )))
 }
 
-fn check_count(promised: usize, seen: usize) -> Result<()> {
-    if promised == seen {
+fn check_count(promised: usize, read: usize) -> Result<()> {
+    if promised == read {
         return Ok(());
     }
-    Err(FormatError::Internal(format!("{seen} of {promised} frames were checked")))
+    Err(FormatError::Internal(format!("only {read} of {promised} frames were read")))
 }
 
 #[cfg(test)]

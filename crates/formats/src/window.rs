@@ -1,4 +1,4 @@
-//! Windows of raw f32 stacks, read without reading the rest.
+//! Reads windows of raw f32 stacks without reading the rest.
 
 use std::fs::File;
 use std::ops::Range;
@@ -12,8 +12,8 @@ use crate::error::Result;
 
 const SAMPLE_BYTES: u64 = 4;
 
-/// A file with little-endian f32 samples in the order (frame, row, column) behind a header. Reads at
-/// positions, so it may be shared between threads.
+/// A file with little-endian f32 samples in the order (frame, row, column) after a header. Reads are positional, so
+/// threads can share it.
 #[derive(Debug)]
 pub struct WindowReader {
     file: File,
@@ -22,19 +22,19 @@ pub struct WindowReader {
 }
 
 impl WindowReader {
-    /// Of a file whose header was checked: the samples of `info` begin at byte `start`.
+    /// A reader of a file after a check of its header. The samples start at byte `start`.
     pub(super) fn new(file: File, info: StackInfo, start: u64) -> Self {
         Self { file, info, start }
     }
 
-    /// Shape and type.
+    /// The description of the stack.
     pub fn info(&self) -> &StackInfo {
         &self.info
     }
 
-    /// Reads a window; the result has the axes (frame, row, column) of the ranges.
+    /// Reads a window (frame, row, column).
     ///
-    /// Errors: I/O, or [`FormatError::Internal`] for a window that is not inside the stack.
+    /// Errors: I/O; [`FormatError::Internal`] for a window outside the stack.
     pub fn read_window(
         &self,
         frames: Range<usize>,
@@ -44,7 +44,7 @@ impl WindowReader {
         self.read_lattice(frames, (rows, columns), 1)
     }
 
-    /// Reads every `step`th row and column of a window, from its first ones on.
+    /// Reads every `step`th row and column of a window, starting with the first ones.
     ///
     /// Errors: as [`Self::read_window`].
     pub fn read_lattice(
@@ -58,13 +58,13 @@ impl WindowReader {
         if !(inside(&frames, self.info.frames) && inside(&rows, height) && inside(&columns, width))
         {
             return Err(FormatError::Internal(format!(
-                "window {frames:?} x {rows:?} x {columns:?} of a stack {} x {height} x {width}",
+                "the window {frames:?} x {rows:?} x {columns:?} is outside the stack of {} x {height} x {width}",
                 self.info.frames
             )));
         }
         let step = step.max(1);
         let shape = (frames.len(), rows.len().div_ceil(step), columns.len().div_ceil(step));
-        // Whole rows lie one after another and are read in one go.
+        // Whole rows are adjacent and are read together.
         let segments = if columns.len() == width && step == 1 { 1 } else { rows.len() };
         let segment_samples = rows.len() * columns.len() / segments.max(1);
         let mut bytes = vec![0; segment_samples * SAMPLE_BYTES as usize];

@@ -1,18 +1,18 @@
-//! One axis of the projection: how much of each mask pixel a sensor pixel sees through each row (or
-//! column) of the aperture.
+//! One axis of the projection: the weight of each mask pixel in a sensor pixel, seen through one row or column of
+//! aperture cells.
 
 use std::collections::BTreeMap;
 
 use ndarray::Array2;
 
-/// Sub-pixel phases that are told apart, per mask pixel: a multiple of 2, 3, 4, 5, 6, 8 and 10.
+/// Resolution of sub-pixel phases, per mask pixel: a multiple of 2, 3, 4, 5, 6, 8 and 10.
 const PHASES: f64 = 240.0;
-/// Reach of the blur in standard deviations.
+/// Radius of the blur kernel in standard deviations.
 const REACH: f64 = 5.0;
-/// Shares below this are rounding.
-const NOTHING: f64 = 1e-9;
+/// Weights below this value are rounding errors.
+const MIN_WEIGHT: f64 = 1e-9;
 
-/// The part of the aperture that a cell covers, as shifts in mask pixels: `from == to` for a point.
+/// The extent of an aperture cell along one axis, as mask shifts in mask pixels. `from == to` for a point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Cell {
     pub(super) from: f64,
@@ -22,25 +22,25 @@ pub(super) struct Cell {
 /// One axis of a projection.
 #[derive(Debug)]
 pub(super) struct Axis {
-    /// The first mask pixel, counted from the start of the canvas, that each sensor pixel may see.
+    /// First mask pixel that contributes to each sensor pixel, relative to the start of the canvas.
     pub(super) start: Vec<usize>,
-    /// The phase of each sensor pixel, as an index of `weights`.
+    /// Sub-pixel phase of each sensor pixel, as an index into `weights`.
     pub(super) phase: Vec<usize>,
-    /// For each phase, the share \[cell, tap\] of the light through a cell that passed mask pixel
-    /// `start + tap`. Shares of a cell add up to 1.
+    /// For each phase, the share \[cell, tap\] of the light through a cell that passes mask pixel `start + tap`. The
+    /// shares of a cell sum to 1.
     pub(super) weights: Vec<Array2<f64>>,
-    /// Mask pixels that are needed.
+    /// Length of the canvas in mask pixels.
     pub(super) length: usize,
-    /// The mask coordinate at which the canvas starts, for tests that compute it otherwise.
+    /// Mask coordinate of the start of the canvas.
     #[cfg(test)]
     pub(super) origin: i64,
 }
 
 impl Axis {
-    /// The axis of `pixels` sensor pixels of which `ratio` show one mask pixel, the first one at
-    /// mask coordinate `offset`, seen through `cells`, blurred by `blur` mask pixels.
+    /// The axis of `pixels` sensor pixels, `ratio` of them per mask pixel. The first one lies at mask coordinate
+    /// `offset`. The mask is seen through `cells` and blurred with a standard deviation of `blur` mask pixels.
     pub(super) fn new(cells: &[Cell], pixels: usize, ratio: f64, offset: f64, blur: f64) -> Self {
-        // 1. Where each sensor pixel begins: a whole mask pixel and a phase.
+        // 1. Split the start of each sensor pixel into a whole mask pixel and a phase.
         let mut phases = BTreeMap::new();
         let (mut whole, mut phase) = (Vec::new(), Vec::new());
         for pixel in 0..pixels {
@@ -52,15 +52,15 @@ impl Axis {
         }
         let mut values: Vec<(usize, f64)> = phases.into_values().collect();
         values.sort_by_key(|&(index, _)| index);
-        // 2. The shares, over every tap that could get one, and then over those that do.
+        // 2. Compute the shares of all taps in reach, and trim those that get no light.
         let lowest = cells.iter().map(|cell| cell.from).fold(f64::INFINITY, f64::min);
         let highest = cells.iter().map(|cell| cell.to).fold(f64::NEG_INFINITY, f64::max);
         let first = (lowest - REACH * blur).floor() as i64 - 1;
         let last = (highest + REACH * blur + 1.0 / ratio).ceil() as i64 + 1;
         let share = |phase: f64, cell: &Cell, tap: i64| {
-            let below = |x: i64| seen_below(x as f64 - phase, 1.0 / ratio, *cell, blur);
+            let below = |x: i64| share_below(x as f64 - phase, 1.0 / ratio, *cell, blur);
             let share = below(tap + 1) - below(tap);
-            if share > NOTHING { share } else { 0.0 }
+            if share > MIN_WEIGHT { share } else { 0.0 }
         };
         let used = |tap: i64| {
             values.iter().any(|&(_, phase)| cells.iter().any(|cell| share(phase, cell, tap) > 0.0))
@@ -74,7 +74,7 @@ impl Axis {
             })
         });
         let weights = weights.collect();
-        // 3. The canvas begins with the first mask pixel that the first sensor pixel may see.
+        // 3. The canvas starts at the first mask pixel that contributes to the first sensor pixel.
         let origin = whole.first().map_or(0, |whole| whole + first);
         let start: Vec<usize> =
             whole.iter().map(|whole| (whole + first - origin).max(0) as usize).collect();
@@ -91,40 +91,45 @@ impl Axis {
     }
 }
 
-/// The share of a sensor pixel's light through a cell that passed the mask below `x`, the pixel
-/// beginning at 0: the distribution function of position in the pixel plus shift plus blur.
-fn seen_below(x: f64, pixel: f64, cell: Cell, blur: f64) -> f64 {
+/// Share of a sensor pixel's light through a cell that passes the mask below `x`, for a pixel from 0 to `pixel`. It is
+/// the cumulative distribution of a uniform position in the pixel, plus a uniform shift within the cell, plus Gaussian
+/// blur.
+fn share_below(x: f64, pixel: f64, cell: Cell, blur: f64) -> f64 {
     let span = cell.to - cell.from;
     if span > 0.0 {
-        let corner = |shift: f64| double(x - shift, blur) - double(x - shift - pixel, blur);
+        let corner = |shift: f64| {
+            step_integral_2(x - shift, blur) - step_integral_2(x - shift - pixel, blur)
+        };
         (corner(cell.from) - corner(cell.to)) / (pixel * span)
     } else {
-        (single(x - cell.from, blur) - single(x - cell.from - pixel, blur)) / pixel
+        (step_integral(x - cell.from, blur) - step_integral(x - cell.from - pixel, blur)) / pixel
     }
 }
 
-/// The integral of the (blurred) step up to `z`.
-fn single(z: f64, blur: f64) -> f64 {
+/// Integral up to `z` of a unit step at 0 that is blurred by a Gaussian.
+fn step_integral(z: f64, blur: f64) -> f64 {
     if blur == 0.0 {
         return z.max(0.0);
     }
-    z * normal_below(z / blur) + blur * normal(z / blur)
+    z * normal_cumulative(z / blur) + blur * normal_density(z / blur)
 }
 
-/// The integral of [`single`] up to `z`.
-fn double(z: f64, blur: f64) -> f64 {
+/// Integral of [`step_integral`] up to `z`.
+fn step_integral_2(z: f64, blur: f64) -> f64 {
     if blur == 0.0 {
         return z.max(0.0).powi(2) / 2.0;
     }
     let t = z / blur;
-    ((z * z + blur * blur) * normal_below(t) + z * blur * normal(t)) / 2.0
+    ((z * z + blur * blur) * normal_cumulative(t) + z * blur * normal_density(t)) / 2.0
 }
 
-fn normal(t: f64) -> f64 {
+/// Density of the standard normal distribution.
+fn normal_density(t: f64) -> f64 {
     (-t * t / 2.0).exp() / (2.0 * std::f64::consts::PI).sqrt()
 }
 
-fn normal_below(t: f64) -> f64 {
+/// Cumulative distribution of the standard normal distribution.
+fn normal_cumulative(t: f64) -> f64 {
     (1.0 + libm::erf(t / std::f64::consts::SQRT_2)) / 2.0
 }
 
@@ -133,7 +138,7 @@ mod tests {
     use super::{Axis, Cell};
 
     #[test]
-    fn whole_shifts_see_one_mask_pixel_each() {
+    fn whole_pixel_shifts_select_one_mask_pixel_each() {
         let cells = [-1.0, 0.0, 1.0].map(|at| Cell { from: at, to: at });
         let axis = Axis::new(&cells, 5, 1.0, 0.0, 0.0);
         assert_eq!(axis.length, 7);
@@ -153,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_add_up_to_one_however_blurred() {
+    fn shares_sum_to_one_for_any_blur() {
         let cells = [Cell { from: -0.7, to: 0.3 }, Cell { from: 0.3, to: 0.3 }];
         for blur in [0.0, 0.4, 2.0] {
             let axis = Axis::new(&cells, 9, 1.5, 0.37, blur);

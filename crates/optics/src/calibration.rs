@@ -1,61 +1,63 @@
-//! From captures of a white board to masks: averages of repeats, Eq. 7 of the paper and its form
-//! with four images.
+//! Computes masks from captures of a white board: averages of repeats, then Eq. 7 of the paper, or its four-image form
+//! with a separate dark for captures through the mask.
 
 use ndarray::{Array2, ArrayView2, Zip};
 
 use super::{OpticsError, Result};
 
-/// Denominators below this share of their median are too dark to divide by.
-const DARKEST: f32 = 0.01;
-/// A mask value so many standard deviations below 0 is no noise.
-const SURELY: f32 = 4.0;
-/// The same where a capture has no repeats to tell its noise: a share of the white.
-const NEGATIVE: f32 = -0.02;
+/// Denominators below this share of their median are too small to divide by.
+const MIN_DENOMINATOR: f32 = 0.01;
+/// Number of standard deviations below 0 from which noise does not explain a mask value.
+const NEGATIVE_SIGMAS: f32 = 4.0;
+/// The corresponding limit for captures without repeats, where the noise is unknown, as a share of the white.
+const NEGATIVE_WITHOUT_REPEATS: f32 = -0.02;
 
-/// Sums of the repeats of one capture, to which one frame is added at a time.
+/// Accumulates the repeats of one capture.
 #[derive(Debug)]
 pub struct Repeats {
     sum: Array2<f64>,
     squares: Array2<f64>,
-    full: Array2<bool>,
+    saturated: Array2<bool>,
     means: Vec<f64>,
     saturation: Option<f32>,
 }
 
-/// The average of the repeats of one capture. Values are numbers as stored.
+/// The average of the repeats of one capture. Values are as stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Average {
     /// Mean \[H,W\].
     pub mean: Array2<f32>,
-    /// Variance \[H,W\] of that mean, from the scatter of the repeats; none for a single capture.
+    /// Variance of the mean \[H,W\], from the scatter of the repeats; `None` for a single capture.
     pub variance: Option<Array2<f32>>,
     /// Number of repeats.
     pub repeats: usize,
-    /// Pixels that were full in any repeat; none if nobody knows when they are.
+    /// Number of pixels that are saturated in any repeat; `None` if the saturation level is unknown.
     pub saturated: Option<u64>,
-    /// Largest difference of a repeat's mean from that of all, as a share of it.
+    /// Largest relative difference between the mean of a repeat and that of all repeats.
     pub drift: f64,
 }
 
 impl Repeats {
-    /// No captures yet, of `height` x `width`; numbers from `saturation` on mean a full pixel.
+    /// An empty accumulator for captures of `height` x `width` pixels. Values of at least `saturation` are saturated.
     pub fn new(height: usize, width: usize, saturation: Option<f32>) -> Self {
         Self {
             sum: Array2::zeros((height, width)),
             squares: Array2::zeros((height, width)),
-            full: Array2::from_elem((height, width), false),
+            saturated: Array2::from_elem((height, width), false),
             means: Vec::new(),
             saturation,
         }
     }
 
-    /// Adds a capture.
-    /// Errors: another size; numbers that are not finite.
+    /// Adds a capture \[H,W\].
+    ///
+    /// Errors: [`OpticsError::Captures`] for another size, and for values that are not finite.
     pub fn add(&mut self, capture: ArrayView2<'_, f32>) -> Result<()> {
         if capture.dim() != self.sum.dim() {
             let ((a, b), (c, d)) = (capture.dim(), self.sum.dim());
             return Err(OpticsError::Captures(format!(
-                "a capture is {a}x{b} (rows x columns), the first one {c}x{d}"
+                "this capture is {a}x{b} (rows x columns), but the first one is {c}x{d}: all captures must have the same \
+                 size"
             )));
         }
         if let Some(((row, column), value)) = capture.indexed_iter().find(|(_, v)| !v.is_finite()) {
@@ -63,23 +65,26 @@ impl Repeats {
                 "{value} at row {row}, column {column} (counted from 0); every value must be finite"
             )));
         }
-        let full = self.saturation.unwrap_or(f32::INFINITY);
+        let saturation = self.saturation.unwrap_or(f32::INFINITY);
         let mut total = 0.0;
-        Zip::from(&mut self.sum).and(&mut self.squares).and(&mut self.full).and(capture).for_each(
-            |sum, square, saturated, &value| {
+        Zip::from(&mut self.sum)
+            .and(&mut self.squares)
+            .and(&mut self.saturated)
+            .and(capture)
+            .for_each(|sum, square, saturated, &value| {
                 let wide = f64::from(value);
                 *sum += wide;
                 *square += wide * wide;
-                *saturated |= value >= full;
+                *saturated |= value >= saturation;
                 total += wide;
-            },
-        );
+            });
         self.means.push(total / capture.len() as f64);
         Ok(())
     }
 
-    /// The average.
-    /// Errors: no captures.
+    /// Returns the average.
+    ///
+    /// Errors: [`OpticsError::Captures`] if there are no captures.
     #[allow(clippy::cast_possible_truncation)] // to the precision of masks
     pub fn average(mut self) -> Result<Average> {
         let repeats = self.means.len();
@@ -87,13 +92,13 @@ impl Repeats {
             return Err(OpticsError::Captures("there is no capture to average".into()));
         }
         let count = repeats as f64;
-        // In place: at 10 megapixels a plane is 80 MB.
+        // In place, because a plane of 10 megapixels takes 80 MB.
         Zip::from(&mut self.squares).and(&self.sum).for_each(|square, &sum| {
             *square = ((*square - sum * sum / count) / ((count - 1.0).max(1.0) * count)).max(0.0);
         });
         let overall = self.means.iter().sum::<f64>() / count;
         let drift = self.means.iter().map(|mean| (mean - overall).abs()).fold(0.0, f64::max);
-        let saturated = self.full.iter().filter(|full| **full).count() as u64;
+        let saturated = self.saturated.iter().filter(|saturated| **saturated).count() as u64;
         Ok(Average {
             mean: self.sum.mapv(|sum| (sum / count) as f32),
             variance: (repeats > 1).then(|| self.squares.mapv(|variance| variance as f32)),
@@ -104,70 +109,72 @@ impl Repeats {
     }
 }
 
-/// Averages of the images without a pattern.
+/// Averaged captures without a pattern.
 #[derive(Debug)]
 pub struct References {
-    /// Without the lithography mask, the LCoS all white.
+    /// LCoS all white, lithography mask removed.
     pub white: Average,
-    /// Without the lithography mask, the LCoS all black.
+    /// LCoS all black, lithography mask removed.
     pub black: Average,
-    /// With the lithography mask, the LCoS all black; none to use `black` for it (Eq. 7).
+    /// LCoS all black, lithography mask in place. `None` uses `black` instead (Eq. 7).
     pub black_with_mask: Option<Average>,
 }
 
-/// Turns averaged captures of patterns into masks.
+/// Computes masks from averaged captures of patterns.
 #[derive(Debug)]
 pub struct Calibrator {
     references: References,
-    /// `white - black`, and 0 where that is too dark to divide by.
+    /// `white - black`, or 0 where it is too small to divide by.
     denominator: Array2<f32>,
     not_positive: u64,
     too_dark: u64,
 }
 
-/// A mask that is not yet divided by the largest value of all masks.
+/// A mask before normalisation to the largest value of all masks.
 #[derive(Debug)]
 pub struct RawMask {
-    /// `(M_k - black_with_mask) / (white - black)` \[H,W\], at least 0, and 0 where nothing is known.
+    /// `(M_k - black_with_mask) / (white - black)` \[H,W\], cut at 0; 0 where the denominator is too small.
     pub values: Array2<f32>,
     /// Largest value.
     pub largest: f32,
-    /// Pixels at or below 0, where the denominator was good.
+    /// Number of pixels at or below 0 among those with a valid denominator.
     pub not_positive: u64,
-    /// Those of them that are too far below 0 for noise: the dark was too bright there.
+    /// Number of pixels below 0 by more than noise explains: the dark is too bright there.
     pub negative: u64,
-    /// Mean over the good pixels, negative ones included.
+    /// Mean over the pixels with a valid denominator, negative values included.
     pub mean: f64,
-    /// Standard deviation that noise gives a value in the mean; none without repeats.
+    /// Root-mean-square standard deviation of a value due to noise; `None` without repeats.
     pub noise: Option<f64>,
 }
 
 impl Calibrator {
-    /// # Errors
-    /// References of different sizes, or a white that is nowhere brighter than the black.
+    /// Prepares the denominator of Eq. 7.
+    ///
+    /// Errors: [`OpticsError::Captures`] if the references differ in size, or if the white is nowhere brighter than the
+    /// black.
     pub fn new(references: References) -> Result<Self> {
         let size = references.white.mean.dim();
         let dark = [Some(&references.black), references.black_with_mask.as_ref()];
         if dark.into_iter().flatten().any(|image| image.mean.dim() != size) {
-            return Err(OpticsError::Captures("the reference images differ in size".into()));
+            return Err(OpticsError::Captures("white, black and black_with_mask differ in size: record them with the same sensor region".into()));
         }
         let mut denominator = &references.white.mean - &references.black.mean;
         let mut positive: Vec<f32> = denominator.iter().copied().filter(|v| *v > 0.0).collect();
         let not_positive = (denominator.len() - positive.len()) as u64;
         if positive.is_empty() {
             return Err(OpticsError::Captures(
-                "white is nowhere brighter than black: were the two confused, or was there no light?"
+                "white is nowhere brighter than black: check that they are not interchanged and that the light was on"
                     .into(),
             ));
         }
         let middle = positive.len() / 2;
-        let floor = *positive.select_nth_unstable_by(middle, f32::total_cmp).1 * DARKEST;
+        let floor = *positive.select_nth_unstable_by(middle, f32::total_cmp).1 * MIN_DENOMINATOR;
         let too_dark = positive.iter().filter(|value| **value < floor).count() as u64;
         denominator.mapv_inplace(|value| if value >= floor { value } else { 0.0 });
         Ok(Self { references, denominator, not_positive, too_dark })
     }
 
-    /// `white - black` \[H,W\], the illumination; 0 where it is too dark to divide by.
+    /// The illumination `white - black` \[H,W\]; 0 where it is too dark to divide by.
     pub fn illumination(&self) -> ArrayView2<'_, f32> {
         self.denominator.view()
     }
@@ -177,12 +184,12 @@ impl Calibrator {
         &self.references
     }
 
-    /// Pixels whose white is not above their black.
+    /// Number of pixels whose white is not above their black.
     pub fn not_positive(&self) -> u64 {
         self.not_positive
     }
 
-    /// Further pixels whose white is above their black by less than 1 % of the median.
+    /// Number of pixels whose white is above their black, but by less than 1 % of the median.
     pub fn too_dark(&self) -> u64 {
         self.too_dark
     }
@@ -191,13 +198,14 @@ impl Calibrator {
         self.references.black_with_mask.as_ref().unwrap_or(&self.references.black)
     }
 
-    /// The mask of an averaged pattern.
-    /// Errors: a capture of another size.
+    /// Computes the mask of an averaged pattern.
+    ///
+    /// Errors: [`OpticsError::Captures`] for a capture of another size.
     pub fn mask(&self, capture: &Average) -> Result<RawMask> {
         if capture.mean.dim() != self.denominator.dim() {
             let ((a, b), (c, d)) = (capture.mean.dim(), self.denominator.dim());
             return Err(OpticsError::Captures(format!(
-                "a pattern's captures are {a}x{b} (rows x columns), the reference images {c}x{d}"
+                "the captures of this pattern are {a}x{b} (rows x columns), but white and black are {c}x{d}"
             )));
         }
         let variance = self.variance(capture);
@@ -209,7 +217,7 @@ impl Calibrator {
             mean: 0.0,
             noise: None,
         };
-        let (mut total, mut noise, mut good) = (0.0, 0.0, 0u64);
+        let (mut total, mut noise, mut valid) = (0.0, 0.0, 0u64);
         for (place, value) in mask.values.indexed_iter_mut() {
             let denominator = self.denominator[place];
             if denominator == 0.0 {
@@ -217,29 +225,29 @@ impl Calibrator {
                 continue;
             }
             *value /= denominator;
-            good += 1;
+            valid += 1;
             total += f64::from(*value);
             let limit = match &variance {
                 Some(variance) => {
                     let variance = variance(place, *value) / (denominator * denominator);
                     noise += f64::from(variance);
-                    -SURELY * variance.sqrt()
+                    -NEGATIVE_SIGMAS * variance.sqrt()
                 }
-                None => NEGATIVE,
+                None => NEGATIVE_WITHOUT_REPEATS,
             };
             mask.not_positive += u64::from(*value <= 0.0);
             mask.negative += u64::from(*value < limit);
             mask.largest = mask.largest.max(*value);
             *value = value.max(0.0);
         }
-        let good = good.max(1) as f64;
-        mask.mean = total / good;
-        mask.noise = variance.is_some().then(|| (noise / good).sqrt());
+        let valid = valid.max(1) as f64;
+        mask.mean = total / valid;
+        mask.noise = variance.is_some().then(|| (noise / valid).sqrt());
         Ok(mask)
     }
 
-    /// The variance of a mask's numerator, the denominator's share included, by place and value;
-    /// none if any of the images has no repeats.
+    /// Variance of a mask value times the squared denominator, by pixel and mask value. It combines the variances of
+    /// numerator and denominator. `None` if any of the images has no repeats.
     fn variance<'a>(
         &'a self,
         capture: &'a Average,
@@ -263,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn repeats_are_averaged_as_they_come() {
+    fn repeats_are_averaged_with_their_variance() {
         let mut repeats = Repeats::new(1, 2, Some(100.0));
         for capture in [array![[1.0, 98.0]], array![[3.0, 100.0]], array![[5.0, 96.0]]] {
             repeats.add(capture.view()).unwrap();
@@ -273,7 +281,7 @@ mod tests {
         assert!(repeats.add(array![[f32::NAN, 1.0]].view()).is_err());
         let average = repeats.average().unwrap();
         assert_eq!(average.mean, array![[3.0, 98.0]]);
-        // Variance 4 of three values, of their mean a third of it.
+        // Three values with variance 4: the variance of their mean is 4/3.
         let variance = average.variance.unwrap();
         assert!((variance[[0, 0]] - 4.0 / 3.0).abs() < 1e-6, "{variance}");
         assert_eq!(average.saturated, Some(1));
@@ -281,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn the_four_images_give_the_mask_and_one_background_gives_equation_7() {
+    fn masks_follow_from_four_images_or_from_equation_7() {
         let references = |black_with_mask| References {
             white: average(array![[110.0, 60.0, 10.0, 10.1]]),
             black: average(array![[10.0, 10.0, 10.0, 10.0]]),
@@ -291,24 +299,30 @@ mod tests {
         let four =
             Calibrator::new(references(Some(average(array![[5.0, 5.0, 5.0, 5.0]])))).unwrap();
         let mask = four.mask(&capture).unwrap();
-        // The third pixel has no light, the fourth too little: nothing is known of either.
+        // The third pixel has no light, the fourth too little.
         assert_eq!(mask.values, array![[0.5, 0.0, 0.0, 0.0]]);
         assert_eq!((four.not_positive(), four.too_dark()), (1, 1));
         assert_eq!((mask.not_positive, mask.negative), (1, 0));
         let seven = Calibrator::new(references(None)).unwrap();
         let mask = seven.mask(&capture).unwrap();
         assert_eq!(mask.values, array![[0.45, 0.0, 0.0, 0.0]]);
-        assert_eq!((mask.not_positive, mask.negative), (1, 1), "(5 - 10) / 50 is no noise");
-        let confused = References {
+        assert_eq!(
+            (mask.not_positive, mask.negative),
+            (1, 1),
+            "(5 - 10) / 50 is below the noise limit"
+        );
+        let interchanged = References {
             white: average(array![[1.0]]),
             black: average(array![[2.0]]),
             black_with_mask: None,
         };
-        assert!(Calibrator::new(confused).unwrap_err().to_string().contains("nowhere brighter"));
+        assert!(
+            Calibrator::new(interchanged).unwrap_err().to_string().contains("nowhere brighter")
+        );
     }
 
     #[test]
-    fn noise_follows_from_the_repeats() {
+    fn noise_is_propagated_from_the_repeats() {
         let with = |mean: f32, variance: f32| Average {
             mean: array![[mean]],
             variance: Some(array![[variance]]),

@@ -1,4 +1,4 @@
-//! A camera that counts electrons: shot noise, read noise, background, bits.
+//! A camera model: shot noise, read noise, background, saturation and bit depth.
 
 use ndarray::{Array2, ArrayView2};
 use rand::Rng;
@@ -7,24 +7,24 @@ use serde::{Deserialize, Serialize};
 
 use super::{OpticsError, Result};
 
-/// A camera and the light that it works in. Signals are shares of the full well.
+/// A camera and its exposure. Signals are shares of the full well.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Camera {
-    /// Bits of a stored number, 1 to 16.
+    /// Bit depth of stored values, 1 to 16.
     pub bits: u32,
-    /// Electrons at which a pixel is full.
+    /// Full-well capacity of a pixel, in electrons.
     pub full_well_e: f64,
-    /// Standard deviation of reading a pixel, in electrons.
+    /// Standard deviation of the read noise, in electrons.
     pub read_noise_e: f64,
-    /// The offset that the camera adds, as a share of the full well.
+    /// Offset that the camera adds to every pixel, as a share of the full well.
     pub black_level: f64,
-    /// Stray light and leakage of the closed LCoS, as a share of the full well.
+    /// Stray light and leakage through the closed LCoS, as a share of the full well.
     pub background: f64,
-    /// Exposure of the calibration: the share of the full well that the white board fills through
-    /// the open aperture without a mask.
+    /// Exposure of the calibration: the share of the full well that a white board fills through the open aperture
+    /// without a mask.
     pub calibration_exposure: f64,
-    /// Exposure of the measurement: the same, for one white frame.
+    /// Exposure of one frame of the measurement, defined like `calibration_exposure`.
     pub measurement_exposure: f64,
 }
 
@@ -44,8 +44,9 @@ impl Default for Camera {
 }
 
 impl Camera {
-    /// Refuses numbers that can't be.
-    /// Errors: [`OpticsError::Parameter`] with the name of the first one that is wrong.
+    /// Checks all parameters.
+    ///
+    /// Errors: [`OpticsError::Parameter`] that names the first one out of range.
     pub fn check(&self) -> Result<()> {
         let refused = |name, value: f64, range| {
             Err(OpticsError::Parameter { name, value: value.to_string(), range })
@@ -77,16 +78,18 @@ impl Camera {
         Ok(())
     }
 
-    /// The largest number that a pixel can have.
+    /// Largest value of a pixel.
     #[allow(clippy::cast_possible_truncation)] // at most 65535
     pub fn saturation(&self) -> u16 {
         ((1u32 << self.bits.min(16)) - 1) as u16
     }
 
-    /// A capture \[H,W\] of `light`, in shares of the full well on top of the background's share
-    /// `background`: photons arrive by chance, reading adds noise, numbers are whole and end at
-    /// [`Camera::saturation`].
-    /// Errors: light that is no number.
+    /// Simulates a capture \[H,W\] of `light` \[H,W\] and a uniform `background`, both as shares of the full well.
+    ///
+    /// Electrons follow a Poisson distribution and are cut at the full well; read noise and the black level are added;
+    /// values are rounded and cut at [`Camera::saturation`]. NaN counts as no light.
+    ///
+    /// Errors: [`OpticsError::Parameter`] for a parameter out of range, [`OpticsError::Pattern`] for infinite light.
     pub fn capture(
         &self,
         light: ArrayView2<'_, f32>,
@@ -118,12 +121,13 @@ fn digital(value: f64, largest: u16) -> u16 {
 }
 
 fn impossible(error: &dyn std::fmt::Display) -> OpticsError {
-    OpticsError::Pattern(format!("the light on the sensor can't be: {error}"))
+    OpticsError::Pattern(format!("the light on the sensor can't be simulated: {error}"))
 }
 
-/// Relative illumination \[H,W\] of a sensor that loses the share `vignetting` of the light at its
-/// corners, by the square of the distance from the centre.
-/// Errors: a share outside \[0,1).
+/// Relative illumination \[H,W\] of a sensor with vignetting: 1 in the centre, and less by the share `vignetting` in
+/// the corners. The loss grows with the square of the distance from the centre.
+///
+/// Errors: [`OpticsError::Parameter`] for a share outside \[0,1).
 pub fn illumination((height, width): (usize, usize), vignetting: f64) -> Result<Array2<f32>> {
     if !(0.0..1.0).contains(&vignetting) {
         return Err(OpticsError::Parameter {
@@ -150,7 +154,7 @@ mod tests {
     use crate::generator;
 
     #[test]
-    fn captures_have_the_noise_of_their_electrons() {
+    fn captures_have_shot_noise_and_read_noise() {
         let camera = Camera { bits: 16, ..Camera::default() };
         let light = Array2::from_elem((100, 100), 0.4);
         let capture = camera.capture(light.view(), 0.05, &mut generator(1)).unwrap();
@@ -174,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn light_falls_off_to_the_corners() {
+    fn illumination_decreases_towards_the_corners() {
         let light = illumination((11, 21), 0.3).unwrap();
         assert_eq!(light[[5, 10]], 1.0);
         assert!((light[[0, 0]] - 0.7).abs() < 1e-6 && (light[[10, 20]] - 0.7).abs() < 1e-6);
@@ -183,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_that_can_not_be_are_refused() {
+    fn parameters_out_of_range_are_refused_by_name() {
         let camera = Camera::default();
         for (bad, name) in [
             (Camera { bits: 17, ..camera }, "camera bits is 17"),

@@ -1,10 +1,9 @@
-//! The camera's lengths, and what they mean for the masks.
+//! Geometry of the camera, and the mask shift that follows from it.
 
 use super::{OpticsError, Result};
 
-/// The hybrid coded aperture: an LCoS in the aperture of a 4f system, a lithography mask shortly
-/// before its image plane, and a relay from there to the sensor. Defaults are the paper's
-/// simulation.
+/// The hybrid coded aperture: an LCoS in the aperture of a 4f system, a lithography mask in front of its image plane,
+/// and a relay to the sensor. The defaults are those of the paper's simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Geometry {
     /// Rows of the LCoS, in pixels.
@@ -19,18 +18,15 @@ pub struct Geometry {
     pub mask_distance_um: f64,
     /// Side of a pixel of the lithography mask, in micrometres.
     pub mask_pitch_um: f64,
-    /// Size of the image on the sensor over its size on the image plane: 1 in the paper's
-    /// simulation, 2 in its camera.
+    /// Magnification of the relay from the image plane to the sensor: 1 in the paper's simulation, 2 in its camera.
     pub magnification: f64,
     /// Side of a sensor pixel, in micrometres.
     pub sensor_pitch_um: f64,
-    /// Standard deviation of the blur of the mask's projection on the image plane (aberration and
-    /// diffraction, taken to be Gaussian), in micrometres.
+    /// Standard deviation, in micrometres on the image plane, of the Gaussian that models aberrations and diffraction.
     pub blur_um: f64,
-    /// Where the sensor's first row begins on the lithography mask, in mask pixels: the part behind
-    /// the point is the sub-pixel phase.
+    /// Position of the sensor's first row on the lithography mask, in mask pixels. Its fraction is the sub-pixel phase.
     pub phase_rows: f64,
-    /// As `phase_rows`, for the first column.
+    /// Position of the sensor's first column on the lithography mask, in mask pixels.
     pub phase_columns: f64,
 }
 
@@ -52,12 +48,13 @@ impl Default for Geometry {
     }
 }
 
-/// The widest shift or blur that is taken for meant, in mask pixels.
-const FAR: f64 = 1000.0;
+/// Largest accepted shift or blur, in mask pixels.
+const MAX_SHIFT: f64 = 1000.0;
 
 impl Geometry {
-    /// Refuses lengths that can't be.
-    /// Errors: [`OpticsError::Parameter`] with the name of the first one that is wrong.
+    /// Checks all parameters.
+    ///
+    /// Errors: [`OpticsError::Parameter`] that names the first one out of range.
     pub fn check(&self) -> Result<()> {
         let lengths = [
             ("lcos pitch_um", self.lcos_pitch_um),
@@ -77,13 +74,13 @@ impl Geometry {
                 return Err(refused(name, value, "from 1 to 65536 pixels"));
             }
         }
-        if !(self.blur_um >= 0.0 && self.blur() <= FAR) {
+        if !(self.blur_um >= 0.0 && self.blur() <= MAX_SHIFT) {
             return Err(refused("projection blur_um", self.blur_um, "0 to 1000 mask pixels"));
         }
         for (name, value) in
             [("phase_rows", self.phase_rows), ("phase_columns", self.phase_columns)]
         {
-            if !(-FAR..=FAR).contains(&value) {
+            if !(-MAX_SHIFT..=MAX_SHIFT).contains(&value) {
                 return Err(refused(name, value, "-1000 to 1000 mask pixels"));
             }
         }
@@ -94,21 +91,21 @@ impl Geometry {
             return Err(refused("relay magnification", self.magnification, range));
         }
         let widest = self.lcos_rows.max(self.lcos_columns) as f64 * self.shift_per_lcos_pixel();
-        if widest > FAR {
+        if widest > MAX_SHIFT {
             let range = "such that the aperture shifts the mask by at most 1000 mask pixels";
             return Err(refused("mask distance_um", self.mask_distance_um, range));
         }
         Ok(())
     }
 
-    /// Mask pixels by which the mask's projection moves when the opening moves by one LCoS pixel:
-    /// distance x pitch / focal length.
+    /// Shift of the projected mask, in mask pixels, when the opening moves by one LCoS pixel: mask distance x LCoS
+    /// pitch / focal length.
     pub fn shift_per_lcos_pixel(&self) -> f64 {
         let shift_um = self.mask_distance_um * self.lcos_pitch_um / (self.focal_length_mm * 1000.0);
         shift_um / self.mask_pitch_um
     }
 
-    /// Sensor pixels along the side of the image of one mask pixel.
+    /// Number of sensor pixels along the side of one projected mask pixel.
     pub fn sensor_pixels_per_mask_pixel(&self) -> f64 {
         self.magnification * self.mask_pitch_um / self.sensor_pitch_um
     }
@@ -139,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_physics_is_refused_by_name() {
+    fn parameters_out_of_range_are_refused_by_name() {
         let paper = Geometry::default();
         let bad = [
             (Geometry { mask_distance_um: 0.0, ..paper }, "mask distance_um is 0"),

@@ -1,13 +1,13 @@
-//! Independent binary masks, as in the public benchmark.
+//! Independent random binary masks, as in the public benchmark.
 
 use ndarray::Array3;
 use rand::Rng;
 
 use super::{Result, check_size, generator};
 
-/// `frames` binary masks of `height` x `width`, each pixel open with probability one half and
-/// independent of all others.
-/// Errors: a size of 0.
+/// Random binary masks \[frames, height, width\]. Each pixel is 1 with probability one half, independent of all others.
+///
+/// Errors: [`OpticsError::Parameter`](super::OpticsError::Parameter) if a size is 0.
 pub fn iid_masks(frames: usize, height: usize, width: usize, seed: u64) -> Result<Array3<f32>> {
     check_size(frames, height, width)?;
     let mut rng = generator(seed);
@@ -21,7 +21,7 @@ mod tests {
     use super::iid_masks;
 
     #[test]
-    fn half_of_the_pixels_are_open_and_the_seed_says_which() {
+    fn half_of_the_pixels_are_open_and_the_seed_determines_which() {
         let masks = iid_masks(4, 64, 64, 7).unwrap();
         assert!(masks.iter().all(|&value| value == 0.0 || value == 1.0));
         let mean = masks.mean().unwrap();

@@ -1,19 +1,22 @@
-//! Masks as a lens and a modulator that is not quite dark show them.
+//! Degradation of ideal masks by lens blur and by light that leaks through closed pixels.
 
 use ndarray::{Array3, ArrayViewMut1, Axis, Zip};
 
 use super::{OpticsError, Result};
 
-/// Reach of the blur in standard deviations.
-const REACH: f64 = 4.0;
-/// A blur that would leave nothing of any mask.
-const WIDEST: f64 = 50.0;
+/// Radius of the blur kernel in standard deviations.
+const KERNEL_RADIUS: f64 = 4.0;
+/// Largest accepted blur in pixels; it erases any mask.
+const MAX_BLUR: f64 = 50.0;
 
-/// Masks \[B,H,W\] on \[0,1\] blurred by a Gaussian of the standard deviation `blur`, pixels, reflected at their edges,
-/// and raised to `leak + (1 - leak) C`, so that closed pixels let the share `leak` of the light of open ones through.
-/// Errors: a blur or a share that is out of range.
+/// Degrades masks \[B,H,W\] on \[0,1\].
+///
+/// Masks are blurred by a Gaussian with a standard deviation of `blur` pixels, reflected at the edges. The result is
+/// `leak + (1 - leak) C`: closed pixels transmit the share `leak` of the light of open ones.
+///
+/// Errors: [`OpticsError::Parameter`] unless `blur` is on \[0,50\] and `leak` on \[0,1).
 pub fn soften(masks: &mut Array3<f32>, blur: f64, leak: f32) -> Result<()> {
-    if !(0.0..=WIDEST).contains(&blur) {
+    if !(0.0..=MAX_BLUR).contains(&blur) {
         let range = "from 0 to 50 pixels";
         return Err(OpticsError::Parameter { name: "blur", value: blur.to_string(), range });
     }
@@ -31,27 +34,27 @@ pub fn soften(masks: &mut Array3<f32>, blur: f64, leak: f32) -> Result<()> {
     Ok(())
 }
 
-/// A Gaussian from its middle on; both sides of it together have the sum 1.
+/// One half of a Gaussian kernel, from its centre outwards. The whole kernel sums to 1.
 fn kernel(deviation: f64) -> Vec<f32> {
     let weight = |at: usize| (-0.5 * (at as f64 / deviation).powi(2)).exp();
-    let half: Vec<f64> = (0..=(REACH * deviation).ceil() as usize).map(weight).collect();
+    let half: Vec<f64> = (0..=(KERNEL_RADIUS * deviation).ceil() as usize).map(weight).collect();
     let sum = 2.0 * half.iter().sum::<f64>() - half[0];
     half.iter().map(|weight| (weight / sum) as f32).collect()
 }
 
+/// Convolves a lane with the kernel, reflected at the ends: `... 1 0 | 0 1 2 ... n-1 | n-1 n-2 ...`.
 fn smooth(mut lane: ArrayViewMut1<'_, f32>, kernel: &[f32]) {
     let values = lane.to_vec();
-    // ... 1 0 | 0 1 2 ... n-1 | n-1 n-2 ...
     let at = |place: isize| {
         let period = 2 * values.len().cast_signed();
         let place = place.rem_euclid(period).cast_unsigned();
         values[place.min(2 * values.len() - 1 - place)]
     };
     for (place, value) in lane.iter_mut().enumerate() {
-        let beside = (1isize..).zip(&kernel[1..]);
+        let sides = (1isize..).zip(&kernel[1..]);
         let place = place.cast_signed();
         *value = kernel[0] * at(place)
-            + beside.map(|(by, weight)| weight * (at(place - by) + at(place + by))).sum::<f32>();
+            + sides.map(|(by, weight)| weight * (at(place - by) + at(place + by))).sum::<f32>();
     }
 }
 
@@ -62,7 +65,7 @@ mod tests {
     use super::soften;
 
     #[test]
-    fn a_blur_keeps_the_light_and_has_its_width() {
+    fn blur_preserves_the_sum_and_has_the_stated_width() {
         let mut masks = Array3::zeros((2, 41, 51));
         masks[[1, 20, 25]] = 1.0;
         soften(&mut masks, 2.0, 0.0).unwrap();
@@ -75,7 +78,7 @@ mod tests {
             let variance: f32 = spread.sum();
             assert!((variance - 4.0).abs() < 0.05, "{variance}");
         }
-        // At an edge nothing is lost, even of a picture smaller than the blur.
+        // Nothing is lost at an edge, even if the image is smaller than the kernel.
         let mut edge = Array3::zeros((1, 3, 9));
         edge[[0, 0, 0]] = 1.0;
         soften(&mut edge, 2.0, 0.0).unwrap();
@@ -83,14 +86,14 @@ mod tests {
     }
 
     #[test]
-    fn closed_pixels_let_their_share_through() {
+    fn closed_pixels_transmit_the_leak() {
         let mut masks = Array3::from_shape_fn((1, 2, 2), |(_, i, _)| i as f32);
         soften(&mut masks, 0.0, 0.2).unwrap();
         assert_eq!(masks.as_slice().unwrap(), [0.2, 0.2, 1.0, 1.0]);
     }
 
     #[test]
-    fn what_is_out_of_range_is_named() {
+    fn parameters_out_of_range_are_refused_by_name() {
         let refused =
             |blur, leak| soften(&mut Array3::zeros((1, 2, 2)), blur, leak).unwrap_err().to_string();
         assert_eq!(refused(-1.0, 0.0), "blur is -1; it must be from 0 to 50 pixels");

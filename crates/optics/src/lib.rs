@@ -1,19 +1,21 @@
-//! The optics: aperture patterns, the masks that they project, and simulated measurements.
+//! The optics of a snapshot compressive camera: aperture patterns, the masks they project, calibration, checks, and
+//! simulated measurements.
 //!
-//! Knows arrays only. Everything random comes from a ChaCha generator with a stated seed, so
-//! that a simulation can be repeated bit for bit.
+//! The crate works on arrays and reads no files. Random numbers come from a seeded ChaCha generator, so simulations are
+//! reproducible bit for bit.
 
 #![warn(missing_docs)]
 
 mod axis;
 mod calibration;
+mod calibration_check;
 mod camera;
-mod check;
-mod findings;
+mod finding;
 mod geometry;
 mod iid;
 mod lens;
 mod masks;
+mod measurement_check;
 mod mosaic;
 mod multiplex;
 mod order;
@@ -24,40 +26,41 @@ mod squares;
 mod study;
 
 pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
+pub use calibration_check::{CaptureFigures, PatternFigures, judge_captures, judge_masks};
 pub use camera::{Camera, illumination};
-pub use check::{Digits, MeasurementFigures, MeasurementStudy, REACH, judge_measurement};
-pub use findings::{
-    CaptureFigures, Finding, PatternFigures, Severity, judge_captures, judge_masks,
-};
+pub use finding::{Entry, Finding, FindingCode, Severity, Subject};
 pub use geometry::Geometry;
 pub use iid::iid_masks;
 pub use lens::soften;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
+pub use measurement_check::{
+    BitUsage, MeasurementFigures, MeasurementStudy, PhaseDifference, REACH, judge_measurement,
+};
 pub use mosaic::{MARGIN, Mosaic};
 pub use multiplex::{Draw, Multiplexing};
-pub use order::{Expected, Reordered, pattern_likeness, reordered};
+pub use order::{ExpectedOrder, Reordering, pattern_overlap, reordering};
 pub use patterns::{ApertureGrid, Circle, check_patterns, pattern_rank, single_apertures};
 pub use projection::{Method, Placement, Projector};
 pub use simulate::{measure, noisy};
 pub use squares::random_squares;
-pub use study::{MaskFigures, MaskStudy, flatness};
+pub use study::{Correlations, MaskFigures, MaskStudy, flatness};
 
 use thiserror::Error;
 
-/// What the functions of this folder give.
+/// The result type of this crate.
 pub type Result<T, E = OpticsError> = std::result::Result<T, E>;
 
-/// What can't be built or simulated.
+/// Errors of this crate.
 #[derive(Debug, Error, PartialEq)]
-#[allow(missing_docs)] // the messages say what the fields are
+#[allow(missing_docs)] // the messages describe the fields
 pub enum OpticsError {
-    /// A number that is out of its range.
+    /// A parameter is out of range.
     #[error("{name} is {value}; it must be {range}")]
     Parameter { name: &'static str, value: String, range: &'static str },
-    /// Random patterns kept a rank below the largest possible one.
+    /// Random patterns did not reach the required rank.
     #[error(
         "{tries} random draws of {frames} patterns with {open} of {apertures} sub-apertures open \
-         reached rank {reached} at most; rank {wanted} is possible: use another seed or open \
+         reached at most rank {reached}, but rank {wanted} is possible: use another seed, or open \
          about half of the sub-apertures"
     )]
     Rank {
@@ -68,23 +71,23 @@ pub enum OpticsError {
         reached: usize,
         wanted: usize,
     },
-    /// Patterns, or a lithography mask, that can't be used.
+    /// Patterns or masks are unusable.
     #[error("{0}")]
     Pattern(String),
-    /// Raw captures that can't be calibrated with.
+    /// Captures are unusable for a calibration.
     #[error("{0}")]
     Captures(String),
-    /// Masks and frames that do not belong together.
-    #[error("the frames are {frames}, the masks {masks}; both must have the same size")]
+    /// Masks and frames differ in size.
+    #[error("the frames are {frames}, but the masks are {masks}; both must have the same size")]
     Sizes { frames: String, masks: String },
 }
 
-/// The generator of everything random here: the same on every machine.
+/// The random number generator of this crate. It gives the same numbers on every machine.
 pub fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
     rand::SeedableRng::seed_from_u64(seed)
 }
 
-/// Refuses an empty stack.
+/// Returns an error if a size is 0.
 fn check_size(frames: usize, height: usize, width: usize) -> Result<()> {
     for (name, value) in [("compression ratio", frames), ("height", height), ("width", width)] {
         if value == 0 {

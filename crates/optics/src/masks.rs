@@ -1,4 +1,4 @@
-//! The masks of a hybrid coded aperture.
+//! The masks of a hybrid coded aperture, computed from its patterns.
 
 use ndarray::{Array2, Array3, ArrayView3, Axis};
 use rand::Rng;
@@ -6,30 +6,29 @@ use rand::Rng;
 use super::projection::centre;
 use super::{Geometry, Method, OpticsError, Placement, Projector, Result, check_patterns};
 
-/// What a mask value of 1 means.
+/// The normalisation of masks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Normalisation {
-    /// The largest value of all masks, as after a calibration.
+    /// 1 is the largest value of all masks, as after a calibration.
     Maximum,
-    /// The light of the whole aperture without a mask, so that masks of patterns that are less
-    /// open are darker.
+    /// 1 is the light of the whole open aperture without a mask. Patterns with fewer openings give darker masks.
     Throughput,
 }
 
-/// The optics that turn patterns into masks. The default is the paper's simulation: sub-apertures
-/// shift a random mask by whole mask pixels.
+/// The optics that turn patterns into masks. The default is the paper's simulation: sub-apertures shift a random
+/// lithography mask by whole mask pixels.
 #[derive(Debug, Clone)]
 pub struct HybridAperture {
-    /// The camera's lengths.
+    /// Lengths and pitches of the camera.
     pub geometry: Geometry,
-    /// Where cells shift the mask to.
+    /// How the shift by an aperture cell is computed.
     pub placement: Placement,
-    /// How the light through a cell is taken.
+    /// How the light through an aperture cell is modelled.
     pub method: Method,
-    /// Transmission of the lithography mask's pixels on \[0,1\]; its centre is used. None for a
-    /// random binary one, half of it open.
+    /// Transmission of the lithography mask's pixels on \[0,1\]. If it is larger than needed, the central part is used.
+    /// `None` for a random binary mask with half of the pixels open.
     pub lithography: Option<Array2<f32>>,
-    /// What a mask value of 1 means.
+    /// The normalisation of the masks.
     pub normalisation: Normalisation,
 }
 
@@ -45,21 +44,22 @@ impl Default for HybridAperture {
     }
 }
 
-/// Masks and how much light they pass.
+/// Projected masks and their throughput.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProjectedMasks {
     /// The masks \[B,H,W\] on \[0,1\].
     pub masks: Array3<f32>,
-    /// Share of the light of the whole aperture without a mask that the masks pass in the mean.
+    /// Mean share of the light of the whole open aperture that the masks transmit.
     pub throughput: f64,
-    /// The mask value that stands for the whole of that light is 1 over this.
+    /// Share of that light where a mask value is 1.
     pub scale: f32,
 }
 
 impl HybridAperture {
-    /// The masks of `patterns` \[B, rows, columns\] on a sensor of `size` (rows, columns).
-    /// Errors: a geometry, patterns or sizes that can't be; a lithography mask that is too small or
-    /// has values outside \[0,1\]; masks without light.
+    /// Computes the masks \[B,H,W\] of `patterns` \[B, rows, columns\] on a sensor of `size` (H, W).
+    ///
+    /// Errors: [`OpticsError::Parameter`] for an impossible geometry or size; [`OpticsError::Pattern`] for unusable
+    /// patterns, for a lithography mask that is too small or has values outside \[0,1\], and for masks without light.
     pub fn masks(
         &self,
         patterns: ArrayView3<'_, f32>,
@@ -82,7 +82,9 @@ impl HybridAperture {
         let throughput = light / (masks.len() as f64 * f64::from(cells));
         let largest = masks.fold(0.0f32, |largest, &value| largest.max(value));
         if largest <= 0.0 {
-            return Err(OpticsError::Pattern("no light passes the lithography mask".into()));
+            return Err(OpticsError::Pattern(
+                "the lithography mask transmits no light: all masks would be 0".into(),
+            ));
         }
         let one = match self.normalisation {
             Normalisation::Maximum => largest,
@@ -104,7 +106,7 @@ impl HybridAperture {
         };
         if given.nrows() < rows || given.ncols() < columns {
             return Err(OpticsError::Pattern(format!(
-                "the lithography mask has {}x{} pixels, but the sensor sees {rows}x{columns} of them",
+                "the lithography mask has {}x{} pixels, but at least {rows}x{columns} are projected onto the sensor",
                 given.nrows(),
                 given.ncols()
             )));
@@ -114,14 +116,14 @@ impl HybridAperture {
         {
             return Err(OpticsError::Pattern(format!(
                 "the lithography mask transmits {value} at row {row}, column {column} (counted from \
-                 0); it must be from 0 to 1"
+                 0); transmissions must be from 0 to 1"
             )));
         }
         Ok(centre(given.view(), (rows, columns)).to_owned())
     }
 }
 
-/// Masks \[frames,side,side\] of a circle that turns once, sharply projected.
+/// Sharply projected masks \[frames,side,side\] of a circle that makes one turn.
 #[cfg(test)]
 pub(super) fn turning_circle(frames: usize, side: usize, seed: u64) -> Array3<f32> {
     use super::{Circle, generator};
@@ -163,27 +165,27 @@ mod tests {
     }
 
     #[test]
-    fn an_even_grid_that_is_centred_correlates_more_and_half_a_pixel_mends_it() {
-        let with = |placement, phase_columns| {
+    fn half_pixel_phases_raise_the_correlation_of_even_grids() {
+        let mean_correlation = |placement, phase_columns| {
             let geometry = Geometry { phase_columns, ..Geometry::default() };
             let optics = HybridAperture { geometry, placement, ..HybridAperture::default() };
-            let seen = (0..4).map(|seed| {
+            let correlations = (0..4).map(|seed| {
                 let patterns = squares(seed);
                 let made = optics.masks(patterns.view(), (128, 128), &mut generator(seed));
                 correlation(&made.unwrap().masks)
             });
-            seen.sum::<f32>() / 4.0
+            correlations.sum::<f32>() / 4.0
         };
-        let whole = with(Placement::WholePixels, 0.0);
+        let whole = mean_correlation(Placement::WholePixels, 0.0);
         assert!((0.45..=0.58).contains(&whole), "{whole}");
-        let centred = with(Placement::Geometric, 0.0);
+        let centred = mean_correlation(Placement::Geometric, 0.0);
         assert!((0.62..=0.72).contains(&centred), "{centred}");
-        let mended = with(Placement::Geometric, 0.5);
-        assert!((0.45..=0.58).contains(&mended), "{mended}");
+        let shifted = mean_correlation(Placement::Geometric, 0.5);
+        assert!((0.45..=0.58).contains(&shifted), "{shifted}");
     }
 
     #[test]
-    fn the_cameras_relay_shows_each_mask_pixel_on_four_sensor_pixels() {
+    fn magnification_2_maps_a_mask_pixel_to_four_sensor_pixels() {
         let geometry = Geometry { magnification: 2.0, ..Geometry::default() };
         let optics = HybridAperture { geometry, ..HybridAperture::default() };
         let masks = optics.masks(squares(1).view(), (32, 48), &mut generator(1)).unwrap().masks;
@@ -196,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn throughput_follows_the_openings() {
+    fn throughput_is_proportional_to_the_openings() {
         let optics = HybridAperture {
             normalisation: Normalisation::Throughput,
             ..HybridAperture::default()
@@ -213,17 +215,17 @@ mod tests {
     }
 
     #[test]
-    fn a_turning_circle_gives_masks_that_are_alike_in_turn() {
+    fn masks_of_a_turning_circle_correlate_more_with_their_neighbours() {
         let all = turning_circle(6, 96, 3);
         let means: Vec<f32> = all.axis_iter(Axis(0)).map(|m| m.mean().unwrap()).collect();
         assert!(means.iter().all(|mean| (mean / means[0] - 1.0).abs() < 0.02), "{means:?}");
         let masks = |k: [usize; 2]| all.select(Axis(0), &k);
-        let (near, far) = (correlation(&masks([0, 1])), correlation(&masks([0, 3])));
-        assert!(near > far + 0.1, "{near} {far}");
+        let (neighbours, opposite) = (correlation(&masks([0, 1])), correlation(&masks([0, 3])));
+        assert!(neighbours > opposite + 0.1, "{neighbours} {opposite}");
     }
 
     #[test]
-    fn a_given_mask_is_used_or_refused() {
+    fn given_lithography_masks_are_used_or_refused() {
         let with = |lithography| HybridAperture {
             lithography: Some(lithography),
             ..HybridAperture::default()

@@ -1,30 +1,29 @@
-//! Which sub-apertures are open in which frame.
+//! Multiplexing matrices: which sub-apertures are open in which frame.
 
 use rand::Rng;
 use rand::seq::index;
 
 use super::{OpticsError, Result};
 
-/// How random patterns are drawn.
+/// Options for drawing random patterns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Draw {
-    /// Open sub-apertures of each pattern.
+    /// Number of open sub-apertures of each pattern.
     pub open: usize,
-    /// The rank that the patterns must have; none for the largest that is possible.
+    /// Required rank of the matrix; `None` requires the largest possible rank.
     pub rank: Option<usize>,
-    /// Draws before giving up. With half of the sub-apertures open a draw of full rank comes within
-    /// the first few.
+    /// Largest number of draws. With half of the sub-apertures open, a few draws usually suffice.
     pub tries: usize,
 }
 
 impl Draw {
-    /// Draws of `open` sub-apertures with the largest possible rank, within 1000 tries.
+    /// Patterns with `open` sub-apertures each and the largest possible rank, in at most 1000 draws.
     pub fn of(open: usize) -> Self {
         Self { open, rank: None, tries: 1000 }
     }
 
-    /// The rank that is asked for, if it is one that `frames` patterns of `apertures` can have.
-    fn wanted(self, frames: usize, apertures: usize) -> Result<usize> {
+    /// The required rank, checked against what `frames` patterns of `apertures` sub-apertures allow.
+    fn required_rank(self, frames: usize, apertures: usize) -> Result<usize> {
         if self.open == 0 || self.open > apertures {
             return Err(OpticsError::Parameter {
                 name: "open sub-apertures",
@@ -32,12 +31,12 @@ impl Draw {
                 range: "at least 1 and at most all of them",
             });
         }
-        // With all of them open there is one pattern only.
+        // With all sub-apertures open there is only one pattern.
         let possible = if self.open == apertures { 1 } else { frames.min(apertures) };
         match self.rank {
             Some(rank) if rank > possible => Err(OpticsError::Pattern(format!(
                 "rank {rank} can't be reached: {frames} patterns with {} of {apertures} \
-                 sub-apertures open have rank {possible} at most",
+                 sub-apertures open have at most rank {possible}",
                 self.open
             ))),
             rank => Ok(rank.unwrap_or(possible)),
@@ -45,19 +44,20 @@ impl Draw {
     }
 }
 
-/// The multiplexing matrix: a row for each frame, a column for each sub-aperture, true where
-/// the sub-aperture is open. Its rank bounds how many frames the masks can tell apart.
+/// The multiplexing matrix: one row per frame, one column per sub-aperture, true where it is open. Its rank limits the
+/// number of frames that the masks can separate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Multiplexing {
     rows: Vec<Vec<bool>>,
 }
 
 impl Multiplexing {
-    /// Draws `frames` patterns of `apertures` sub-apertures until their matrix has the rank that is
-    /// wanted.
-    /// Errors: openings or a rank that can't be; no such matrix within the tries.
+    /// Draws `frames` patterns of `apertures` sub-apertures until their matrix has the required rank.
+    ///
+    /// Errors: [`OpticsError::Parameter`] or [`OpticsError::Pattern`] for impossible options, [`OpticsError::Rank`] if
+    /// no draw has the required rank.
     pub fn random(frames: usize, apertures: usize, draw: Draw, rng: &mut impl Rng) -> Result<Self> {
-        let wanted = draw.wanted(frames, apertures)?;
+        let wanted = draw.required_rank(frames, apertures)?;
         let Draw { open, tries, .. } = draw;
         let mut reached = 0;
         for _ in 0..tries {
@@ -84,15 +84,15 @@ impl Multiplexing {
         &self.rows
     }
 
-    /// Rank over the real numbers.
+    /// Rank of the matrix over the real numbers.
     pub fn rank(&self) -> usize {
         let number = |&open: &bool| f64::from(u8::from(open));
-        // The entries are small integers: anything this small is rounding.
+        // Entries are 0 or 1, so such small values are rounding errors.
         rank(self.rows.iter().map(|row| row.iter().map(number).collect()).collect(), 1e-9)
     }
 }
 
-/// Rank of a matrix, by elimination with pivoting; entries up to `tolerance` count as 0.
+/// Rank of a matrix by Gaussian elimination with pivoting. Entries up to `tolerance` count as 0.
 pub(super) fn rank(mut rows: Vec<Vec<f64>>, tolerance: f64) -> usize {
     let columns = rows.first().map_or(0, Vec::len);
     let mut rank = 0;
@@ -127,17 +127,17 @@ mod tests {
     }
 
     #[test]
-    fn rank_is_that_of_linear_algebra() {
+    fn rank_counts_independent_rows() {
         assert_eq!(matrix(&[&[1, 0], &[0, 1]]).rank(), 2);
         assert_eq!(matrix(&[&[1, 1], &[1, 1]]).rank(), 1);
         assert_eq!(matrix(&[&[0, 0], &[0, 0]]).rank(), 0);
-        // The rows are different, but the first two add up to the other two.
+        // All rows differ, but the sum of the first two equals that of the other two.
         assert_eq!(matrix(&[&[1, 1, 0, 0], &[0, 0, 1, 1], &[1, 0, 1, 0], &[0, 1, 0, 1]]).rank(), 3);
         assert_eq!(matrix(&[&[0, 1, 1], &[1, 0, 1]]).rank(), 2);
     }
 
     #[test]
-    fn draws_have_full_rank_and_the_stated_openings() {
+    fn draws_have_full_rank_and_the_requested_openings() {
         for (frames, apertures) in [(6, 12), (10, 12), (12, 12), (20, 20), (30, 30), (1, 12)] {
             let drawn =
                 Multiplexing::random(frames, apertures, Draw::of(apertures / 2), &mut generator(3))
@@ -150,21 +150,22 @@ mod tests {
     }
 
     #[test]
-    fn impossible_openings_are_refused() {
+    fn impossible_numbers_of_openings_are_refused() {
         for open in [0, 5] {
             let error = Multiplexing::random(3, 4, Draw::of(open), &mut generator(1)).unwrap_err();
             assert!(matches!(error, OpticsError::Parameter { .. }), "{error}");
         }
     }
+
     #[test]
-    fn a_rank_that_can_not_be_reached_is_refused() {
+    fn unreachable_ranks_are_refused() {
         let draw = |open, rank| Draw { rank, ..Draw::of(open) };
         let random = |frames, draw| {
             Multiplexing::random(frames, 12, draw, &mut generator(1)).unwrap_err().to_string()
         };
         let error = random(20, draw(6, Some(20)));
         assert!(error.contains("rank 20 can't be reached") && error.contains("12"), "{error}");
-        // Twelve single openings that are all different: possible, but not by chance.
+        // Twelve different single openings are possible, but practically never drawn by chance.
         let error = random(12, draw(1, None));
         assert!(error.contains("1000 random draws"), "{error}");
         let fewer = Multiplexing::random(6, 12, draw(6, Some(3)), &mut generator(1)).unwrap();

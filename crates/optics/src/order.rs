@@ -1,26 +1,26 @@
-//! Whether masks stand in the order of their patterns, told by how alike they are.
+//! Detects masks that are not in the order of their patterns, from the correlations between them.
 
 use ndarray::{Array2, ArrayView2, ArrayView3};
 
-/// How much better than the order as it is another one must agree to be believed.
-const BETTER: f64 = 0.05;
-/// Masks fewer than this leave too much to chance.
-const FEWEST: usize = 6;
+/// Gain in agreement from which another order is reported.
+const MIN_GAIN: f64 = 0.05;
+/// Smallest number of masks for which a turning pattern is recognised. Fewer agree by chance.
+const MIN_TURNING_MASKS: usize = 6;
 
-/// An order of the masks that fits their patterns better than the one they are in.
+/// An order of the masks that fits their patterns better than the current one.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Reordered {
-    /// The masks that stand in each other's place, counted from 0.
+pub struct Reordering {
+    /// The pairs of masks that are interchanged, counted from 0.
     pub swaps: Vec<(usize, usize)>,
-    /// Agreement (correlation of likenesses) of the order as it is.
+    /// Agreement of the current order: the correlation between expected and actual mask correlations.
     pub before: f64,
-    /// Agreement with these swaps undone.
+    /// Agreement after the swaps.
     pub after: f64,
 }
 
-/// Likeness \[B,B\] of masks whose patterns \[B,rows,columns\] are known: the share of openings in
-/// common.
-pub fn pattern_likeness(patterns: ArrayView3<'_, f32>) -> Array2<f64> {
+/// Normalised overlap \[B,B\] of patterns \[B,rows,columns\]: `<p_k, p_l> / (|p_k| |p_l|)`. Masks correlate as their
+/// patterns overlap.
+pub fn pattern_overlap(patterns: ArrayView3<'_, f32>) -> Array2<f64> {
     let frames = patterns.dim().0;
     let flat: Vec<Vec<f64>> = patterns
         .outer_iter()
@@ -34,109 +34,119 @@ pub fn pattern_likeness(patterns: ArrayView3<'_, f32>) -> Array2<f64> {
     })
 }
 
-/// What is known of the patterns.
+/// Prior knowledge about the order of the patterns.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Expected {
-    /// How alike any two of them are \[B,B\].
-    Likeness(Array2<f64>),
-    /// Perhaps they turn evenly about an axis: then their likeness depends on the angle between them
-    /// alone, and falls with it.
+pub enum ExpectedOrder {
+    /// The overlap of each pair of patterns \[B,B\]; see [`pattern_overlap`].
+    Overlap(Array2<f64>),
+    /// The patterns are unknown, but may turn evenly about an axis. The correlation of two masks then depends only on
+    /// the angle between them, and decreases with it.
     Turning,
 }
 
-impl Expected {
-    /// How well the masks' correlations agree with this if the pattern `order[k]` was shown at place
-    /// k, at most 1; none if nothing can be told.
+impl ExpectedOrder {
+    /// Agreement between the masks' correlations \[B,B\] and the expected ones, at most 1, if pattern `order[k]` was
+    /// shown in frame k. `None` if all correlations are equal.
     fn agreement(&self, correlation: ArrayView2<'_, f64>, order: &[usize]) -> Option<f64> {
         match self {
-            Self::Likeness(expected) => agreement(correlation, expected.view(), order),
+            Self::Overlap(expected) => agreement(correlation, expected.view(), order),
             Self::Turning => {
-                let (expected, falls) = by_angle(correlation, order);
+                let TurningModel { expected, decreases } = TurningModel::fit(correlation, order);
                 let natural: Vec<usize> = (0..order.len()).collect();
-                let seen = agreement(correlation, expected.view(), &natural)?;
-                falls.then_some(seen).or(Some(0.0))
+                let agreement = agreement(correlation, expected.view(), &natural)?;
+                Some(if decreases { agreement } else { 0.0 })
             }
         }
     }
 
-    fn convincing(&self) -> f64 {
+    /// Agreement from which a new order is accepted.
+    fn min_agreement(&self) -> f64 {
         match self {
-            Self::Likeness(_) => 0.9,
-            // The likeness is taken from the masks themselves, which flatters.
+            Self::Overlap(_) => 0.9,
+            // The model is fitted to the same masks, which biases the agreement upwards.
             Self::Turning => 0.95,
         }
     }
 }
 
-/// The mean correlation of masks as far apart in a turn as any two of them, and whether it falls.
-fn by_angle(correlation: ArrayView2<'_, f64>, order: &[usize]) -> (Array2<f64>, bool) {
-    let frames = order.len();
-    let apart = |k: usize, l: usize| {
-        let steps = order[k].abs_diff(order[l]);
-        steps.min(frames - steps)
-    };
-    let (mut sums, mut counts) = (vec![0.0; frames / 2 + 1], vec![0.0; frames / 2 + 1]);
-    for ((k, l), value) in correlation.indexed_iter().filter(|((k, l), _)| k != l) {
-        sums[apart(k, l)] += value;
-        counts[apart(k, l)] += 1.0;
-    }
-    let means: Vec<f64> =
-        sums.iter().zip(&counts).skip(1).map(|(sum, count)| sum / count).collect();
-    let falls = means.windows(2).all(|pair| pair[1] <= pair[0] + 0.02);
-    let drop = means.first().zip(means.last()).is_some_and(|(first, last)| first - last > 0.15);
-    let expected =
-        Array2::from_shape_fn(
-            (frames, frames),
-            |(k, l)| {
-                if k == l { 1.0 } else { means[apart(k, l) - 1] }
-            },
-        );
-    (expected, falls && drop)
+/// Correlations of masks with a pattern that turns evenly.
+struct TurningModel {
+    /// Mean correlation of all masks at the same angle, for each pair \[B,B\].
+    expected: Array2<f64>,
+    /// True if the correlation decreases with the angle, as it does for a turning pattern.
+    decreases: bool,
 }
 
-/// Looks for swaps of two masks after which their correlations agree with what is known of their
-/// patterns. None if the order is good, or if nothing can be told.
-pub fn reordered(correlation: ArrayView2<'_, f64>, expected: &Expected) -> Option<Reordered> {
+impl TurningModel {
+    fn fit(correlation: ArrayView2<'_, f64>, order: &[usize]) -> Self {
+        let frames = order.len();
+        let angle = |k: usize, l: usize| {
+            let steps = order[k].abs_diff(order[l]);
+            steps.min(frames - steps)
+        };
+        let (mut sums, mut counts) = (vec![0.0; frames / 2 + 1], vec![0.0; frames / 2 + 1]);
+        for ((k, l), value) in correlation.indexed_iter().filter(|((k, l), _)| k != l) {
+            sums[angle(k, l)] += value;
+            counts[angle(k, l)] += 1.0;
+        }
+        let means: Vec<f64> =
+            sums.iter().zip(&counts).skip(1).map(|(sum, count)| sum / count).collect();
+        let monotonic = means.windows(2).all(|pair| pair[1] <= pair[0] + 0.02);
+        let drop = means.first().zip(means.last()).is_some_and(|(first, last)| first - last > 0.15);
+        let expected = Array2::from_shape_fn((frames, frames), |(k, l)| {
+            if k == l { 1.0 } else { means[angle(k, l) - 1] }
+        });
+        Self { expected, decreases: monotonic && drop }
+    }
+}
+
+/// Searches for swaps after which the correlations of the masks \[B,B\] agree with the expected order. `None` if the
+/// order is correct, or if it can't be determined.
+pub fn reordering(
+    correlation: ArrayView2<'_, f64>,
+    expected: &ExpectedOrder,
+) -> Option<Reordering> {
     let frames = correlation.nrows();
-    let fewest = match expected {
-        Expected::Likeness(likeness) if likeness.dim() != correlation.dim() => return None,
-        Expected::Likeness(_) => 3,
-        Expected::Turning => FEWEST,
+    let min_frames = match expected {
+        ExpectedOrder::Overlap(overlap) if overlap.dim() != correlation.dim() => return None,
+        ExpectedOrder::Overlap(_) => 3,
+        ExpectedOrder::Turning => MIN_TURNING_MASKS,
     };
-    if frames < fewest {
+    if frames < min_frames {
         return None;
     }
     let mut order: Vec<usize> = (0..frames).collect();
     let before = expected.agreement(correlation, &order)?;
     let (mut after, mut swaps) = (before, Vec::new());
-    // The best swap, then the best one after it: few masks are ever in a wrong place.
+    // Greedy search: in practice few masks are misplaced.
     while swaps.len() < frames / 2 {
         let mut best = None;
         for k in 0..frames {
             for l in 0..k {
                 order.swap(k, l);
-                let seen = expected.agreement(correlation, &order)?;
+                let agreement = expected.agreement(correlation, &order)?;
                 order.swap(k, l);
-                if best.is_none_or(|(most, _, _)| seen > most) {
-                    best = Some((seen, l, k));
+                if best.is_none_or(|(largest, _, _)| agreement > largest) {
+                    best = Some((agreement, l, k));
                 }
             }
         }
         match best {
-            Some((seen, k, l)) if seen > after + BETTER / 2.0 => {
+            Some((agreement, k, l)) if agreement > after + MIN_GAIN / 2.0 => {
                 order.swap(k, l);
                 swaps.push((k, l));
-                after = seen;
+                after = agreement;
             }
             _ => break,
         }
     }
-    let found = !swaps.is_empty() && after > expected.convincing() && after > before + BETTER;
-    found.then_some(Reordered { swaps, before, after })
+    let convincing =
+        !swaps.is_empty() && after > expected.min_agreement() && after > before + MIN_GAIN;
+    convincing.then_some(Reordering { swaps, before, after })
 }
 
-/// Correlation, over all pairs, of how alike masks are and should be, if the pattern `order[k]`
-/// was shown at place k. None if all are equally alike.
+/// Correlation, over all pairs of masks, between actual and expected mask correlations if pattern `order[k]` was shown
+/// in frame k. `None` if either is the same for all pairs.
 fn agreement(
     correlation: ArrayView2<'_, f64>,
     expected: ArrayView2<'_, f64>,
@@ -164,48 +174,56 @@ fn agreement(
 mod tests {
     use ndarray::{Array2, Array3, Axis};
 
-    use super::{Expected, pattern_likeness, reordered};
+    use super::{ExpectedOrder, pattern_overlap, reordering};
     use crate::masks::turning_circle;
     use crate::{ApertureGrid, MaskStudy, random_squares};
 
-    fn correlation(masks: &Array3<f32>) -> Array2<f64> {
+    fn correlation_of(masks: &Array3<f32>) -> Array2<f64> {
         let (frames, height, width) = masks.dim();
         let mut study = MaskStudy::new(frames, height, width);
         study.add(masks.view()).unwrap();
         study.finish().unwrap().correlation
     }
 
-    fn swapped(masks: &Array3<f32>, k: usize, l: usize) -> Array3<f32> {
+    fn with_swap(masks: &Array3<f32>, k: usize, l: usize) -> Array3<f32> {
         let mut order: Vec<usize> = (0..masks.dim().0).collect();
         order.swap(k, l);
         masks.select(Axis(0), &order)
     }
 
     #[test]
-    fn a_swap_against_known_patterns_is_found() {
+    fn swaps_are_detected_with_known_patterns() {
         for seed in 0..5 {
             let (masks, openings) = random_squares(10, 96, 96, seed).unwrap();
             let patterns = openings.patterns(ApertureGrid::for_frames(10));
-            let expected = Expected::Likeness(pattern_likeness(patterns.view()));
-            let seen = correlation(&masks);
-            assert_eq!(reordered(seen.view(), &expected), None, "seed {seed}");
-            assert_eq!(reordered(seen.view(), &Expected::Turning), None, "seed {seed}");
-            let seen = correlation(&swapped(&masks, 2, 7));
-            let found = reordered(seen.view(), &expected).unwrap();
+            let expected = ExpectedOrder::Overlap(pattern_overlap(patterns.view()));
+            let correlation = correlation_of(&masks);
+            assert_eq!(reordering(correlation.view(), &expected), None, "seed {seed}");
+            assert_eq!(
+                reordering(correlation.view(), &ExpectedOrder::Turning),
+                None,
+                "seed {seed}"
+            );
+            let correlation = correlation_of(&with_swap(&masks, 2, 7));
+            let found = reordering(correlation.view(), &expected).unwrap();
             assert_eq!(found.swaps, [(2, 7)], "seed {seed}: {found:?}");
-            // Without patterns nothing can be told of random ones.
-            assert_eq!(reordered(seen.view(), &Expected::Turning), None, "seed {seed}");
+            // The order of random patterns can be checked only if they are known.
+            assert_eq!(
+                reordering(correlation.view(), &ExpectedOrder::Turning),
+                None,
+                "seed {seed}"
+            );
         }
     }
 
     #[test]
-    fn a_swap_among_turning_patterns_is_found_without_them() {
+    fn swaps_of_turning_patterns_are_detected_without_knowing_them() {
         for frames in [6, 10, 20] {
             let masks = turning_circle(frames, 96, 5);
-            let seen = correlation(&masks);
-            assert_eq!(reordered(seen.view(), &Expected::Turning), None);
-            let seen = correlation(&swapped(&masks, 1, 4));
-            let found = reordered(seen.view(), &Expected::Turning).unwrap();
+            let correlation = correlation_of(&masks);
+            assert_eq!(reordering(correlation.view(), &ExpectedOrder::Turning), None);
+            let correlation = correlation_of(&with_swap(&masks, 1, 4));
+            let found = reordering(correlation.view(), &ExpectedOrder::Turning).unwrap();
             assert_eq!(found.swaps, [(1, 4)], "{frames} frames: {found:?}");
         }
     }

@@ -1,5 +1,5 @@
-//! Aperture patterns \[B, rows, columns\]: the transmission, on \[0,1\], of each cell of the
-//! LCoS in each frame. The cells share the LCoS evenly.
+//! Aperture patterns \[B, rows, columns\]: the transmission on \[0,1\] of each cell of the LCoS in each frame. The
+//! cells divide the LCoS evenly.
 
 use ndarray::{Array3, ArrayView3};
 use rand::Rng;
@@ -9,13 +9,13 @@ use serde::{Deserialize, Serialize};
 use super::multiplex::rank;
 use super::{Geometry, Multiplexing, OpticsError, Result, check_size};
 
-/// LCoS pixels along the side of a cell in which a circle is drawn: far below a mask pixel.
+/// Side, in LCoS pixels, of the cells in which circles are drawn. Their shift of the mask is far below a mask pixel.
 const CIRCLE_CELL: usize = 8;
-/// Points along the side of such a cell by which the circle's share of it is told.
+/// Number of sample points along the side of such a cell, for the share of it that the circle covers.
 const CIRCLE_POINTS: usize = 8;
 
-/// A grid of square sub-apertures. Opening one shifts the projected lithography mask by whole
-/// mask pixels, neighbours by one pixel more.
+/// A grid of square sub-apertures. Each one shifts the projected lithography mask by a whole number of mask pixels,
+/// one more than its neighbour.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ApertureGrid {
     /// Rows of sub-apertures.
@@ -25,9 +25,9 @@ pub struct ApertureGrid {
 }
 
 impl ApertureGrid {
-    /// The grid for `frames` frames in a snapshot: 3x4 up to 12 frames and 4x5 up to 20, as in
-    /// the paper and its code, and for more the smallest grid of r x (r+1) with at least as many
-    /// sub-apertures as frames (5x6 up to 30), because fewer can't tell the frames apart.
+    /// The grid for `frames` frames in a snapshot: 3x4 up to 12 frames and 4x5 up to 20, as in the paper and its code.
+    /// For more frames it is the smallest grid of r x (r+1) with at least one sub-aperture per frame, because fewer
+    /// can't separate the frames.
     pub fn for_frames(frames: usize) -> Self {
         let mut rows = 3;
         while rows * (rows + 1) < frames {
@@ -43,7 +43,7 @@ impl ApertureGrid {
 }
 
 impl Multiplexing {
-    /// The patterns on a grid of sub-apertures, row by row.
+    /// The patterns \[B, rows, columns\] on a grid of sub-apertures, filled row by row.
     pub fn patterns(&self, grid: ApertureGrid) -> Array3<f32> {
         let open = |(frame, row, column)| {
             let rows: &Vec<bool> = &self.rows()[frame];
@@ -54,8 +54,9 @@ impl Multiplexing {
     }
 }
 
-/// `frames` patterns with one open sub-aperture each, all different: no multiplexing.
-/// Errors: more frames than sub-apertures.
+/// Patterns \[frames, rows, columns\] with one open sub-aperture each, all different: no multiplexing.
+///
+/// Errors: [`OpticsError::Pattern`] for more frames than sub-apertures.
 pub fn single_apertures(
     frames: usize,
     grid: ApertureGrid,
@@ -64,7 +65,7 @@ pub fn single_apertures(
     check_size(frames, grid.rows, grid.columns)?;
     if frames > grid.count() {
         return Err(OpticsError::Pattern(format!(
-            "{frames} frames need as many single sub-apertures, and a grid of {}x{} has {}",
+            "{frames} frames need {frames} sub-apertures, but a grid of {}x{} has {}: use a larger grid or fewer frames",
             grid.rows,
             grid.columns,
             grid.count()
@@ -77,13 +78,13 @@ pub fn single_apertures(
     Ok(patterns)
 }
 
-/// An open circle that turns about the axis of the LCoS from frame to frame: the paper's camera.
+/// An open circle that turns about the centre of the LCoS from frame to frame, as in the paper's camera.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Circle {
-    /// Its radius in LCoS pixels.
+    /// Radius in LCoS pixels.
     pub radius_pixels: f64,
-    /// Distance of its centre from the axis, in LCoS pixels.
+    /// Distance of the circle's centre from that of the LCoS, in LCoS pixels.
     pub centre_pixels: f64,
 }
 
@@ -95,8 +96,10 @@ impl Default for Circle {
 }
 
 impl Circle {
-    /// `frames` patterns, each turned by 360/`frames` degrees against the one before.
-    /// Errors: no circle, or one that leaves the LCoS.
+    /// Patterns \[frames, rows, columns\], each turned by 360/`frames` degrees from the previous one.
+    ///
+    /// Errors: [`OpticsError::Parameter`] for an impossible circle, [`OpticsError::Pattern`] for one that leaves the
+    /// LCoS.
     pub fn patterns(self, frames: usize, geometry: &Geometry) -> Result<Array3<f32>> {
         geometry.check()?;
         check_size(frames, geometry.lcos_rows, geometry.lcos_columns)?;
@@ -135,20 +138,20 @@ impl Circle {
         let reach = self.radius_pixels + self.centre_pixels;
         if reach > edge {
             return Err(OpticsError::Pattern(format!(
-                "the circle reaches {reach} LCoS pixels from the axis (radius {} and centre {}), but \
-                 the LCoS ends at {edge}",
+                "the circle reaches {reach} LCoS pixels from the axis (radius {}, centre {}), but the LCoS ends at \
+                 {edge}: reduce the radius or the distance of the centre",
                 self.radius_pixels, self.centre_pixels
             )));
         }
         Ok(())
     }
 
-    /// The share of a cell that lies in the circle about `centre`.
+    /// Share of a cell that lies inside the circle about `centre`.
     fn share(self, centre: (f64, f64), corner: (f64, f64), sides: [f64; 2]) -> f32 {
         let inside = |&(row, column): &(f64, f64)| {
             (row - centre.0).hypot(column - centre.1) <= self.radius_pixels
         };
-        // Most cells are far from the edge: look closer only at those that are not.
+        // Only cells near the edge of the circle need sampling.
         let middle = (corner.0 + sides[0] / 2.0, corner.1 + sides[1] / 2.0);
         let distance = (middle.0 - centre.0).hypot(middle.1 - centre.1) - self.radius_pixels;
         if distance.abs() > sides[0].hypot(sides[1]) / 2.0 {
@@ -163,14 +166,16 @@ impl Circle {
     }
 }
 
-/// Refuses patterns that are not `frames` transmissions on \[0,1\] with some light each.
-/// Errors: another number of patterns, values outside, a pattern that is closed everywhere.
+/// Checks patterns \[B, rows, columns\] for `frames` frames.
+///
+/// Errors: [`OpticsError::Pattern`] for another number of patterns, for values outside \[0,1\], and for a pattern that
+/// is closed everywhere.
 pub fn check_patterns(patterns: ArrayView3<'_, f32>, frames: usize) -> Result<()> {
     let (count, rows, columns) = patterns.dim();
     check_size(frames, rows, columns)?;
     if count != frames {
         return Err(OpticsError::Pattern(format!(
-            "{count} patterns of {rows}x{columns} cells were given for {frames} frames"
+            "{count} patterns of {rows}x{columns} cells were given for {frames} frames; one pattern per frame is needed"
         )));
     }
     if let Some(((frame, row, column), value)) =
@@ -178,19 +183,19 @@ pub fn check_patterns(patterns: ArrayView3<'_, f32>, frames: usize) -> Result<()
     {
         return Err(OpticsError::Pattern(format!(
             "pattern {frame} transmits {value} at row {row}, column {column} (all counted from 0); \
-             it must be from 0 to 1"
+             transmissions must be from 0 to 1"
         )));
     }
     let dark = patterns.outer_iter().position(|pattern| pattern.iter().all(|&open| open == 0.0));
     match dark {
-        Some(frame) => {
-            Err(OpticsError::Pattern(format!("pattern {frame} (counted from 0) is all closed")))
-        }
+        Some(frame) => Err(OpticsError::Pattern(format!(
+            "pattern {frame} (counted from 0) is closed everywhere and lets no light through"
+        ))),
         None => Ok(()),
     }
 }
 
-/// The rank of patterns of any kind: how many of them are independent of the others.
+/// Number of linearly independent patterns.
 pub fn pattern_rank(patterns: ArrayView3<'_, f32>) -> usize {
     let product = |a: usize, b: usize| {
         let (a, b) =
@@ -212,7 +217,7 @@ mod tests {
     use crate::{ApertureGrid, Geometry, generator};
 
     #[test]
-    fn grids_follow_the_stated_rule() {
+    fn grids_grow_with_the_number_of_frames() {
         for (frames, rows, columns) in
             [(1, 3, 4), (10, 3, 4), (12, 3, 4), (13, 4, 5), (20, 4, 5), (21, 5, 6), (30, 5, 6)]
         {
@@ -222,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn circles_have_their_area_and_turn() {
+    fn circles_have_the_right_area_and_turn_evenly() {
         let geometry = Geometry::default();
         for frames in [6, 10] {
             let patterns = Circle::default().patterns(frames, &geometry).unwrap();
@@ -232,7 +237,7 @@ mod tests {
                 assert!((pattern.sum() / expected - 1.0).abs() < 2e-3, "{}", pattern.sum());
             }
             assert_eq!(pattern_rank(patterns.view()), frames);
-            // The first circle lies to the right of the axis, the second one is turned by 360/Cr.
+            // The first circle is to the right of the axis, the second one is turned by 360/B degrees.
             let centre = |k: usize| {
                 let pattern = patterns.index_axis(Axis(0), k);
                 let at = |(i, j): (usize, usize)| (i as f32 + 0.5 - 96.0, j as f32 + 0.5 - 128.0);
@@ -248,14 +253,14 @@ mod tests {
     }
 
     #[test]
-    fn circles_that_can_not_be_are_refused() {
+    fn impossible_circles_are_refused() {
         let geometry = Geometry::default();
-        let new = |radius_pixels, centre_pixels| {
+        let error = |radius_pixels, centre_pixels| {
             Circle { radius_pixels, centre_pixels }.patterns(6, &geometry).unwrap_err().to_string()
         };
-        assert!(new(400.0, 400.0).contains("reaches 800 LCoS pixels"));
-        assert!(new(0.0, 0.0).contains("radius_pixels is 0"));
-        assert!(new(10.0, -1.0).contains("centre_pixels is -1"));
+        assert!(error(400.0, 400.0).contains("reaches 800 LCoS pixels"));
+        assert!(error(0.0, 0.0).contains("radius_pixels is 0"));
+        assert!(error(10.0, -1.0).contains("centre_pixels is -1"));
     }
 
     #[test]
@@ -269,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn patterns_of_users_are_looked_at() {
+    fn unusable_patterns_are_refused_with_the_place() {
         let good = Array3::from_elem((2, 3, 4), 0.5f32);
         check_patterns(good.view(), 2).unwrap();
         let refused = |patterns: &Array3<f32>, frames| {

@@ -1,4 +1,4 @@
-//! From aperture patterns to the masks that the sensor sees.
+//! Projection of aperture patterns: the masks they produce on the sensor.
 
 use ndarray::{Array1, Array2, ArrayView2, s};
 use rayon::iter::{IndexedParallelIterator, ParallelIterator};
@@ -8,30 +8,31 @@ use serde::{Deserialize, Serialize};
 use super::axis::{Axis, Cell};
 use super::{Geometry, OpticsError, Result, check_size};
 
-/// Where the cells of a pattern shift the mask to.
+/// How the shift of the mask by an aperture cell is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Placement {
-    /// By whole mask pixels, neighbours by what the geometry gives, rounded: the paper's simulation.
+    /// By whole mask pixels: the geometric shift between neighbours is rounded, as in the paper's simulation.
     WholePixels,
-    /// Where the geometry puts them, the pattern centred on the axis.
+    /// As the geometry determines, with the pattern centred on the optical axis.
     Geometric,
 }
 
-/// How the light through a cell is taken.
+/// How the light through an aperture cell is modelled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
-    /// All through the cell's centre: a pattern's mask is a sum of shifted masks (Eq. 1).
+    /// All light passes the centre of the cell, so a mask is a sum of shifted lithography masks (Eq. 1).
     Shifts,
-    /// Through its whole area: a convolution of the mask with the scaled pattern.
+    /// Light passes the whole area of the cell, so a mask is the convolution of the lithography mask with the scaled
+    /// pattern.
     Convolution,
 }
 
-/// The way from a pattern of aperture cells to a mask on the sensor.
+/// Projects patterns of aperture cells to masks on the sensor.
 ///
-/// A ray that meets the image plane at x and came through the aperture at u crosses the mask, which
-/// stands a distance d before the image plane, at x + d u / f.
+/// A ray through the aperture at u that reaches the image plane at x crosses the lithography mask, at a distance d
+/// before the image plane, at `x + d u / f`.
 #[derive(Debug)]
 pub struct Projector {
     rows: Axis,
@@ -40,9 +41,11 @@ pub struct Projector {
 }
 
 impl Projector {
-    /// A projector of patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of
-    /// `sensor` (rows, columns).
-    /// Errors: a geometry or size that can't be; cells too close for whole pixels.
+    /// A projector from patterns of `cells` (rows, columns), which cover the LCoS, to a sensor of `sensor` (rows,
+    /// columns) pixels.
+    ///
+    /// Errors: [`OpticsError::Parameter`] for an impossible geometry or size, [`OpticsError::Pattern`] if neighbouring
+    /// cells shift the mask by less than half a pixel with [`Placement::WholePixels`].
     pub fn new(
         geometry: &Geometry,
         cells: (usize, usize),
@@ -56,7 +59,7 @@ impl Projector {
         let ratio = geometry.sensor_pixels_per_mask_pixel();
         let axis = |lcos: usize, count: usize, pixels: usize, offset: f64| {
             let pitch = lcos as f64 / count as f64 * shift;
-            let cells = place(pitch, count, placement, method)?;
+            let cells = cells_along_axis(pitch, count, placement, method)?;
             Ok::<_, OpticsError>(Axis::new(&cells, pixels, ratio, offset, geometry.blur()))
         };
         for (name, count, pixels) in [
@@ -64,7 +67,7 @@ impl Projector {
             ("pattern columns", cells.1, geometry.lcos_columns),
         ] {
             if !(1..=pixels).contains(&count) {
-                let range = "at least 1 and at most the LCoS's pixels";
+                let range = "at least 1 and at most the number of LCoS pixels";
                 return Err(OpticsError::Parameter { name, value: count.to_string(), range });
             }
         }
@@ -75,15 +78,16 @@ impl Projector {
         })
     }
 
-    /// Rows and columns of the part of the lithography mask that the sensor can see.
+    /// Rows and columns of the part of the lithography mask that is projected onto the sensor.
     pub fn mask_size(&self) -> (usize, usize) {
         (self.rows.length, self.columns.length)
     }
 
-    /// The mask \[H,W\] on the sensor: the sum, over the cells of `pattern`, of the cell's
-    /// transmission times the lithography mask as seen through it. All open and no mask gives the
-    /// number of cells.
-    /// Errors: arrays that have not the sizes of [`Projector::new`] and [`Projector::mask_size`].
+    /// Returns the mask on the sensor \[H,W\]: the sum over the cells of `pattern` of the cell's transmission times the
+    /// lithography mask seen through it. Without a mask and with all cells open, each value is the number of cells.
+    ///
+    /// Errors: [`OpticsError::Pattern`] if the arrays do not have the sizes of [`Projector::new`] and
+    /// [`Projector::mask_size`].
     pub fn project(
         &self,
         lithography: ArrayView2<'_, f32>,
@@ -93,11 +97,11 @@ impl Projector {
             let text = |(rows, columns): (usize, usize)| format!("{rows}x{columns}");
             let (mask_rows, mask_columns) = self.mask_size();
             return Err(OpticsError::Pattern(format!(
-                "a pattern of {} cells and a lithography mask of {} pixels were given to a projector \
-                 of {} cells and {mask_rows}x{mask_columns} pixels",
+                "the pattern has {} cells, but {} are expected; the lithography mask has {} pixels, but \
+                 {mask_rows}x{mask_columns} are expected",
                 text(pattern.dim()),
-                text(lithography.dim()),
                 text(self.cells),
+                text(lithography.dim()),
             )));
         }
         let kernels = self.kernels(&pattern.mapv(f64::from));
@@ -117,7 +121,7 @@ impl Projector {
             .map_err(|error| OpticsError::Pattern(error.to_string()))
     }
 
-    /// The taps of the pattern's kernel, for each phase of the rows and of the columns.
+    /// Taps of the pattern's kernel for each row phase and column phase.
     fn kernels(&self, pattern: &Array2<f64>) -> Vec<Vec<Vec<Tap>>> {
         let row_kernels = self.rows.weights.iter().map(|rows| {
             let half = rows.t().dot(pattern);
@@ -128,7 +132,7 @@ impl Projector {
     }
 }
 
-/// A mask pixel that a sensor pixel sees, and how much light comes through it.
+/// A mask pixel and its weight in a sensor pixel.
 #[derive(Debug, Clone, Copy)]
 struct Tap {
     row: usize,
@@ -142,8 +146,13 @@ fn taps(kernel: &Array2<f64>) -> Vec<Tap> {
     taps.map(|((row, column), &weight)| Tap { row, column, weight: weight as f32 }).collect()
 }
 
-/// The cells of an axis, as shifts in mask pixels; `pitch` of them from one cell to the next.
-fn place(pitch: f64, count: usize, placement: Placement, method: Method) -> Result<Vec<Cell>> {
+/// The cells along one axis. `pitch` is the shift between neighbouring cells in mask pixels.
+fn cells_along_axis(
+    pitch: f64,
+    count: usize,
+    placement: Placement,
+    method: Method,
+) -> Result<Vec<Cell>> {
     let half = match method {
         Method::Shifts => 0.0,
         Method::Convolution => pitch / 2.0,
@@ -155,9 +164,8 @@ fn place(pitch: f64, count: usize, placement: Placement, method: Method) -> Resu
             let step = pitch.round();
             if step < 1.0 && count > 1 {
                 return Err(OpticsError::Pattern(format!(
-                    "neighbouring sub-apertures shift the mask by {pitch:.3} mask pixels, which is 0 \
-                     whole pixels: use fewer sub-apertures, a greater mask distance, or the \
-                     placement geometric"
+                    "neighbouring sub-apertures shift the mask by {pitch:.3} mask pixels, which rounds to 0: \
+                     use fewer sub-apertures, a greater mask distance, or the placement `geometric`"
                 )));
             }
             let middle = ((count - 1) / 2) as f64;
@@ -168,7 +176,7 @@ fn place(pitch: f64, count: usize, placement: Placement, method: Method) -> Resu
     Ok(centre.iter().map(cell).collect())
 }
 
-/// The centre of an array, `(rows, columns)` of it.
+/// The central part of an array, of the given numbers of rows and columns.
 pub(super) fn centre(
     array: ArrayView2<'_, f32>,
     (rows, columns): (usize, usize),

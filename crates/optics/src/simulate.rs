@@ -1,12 +1,13 @@
-//! Measurements of known scenes.
+//! Simulated measurements of known scenes.
 
 use ndarray::{Array2, ArrayView3};
 use rand_distr::{Distribution, Normal};
 
 use super::{OpticsError, Result, generator};
 
-/// `y = sum_k C_k x_k` \[H,W\] of masks and frames \[B,H,W\], both on \[0,1\].
-/// Errors: sizes that differ.
+/// The forward model `y = sum_k C_k x_k` \[H,W\] for masks C and frames x \[B,H,W\], both on \[0,1\].
+///
+/// Errors: [`OpticsError::Sizes`] if the sizes differ.
 pub fn measure(masks: ArrayView3<'_, f32>, frames: ArrayView3<'_, f32>) -> Result<Array2<f32>> {
     if masks.dim() != frames.dim() {
         let text = |(b, h, w): (usize, usize, usize)| format!("{b}x{h}x{w}");
@@ -19,9 +20,10 @@ pub fn measure(masks: ArrayView3<'_, f32>, frames: ArrayView3<'_, f32>) -> Resul
     Ok(y)
 }
 
-/// `y` with white noise of standard deviation `sigma` added, on the scale of `y` itself (the
-/// literature's level S on \[0,255\] is `S / 255`).
-/// Errors: a `sigma` that is no number of at least 0.
+/// Adds white Gaussian noise of standard deviation `sigma` to `y`, on the scale of `y`. A noise level S on \[0,255\] is
+/// `S / 255`.
+///
+/// Errors: [`OpticsError::Parameter`] unless `sigma` is finite and at least 0.
 pub fn noisy(y: Array2<f32>, sigma: f32, seed: u64) -> Result<Array2<f32>> {
     let refused = || OpticsError::Parameter {
         name: "noise sigma",
@@ -35,8 +37,7 @@ pub fn noisy(y: Array2<f32>, sigma: f32, seed: u64) -> Result<Array2<f32>> {
         return Ok(y);
     }
     let noise = Normal::new(0.0, sigma).map_err(|_| refused())?;
-    // Another stream than the masks', so that noise of another level leaves the masks alone and
-    // is not made of their numbers.
+    // A separate stream: the noise is independent of masks drawn from the same seed.
     let mut rng = generator(seed);
     rng.set_stream(1);
     Ok(y.mapv_into(|value| value + noise.sample(&mut rng)))
@@ -60,13 +61,13 @@ mod tests {
     }
 
     #[test]
-    fn noise_has_its_level_and_its_seed() {
+    fn noise_has_the_requested_level_and_is_reproducible() {
         let y = Array2::from_elem((200, 200), 3.0f32);
-        let seen = noisy(y.clone(), 0.02, 5).unwrap();
-        let deviation = seen.std(0.0);
+        let noisy_y = noisy(y.clone(), 0.02, 5).unwrap();
+        let deviation = noisy_y.std(0.0);
         assert!((deviation - 0.02).abs() < 0.0005, "{deviation}");
-        assert!((seen.mean().unwrap() - 3.0).abs() < 0.0005);
-        assert_eq!(seen, noisy(y.clone(), 0.02, 5).unwrap());
+        assert!((noisy_y.mean().unwrap() - 3.0).abs() < 0.0005);
+        assert_eq!(noisy_y, noisy(y.clone(), 0.02, 5).unwrap());
         assert_eq!(noisy(y.clone(), 0.0, 5).unwrap(), y);
         assert!(noisy(y, f32::NAN, 5).is_err());
     }

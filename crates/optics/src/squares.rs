@@ -1,17 +1,17 @@
-//! "Random squares": the masks of the hybrid coded aperture in the paper's simulation.
+//! "Random squares": the masks of the paper's simulated hybrid coded aperture.
 
 use ndarray::Array3;
 
 use super::{ApertureGrid, Draw, HybridAperture, Multiplexing, Result, check_size, generator};
 
-/// `frames` masks of `height` x `width` on \[0,1\], and the openings that made them: the paper's
-/// simulation.
+/// Masks \[frames, height, width\] on \[0,1\] as in the paper's simulation, and their multiplexing matrix.
 ///
-/// A random binary lithography mask (half of it open) is seen through the sub-apertures of
-/// [`ApertureGrid::for_frames`], half of them open in each frame: the mask of a frame is the sum
-/// of the shifted lithography masks of its open sub-apertures (Eq. 1 of the paper), divided by
-/// the largest value of all frames.
-/// Errors: a size of 0, or no multiplexing matrix of full rank within bounded tries.
+/// A random binary lithography mask, half open, is projected through the sub-apertures of [`ApertureGrid::for_frames`],
+/// half of them open in each frame. A mask is the sum of the lithography masks shifted by the open sub-apertures (Eq. 1
+/// of the paper). All masks are divided by their largest value.
+///
+/// Errors: [`OpticsError::Parameter`](super::OpticsError::Parameter) if a size is 0, and
+/// [`OpticsError::Rank`](super::OpticsError::Rank) if no draw has full rank.
 pub fn random_squares(
     frames: usize,
     height: usize,
@@ -33,9 +33,15 @@ mod tests {
     use super::random_squares;
     use ndarray::{Array2, Axis};
 
-    /// Mean, mean over the pixels of the deviation over the frames, mean and largest correlation
-    /// between two frames.
-    fn statistics(seed: u64) -> (f32, f32, f32, f32) {
+    struct Statistics {
+        mean: f32,
+        /// Standard deviation over the masks, averaged over all pixels.
+        deviation: f32,
+        mean_correlation: f32,
+        largest_correlation: f32,
+    }
+
+    fn statistics(seed: u64) -> Statistics {
         let (masks, openings) = random_squares(10, 128, 128, seed).unwrap();
         assert_eq!(openings.rank(), 10);
         let deviation = masks.std_axis(Axis(0), 0.0).mean().unwrap();
@@ -48,24 +54,28 @@ mod tests {
                 correlations.push((a * b).sum() / norm);
             }
         }
-        let mean = correlations.iter().sum::<f32>() / correlations.len() as f32;
-        let largest = correlations.iter().fold(0.0f32, |a, &b| a.max(b));
-        (masks.mean().unwrap(), deviation, mean, largest)
-    }
-
-    #[test]
-    fn statistics_are_those_of_the_paper() {
-        for seed in 0..8 {
-            let (mean, deviation, correlation, largest) = statistics(seed);
-            assert!((0.45..=0.55).contains(&mean), "seed {seed}: mean {mean}");
-            assert!((0.117..=0.143).contains(&deviation), "seed {seed}: deviation {deviation}");
-            assert!((0.45..=0.58).contains(&correlation), "seed {seed}: {correlation}");
-            assert!(largest <= 0.86, "seed {seed}: largest correlation {largest}");
+        Statistics {
+            mean: masks.mean().unwrap(),
+            deviation,
+            mean_correlation: correlations.iter().sum::<f32>() / correlations.len() as f32,
+            largest_correlation: correlations.iter().fold(0.0f32, |a, &b| a.max(b)),
         }
     }
 
     #[test]
-    fn masks_reach_one_and_repeat_with_their_seed() {
+    fn statistics_match_the_paper() {
+        for seed in 0..8 {
+            let Statistics { mean, deviation, mean_correlation, largest_correlation } =
+                statistics(seed);
+            assert!((0.45..=0.55).contains(&mean), "seed {seed}: mean {mean}");
+            assert!((0.117..=0.143).contains(&deviation), "seed {seed}: deviation {deviation}");
+            assert!((0.45..=0.58).contains(&mean_correlation), "seed {seed}: {mean_correlation}");
+            assert!(largest_correlation <= 0.86, "seed {seed}: {largest_correlation}");
+        }
+    }
+
+    #[test]
+    fn masks_are_normalised_and_reproducible() {
         let (masks, openings) = random_squares(8, 40, 30, 1).unwrap();
         assert_eq!(masks.fold(0.0f32, |a, &b| a.max(b)), 1.0);
         assert!(masks.iter().all(|&v| v >= 0.0));
@@ -75,8 +85,7 @@ mod tests {
 
     #[test]
     fn a_mask_is_the_sum_of_its_open_sub_apertures() {
-        // Two frames that differ in their openings differ by shifts of one lithography mask:
-        // the values are sixths.
+        // Six of twelve sub-apertures are open, so values are multiples of one sixth.
         let (masks, _) = random_squares(10, 64, 64, 4).unwrap();
         assert!(masks.iter().all(|v| (v * 6.0 - (v * 6.0).round()).abs() < 1e-5));
     }

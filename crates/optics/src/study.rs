@@ -1,58 +1,72 @@
-//! What can be told of masks by looking at them: the figures of a calibration report.
+//! Statistics of masks: the figures of a calibration report.
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 
 use super::{OpticsError, Result};
 
-/// Bins of the histogram on \[0,1\].
+/// Number of bins of the histogram over \[0,1\].
 const BINS: usize = 4096;
-/// A pixel whose masks are all above this does not follow the patterns.
-const STUCK_OPEN: f32 = 0.95;
+/// A pixel is stuck if it exceeds this value in every mask.
+const STUCK_PIXEL: f32 = 0.95;
 
-/// Looks at masks band by band, so that all of them need not be in memory at once.
+/// Accumulates the statistics of masks band by band, so that they need not fit in memory at once.
 #[derive(Debug)]
 pub struct MaskStudy {
     next_row: usize,
+    /// Inner products of the masks \[B,B\].
     products: Array2<f64>,
+    /// Sum of each mask \[B\].
     sums: Vec<f64>,
-    /// Of each mask, the sum over its rows of the squared sum of a row.
-    row_squares: Vec<f64>,
-    /// Sums \[B,W\] of the columns of each mask.
-    columns: Array2<f64>,
+    /// For each mask, the sum over its rows of the squared row sum \[B\].
+    squared_row_sums: Vec<f64>,
+    /// Column sums of each mask \[B,W\].
+    column_sums: Array2<f64>,
     mean: Array2<f32>,
     deviation: Array2<f32>,
     gram: Array2<f32>,
     histogram: Vec<u64>,
-    zeros: u64,
-    stuck_open: u64,
+    values_at_zero: u64,
+    stuck_pixels: u64,
 }
 
-/// Figures of a set of masks \[B,H,W\] on \[0,1\].
+/// Statistics of masks \[B,H,W\] on \[0,1\].
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskFigures {
-    /// Mean of each mask.
+    /// Mean of each mask \[B\].
     pub frame_means: Vec<f64>,
-    /// Correlation \[B,B\] of each mask with each other, over the pixels.
+    /// Correlation between the masks over all pixels \[B,B\].
     pub correlation: Array2<f64>,
-    /// The share of the masks' variance over the pixels that is between rows, and between columns: 1 where
-    /// all pixels of a row (of a column) are the same.
-    pub along: (f64, f64),
-    /// Mean over the frames of each pixel \[H,W\].
+    /// Share of the masks' variance that is between rows; 1 if all pixels of a row are equal.
+    pub variance_between_rows: f64,
+    /// Share of the masks' variance that is between columns; 1 if all pixels of a column are equal.
+    pub variance_between_columns: f64,
+    /// Mean of each pixel over the masks \[H,W\].
     pub mean: Array2<f32>,
-    /// Standard deviation over the frames of each pixel \[H,W\].
+    /// Standard deviation of each pixel over the masks \[H,W\].
     pub deviation: Array2<f32>,
-    /// Sum of squares over the frames of each pixel \[H,W\]: the gram diagonal.
+    /// Sum of squares of each pixel over the masks \[H,W\]: the Gram diagonal.
     pub gram: Array2<f32>,
-    /// Pixels that are dark in all masks, of which nothing can be known.
-    pub dead: u64,
-    /// Pixels that are open in all masks and so do not follow the patterns.
-    pub stuck_open: u64,
-    /// Values that are 0.
-    pub zeros: u64,
+    /// Number of pixels that are dark in every mask, and so can't be reconstructed.
+    pub dead_pixels: u64,
+    /// Number of pixels that are open in every mask, and so do not follow the patterns.
+    pub stuck_pixels: u64,
+    /// Number of values that are 0.
+    pub values_at_zero: u64,
     /// The largest value.
     pub largest: f32,
-    /// The values below which 1 % and 99 % of all values lie.
-    pub percentiles: (f32, f32),
+    /// The 1st percentile of all values.
+    pub percentile_1: f32,
+    /// The 99th percentile of all values.
+    pub percentile_99: f32,
+}
+
+/// Correlations between pairs of different masks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Correlations {
+    /// Mean over all pairs.
+    pub mean: f64,
+    /// Largest of all pairs.
+    pub largest: f64,
 }
 
 impl MaskFigures {
@@ -61,76 +75,77 @@ impl MaskFigures {
         self.frame_means.iter().sum::<f64>() / self.frame_means.len().max(1) as f64
     }
 
-    /// Mean over the pixels of the deviation over the frames.
+    /// Standard deviation over the masks, averaged over all pixels.
     pub fn mean_deviation(&self) -> f64 {
         self.deviation.iter().map(|&value| f64::from(value)).sum::<f64>()
             / self.deviation.len().max(1) as f64
     }
 
-    /// Mean and largest correlation between two masks; none for a single one.
-    pub fn correlations(&self) -> Option<(f64, f64)> {
+    /// Correlations between pairs of masks; `None` for a single mask.
+    pub fn correlations(&self) -> Option<Correlations> {
         let pairs = self.correlation.indexed_iter().filter(|((k, l), _)| k < l);
         let values: Vec<f64> = pairs.map(|(_, &value)| value).collect();
         let largest = values.iter().copied().reduce(f64::max)?;
-        Some((values.iter().sum::<f64>() / values.len() as f64, largest))
+        Some(Correlations { mean: values.iter().sum::<f64>() / values.len() as f64, largest })
     }
 }
 
 impl MaskStudy {
-    /// A study of `frames` masks of `height` x `width`.
+    /// An empty study of `frames` masks of `height` x `width` pixels.
     pub fn new(frames: usize, height: usize, width: usize) -> Self {
         let map = || Array2::zeros((height, width));
         Self {
             next_row: 0,
             products: Array2::zeros((frames, frames)),
             sums: vec![0.0; frames],
-            row_squares: vec![0.0; frames],
-            columns: Array2::zeros((frames, width)),
+            squared_row_sums: vec![0.0; frames],
+            column_sums: Array2::zeros((frames, width)),
             mean: map(),
             deviation: map(),
             gram: map(),
             histogram: vec![0; BINS],
-            zeros: 0,
-            stuck_open: 0,
+            values_at_zero: 0,
+            stuck_pixels: 0,
         }
     }
 
-    /// Looks at the next rows \[B,rows,W\] of all masks, on \[0,1\].
-    /// Errors: a band that is not the next one of such masks.
+    /// Adds the next rows of all masks \[B,rows,W\], on \[0,1\].
+    ///
+    /// Errors: [`OpticsError::Pattern`] if the band does not fit the masks.
     pub fn add(&mut self, band: ArrayView3<'_, f32>) -> Result<()> {
         let (frames, rows, width) = band.dim();
         let (height, expected) = self.mean.dim();
         if frames != self.sums.len() || width != expected || self.next_row + rows > height {
             return Err(OpticsError::Pattern(format!(
-                "a band of {frames}x{rows}x{width} does not fit masks of {}x{height}x{expected}, of \
-                 which {} rows are known",
+                "a band of {frames}x{rows}x{width} does not fit masks of {}x{height}x{expected} after \
+                 {} rows",
                 self.sums.len(),
                 self.next_row
             )));
         }
         for row in 0..rows {
             let line = band.slice(s![.., row, ..]);
-            // Sums of one row in f32, of all rows in f64.
+            // Within a row sums are f32, across rows f64.
             self.products += &line.dot(&line.t()).mapv(f64::from);
             for (frame, mask) in line.outer_iter().enumerate() {
                 let sum = f64::from(mask.sum());
                 self.sums[frame] += sum;
-                self.row_squares[frame] += sum * sum;
+                self.squared_row_sums[frame] += sum * sum;
             }
-            ndarray::azip!((sum in &mut self.columns, &value in &line) *sum += f64::from(value));
+            ndarray::azip!((sum in &mut self.column_sums, &value in &line) *sum += f64::from(value));
             for &value in line {
-                self.zeros += u64::from(value <= 0.0);
+                self.values_at_zero += u64::from(value <= 0.0);
                 self.histogram[bin(value)] += 1;
             }
             for column in 0..width {
-                self.pixel((self.next_row + row, column), line.column(column));
+                self.add_pixel((self.next_row + row, column), line.column(column));
             }
         }
         self.next_row += rows;
         Ok(())
     }
 
-    fn pixel(&mut self, at: (usize, usize), values: ndarray::ArrayView1<'_, f32>) {
+    fn add_pixel(&mut self, at: (usize, usize), values: ndarray::ArrayView1<'_, f32>) {
         let count = values.len() as f32;
         let mean = values.sum() / count;
         let gram: f32 = values.iter().map(|value| value * value).sum();
@@ -138,16 +153,17 @@ impl MaskStudy {
         self.mean[at] = mean;
         self.gram[at] = gram;
         self.deviation[at] = (scatter / count).sqrt();
-        self.stuck_open += u64::from(values.iter().all(|value| *value > STUCK_OPEN));
+        self.stuck_pixels += u64::from(values.iter().all(|value| *value > STUCK_PIXEL));
     }
 
-    /// The figures.
-    /// Errors: rows that are missing.
+    /// Returns the statistics.
+    ///
+    /// Errors: [`OpticsError::Pattern`] if rows are missing.
     pub fn finish(self) -> Result<MaskFigures> {
         let (height, width) = self.mean.dim();
         if self.next_row != height {
             return Err(OpticsError::Pattern(format!(
-                "{} rows of {height} are known",
+                "the masks are incomplete: {} of {height} rows were added",
                 self.next_row
             )));
         }
@@ -159,25 +175,27 @@ impl MaskStudy {
             let norm = (covariance(k, k) * covariance(l, l)).sqrt();
             if norm > 0.0 { (covariance(k, l) / norm).clamp(-1.0, 1.0) } else { 0.0 }
         });
-        // Between rows: of the rows' means; each stands for a row of pixels.
-        let squared = |sum: f64| sum * sum / (pixels * pixels);
-        let (mut whole, mut rows, mut columns) = (0.0, 0.0, 0.0);
+        let squared_mean = |sum: f64| sum * sum / (pixels * pixels);
+        let (mut total, mut rows, mut columns) = (0.0, 0.0, 0.0);
         for (k, &sum) in self.sums.iter().enumerate() {
-            let lines = self.columns.row(k).iter().map(|sum| sum * sum).sum::<f64>();
-            whole += covariance(k, k);
-            rows += self.row_squares[k] / (width * width * height) as f64 - squared(sum);
-            columns += lines / (height * height * width) as f64 - squared(sum);
+            let squared_column_sums =
+                self.column_sums.row(k).iter().map(|sum| sum * sum).sum::<f64>();
+            total += covariance(k, k);
+            rows += self.squared_row_sums[k] / (width * width * height) as f64 - squared_mean(sum);
+            columns += squared_column_sums / (height * height * width) as f64 - squared_mean(sum);
         }
-        let share = |part: f64| if whole > 0.0 { (part / whole).clamp(0.0, 1.0) } else { 0.0 };
+        let share = |part: f64| if total > 0.0 { (part / total).clamp(0.0, 1.0) } else { 0.0 };
         Ok(MaskFigures {
-            along: (share(rows), share(columns)),
+            variance_between_rows: share(rows),
+            variance_between_columns: share(columns),
             frame_means: self.sums.iter().map(|sum| sum / pixels).collect(),
             correlation,
-            dead: self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64,
-            stuck_open: self.stuck_open,
-            zeros: self.zeros,
+            dead_pixels: self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64,
+            stuck_pixels: self.stuck_pixels,
+            values_at_zero: self.values_at_zero,
             largest: percentile(&self.histogram, 1.0),
-            percentiles: (percentile(&self.histogram, 0.01), percentile(&self.histogram, 0.99)),
+            percentile_1: percentile(&self.histogram, 0.01),
+            percentile_99: percentile(&self.histogram, 0.99),
             mean: self.mean,
             deviation: self.deviation,
             gram: self.gram,
@@ -192,17 +210,17 @@ fn bin(value: f32) -> usize {
 
 fn percentile(histogram: &[u64], share: f64) -> f32 {
     let total: u64 = histogram.iter().sum();
-    let wanted = share * total as f64;
-    let mut below = 0;
-    let found = histogram.iter().position(|count| {
-        below += count;
-        below as f64 >= wanted
+    let rank = share * total as f64;
+    let mut cumulative = 0;
+    let bin = histogram.iter().position(|count| {
+        cumulative += count;
+        cumulative as f64 >= rank
     });
-    found.unwrap_or(0) as f32 / (BINS - 1) as f32
+    bin.unwrap_or(0) as f32 / (BINS - 1) as f32
 }
 
-/// How even an illumination \[H,W\] is: its darkest over its brightest 16th of the rows and
-/// columns, as block means; pixels at 0 are left out. None without light.
+/// Uniformity of an illumination \[H,W\]: the smallest over the largest block mean, where the image is divided into
+/// 16x16 blocks. Pixels at 0 are ignored. `None` if all pixels are 0.
 pub fn flatness(illumination: &ndarray::ArrayView2<'_, f32>) -> Option<f64> {
     let (height, width) = illumination.dim();
     let side = |length: usize| length.div_ceil(16).max(1);
@@ -229,7 +247,7 @@ mod tests {
     use crate::random_squares;
 
     #[test]
-    fn figures_are_those_of_the_whole_arrays() {
+    fn statistics_of_bands_equal_those_of_the_whole_masks() {
         let (mut masks, _) = random_squares(6, 40, 30, 2).unwrap();
         masks.slice_mut(s![.., 3, 4]).fill(0.0);
         masks.slice_mut(s![.., 5, 6]).fill(1.0);
@@ -238,13 +256,14 @@ mod tests {
             study.add(band).unwrap();
         }
         let figures = study.finish().unwrap();
-        let all = |wrong: fn(f32) -> bool| {
+        let pixels_where_all = |condition: fn(f32) -> bool| {
             let pixels = masks.lanes(Axis(0)).into_iter();
-            pixels.filter(|pixel| pixel.iter().all(|&value| wrong(value))).count() as u64
+            pixels.filter(|pixel| pixel.iter().all(|&value| condition(value))).count() as u64
         };
-        assert_eq!((figures.dead, figures.stuck_open), (all(|v| v == 0.0), all(|v| v > 0.95)));
-        assert!(figures.dead > 0 && figures.stuck_open > 0);
-        assert_eq!(figures.zeros, masks.iter().filter(|v| **v == 0.0).count() as u64);
+        assert_eq!(figures.dead_pixels, pixels_where_all(|value| value == 0.0));
+        assert_eq!(figures.stuck_pixels, pixels_where_all(|value| value > 0.95));
+        assert!(figures.dead_pixels > 0 && figures.stuck_pixels > 0);
+        assert_eq!(figures.values_at_zero, masks.iter().filter(|v| **v == 0.0).count() as u64);
         assert!((figures.overall_mean() - f64::from(masks.mean().unwrap())).abs() < 1e-5);
         let deviation = masks.std_axis(Axis(0), 0.0);
         assert!((&figures.deviation - &deviation).iter().all(|v| v.abs() < 1e-5));
@@ -254,7 +273,7 @@ mod tests {
         let (a, b) = (&a - a.mean().unwrap(), &b - b.mean().unwrap());
         let expected = (&a * &b).sum() / ((&a * &a).sum() * (&b * &b).sum()).sqrt();
         assert!((figures.correlation[[1, 4]] - f64::from(expected)).abs() < 1e-4);
-        assert!(figures.percentiles.0 < 0.2 && figures.percentiles.1 > 0.8);
+        assert!(figures.percentile_1 < 0.2 && figures.percentile_99 > 0.8);
     }
 
     #[test]
@@ -267,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn an_even_light_is_flat() {
+    fn flatness_is_the_ratio_of_extreme_block_means() {
         assert_eq!(flatness(&Array2::from_elem((64, 48), 3.0).view()), Some(1.0));
         let half = Array2::from_shape_fn((64, 64), |(_, j)| if j < 32 { 1.0 } else { 2.0 });
         assert_eq!(flatness(&half.view()), Some(0.5));
@@ -275,23 +294,24 @@ mod tests {
     }
 
     #[test]
-    fn variance_along_one_axis_is_told() {
+    fn variance_is_split_between_rows_and_columns() {
         let noise = |i: usize| (i * 7919 % 101) as f32 / 100.0;
-        let along = |height: usize, width: usize, value: &dyn Fn(usize, usize) -> f32| {
+        let shares = |height: usize, width: usize, value: &dyn Fn(usize, usize) -> f32| {
             let masks =
                 Array3::from_shape_fn((3, height, width), |(k, i, j)| value(i + 13 * k, j + 5 * k));
             let mut study = MaskStudy::new(3, height, width);
             study.add(masks.slice(s![.., ..height / 2, ..])).unwrap();
             study.add(masks.slice(s![.., height / 2.., ..])).unwrap();
-            study.finish().unwrap().along
+            let figures = study.finish().unwrap();
+            (figures.variance_between_rows, figures.variance_between_columns)
         };
-        let (rows, columns) = along(40, 30, &|i, _| noise(i));
+        let (rows, columns) = shares(40, 30, &|i, _| noise(i));
         assert!(rows > 0.999 && columns < 1e-6, "{rows} {columns}");
-        let (rows, columns) = along(40, 30, &|_, j| noise(j));
+        let (rows, columns) = shares(40, 30, &|_, j| noise(j));
         assert!(rows < 1e-6 && columns > 0.999, "{rows} {columns}");
-        let (rows, columns) = along(40, 30, &|i, j| noise(31 * i + 17 * j * j));
+        let (rows, columns) = shares(40, 30, &|i, j| noise(31 * i + 17 * j * j));
         assert!(rows < 0.3 && columns < 0.3, "{rows} {columns}");
-        assert!(along(1, 900, &|_, j| noise(j)).1 > 0.999);
-        assert_eq!(along(8, 8, &|_, _| 1.0), (0.0, 0.0));
+        assert!(shares(1, 900, &|_, j| noise(j)).1 > 0.999);
+        assert_eq!(shares(8, 8, &|_, _| 1.0), (0.0, 0.0));
     }
 }

@@ -328,7 +328,7 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
             measurement_sha256: measurement.data,
             measurement_axes: measurement.axes.clone(),
         },
-        models: ModelRecord::of_job(spec),
+        models: ModelRecord::for_job(spec),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,

@@ -46,7 +46,7 @@ pub(super) fn perform(
     let (record, output) = match input {
         TaskInput::Prepare { arrays, snapshots } => {
             arrays.verify()?;
-            let white = scale::white_of_job(&arrays, snapshots, monitor)?;
+            let white = scale::job_white_level(&arrays, snapshots, monitor)?;
             monitor.reach(TaskStage::Reading, 1.0);
             (json(&PreparedRecord { white })?, Output::Record)
         }
@@ -103,7 +103,7 @@ pub(super) fn perform(
         TaskInput::Manifest { job, spec, recipe, tasks, folder } => {
             let snapshots = tasks.snapshots.iter();
             let of_all =
-                Assessment::of_all(snapshots.map(|(_, record)| record.assessment.as_ref()));
+                Assessment::combined(snapshots.map(|(_, record)| record.assessment.as_ref()));
             let file = write_manifest(folder.path(), &recipe.job(job, &spec, tasks))?;
             monitor.reach(TaskStage::Writing, 1.0);
             (json(&of_all)?, Output::Files(folder, vec![file]))

@@ -188,7 +188,7 @@ impl Bench<'_> {
             };
             let solved = solve_on_all_cores(&input, &self.network)?;
             let frame = |k| solved.frame(&input, 0, k);
-            let value = Quality::of_frames(frame, clip.frames.view(), Channels::Grey)?.psnr;
+            let value = Quality::compare(frame, clip.frames.view(), Channels::Grey)?.psnr;
             eprintln!("{}, {name}, sigma {sigma}: {value:.2} dB", clip.name);
             by_sigma.push(value);
         }

@@ -10,7 +10,7 @@ use super::super::download::Download;
 use super::super::error::{ApiError, Code, Result};
 use super::super::results::{file_name, media_type};
 use super::clip::Clip;
-use engine::job::LEAST_MOVIE_SIDE;
+use engine::job::MIN_MOVIE_SIDE;
 use store::{Movie, StoreError};
 
 const NAME: &str = "movie.mp4";
@@ -33,7 +33,7 @@ pub(in crate::http) async fn movie(
 ) -> Result<Response> {
     if !clip.job.spec.has_movie() {
         let detail = format!(
-            "there is no movie of frames of {}x{}: it would have a side below {LEAST_MOVIE_SIDE} pixels",
+            "there is no movie of frames of {}x{}: it would have a side below {MIN_MOVIE_SIDE} pixels",
             clip.job.spec.shape.height, clip.job.spec.shape.width
         );
         return Err(ApiError::new(Code::NotFound, detail));

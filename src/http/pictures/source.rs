@@ -72,7 +72,7 @@ impl Stack {
                 let seen = self.stored(frames, down, across)?;
                 let mut shown = Array3::zeros((seen.dim().0, rows.len(), 3 * columns.len()));
                 for (seen, mut shown) in seen.outer_iter().zip(shown.outer_iter_mut()) {
-                    shown.assign(&mosaic.colours(seen, first).slice(inside));
+                    shown.assign(&mosaic.demosaick(seen, first).slice(inside));
                 }
                 Ok(shown)
             }
@@ -88,7 +88,7 @@ impl Stack {
         let colours = self.window(frames, rows.clone(), columns.clone())?;
         let mut seen = Array3::zeros((colours.dim().0, rows.len(), columns.len()));
         for (colours, mut seen) in colours.outer_iter().zip(seen.outer_iter_mut()) {
-            seen.assign(&mosaic.seen(colours, first));
+            seen.assign(&mosaic.sample(colours, first));
         }
         Ok(seen)
     }
@@ -396,7 +396,7 @@ mod tests {
             Array3::from_shape_fn((2, 16, 20), |(k, i, j)| ((k * 320 + i * 20 + j) as f32).sin());
         let mut colours = Array3::zeros((2, 16, 60));
         for (seen, mut colours) in seen.outer_iter().zip(colours.outer_iter_mut()) {
-            colours.assign(&mosaic.colours(seen, (0, 0)));
+            colours.assign(&mosaic.demosaick(seen, (0, 0)));
         }
         let array = folder.path().join("frames.npy");
         npy::write_colours(&array, colours.view()).unwrap();

@@ -1,7 +1,6 @@
-//! Masks from raw captures, and what is to be told of masks.
+//! Computes masks from raw captures, and reports on masks.
 //!
-//! Captures are read one frame at a time and added to running sums, so that memory holds a few planes
-//! however many repeats there are.
+//! Captures are read one frame at a time and added to running sums, so memory does not grow with the number of repeats.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -12,7 +11,7 @@ use ndarray::{Array2, Array3, Axis, s};
 
 use super::IntakeError;
 use crate::intake::error::Result;
-use crate::job::{CalibrationReport, Captures, Finding, MOST_SECONDS, planned_seconds};
+use crate::job::{CalibrationReport, Captures, Finding, MAX_CALIBRATION_SECONDS, planned_seconds};
 use formats::planar::{self, Reader};
 use formats::{
     self, Channels, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo,
@@ -23,42 +22,44 @@ use optics::{
     Repeats, check_patterns, judge_captures, judge_masks,
 };
 
-/// Bytes of the masks that are looked at in one go.
+/// Bytes of masks that are analysed at a time.
 const BAND_BYTES: usize = 64 << 20;
-/// Longest side of a picture of a report, in pixels.
-const PICTURE: usize = 640;
-/// The share of the work that averaging is; writing the masks and looking at them are a tenth each.
-const AVERAGING: f64 = 0.8;
+/// Longest side of the pictures of a report, in pixels.
+const PICTURE_SIDE: usize = 640;
+/// Share of averaging in the work. Writing and analysing the masks take a tenth each.
+const AVERAGING_SHARE: f64 = 0.8;
 
+/// The captures of a calibration as paths.
 pub type CaptureFiles = Captures<PathBuf>;
 
-/// Hears how much of the work is done, on \[0,1\]; false asks to stop.
+/// Receives the finished share of the work on \[0,1\]. Returning false stops the work.
 pub type Progress<'a> = dyn FnMut(f64) -> bool + 'a;
 
-/// What is known of masks that were made of captures.
+/// The result of a calibration from captures.
 #[derive(Debug)]
 pub struct Calibrated {
     pub report: Report,
-    /// How the captures are stored.
+    /// Data type of the captures.
     pub sample: SampleType,
-    /// Values below 0 that were set to 0.
+    /// Number of mask values below 0 that were set to 0.
     pub clipped_negatives: u64,
 }
 
+/// A report with its pictures.
 #[derive(Debug)]
 pub struct Report {
-    /// What is known of the masks.
+    /// The report on the masks.
     pub report: CalibrationReport,
-    /// Pictures by name, as PNG.
+    /// Name and PNG content of each map.
     pub maps: Vec<(String, Vec<u8>)>,
 }
 
-/// Makes masks \[B,H,W\] on \[0,1\] of captures, and a report on them.
+/// Computes masks \[B,H,W\] on \[0,1\] from captures, and reports on them.
 ///
-/// Their scale is known only after the last of them: until then they lie in `scratch`, a file that is
-/// there. Then `open` is asked for the writer of such a stack, and each mask is written. Returns what is
-/// known of the masks, and what the writer wrote to.
-/// Errors: captures or patterns that can't be read or used; I/O; a stop; those of `open`.
+/// The masks' scale is known only after the last one, so they are first written to `scratch`, an existing file. Then
+/// the normalised masks go to the writer that `open` returns. Returns the report and the output of the writer.
+///
+/// Errors: unreadable or unusable captures or patterns; I/O; [`IntakeError::Stopped`]; those of `open`.
 pub fn calibrate<W: Write>(
     files: &CaptureFiles,
     limits: &Limits,
@@ -66,37 +67,40 @@ pub fn calibrate<W: Write>(
     open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, FormatError>,
     progress: &mut Progress<'_>,
 ) -> Result<(Calibrated, W)> {
-    // Checked before hours of averaging.
+    // Patterns are checked before the averaging, which may take an hour.
     let patterns = read_patterns(files, limits)?;
     let captured = average_masks(files, limits, scratch, progress)?;
     let raw = Reader::open(scratch, limits)?;
     let masks = write_scaled(&raw, captured.scale, open(raw.info())?, progress)?;
     let figures = study(&raw, captured.scale, progress)?;
-    let report = tell(&figures, Some(&captured), patterns.as_ref())?;
+    let report = report_on(&figures, Some(&captured), patterns.as_ref())?;
     let Captured { sample, clipped_negatives, .. } = captured;
     Ok((Calibrated { report, sample, clipped_negatives }, masks))
 }
 
-/// The report on masks \[B,H,W\] on \[0,1\] that were sent as such.
-/// Errors: masks that can't be read; a stop.
+/// Reports on uploaded masks \[B,H,W\] on \[0,1\].
+///
+/// Errors: unreadable masks; [`IntakeError::Stopped`].
 pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
-    tell(&study(masks, 1.0, progress)?, None, None)
+    report_on(&study(masks, 1.0, progress)?, None, None)
 }
 
-/// What a calibration of captures will take.
+/// The planned cost of a calibration from captures.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plan {
     /// Rows and columns of the captures.
     pub size: (usize, usize),
-    /// Of the masks that are made.
+    /// Size of the masks in bytes.
     pub bytes: u64,
-    /// Of processor time.
+    /// CPU time in seconds.
     pub seconds: f64,
 }
 
-/// Looks at the headers of captures: they must be stacks of one size, and not more than can be averaged in
-/// [`MOST_SECONDS`].
-/// Errors: files that can't be read, or differ in size, by their place in a request; too many of them.
+/// Plans a calibration from the headers of its captures. All must have one size, and averaging them must not take
+/// longer than [`MAX_CALIBRATION_SECONDS`].
+///
+/// Errors: [`IntakeError::Format`] for unreadable files; [`IntakeError::Size`] for files that differ in size, or too
+/// many captures. Places are JSON pointers into the request.
 pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
     let (mut first, mut captured) = (None, 0);
     for (place, paths) in files.lists() {
@@ -107,7 +111,8 @@ pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
             let (height, width) = *first.get_or_insert((info.height, info.width));
             if (info.height, info.width) != (height, width) {
                 let detail = format!(
-                    "this capture is {}x{} (rows x columns), but those before it are {height}x{width}",
+                    "this capture is {}x{} (rows x columns), but the earlier ones are {height}x{width}: all captures \
+                     must have the same size",
                     info.height, info.width
                 );
                 return Err(IntakeError::Size { place, detail });
@@ -118,29 +123,28 @@ pub fn plan(files: &CaptureFiles, limits: &Limits) -> Result<Plan> {
     let (height, width) = first.unwrap_or_default();
     let (masks, pixels) = (files.masks.len(), height * width);
     let seconds = planned_seconds(captured * pixels as u64, masks, pixels);
-    if seconds > MOST_SECONDS {
+    if seconds > MAX_CALIBRATION_SECONDS {
         let detail = format!(
-            "{captured} captures of {height}x{width} pixels would take {seconds:.0} s of a core, and may take \
-             {MOST_SECONDS}: take fewer repeats of each"
+            "{captured} captures of {height}x{width} pixels would take {seconds:.0} s of CPU time; the limit is \
+             {MAX_CALIBRATION_SECONDS} s: use fewer repeats"
         );
         return Err(IntakeError::Size { place: "/captures".into(), detail });
     }
     Ok(Plan { size: (height, width), bytes: (masks * pixels * size_of::<f32>()) as u64, seconds })
 }
 
-/// What the captures of masks have told.
+/// The results of averaging the captures.
 struct Captured {
-    /// The masks' scale: the share of the white's light where a mask is 1.
+    /// Largest value of all masks before normalisation: the share of the white's light where a mask is 1.
     scale: f32,
     figures: CaptureFigures,
-    /// `white - black`.
+    /// `white - black` \[H,W\].
     illumination: Array2<f32>,
     sample: SampleType,
     clipped_negatives: u64,
 }
 
-/// Averages captures frame by frame and writes the masks \[B,H,W\], not yet divided by their largest
-/// value, to `raw`.
+/// Averages captures frame by frame, and writes the masks \[B,H,W\] before normalisation to `raw`.
 fn average_masks(
     files: &CaptureFiles,
     limits: &Limits,
@@ -150,10 +154,10 @@ fn average_masks(
     let total = files.masks.len() + 3;
     let mut done = 0;
     let mut average = |name: &str, paths: &[PathBuf]| {
-        let whole = |share: f64| (f64::from(done) + share) / total as f64 * AVERAGING;
+        let whole = |share: f64| (f64::from(done) + share) / total as f64 * AVERAGING_SHARE;
         let place = |index| format!("captures of {name}, file {}", index + 1);
-        let mut heard = |share| progress(whole(share));
-        let averaged = average(paths, files.saturation, limits, place, &mut heard);
+        let mut report = |share| progress(whole(share));
+        let averaged = average(paths, files.saturation, limits, place, &mut report);
         done += 1;
         averaged
     };
@@ -182,14 +186,18 @@ fn average_masks(
     }
     writer.finish()?;
     if scale <= 0.0 {
-        return Err(IntakeError::content("patterns", &"no pattern is brighter than the dark"));
+        return Err(IntakeError::content(
+            "patterns",
+            &"no pattern is brighter than the dark frames: check that the light was on and that the LCoS showed the \
+              patterns",
+        ));
     }
     let figures = CaptureFigures::new(&calibrator, patterns);
     let illumination = calibrator.illumination().to_owned();
     Ok(Captured { scale, figures, illumination, sample, clipped_negatives: clipped })
 }
 
-/// The average of all frames of some files; `place` is what errors call each.
+/// Averages all frames of some files. `place` names a file in errors, by its index.
 pub(super) fn average(
     paths: &[PathBuf],
     saturation: Option<u32>,
@@ -203,39 +211,41 @@ pub(super) fn average(
         let mut reader = formats::open_stack(path, limits).map_err(failed)?;
         let info = *reader.info();
         sample = info.sample;
-        let full = full_number(sample, saturation);
-        let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, full));
+        let level = saturation_level(sample, saturation);
+        let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, level));
         let mut frame = 0;
         while let Some(capture) = reader.next_frame().map_err(failed)? {
             let added = repeats.add(capture.view());
             added.map_err(|error| IntakeError::content(place(index), &error))?;
             frame += 1;
             let share = frame as f64 / info.frames as f64;
-            go_on(progress, (index as f64 + share) / paths.len() as f64)?;
+            report_progress(progress, (index as f64 + share) / paths.len() as f64)?;
         }
     }
     let average = repeats.unwrap_or_else(|| Repeats::new(0, 0, None)).average();
     Ok((average.map_err(|error| IntakeError::content(place(0), &error))?, sample))
 }
 
-/// The stored number from which on a pixel is full: the one stated, or the largest of the type.
-/// Floats have none: there it must be stated.
-#[allow(clippy::cast_precision_loss)] // cameras' numbers are small
-pub(super) fn full_number(sample: SampleType, stated: Option<u32>) -> Option<f32> {
+/// Stored value from which a pixel is saturated: the stated one, or the largest of the data type. Floats have no such
+/// default.
+#[allow(clippy::cast_precision_loss)] // camera values are small
+pub(super) fn saturation_level(sample: SampleType, stated: Option<u32>) -> Option<f32> {
     let largest = sample.default_full_scale().filter(|largest| *largest != FullScale::ONE);
     let largest = largest.map(FullScale::value);
     stated.map(|value| value as f32).or(largest)
 }
 
-fn go_on(progress: &mut Progress<'_>, share: f64) -> Result<()> {
+/// Reports the finished share of the work. Errors: [`IntakeError::Stopped`].
+fn report_progress(progress: &mut Progress<'_>, share: f64) -> Result<()> {
     if progress(share) { Ok(()) } else { Err(IntakeError::Stopped) }
 }
 
-/// Divides masks by their scale, so that the largest value is 1.
-fn divide(masks: &mut Array3<f32>, scale: f32) {
+/// Divides masks by their largest value.
+fn normalise(masks: &mut Array3<f32>, scale: f32) {
     masks.mapv_inplace(|value| (value / scale).min(1.0));
 }
 
+/// Writes the normalised masks.
 fn write_scaled<W: Write>(
     raw: &Reader,
     scale: f32,
@@ -245,16 +255,16 @@ fn write_scaled<W: Write>(
     let StackInfo { frames, height, width, .. } = *raw.info();
     for frame in 0..frames {
         let mut mask = raw.read_window(frame..frame + 1, 0..height, 0..width)?;
-        divide(&mut mask, scale);
+        normalise(&mut mask, scale);
         to.write_frame(mask.index_axis(Axis(0), 0))?;
-        go_on(progress, AVERAGING + 0.1 * (frame + 1) as f64 / frames as f64)?;
+        report_progress(progress, AVERAGING_SHARE + 0.1 * (frame + 1) as f64 / frames as f64)?;
     }
     Ok(to.finish()?)
 }
 
-/// The report on masks. `captured` is known if they were made of captures, `patterns` if somebody told
-/// the patterns that were meant.
-fn tell(
+/// Checks masks and reports on them. `captured` is given for masks from captures, `patterns` if the intended patterns
+/// are known.
+fn report_on(
     figures: &MaskFigures,
     captured: Option<&Captured>,
     patterns: Option<&Array3<f32>>,
@@ -275,7 +285,7 @@ fn tell(
     Ok(Report { report: CalibrationReport::new(figures, captures, findings, names), maps })
 }
 
-/// Looks at masks, once they are divided by `scale`, band by band.
+/// Computes the statistics of masks, normalised by `scale`, band by band.
 fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<MaskFigures> {
     let StackInfo { frames, height, width, .. } = *masks.info();
     let refused = |error| IntakeError::content("masks", &error);
@@ -285,14 +295,14 @@ fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<Mask
         let rows: Range<usize> = start..(start + rows).min(height);
         let end = rows.end;
         let mut band = masks.read_window(0..frames, rows, 0..width)?;
-        divide(&mut band, scale);
+        normalise(&mut band, scale);
         study.add(band.view()).map_err(refused)?;
-        go_on(progress, 0.9 + 0.1 * end as f64 / height as f64)?;
+        report_progress(progress, 0.9 + 0.1 * end as f64 / height as f64)?;
     }
     study.finish().map_err(refused)
 }
 
-/// The patterns that were shown \[B,h,w\], on \[0,1\], if there is a file of them.
+/// Reads the intended patterns \[B,h,w\] on \[0,1\], if there is a file of them.
 fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<f32>>> {
     let Some(path) = &files.patterns else { return Ok(None) };
     let (info, patterns) = read_stack(path, limits).map_err(IntakeError::format("patterns"))?;
@@ -302,10 +312,11 @@ fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<
     Ok(Some(patterns))
 }
 
-/// A picture of a map, small enough to look at: block means, black at 0, white at the largest.
+/// Encodes a map \[H,W\] as a PNG of at most [`PICTURE_SIDE`] pixels: block means, from black at 0 to white at the
+/// largest.
 fn picture(map: &Array2<f32>) -> Result<Vec<u8>, FormatError> {
     let (height, width) = map.dim();
-    let side = height.max(width).div_ceil(PICTURE).max(1);
+    let side = height.max(width).div_ceil(PICTURE_SIDE).max(1);
     let small = Array2::from_shape_fn((height.div_ceil(side), width.div_ceil(side)), |(i, j)| {
         let rows = i * side..((i + 1) * side).min(height);
         let columns = j * side..((j + 1) * side).min(width);
@@ -320,11 +331,11 @@ mod tests {
     use std::io::Write;
 
     use super::{CaptureFiles, plan};
-    use crate::job::MOST_SECONDS;
+    use crate::job::MAX_CALIBRATION_SECONDS;
     use formats::Limits;
 
     #[test]
-    fn what_takes_too_long_is_refused_before_it_begins() {
+    fn calibrations_beyond_the_time_limit_are_refused_when_planned() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("repeats.npy");
         let mut header = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
@@ -333,7 +344,7 @@ mod tests {
         header.push(b'\n');
         let mut file = std::fs::File::create(&path).unwrap();
         file.write_all(&header).unwrap();
-        // A hole: nothing of it is read.
+        // A sparse file suffices, because only the header is read.
         file.set_len(128 + 20 * 3000 * 3000).unwrap();
         let files = |masks: usize, repeats: usize| CaptureFiles {
             masks: vec![vec![path.clone(); repeats]; masks],
@@ -348,6 +359,9 @@ mod tests {
         assert!((20.0..60.0).contains(&planned.seconds), "{planned:?}");
         let refused = plan(&files(64, 60), &Limits::default()).unwrap_err().to_string();
         assert!(refused.contains("76840 captures"), "{refused}");
-        assert!(refused.contains(&format!("may take {MOST_SECONDS}")), "{refused}");
+        assert!(
+            refused.contains(&format!("the limit is {MAX_CALIBRATION_SECONDS} s")),
+            "{refused}"
+        );
     }
 }

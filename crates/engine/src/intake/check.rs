@@ -1,5 +1,7 @@
-//! Checks of masks and measurements as they pass: brought onto their scale frame by frame, a measurement
-//! less its dark, and samples of it held against the masks of its calibration.
+//! Checks masks and measurements while they are read.
+//!
+//! Frames are scaled one at a time, and dark frames are subtracted from a measurement. Afterwards windows of some
+//! snapshots are checked against the masks of the calibration.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -7,42 +9,45 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, ArrayView2};
 
 use super::IntakeError;
-use super::captures::{average, full_number};
+use super::captures::{average, saturation_level};
 use super::open::Opened;
 use crate::intake::error::Result;
-use crate::job::{Finding, MOST_MASKS, Mosaic};
+use crate::job::{Finding, FindingCode, MAX_MASKS, Mosaic};
 use formats::planar::Reader;
 use formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use formats::{self, FormatError, FrameReader, Limits, SampleType, StackInfo};
-use optics::{Digits, MeasurementStudy, REACH, judge_measurement};
+use optics::{BitUsage, MeasurementStudy, REACH, judge_measurement};
 
-/// Side of a window that is looked at, without its margin.
+/// Side of a checked window without its margin, in pixels.
 const WINDOW: usize = 64;
-/// Windows along each side of a picture.
+/// Number of checked windows along each side of a picture.
 const WINDOWS: usize = 4;
-/// Snapshots of a sequence that are looked at.
+/// Number of checked snapshots of a measurement.
 const SNAPSHOTS: usize = 8;
 
-/// How a measurement was taken.
+/// How a measurement was recorded.
 #[derive(Debug, Default)]
 pub struct Exposure {
-    /// Captures of the dark, to be averaged and subtracted.
+    /// Dark frames, which are averaged and subtracted.
     pub dark: Vec<PathBuf>,
-    /// The stored number from which on a pixel is full; none for the largest of its type.
+    /// Stored value from which a pixel is saturated; `None` for the largest of the data type.
     pub saturation: Option<u32>,
 }
 
-/// What was seen of a measurement as it passed.
+/// The results of reading a measurement.
 #[derive(Debug)]
 pub struct Passed {
-    /// The share of full pixels of each snapshot; none if nobody knows when they are.
+    /// Share of saturated pixels of each snapshot; `None` if the saturation level is unknown.
     pub saturated: Option<Vec<f64>>,
+    /// Findings on the bit depth.
     pub findings: Vec<Finding>,
 }
 
-/// Hands each mask on \[0,1\] to `sink`.
-/// Errors: whatever is wrong with the file; a shape that masks don't have; values outside the scale; masks
-/// without an open pixel; those of `sink`. What it received must be thrown away then.
+/// Reads masks and passes each one \[H,W\] on \[0,1\] to `sink`.
+///
+/// Errors: [`IntakeError::Size`] for more than [`MAX_MASKS`] masks; [`IntakeError::Format`] for unreadable files,
+/// values outside the scale and masks without an open pixel, and for errors of `sink`. After an error the output of
+/// `sink` is invalid.
 pub fn masks(
     mut opened: Opened,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
@@ -52,23 +57,25 @@ pub fn masks(
         .map_err(IntakeError::format(opened.name))
 }
 
-/// Refuses what has more frames than one exposure can tell apart.
+/// Checks the number of masks.
 fn check_count(opened: &Opened) -> Result<()> {
     let StackInfo { frames, height, width, axes, .. } = opened.info;
-    if frames <= MOST_MASKS {
+    if frames <= MAX_MASKS {
         return Ok(());
     }
-    let read = axes.map(|axes| format!(", read as {axes}")).unwrap_or_default();
+    let order = axes.map(|axes| format!(", read as {axes}")).unwrap_or_default();
     let detail = format!(
-        "{frames} masks of {height}x{width} (rows x columns{read}); a calibration has at most {MOST_MASKS}: \
-         send one mask for each frame of an exposure, or state axes"
+        "the file has {frames} masks of {height}x{width} (rows x columns{order}); a calibration has at most \
+         {MAX_MASKS}: send one mask per frame of an exposure, or state `axes`"
     );
     Err(IntakeError::Size { place: opened.name.clone(), detail })
 }
 
-/// Hands each snapshot, less its dark and divided by the full scale, to `sink`, and tells what was seen.
-/// Errors: whatever is wrong with the file; a dark of another size; snapshots that are 0
-/// everywhere; those of `sink`. What it received must be thrown away then.
+/// Reads a measurement, subtracts the dark frames, divides by the full scale, and passes each snapshot \[H,W\] to
+/// `sink`.
+///
+/// Errors: [`IntakeError::Size`] for dark frames of another size; [`IntakeError::Format`] for unreadable files and
+/// snapshots that are 0 everywhere, and for errors of `sink`. After an error the output of `sink` is invalid.
 pub fn measurement(
     opened: Opened,
     exposure: &Exposure,
@@ -77,16 +84,16 @@ pub fn measurement(
 ) -> Result<Passed> {
     let Opened { info, full_scale, reader, name } = opened;
     let dark = average_dark(&exposure.dark, (info.height, info.width), limits)?;
-    let saturation = full_number(info.sample, exposure.saturation);
-    let digits = (info.sample == SampleType::U16).then(Digits::default);
-    let mut exposed = Exposed { reader, dark, saturation, full: Vec::new(), digits };
+    let saturation = saturation_level(info.sample, exposure.saturation);
+    let bits = (info.sample == SampleType::U16).then(BitUsage::default);
+    let mut exposed = DarkCorrected { reader, dark, saturation, saturated: Vec::new(), bits };
     check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
-    let judge = |digits: Digits| digits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
-    let findings = exposed.digits.and_then(judge).map(Finding::from).into_iter().collect();
-    Ok(Passed { saturated: saturation.map(|_| exposed.full), findings })
+    let judge = |bits: BitUsage| bits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
+    let findings = exposed.bits.and_then(judge).map(Finding::from).into_iter().collect();
+    Ok(Passed { saturated: saturation.map(|_| exposed.saturated), findings })
 }
 
-/// The average \[H,W\] of dark captures, as stored.
+/// Averages dark frames \[H,W\], as stored. `None` if there are none.
 fn average_dark(
     dark: &[PathBuf],
     (height, width): (usize, usize),
@@ -101,7 +108,8 @@ fn average_dark(
         let info = *opened.map_err(IntakeError::format(place(index)))?.info();
         if (info.height, info.width) != (height, width) {
             let detail = format!(
-                "the dark is {}x{} (rows x columns), but the measurement is {height}x{width}",
+                "the dark frames are {}x{} (rows x columns), but the measurement is {height}x{width}: both must have \
+                 the same size",
                 info.height, info.width
             );
             return Err(IntakeError::Size { place: place(index), detail });
@@ -110,30 +118,30 @@ fn average_dark(
     Ok(Some(average(dark, None, limits, place, &mut |_| true)?.0.mean))
 }
 
-/// A measurement less its dark, of which the full pixels are counted.
-struct Exposed {
+/// A reader that subtracts dark frames and counts saturated pixels.
+struct DarkCorrected {
     reader: Box<dyn FrameReader + Send>,
     dark: Option<Array2<f32>>,
     saturation: Option<f32>,
-    /// Share of full pixels of each snapshot so far.
-    full: Vec<f64>,
-    /// Of 16-bit numbers.
-    digits: Option<Digits>,
+    /// Share of saturated pixels of each snapshot so far.
+    saturated: Vec<f64>,
+    /// Bit usage of 16-bit values; `None` for other data types.
+    bits: Option<BitUsage>,
 }
 
-impl FrameReader for Exposed {
+impl FrameReader for DarkCorrected {
     fn info(&self) -> &StackInfo {
         self.reader.info()
     }
 
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
         let Some(mut frame) = self.reader.next_frame()? else { return Ok(None) };
-        if let Some(digits) = &mut self.digits {
-            digits.add(&frame);
+        if let Some(bits) = &mut self.bits {
+            bits.add(&frame);
         }
         if let Some(saturation) = self.saturation {
-            let full = frame.iter().filter(|value| **value >= saturation).count();
-            self.full.push(full as f64 / frame.len().max(1) as f64);
+            let saturated = frame.iter().filter(|value| **value >= saturation).count();
+            self.saturated.push(saturated as f64 / frame.len().max(1) as f64);
         }
         if let Some(dark) = &self.dark {
             frame -= dark;
@@ -142,14 +150,16 @@ impl FrameReader for Exposed {
     }
 }
 
-/// Holds samples of snapshots \[S,H,W\] against masks \[B,H,W\], both as prepared files; of a mosaic its first green
-/// sub-image, as colours differ from pixel to pixel. `saturated` is the share of full pixels of each snapshot,
-/// `darkened` whether a dark was subtracted.
+/// Checks up to [`SNAPSHOTS`] snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
+/// the first green sub-image is checked. `saturated` is the share of saturated pixels of each snapshot;
+/// `dark_subtracted` is true if dark frames were subtracted.
+///
+/// Errors: files that can't be read.
 pub fn judge(
     (masks, snapshots): (&Path, &Path),
     mosaic: Option<Mosaic>,
     saturated: Option<&[f64]>,
-    darkened: bool,
+    dark_subtracted: bool,
     limits: &Limits,
 ) -> Result<Vec<Finding>, FormatError> {
     let (masks, snapshots) = (Reader::open(masks, limits)?, Reader::open(snapshots, limits)?);
@@ -160,16 +170,17 @@ pub fn judge(
         let share = saturated.and_then(|shares| shares.get(snapshot)).copied();
         let Some(figures) = study(&masks, &snapshots, snapshot, mosaic)?.finish() else { continue };
         let number = u32::try_from(snapshot).ok();
-        let mut judged = judge_measurement(&figures, share, darkened);
-        // Told by whoever sent them.
-        judged.retain(|found| mosaic.is_none() || found.code != "mosaic");
+        let mut judged = judge_measurement(&figures, share, dark_subtracted);
+        // The user has stated the mosaic.
+        judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
         let judged = judged.into_iter();
-        findings.extend(judged.map(|found| Finding { snapshot: number, ..Finding::from(found) }));
+        findings
+            .extend(judged.map(|finding| Finding { snapshot: number, ..Finding::from(finding) }));
     }
     Ok(findings)
 }
 
-/// Looks at windows spread evenly over a snapshot.
+/// Computes the statistics of windows that are spread evenly over a snapshot.
 fn study(
     masks: &Reader,
     snapshots: &Reader,
@@ -178,7 +189,7 @@ fn study(
 ) -> Result<MeasurementStudy, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
     let ((row, column), step) = mosaic.map_or(((0, 0), 1), |mosaic| (mosaic.green(), 2));
-    // From the first pixel to the one behind the last that is looked at.
+    // Sensor pixels of a window of the sub-image.
     let place = |window: &Range<usize>, first: usize| {
         first + window.start * step..first + (window.end * step + 1).saturating_sub(step)
     };
@@ -194,14 +205,14 @@ fn study(
     Ok(study)
 }
 
-/// Windows with their margins along a side, from even pixels on: all of it if it is short.
+/// Windows with their margins along one side. All start at even pixels. A short side has one window.
 fn windows(length: usize) -> Vec<Range<usize>> {
     let side = WINDOW + 2 * REACH;
     let count = (length / side).clamp(1, WINDOWS);
     let side = if count == 1 { length.min(2 * side) } else { side };
     let start = |index: usize| match count {
         1 => ((length - side) / 2) & !1,
-        // Even, so that the phases of a mosaic are the same in all.
+        // Even starts keep the phases of a mosaic.
         _ => (index * (length - side) / (count - 1)) & !1,
     };
     (0..count).map(|index| start(index)..start(index) + side).collect()
@@ -212,7 +223,7 @@ mod tests {
     use super::windows;
 
     #[test]
-    fn windows_spread_over_a_side_of_any_length() {
+    fn windows_are_spread_over_sides_of_any_length() {
         assert_eq!(windows(48).first(), Some(&(0..48)));
         assert_eq!(windows(143).first(), Some(&(0..143)));
         assert_eq!(windows(144), [0..72, 72..144]);

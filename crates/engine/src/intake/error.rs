@@ -1,20 +1,24 @@
-//! Why a file is not taken in.
+//! Errors of reading and checking the files of a lab.
 
 use formats::FormatError;
 
 pub type Result<T, E = IntakeError> = std::result::Result<T, E>;
 
-/// Why a file, or what is in it, is refused. Each names the file by its `place`: a JSON pointer into
-/// the request, or a name and path, as the caller has called it; empty where there is but one.
+/// The reason why a file or its content is refused. `place` names the file: a JSON pointer into the request, or a name
+/// with a path. It is empty if there is only one file.
 #[derive(Debug, thiserror::Error)]
 pub enum IntakeError {
+    /// The file can't be read, or its content is invalid.
     #[error("{}{source}", prefix(.place))]
     Format { place: String, source: FormatError },
+    /// The size or the number of frames does not fit.
     #[error("{}{detail}", prefix(.place))]
     Size { place: String, detail: String },
+    /// The content is unusable.
     #[error("{}{detail}", prefix(.place))]
     Content { place: String, detail: String },
-    #[error("stopped")]
+    /// The caller stopped the work.
+    #[error("the task was stopped before its end")]
     Stopped,
 }
 
@@ -23,7 +27,7 @@ fn prefix(place: &str) -> String {
 }
 
 impl IntakeError {
-    /// Whether another attempt may succeed: the machine failed, not the data.
+    /// True if another attempt may succeed, because the machine failed and not the data.
     pub fn is_retryable(&self) -> bool {
         match self {
             Self::Format { source, .. } => !source.is_callers_fault(),
@@ -32,7 +36,7 @@ impl IntakeError {
         }
     }
 
-    /// For `map_err` on what goes wrong with the file called `place`.
+    /// Adds the place of a file to an error, for use with `map_err`.
     pub(super) fn format(place: impl Into<String>) -> impl FnOnce(FormatError) -> Self {
         move |source| Self::Format { place: place.into(), source }
     }
@@ -42,7 +46,7 @@ impl IntakeError {
     }
 }
 
-/// For results and files of ours, which have no name.
+/// For output and scratch files, which have no place.
 impl From<FormatError> for IntakeError {
     fn from(source: FormatError) -> Self {
         Self::Format { place: String::new(), source }

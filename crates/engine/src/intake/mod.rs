@@ -1,7 +1,7 @@
-//! From a lab's files to checked arrays: masks, measurements, true frames, captures.
+//! Reads and checks the files of a lab: masks, measurements, ground truth, captures.
 //!
-//! What the service does with uploads and the commands with paths is the same, and stands here.
-//! Stacks are read frame by frame and handed on to a writer, so that memory holds a few planes.
+//! The service (with uploads) and the commands (with paths) share this code. Stacks are read frame by frame and passed
+//! on to a writer, so memory holds a few planes.
 
 mod captures;
 mod check;

@@ -1,4 +1,4 @@
-//! Opening a file: its format is told by its content, its full scale is the one stated or its type's.
+//! Opens a file. Its content determines the format; the full scale is the stated one, or that of the data type.
 
 use std::path::Path;
 
@@ -6,31 +6,31 @@ use ndarray::Array2;
 
 use super::IntakeError;
 use crate::intake::error::Result;
-use crate::job::MOST_MASKS;
+use crate::job::MAX_MASKS;
 use formats::mat::SceneArray;
 use formats::{
     self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, StackInfo, Wanted,
 };
 
-/// A file, and which array of it is meant if it has several.
+/// A file, and the array in it if it has several.
 #[derive(Debug, Clone)]
 pub struct Source<'a> {
     pub path: &'a Path,
     pub array: SceneArray,
-    /// What that array is called there; none for the field's own name.
+    /// Name of the array in the file; `None` for [`SceneArray::name`].
     pub named: Option<String>,
-    /// The order of its axes; none for the one that fits.
+    /// Order of the axes; `None` for automatic detection.
     pub axes: Option<Axes>,
-    /// Rows and columns of a frame, where they are known.
+    /// Expected rows and columns of a frame, if known.
     pub size: Option<(usize, usize)>,
-    /// The stored number that means 1; none for the file's own.
+    /// Stored value that means 1; `None` for the default of the file.
     pub full_scale: Option<f32>,
     pub limits: Limits,
-    /// What errors call it; empty for an upload, of which there is one, and whose path is ours.
+    /// Name of the file in errors; empty for an upload, whose path is internal.
     pub name: String,
 }
 
-/// A stack whose frames are read one at a time.
+/// An open stack, whose frames are read one at a time.
 pub struct Opened {
     pub info: StackInfo,
     pub full_scale: FullScale,
@@ -39,18 +39,18 @@ pub struct Opened {
 }
 
 impl<'a> Source<'a> {
-    /// A file that the user has named.
+    /// A file on the user's machine.
     pub fn file(path: &'a Path, array: SceneArray, full_scale: Option<f32>) -> Self {
-        let what = match array {
+        let kind = match array {
             SceneArray::Masks => "masks",
             SceneArray::Measurements => "measurement",
             SceneArray::Truth => "frames",
         };
-        let name = format!("{what} {}", path.display());
+        let name = format!("{kind} {}", path.display());
         Self { name, ..Self::upload(path, array, full_scale, Limits::default()) }
     }
 
-    /// A file of the service.
+    /// An upload of the service.
     pub fn upload(
         path: &'a Path,
         array: SceneArray,
@@ -61,41 +61,44 @@ impl<'a> Source<'a> {
         Self { path, array, named, axes, size, full_scale, limits, name }
     }
 
-    /// The same file, of which the array with this name is meant.
+    /// Selects the array with this name.
     pub fn named(self, named: Option<String>) -> Self {
         Self { named, ..self }
     }
 
-    /// The same file, whose axes are stated, or whose frames have these rows and columns.
+    /// States the order of the axes, or the rows and columns of a frame.
     pub fn arranged(self, axes: Option<Axes>, size: Option<(usize, usize)>) -> Self {
         Self { axes, size, ..self }
     }
 
-    /// Opens it.
-    /// Errors: no file, or none of a format that is read; larger than the limits; no such array; axes in
-    /// several orders that fit; no full scale.
+    /// Opens the file.
+    ///
+    /// Errors: [`IntakeError::Format`] if the file is missing, unsupported or larger than the limits, if it does not
+    /// have the array, if several orders of its axes fit, or if the full scale is unknown.
     pub fn open(&self) -> Result<Opened> {
-        let most_frames = (self.array == SceneArray::Masks).then_some(MOST_MASKS);
-        let expected = Expected { axes: self.axes, most_frames, size: self.size };
+        let max_frames = (self.array == SceneArray::Masks).then_some(MAX_MASKS);
+        let expected = Expected { axes: self.axes, max_frames, size: self.size };
         let wanted = Wanted { array: self.array, name: self.named.as_deref(), expected };
         let opened = formats::open_array(self.path, wanted, &self.limits);
-        self.opened(opened.map_err(IntakeError::format(&self.name))?)
+        self.with_full_scale(opened.map_err(IntakeError::format(&self.name))?)
     }
 
-    /// The same of a clip of colours: frames \[H,3W\], red, green and blue of each pixel. None if the file is of
-    /// another kind.
+    /// Opens a colour clip with frames \[H,3W\], which interleave red, green and blue. `None` if the file is not in
+    /// colour.
+    ///
+    /// Errors: as [`Self::open`].
     pub fn open_colours(&self) -> Result<Option<Opened>> {
         let opened = formats::open_colours(self.path, &self.limits);
         let reader = opened.map_err(IntakeError::format(&self.name))?;
-        reader.map(|reader| self.opened(reader)).transpose()
+        reader.map(|reader| self.with_full_scale(reader)).transpose()
     }
 
-    fn opened(&self, reader: Box<dyn FrameReader + Send>) -> Result<Opened> {
+    fn with_full_scale(&self, reader: Box<dyn FrameReader + Send>) -> Result<Opened> {
         let info = *reader.info();
         let full_scale = match (self.full_scale, info.default_full_scale) {
             (Some(value), _) => FullScale::new(value),
-            (None, Some(own)) => Ok(own),
-            // Of 0 and 1; a larger value is refused with the question for the scale.
+            (None, Some(default)) => Ok(default),
+            // Masks of 0 and 1. For larger values the check asks for the full scale.
             (None, None) if self.array == SceneArray::Masks => Ok(FullScale::ONE),
             (None, None) => Err(FormatError::FullScaleNeeded(info.sample.to_string())),
         };
@@ -105,7 +108,7 @@ impl<'a> Source<'a> {
 }
 
 impl Opened {
-    /// The next frame \[H,W\] divided by the full scale; none after the last.
+    /// Returns the next frame \[H,W\] divided by the full scale; `None` after the last one.
     pub fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         let frame = self.reader.next_frame().map_err(IntakeError::format(&self.name))?;
         Ok(frame.map(|frame| frame / self.full_scale.value()))

@@ -1,4 +1,4 @@
-//! Whole arrays in memory, for commands: a snapshot with its masks, and clips.
+//! Reads whole arrays into memory, for commands: masks, snapshots and clips.
 
 use std::fs;
 use std::ops::Range;
@@ -13,16 +13,19 @@ use crate::intake::error::Result;
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, FormatError};
 
-/// An array on its own scale, and the full scale that brought it there.
+/// An array divided by its full scale.
 #[derive(Debug)]
 pub struct Scaled<T> {
     pub array: T,
+    /// Stored value that means 1.
     pub full_scale: f32,
-    /// How the axes of the file were read; none for pictures.
+    /// Order in which the axes of the file were read; `None` for pictures.
     pub axes: Option<Axes>,
 }
 
-/// Masks \[B,H,W\] on \[0,1\], checked.
+/// Reads and checks masks \[B,H,W\] on \[0,1\].
+///
+/// Errors: as [`masks`].
 pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     let opened = source.open()?;
     let (full_scale, axes) = (opened.full_scale.value(), opened.info.axes);
@@ -31,8 +34,10 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     Ok(Scaled { array: stack.into_array()?, full_scale, axes })
 }
 
-/// Snapshots \[S,H,W\] of a measurement, checked, and how many there are in all. They are given by the
-/// indices of the first and the last; without a last one, to its end.
+/// Reads and checks the snapshots \[S,H,W\] from `first` to `last`, both included, or to the end for `None`. Returns
+/// them with the total number of snapshots.
+///
+/// Errors: as [`measurement`]; [`IntakeError::Content`] for snapshots that do not exist.
 pub fn read_snapshots(
     source: &Source<'_>,
     (first, last): (usize, Option<usize>),
@@ -42,28 +47,30 @@ pub fn read_snapshots(
     let snapshots = opened.info.frames;
     let last = last.unwrap_or(snapshots.saturating_sub(1));
     if last >= snapshots || last < first {
-        let asked = if first == last { first.to_string() } else { format!("{first} to {last}") };
+        let requested =
+            if first == last { first.to_string() } else { format!("{first} to {last}") };
         let detail = format!(
-            "{} holds {snapshots} snapshots, counted from 0; there is no snapshot {asked}",
+            "{} has {snapshots} snapshots, counted from 0; there is no snapshot {requested}",
             source.name
         );
         return Err(IntakeError::content("", &detail));
     }
-    let (mut next, mut found) = (0, Stack::default());
+    let (mut next, mut selected) = (0, Stack::default());
     measurement(opened, &Exposure::default(), &source.limits, |snapshot| {
         if (first..=last).contains(&next) {
-            found.push(snapshot)?;
+            selected.push(snapshot)?;
         }
         next += 1;
         Ok(())
     })?;
-    Ok((Scaled { array: found.into_array()?, full_scale, axes }, snapshots))
+    Ok((Scaled { array: selected.into_array()?, full_scale, axes }, snapshots))
 }
 
-/// The true frames \[S B,H,W\] of some snapshots of a measurement, of a file that has those of these
-/// snapshots or of all. A .mat scene may go without; another file may not. Behind a mosaic they may have colours
-/// \[S B,H,3W\], too, which is told.
-/// Errors: a file that can't be read; other sizes.
+/// Reads the true frames \[S B,H,W\] of the snapshots `which`, from a file that has those of these snapshots or of all
+/// `snapshots`. `None` if a .mat scene has no truth. Behind a mosaic the truth may be in colour \[S B,H,3W\], as the
+/// returned channels indicate.
+///
+/// Errors: as [`Source::open`]; [`IntakeError::Size`] for other sizes.
 pub fn read_truth(
     source: &Source<'_>,
     (frames, height, width): (usize, usize, usize),
@@ -75,7 +82,7 @@ pub fn read_truth(
     let channels = if colours.is_some() { Channels::Rgb } else { Channels::Grey };
     let truth = match colours
         .map_or_else(|| source.open(), Ok)
-        .and_then(|opened| frames_of(source, opened))
+        .and_then(|opened| collect_frames(source, opened))
     {
         Err(IntakeError::Format { source: FormatError::MissingArray { .. }, .. }) => {
             return Ok(None);
@@ -84,41 +91,44 @@ pub fn read_truth(
     };
     let width = width * channels.count();
     let (count, rows, columns) = truth.dim();
-    let wanted = frames * which.len();
+    let needed = frames * which.len();
     let first = match count {
         _ if (rows, columns) != (height, width) => None,
-        _ if count == wanted => Some(0),
+        _ if count == needed => Some(0),
         _ if count == frames * snapshots => Some(which.start * frames),
         _ => None,
     };
     let Some(first) = first else {
         let detail = format!(
-            "the true frames {} are {count}x{rows}x{columns}; {wanted}x{height}x{width} (of what is \
-             reconstructed) or {}x{height}x{width} (of all snapshots) would fit",
+            "the true frames {} are {count}x{rows}x{columns}, but {needed}x{height}x{width} (for the \
+             reconstructed snapshots) or {}x{height}x{width} (for all snapshots) are needed",
             source.path.display(),
             frames * snapshots
         );
         return Err(IntakeError::Size { place: String::new(), detail });
     };
-    Ok(Some((truth.slice(s![first..first + wanted, .., ..]).to_owned(), channels)))
+    Ok(Some((truth.slice(s![first..first + needed, .., ..]).to_owned(), channels)))
 }
 
-/// Frames \[T,H,W\] of a file, or of a folder of pictures in the order of their names, divided by the full
-/// scale; all finite.
-/// Errors: files that can't be read; pictures of different sizes.
+/// Reads frames \[T,H,W\], divided by the full scale, from a file, or from a folder of PNG pictures in the order of
+/// their names.
+///
+/// Errors: as [`Source::open`]; [`IntakeError::Content`] for values that are not finite, and for pictures of different
+/// sizes.
 pub fn read_clip(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
     clip(path, full_scale, read_frames)
 }
 
-/// The same of frames of colours \[T,H,3W\].
-/// Errors: as [`read_clip`]; frames without colours.
+/// Reads colour frames \[T,H,3W\] like [`read_clip`].
+///
+/// Errors: as [`read_clip`]; [`IntakeError::Content`] for frames without colours.
 pub fn read_colours(path: &Path, full_scale: Option<f32>) -> Result<Array3<f32>> {
     clip(path, full_scale, |source| match source.open_colours()? {
-        Some(opened) => frames_of(source, opened),
+        Some(opened) => collect_frames(source, opened),
         None => {
-            let problem = "they have no colours; an array [frame, row, column, 3] or pictures of red, green and \
-                           blue are needed (python -c \"import numpy as n; n.save('colours.npy', \
-                           n.repeat(n.load('FILE.npy')[..., None], 3, -1))\" makes grey ones of the form)";
+            let problem = "the frames are not in colour; an array [frame, row, column, 3] or RGB pictures are needed \
+                           (python -c \"import numpy as n; n.save('colours.npy', \
+                           n.repeat(n.load('FILE.npy')[..., None], 3, -1))\" converts grey frames)";
             Err(IntakeError::content(&source.name, &problem))
         }
     })
@@ -134,7 +144,7 @@ fn clip(
         return read_frames(&source(path));
     }
     let refused = |detail: String| IntakeError::content("", &detail);
-    let unreadable = |error| refused(format!("cannot read {}: {error}", path.display()));
+    let unreadable = |error| refused(format!("can't read {}: {error}", path.display()));
     let mut files: Vec<PathBuf> = Vec::new();
     for entry in fs::read_dir(path).map_err(unreadable)? {
         let file = entry.map_err(unreadable)?.path();
@@ -150,30 +160,30 @@ fn clip(
         let (height, width) = stack.size;
         if stack.frames > 0 && (rows, columns) != (height, width) {
             return Err(refused(format!(
-                "{} is {rows}x{columns}, but the pictures before it are {height}x{width}",
+                "{} is {rows}x{columns}, but the earlier pictures are {height}x{width}: all must have the same size",
                 file.display(),
             )));
         }
         picture.outer_iter().try_for_each(|frame| stack.push(frame))?;
     }
     if files.is_empty() {
-        return Err(refused(format!("the folder {} holds no .png pictures", path.display())));
+        return Err(refused(format!("the folder {} contains no .png pictures", path.display())));
     }
     stack.into_array()
 }
 
-/// Frames \[T,H,W\] divided by the full scale, all finite.
+/// Reads frames \[T,H,W\] divided by the full scale.
 fn read_frames(source: &Source<'_>) -> Result<Array3<f32>> {
-    frames_of(source, source.open()?)
+    collect_frames(source, source.open()?)
 }
 
-/// All frames of what was opened of a source.
-fn frames_of(source: &Source<'_>, mut opened: Opened) -> Result<Array3<f32>> {
+/// Collects all frames of an open source. All values must be finite.
+fn collect_frames(source: &Source<'_>, mut opened: Opened) -> Result<Array3<f32>> {
     let mut stack = Stack::default();
     while let Some(frame) = opened.next_frame()? {
         if let Some(((row, column), value)) = frame.indexed_iter().find(|(_, v)| !v.is_finite()) {
             let problem = format!(
-                "{value} at frame {}, row {row}, column {column} (counted from 0); every value must \
+                "the value at frame {}, row {row}, column {column} (counted from 0) is {value}; all values must \
                  be finite",
                 stack.frames
             );
@@ -184,7 +194,7 @@ fn frames_of(source: &Source<'_>, mut opened: Opened) -> Result<Array3<f32>> {
     stack.into_array()
 }
 
-/// Frames of one size as they arrive.
+/// Collects frames of one size.
 #[derive(Default)]
 struct Stack {
     values: Vec<f32>,

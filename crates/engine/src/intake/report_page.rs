@@ -1,14 +1,16 @@
-//! The report of a calibration as a page: plain HTML with pictures, no script, no style of its own.
+//! The report of a calibration as a page: plain HTML with pictures, without scripts and inline styles.
 
 use maud::{DOCTYPE, Markup, html};
 
-use crate::job::{CalibrationReport, CaptureReport, Finding, Grade, MaskReport, Severity};
+use crate::job::{
+    CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, Severity,
+};
 
-/// Side of a cell of the correlation matrix, in pixels.
+/// Side of a cell of the drawn correlation matrix, in pixels.
 const CELL: usize = 16;
 
-/// The page of a report; `title` names the calibration. Pictures are looked for in `maps/` beside it,
-/// and the style where the service has it: without one it is plain.
+/// Renders a report; `title` names the calibration. The page refers to pictures in `maps/` and to the style sheet of
+/// the service. It is readable without the style sheet.
 pub fn report_page(title: &str, report: &CalibrationReport) -> String {
     let page = html! {
         (DOCTYPE)
@@ -22,7 +24,7 @@ pub fn report_page(title: &str, report: &CalibrationReport) -> String {
             body {
                 main {
                     h1 { "Calibration " (title) }
-                    (verdict(report))
+                    (grade(report))
                     h2 { "Masks" }
                     (masks(&report.masks, report))
                     @if let Some(captures) = &report.captures {
@@ -30,7 +32,7 @@ pub fn report_page(title: &str, report: &CalibrationReport) -> String {
                         (captured(captures))
                         (patterns(captures))
                     }
-                    h2 { "How alike the masks are" }
+                    h2 { "Correlation between the masks" }
                     (correlation(&report.masks))
                     @for map in &report.maps {
                         h2 { (caption(map)) }
@@ -43,26 +45,28 @@ pub fn report_page(title: &str, report: &CalibrationReport) -> String {
     page.into_string()
 }
 
-fn verdict(report: &CalibrationReport) -> Markup {
+fn grade(report: &CalibrationReport) -> Markup {
     let (class, text) = match report.grade {
-        Grade::Good => ("good", "Good: nothing is wrong with it."),
-        Grade::Usable => ("warn", "Usable, but it could be better:"),
-        Grade::Bad => ("trouble", "Bad: frames made with it will be wrong:"),
+        Grade::Good => ("good", "Good: no problems were found."),
+        Grade::Usable => ("warn", "Usable, with these limitations:"),
+        Grade::Bad => ("trouble", "Bad: frames reconstructed with it will be wrong."),
     };
     html! {
         p class=(class) { strong { (text) } }
-        @for finding in &report.findings { (trouble(finding)) }
+        @for finding in &report.findings { (problem(finding)) }
     }
 }
 
-fn trouble(finding: &Finding) -> Markup {
+fn problem(finding: &Finding) -> Markup {
     let class = match finding.severity {
         Severity::Warning => "warn",
         Severity::Error => "trouble",
     };
+    let title = finding.code.parse::<FindingCode>().map(|code| code.entry().title);
     html! {
         p class=(class) {
-            code { (finding.code) } " " (finding.detail) br;
+            code { (finding.code) } @if let Ok(title) = title { ": " (title) } br;
+            (finding.detail) "." br;
             "What to do: " (finding.remedy) "."
         }
     }
@@ -77,13 +81,13 @@ fn masks(masks: &MaskReport, report: &CalibrationReport) -> Markup {
             format!("{} x {} x {}", report.frames, report.height, report.width),
         ),
         ("Mean", number(masks.mean)),
-        ("Deviation over the frames", number(masks.deviation)),
+        ("Standard deviation over the masks", number(masks.deviation)),
         (
-            "1 % and 99 % of all values are below",
+            "1st and 99th percentile of all values",
             format!("{} and {}", number(masks.percentile_1), number(masks.percentile_99)),
         ),
         (
-            "Correlation between frames, mean and largest",
+            "Correlation between masks: mean, largest",
             format!(
                 "{} and {}",
                 optional(masks.correlation_mean),
@@ -91,8 +95,8 @@ fn masks(masks: &MaskReport, report: &CalibrationReport) -> Markup {
             ),
         ),
         ("Gram diagonal: smallest, mean, largest", masks.gram.map(number).join(", ")),
-        ("Dead pixels (dark in all masks)", share(masks.dead_pixels, pixels)),
-        ("Stuck pixels (open in all masks)", share(masks.stuck_pixels, pixels)),
+        ("Dead pixels (dark in every mask)", share(masks.dead_pixels, pixels)),
+        ("Stuck pixels (open in every mask)", share(masks.stuck_pixels, pixels)),
         ("Values at 0", share(masks.values_at_zero, pixels * report.frames as f64)),
     ])
 }
@@ -102,10 +106,13 @@ fn captured(captures: &CaptureReport) -> Markup {
     table(&[
         ("Light throughput", percent(captures.light_throughput)),
         ("Share of the light where a mask is 1", percent(captures.mask_scale)),
-        ("Noise of the averaged masks", optional(captures.noise)),
-        ("Dynamic range (deviation over noise)", range.unwrap_or_else(|| "not known".into())),
+        ("Noise of a mask value", optional(captures.noise)),
         (
-            "White, black, black with mask (as stored)",
+            "Dynamic range (standard deviation over noise)",
+            range.unwrap_or_else(|| "unknown".into()),
+        ),
+        (
+            "Mean stored value of white, black, black with mask",
             format!(
                 "{:.1}, {:.1}, {}",
                 captures.white_level,
@@ -115,10 +122,13 @@ fn captured(captures: &CaptureReport) -> Markup {
                     .map_or("none (Eq. 7)".into(), |level| format!("{level:.1}"))
             ),
         ),
-        ("Full pixels of the white", share(captures.white_saturated)),
-        ("Illumination: darkest over brightest part", share(captures.illumination_flatness)),
+        ("Saturated pixels of the white image", share(captures.white_saturated)),
+        ("Illumination: darkest part over brightest part", share(captures.illumination_flatness)),
         ("Pixels whose white is not above their black", percent(captures.denominator_not_positive)),
-        ("Pixels whose white is hardly above their black", percent(captures.denominator_too_dark)),
+        (
+            "Pixels whose white is too little above their black",
+            percent(captures.denominator_too_dark),
+        ),
     ])
 }
 
@@ -126,7 +136,7 @@ fn patterns(captures: &CaptureReport) -> Markup {
     html! {
         table {
             thead { tr {
-                @for name in ["Pattern", "Light", "At or below 0", "Too far below 0 for noise", "Noise", "Full", "Drift of the light"] {
+                @for name in ["Pattern", "Light", "At or below 0", "Below 0 by more than noise", "Noise", "Saturated", "Drift of the light"] {
                     th scope="col" { (name) }
                 }
             } }
@@ -147,12 +157,12 @@ fn patterns(captures: &CaptureReport) -> Markup {
     }
 }
 
-/// The matrix as squares, white for 0 and dark blue for 1.
+/// Draws the correlation matrix, from white for 0 to dark blue for 1.
 fn correlation(masks: &MaskReport) -> Markup {
     let side = masks.correlation.len() * CELL;
     html! {
         svg xmlns="http://www.w3.org/2000/svg" width=(side) height=(side) role="img"
-            aria-label="Correlation of each mask with each other" {
+            aria-label="Correlation between the masks" {
             @for (k, row) in masks.correlation.iter().enumerate() {
                 @for (l, value) in row.iter().enumerate() {
                     rect x=(l * CELL) y=(k * CELL) width=(CELL) height=(CELL) fill=(shade(*value)) {
@@ -173,10 +183,10 @@ fn shade(value: f64) -> String {
 
 fn caption(map: &str) -> String {
     match map {
-        "mean" => "Mean of each pixel over the frames".into(),
-        "deviation" => "Deviation of each pixel over the frames".into(),
-        "gram" => "Gram diagonal: sum of squares of each pixel (black: nothing is known)".into(),
-        "illumination" => "Illumination: white less black".into(),
+        "mean" => "Mean of each pixel over the masks".into(),
+        "deviation" => "Standard deviation of each pixel over the masks".into(),
+        "gram" => "Gram diagonal: sum of squares of each pixel over the masks (black pixels can't be reconstructed)".into(),
+        "illumination" => "Illumination: white minus black".into(),
         other => other.into(),
     }
 }
@@ -194,7 +204,7 @@ fn number(value: f64) -> String {
 }
 
 fn optional(value: Option<f64>) -> String {
-    value.map_or_else(|| "not known".into(), number)
+    value.map_or_else(|| "unknown".into(), number)
 }
 
 fn percent(value: f64) -> String {
@@ -202,32 +212,25 @@ fn percent(value: f64) -> String {
 }
 
 fn share(value: Option<f64>) -> String {
-    value.map_or_else(|| "not known".into(), percent)
+    value.map_or_else(|| "unknown".into(), percent)
 }
 
 #[cfg(test)]
 mod tests {
     use super::report_page;
-    use crate::job::{CalibrationReport, Finding, Severity};
+    use crate::job::{CalibrationReport, Finding, FindingCode};
     use optics::{MaskStudy, random_squares};
 
     #[test]
-    fn a_page_shows_everything_and_runs_nothing() {
+    fn the_page_escapes_names_and_has_no_scripts() {
         let (masks, _) = random_squares(4, 16, 16, 1).unwrap();
         let mut study = MaskStudy::new(4, 16, 16);
         study.add(masks.view()).unwrap();
-        let finding = Finding {
-            code: "swapped_order".into(),
-            severity: Severity::Error,
-            detail: "masks 1 and 2".into(),
-            remedy: "swap them".into(),
-            frames: vec![1, 2],
-            snapshot: None,
-        };
+        let finding = Finding::new(FindingCode::SwappedOrder, "masks 1 and 2");
         let maps = vec!["gram".to_owned()];
         let report = CalibrationReport::new(&study.finish().unwrap(), None, vec![finding], maps);
         let page = report_page("<b>bench</b> 3", &report);
-        assert!(page.contains("&lt;b&gt;bench&lt;/b&gt; 3"), "names are text");
+        assert!(page.contains("&lt;b&gt;bench&lt;/b&gt; 3"), "names are escaped");
         assert!(page.contains("Bad: frames") && page.contains("swapped_order"));
         assert!(page.contains("maps/gram.png") && page.matches("<rect").count() == 16);
         for forbidden in ["<script", " style=", "<style", "http://www.w3.org/2000/svg\" onload"] {

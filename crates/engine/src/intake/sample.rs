@@ -1,5 +1,4 @@
-//! What a lab would send, made of the clip that comes with the program: masks, one snapshot, and the true
-//! frames.
+//! A sample data set, simulated from the embedded clip: masks, one snapshot, and the true frames.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +11,7 @@ use crate::intake::error::Result;
 use formats::{FormatError, npy};
 use optics::{measure, random_squares};
 
-/// The first frames of `demo/clip` (its README says where they come from), one snapshot's worth.
+/// The first frames of `demo/clip`, enough for one snapshot. The README of the folder states their source.
 const FRAMES: [&[u8]; 8] = [
     include_bytes!("../../../../demo/clip/frame_0001.png"),
     include_bytes!("../../../../demo/clip/frame_0002.png"),
@@ -24,9 +23,10 @@ const FRAMES: [&[u8]; 8] = [
     include_bytes!("../../../../demo/clip/frame_0008.png"),
 ];
 
+/// Seed of the masks.
 const SEED: u64 = 1;
 
-/// Files of a sample, in its folder.
+/// The files of a sample.
 #[derive(Debug)]
 pub struct Sample {
     pub masks: PathBuf,
@@ -37,19 +37,19 @@ pub struct Sample {
     pub frames: Array3<f32>,
 }
 
-/// Writes `masks.npy`, `measurement.npy`, `truth.npy` and the true frames as PNG into `folder`, which is
-/// made.
-/// Errors: the disk.
+/// Creates `folder` and writes `masks.npy`, `measurement.npy`, `truth.npy`, and the true frames as PNG in `clip`.
+///
+/// Errors: I/O.
 pub fn sample(folder: &Path) -> Result<Sample> {
     let clip = folder.join("clip");
-    fs::create_dir_all(&clip).map_err(FormatError::io("make the folder"))?;
+    fs::create_dir_all(&clip).map_err(FormatError::io("create the folder"))?;
     for (number, png) in (1..).zip(FRAMES) {
         fs::write(clip.join(format!("frame_{number:04}.png")), png)
             .map_err(FormatError::io("write the file"))?;
     }
     let frames = read_clip(&clip, None)?;
     let (count, height, width) = frames.dim();
-    // Of the clip that is built in: these can't fail.
+    // The clip is embedded, so these steps can't fail.
     let failed = |error: &dyn std::fmt::Display| IntakeError::content("sample", error);
     let (masks, _) = random_squares(count, height, width, SEED).map_err(|error| failed(&error))?;
     let y = measure(masks.view(), frames.view()).map_err(|error| failed(&error))?;
@@ -71,7 +71,7 @@ mod tests {
     use super::sample;
 
     #[test]
-    fn the_clip_is_one_snapshot_that_moves() {
+    fn the_sample_has_one_snapshot_with_motion() {
         let folder = tempfile::tempdir().unwrap();
         let sample = sample(folder.path()).unwrap();
         let truth = &sample.frames;

@@ -1,4 +1,4 @@
-//! Who may do what: labs, roles and tokens.
+//! Access control: labs, roles and tokens.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,13 +11,13 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
 use super::text::{InvalidText, Sha256};
 
-/// A lab, to which data belong: no lab sees another one's.
+/// A lab (tenant). Data belong to one lab and are invisible to all others.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, derive_more::Display)]
 #[serde(transparent)]
 pub struct Lab(String);
 
 impl Lab {
-    /// The lab of all who use a service without tokens.
+    /// The lab of a service that runs without tokens.
     pub fn local() -> Self {
         Self("local".into())
     }
@@ -36,12 +36,12 @@ impl FromStr for Lab {
             return Ok(Self(text.into()));
         }
         Err(InvalidText::new(format!(
-            "{text:?} can't be the name of a lab; it has 1 to 40 of a-z, 0-9 and -"
+            "{text:?} is not a valid lab name: use 1 to 40 characters of a-z, 0-9 and -"
         )))
     }
 }
 
-/// What a token is good for. Each role may do what those before it may.
+/// The permissions of a token. Each role includes those before it.
 #[derive(
     Debug,
     Clone,
@@ -58,54 +58,54 @@ impl FromStr for Lab {
 )]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
-#[strum(parse_err_ty = InvalidText, parse_err_fn = no_role)]
+#[strum(parse_err_ty = InvalidText, parse_err_fn = unknown_role)]
 pub enum Role {
-    /// Look at the lab's data and download results.
+    /// View the lab's data and download results.
     Read,
-    /// Upload, ask for jobs, cancel and delete.
+    /// Upload data, submit and cancel jobs, delete.
     Submit,
-    /// See the figures of the whole service, too.
+    /// View the metrics of the whole service.
     Admin,
 }
 
-/// Says which roles there are.
-fn no_role(text: &str) -> InvalidText {
-    InvalidText::new(format!("{text:?} is not a role; roles are read, submit and admin"))
+fn unknown_role(text: &str) -> InvalidText {
+    InvalidText::new(format!("{text:?} is not a role: use read, submit or admin"))
 }
 
-/// A token or session as its holder has it. It shows itself to nobody who only prints it for debugging.
+/// The secret of a token or a session. `Debug` does not print it.
 #[derive(Clone, PartialEq, Eq, Hash)]
 pub struct Secret(String);
 
-/// With this, a token that was left lying about is known for what it is.
+/// Prefix of all tokens, so that leaked ones can be recognised, for example by secret scanners.
 const PREFIX: &str = "sci_";
 
 impl Secret {
-    /// A new one.
-    /// Errors: if the system gives no random numbers.
+    /// Generates a new secret.
+    ///
+    /// Errors: the operating system provides no random numbers.
     pub fn random() -> Result<Self, OsError> {
         let mut bytes = [0; 32];
         OsRng.try_fill_bytes(&mut bytes)?;
         Ok(Self::from_bytes(bytes))
     }
 
-    /// The token of 256 random bits.
+    /// The secret with these 256 bits.
     fn from_bytes(bytes: [u8; 32]) -> Self {
         Self(format!("{PREFIX}{}", Sha256::new(bytes)))
     }
 
-    /// The text, if it has the form of a token.
+    /// Parses a secret; `None` if the text is malformed.
     pub fn parse(text: &str) -> Option<Self> {
         text.strip_prefix(PREFIX)?.parse::<Sha256>().ok()?;
         Some(Self(text.into()))
     }
 
-    /// What is stored instead of the token. Its bits are random, so a plain hash keeps it.
+    /// The hash that is stored instead of the secret. A plain hash suffices because the secret is random.
     pub fn hash(&self) -> Sha256 {
         Sha256::of(self.0.as_bytes())
     }
 
-    /// The token itself, to be shown once to the one it is made for.
+    /// The secret itself, to be shown once to its owner.
     pub fn reveal(&self) -> &str {
         &self.0
     }
@@ -124,7 +124,7 @@ mod tests {
     use super::{Lab, Role, Secret};
 
     #[test]
-    fn labs_have_plain_names() {
+    fn lab_names_are_lower_case_identifiers() {
         assert!("optics-2".parse::<Lab>().is_ok());
         for bad in ["", "a b", "A", "a/b", "..", "\u{e9}", &"x".repeat(41)] {
             assert!(bad.parse::<Lab>().is_err(), "{bad}");
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_secret_is_parsed_but_not_printed() {
+    fn secrets_are_parsed_but_not_printed() {
         let secret = Secret::from_bytes([7; 32]);
         assert_eq!(Secret::parse(secret.reveal()).unwrap(), secret);
         assert!(!format!("{secret:?}").contains("0707"));

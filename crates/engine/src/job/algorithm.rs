@@ -1,4 +1,4 @@
-//! The algorithms, and what belongs to each.
+//! Reconstruction algorithms with their default schedules, tiles and priors.
 
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
@@ -11,6 +11,7 @@ use reconstruction::prior::registry::TV_FASTDVDNET;
 use reconstruction::prior::tv::TV;
 use reconstruction::schedule::Schedule;
 
+/// A reconstruction algorithm.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray,
 )]
@@ -18,51 +19,50 @@ use reconstruction::schedule::Schedule;
 #[strum(serialize_all = "kebab-case", const_into_str)]
 pub enum Algorithm {
     GapTv,
-    /// GAP with total variation in space and, where it pays, in time.
+    /// GAP with total variation in space, and in time where the pilot finds a gain.
     GapTv3d,
     AdmmTv,
     PnpNonlocal,
     PnpFfdnet,
     PnpFastdvdnet,
     PnpTvFastdvdnet,
-    /// A network from measurement and masks to frames, trained for one calibration.
+    /// An end-to-end network from measurement and masks to frames, trained for one calibration.
     Learned,
 }
 
 impl Algorithm {
-    /// What it does, in a sentence.
+    /// A one-sentence description for users.
     pub fn summary(self) -> &'static str {
         match self {
             Self::GapTv => {
-                "Accelerated generalized alternating projection with total variation: seconds, \
-                 no network."
+                "Accelerated generalized alternating projection with total variation: takes seconds, \
+                 needs no network."
             }
             Self::GapTv3d => {
-                "As gap-tv, with total variation along time, too, where a pilot finds that it pays: \
-                 the best that takes seconds."
+                "Like gap-tv, with total variation along time where a pilot finds a gain: the best \
+                 algorithm that takes seconds."
             }
             Self::AdmmTv => {
-                "The alternating direction method of multipliers with total variation: for noisy \
-                 measurements."
+                "Alternating direction method of multipliers with total variation, for noisy measurements."
             }
             Self::PnpNonlocal => {
-                "Total variation, then groups of similar patches of several frames, filtered by \
-                 their own covariance: no network."
+                "Total variation, then nonlocal filtering of similar patches from several frames: needs \
+                 no network."
             }
             Self::PnpFfdnet => "Total variation, then FFDNet on each frame.",
             Self::PnpFastdvdnet => "Total variation, then FastDVDNet over the clip.",
             Self::PnpTvFastdvdnet => {
-                "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best \
-                 on all masks measured."
+                "Total variation, a few passes of FastDVDNet, then the nonlocal prior: the best quality \
+                 on all masks tested."
             }
             Self::Learned => {
-                "A network of your own from measurement and masks to frames, registered for a \
-                 calibration as a model: one run, no schedule."
+                "Your own end-to-end network, registered as a model for one calibration: it runs once, \
+                 without a schedule."
             }
         }
     }
 
-    /// The schedule of a job that names none; without stages for [`Self::Learned`], which has none.
+    /// The schedule of a job that does not state one. It has no stages for [`Self::Learned`].
     pub fn default_schedule(self) -> Schedule {
         match self {
             Self::GapTv => Schedule::gap_tv(),
@@ -76,8 +76,8 @@ impl Algorithm {
         }
     }
 
-    /// The tiles of a job that names none. Larger ones share less with their neighbours and are as fast
-    /// (measured up to 512), but take more memory and let fewer workers help.
+    /// The tiles of a job that does not state any. Larger tiles waste less on overlaps, but take more memory and spread
+    /// over fewer workers; the speed per pixel is the same up to a size of 512.
     pub fn default_tile(self) -> TileSpec {
         match self {
             Self::GapTv | Self::GapTv3d | Self::AdmmTv => TileSpec { size: 384, overlap: 16 },
@@ -86,7 +86,7 @@ impl Algorithm {
         }
     }
 
-    /// The priors that a schedule of this algorithm may name.
+    /// The priors that a schedule of this algorithm may use.
     pub fn priors(self) -> &'static [&'static dyn Prior] {
         match self {
             Self::GapTv | Self::GapTv3d | Self::AdmmTv => &[&TV],
@@ -100,16 +100,21 @@ impl Algorithm {
         }
     }
 
-    /// What of a schedule does not belong to this algorithm, if anything: a name must not promise
-    /// what the stages don't do.
+    /// Explains why a schedule does not belong to this algorithm; `None` if it does. The name of an algorithm must
+    /// match what its stages do.
     pub fn misfit(self, schedule: &Schedule) -> Option<String> {
-        let own = self.priors();
-        let stranger = schedule.stages.iter().find(|stage| !own.contains(&stage.prior))?;
-        let taken = |other: &&Self| other.misfit(schedule).is_none();
-        // Later ones take more.
-        let later = Self::VARIANTS.iter().skip_while(|other| **other != self).skip(1).find(taken);
-        let instead =
-            later.map_or_else(String::new, |other| format!("; ask for {}", other.into_str()));
-        Some(format!("{} has no stages of {}{instead}", self.into_str(), stranger.prior.name()))
+        let priors = self.priors();
+        let unsupported = schedule.stages.iter().find(|stage| !priors.contains(&stage.prior))?;
+        let accepts = |other: &&Self| other.misfit(schedule).is_none();
+        // Algorithms are ordered by the priors they support, so a suitable one comes later.
+        let alternative =
+            Self::VARIANTS.iter().skip_while(|other| **other != self).skip(1).find(accepts);
+        let hint = alternative
+            .map_or_else(String::new, |other| format!("; use the algorithm {}", other.into_str()));
+        Some(format!(
+            "{} does not support the prior {}{hint}",
+            self.into_str(),
+            unsupported.prior.name()
+        ))
     }
 }

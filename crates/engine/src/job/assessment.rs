@@ -1,34 +1,34 @@
-//! A verdict on frames whose truth nobody knows.
+//! The predicted quality of frames without ground truth.
 
 use serde::{Deserialize, Serialize};
 
 use super::report::{Finding, Grade};
 
-/// How good frames are expected to be.
+/// The predicted quality of the frames of a snapshot or a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Assessment {
     pub grade: Grade,
-    /// The PSNR that is expected, mean over the frames, of the full scale of the measurement; 40 dB for all that is
-    /// better, too.
+    /// Predicted PSNR in dB relative to the full scale of the measurement, mean over the frames. Values above 40 dB are
+    /// reported as 40 dB.
     pub psnr_db: f64,
-    /// Four of five true values lie between this
+    /// Lower end of the interval that contains the true PSNR in four of five cases, in dB.
     pub psnr_low_db: f64,
-    /// and this.
+    /// Upper end of that interval, in dB.
     pub psnr_high_db: f64,
-    /// Why no better, and what makes the figures doubtful.
+    /// Findings that limit the quality or the reliability of the prediction.
     pub reasons: Vec<Finding>,
 }
 
 impl Assessment {
-    /// Of a job: the mean over its snapshots, and the worst grade.
-    pub fn of_all<'a>(snapshots: impl Iterator<Item = Option<&'a Self>>) -> Option<Self> {
+    /// The assessment of a job: the means over its snapshots, and the worst grade. `None` if a snapshot has none.
+    pub fn combined<'a>(snapshots: impl Iterator<Item = Option<&'a Self>>) -> Option<Self> {
         let all = snapshots.collect::<Option<Vec<_>>>().filter(|all| !all.is_empty())?;
         let mean = |value: fn(&Self) -> f64| {
             Self::round(all.iter().map(|one| value(one)).sum::<f64>() / all.len() as f64)
         };
         let mut reasons: Vec<Finding> = Vec::new();
         for reason in all.iter().flat_map(|one| &one.reasons) {
-            if !reasons.iter().any(|known| known.code == reason.code) {
+            if !reasons.iter().any(|present| present.code == reason.code) {
                 reasons.push(reason.clone());
             }
         }
@@ -41,7 +41,7 @@ impl Assessment {
         })
     }
 
-    /// Tenths of a decibel: more is not known.
+    /// Rounds to tenths of a decibel, the precision of the prediction.
     pub fn round(decibels: f64) -> f64 {
         (decibels * 10.0).round() / 10.0
     }

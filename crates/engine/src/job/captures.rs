@@ -1,50 +1,48 @@
-//! The captures that a calibration is made of.
+//! The captures from which a calibration computes masks.
 
 use serde::{Deserialize, Serialize};
 
 use super::{InvalidField, Sha256};
 
-/// The most patterns, and the most uploads for each.
-const MOST: usize = 4096;
-/// Masks of a calibration. Published systems have up to 50.
-pub const MOST_MASKS: usize = 64;
+/// Largest number of uploads for one capture.
+const MAX_REPEATS: usize = 4096;
+/// Largest number of masks of a calibration. Published systems have up to 50.
+pub const MAX_MASKS: usize = 64;
 
-/// The most processor time that a calibration is planned to take, in seconds: 36,000 captures of 3200x3200 take it.
-pub const MOST_SECONDS: f64 = 3600.0;
+/// Largest planned CPU time of a calibration in seconds. About 36,000 captures of 3200x3200 pixels take that long.
+pub const MAX_CALIBRATION_SECONDS: f64 = 3600.0;
 
-/// Planned processor seconds of a calibration: `captured` samples to average, and `frames` masks of `pixels`
-/// each to look at. Measured on one core.
+/// Planned CPU seconds of a calibration that averages `samples` stored values and analyses `frames` masks of `pixels`
+/// pixels. The constants were measured on one core.
 #[allow(clippy::cast_precision_loss)] // samples far below 2^53
-pub fn planned_seconds(captured: u64, frames: usize, pixels: usize) -> f64 {
+pub fn planned_seconds(samples: u64, frames: usize, pixels: usize) -> f64 {
     let masks = frames as f64 * pixels as f64;
-    6e-9 * captured as f64 + masks * (25e-9 + 0.2e-9 * frames as f64)
+    6e-9 * samples as f64 + masks * (25e-9 + 0.2e-9 * frames as f64)
 }
 
-/// Files by what they show, as uploads or as paths. Each has one frame or several: all are repeats of
-/// the same.
+/// The captures of a calibration, as uploads or as paths. Each file holds one frame or several repeats.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Captures<T = Sha256> {
-    /// For each pattern, in order: the white board through the lithography mask.
+    /// For each pattern, in order: captures of the white board with the lithography mask in place.
     pub masks: Vec<Vec<T>>,
-    /// The lithography mask taken out, the LCoS all white.
+    /// LCoS all white, lithography mask removed.
     pub white: Vec<T>,
-    /// The lithography mask taken out, the LCoS all black.
+    /// LCoS all black, lithography mask removed.
     pub black: Vec<T>,
-    /// With the lithography mask, the LCoS all black. Without these, `black` serves for it: Eq. 7 of
-    /// the paper.
+    /// LCoS all black, lithography mask in place. If empty, `black` is used instead (Eq. 7 of the paper).
     #[serde(default = "Vec::new")]
     pub black_with_mask: Vec<T>,
-    /// The aperture patterns that were shown, one frame each, to tell whether the order is right.
+    /// The intended aperture patterns, one frame each, for a check of the order.
     #[serde(default = "Option::default")]
     pub patterns: Option<T>,
-    /// The stored number from which on a pixel is full; by default the largest of its type.
+    /// Stored value from which a pixel is saturated; by default the largest of the data type.
     #[serde(default)]
     pub saturation: Option<u32>,
 }
 
 impl<T> Captures<T> {
-    /// The same captures, each named by what `to` makes of it.
+    /// Converts the reference to each file with `to`.
     pub fn map<U>(&self, to: impl Fn(&T) -> U) -> Captures<U> {
         let list = |list: &Vec<T>| list.iter().map(&to).collect();
         Captures {
@@ -57,7 +55,7 @@ impl<T> Captures<T> {
         }
     }
 
-    /// Each list of repeats with its place in the request.
+    /// Each list of repeats with its JSON pointer in the request.
     pub fn lists(&self) -> impl Iterator<Item = (String, &[T])> {
         let masks = self.masks.iter().enumerate();
         let masks = masks.map(|(index, list)| (format!("/captures/masks/{index}"), &list[..]));
@@ -70,7 +68,7 @@ impl<T> Captures<T> {
 }
 
 impl Captures {
-    /// Each upload with its place in the request.
+    /// Each upload with its JSON pointer in the request.
     pub fn uploads(&self) -> impl Iterator<Item = (String, Sha256)> {
         let lists = self.lists().flat_map(|(place, list)| {
             let uploads = list.iter().enumerate();
@@ -79,26 +77,31 @@ impl Captures {
         lists.chain(self.patterns.map(|upload| ("/captures/patterns".to_owned(), upload)))
     }
 
-    /// Refuses lists that are empty or too long.
-    /// Errors: all that is wrong, each with its place.
+    /// Checks the lengths of all lists.
+    ///
+    /// Errors: every violation, each with its JSON pointer.
     pub fn check(&self) -> Result<(), Vec<InvalidField>> {
         let mut errors = Vec::new();
-        if self.masks.is_empty() || self.masks.len() > MOST_MASKS {
-            let detail = format!("{} patterns; it must be 1 to {MOST_MASKS}", self.masks.len());
+        if self.masks.is_empty() || self.masks.len() > MAX_MASKS {
+            let detail =
+                format!("there are {} patterns; 1 to {MAX_MASKS} are accepted", self.masks.len());
             errors.push(InvalidField::new("/captures/masks", detail));
         }
         for (place, list) in self.lists() {
             let may_be_empty = place == "/captures/black_with_mask";
-            if (list.is_empty() && !may_be_empty) || list.len() > MOST {
+            if (list.is_empty() && !may_be_empty) || list.len() > MAX_REPEATS {
                 let detail = format!(
-                    "{} uploads; each capture needs 1 to {MOST}: a pattern without one is missing",
+                    "there are {} uploads for this capture; 1 to {MAX_REPEATS} are accepted",
                     list.len()
                 );
                 errors.push(InvalidField::new(&place, detail));
             }
         }
         if self.saturation == Some(0) {
-            errors.push(InvalidField::new("/captures/saturation", "0; it must be at least 1"));
+            errors.push(InvalidField::new(
+                "/captures/saturation",
+                "saturation is 0; it must be at least 1",
+            ));
         }
         if errors.is_empty() { Ok(()) } else { Err(errors) }
     }

@@ -1,5 +1,6 @@
-//! How identifiers, states and times lie in columns of SQLite. Here and not in the store, since only
-//! the crate of a type may say how a foreign crate sees it.
+//! Storage of identifiers, states and times in SQLite columns.
+//!
+//! These trait implementations must be in this crate, because neither the traits nor the types belong to the store.
 
 use sqlx::encode::IsNull;
 use sqlx::error::BoxDynError;
@@ -11,7 +12,7 @@ use super::{
     Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
 };
 
-/// How a type lies in a column: as another one, and how it becomes that one and is read of it.
+/// Stores types in a column of type `$other`, with conversions in both directions.
 macro_rules! column {
     ($($type:ty),* as $other:ty, $write:expr, $read:expr) => {$(
         impl Type<Sqlite> for $type {
@@ -19,8 +20,8 @@ macro_rules! column {
                 <$other as Type<Sqlite>>::type_info()
             }
 
-            fn compatible(found: &SqliteTypeInfo) -> bool {
-                <$other as Type<Sqlite>>::compatible(found)
+            fn compatible(stored: &SqliteTypeInfo) -> bool {
+                <$other as Type<Sqlite>>::compatible(stored)
             }
         }
 
@@ -40,7 +41,7 @@ macro_rules! column {
     )*};
 }
 
-column!(Timestamp as i64, |time| time.0, |millis| Ok(Timestamp(millis)));
+column!(Timestamp as i64, |time| time.0, |milliseconds| Ok(Timestamp(milliseconds)));
 column!(
     Sha256,
     Lab,

@@ -1,4 +1,4 @@
-//! Identifiers: one type for each kind of thing, all version 7 UUIDs, so that they sort by time.
+//! Identifiers: one type per kind of resource. All are version 7 UUIDs, so they sort by creation time.
 
 use std::str::FromStr;
 
@@ -6,11 +6,11 @@ use derive_more::Display;
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 use uuid::Uuid;
 
-/// The text given is not an identifier.
+/// A text is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{text:?} is not an identifier; it should be a lower-case UUID with hyphens")]
+#[error("{text:?} is not an identifier; identifiers are lower-case UUIDs with hyphens")]
 pub struct InvalidId {
-    /// What was given, cut to a length that can be shown.
+    /// The beginning of the text, at most 60 characters.
     pub text: String,
 }
 
@@ -22,8 +22,8 @@ macro_rules! identifiers {
         pub struct $name(Uuid);
 
         impl $name {
-            /// A new identifier, greater than all those made before it in this process.
-            #[allow(clippy::new_without_default)] // two calls differ: a default should not
+            /// A new identifier, greater than all earlier ones of this process.
+            #[allow(clippy::new_without_default)] // each call returns a different value
             pub fn new() -> Self {
                 Self(Uuid::now_v7())
             }
@@ -33,7 +33,7 @@ macro_rules! identifiers {
             type Err = InvalidId;
 
             fn from_str(text: &str) -> Result<Self, InvalidId> {
-                // Only the form that we print: one thing has one address.
+                // Only the canonical spelling, so that each resource has one address.
                 Uuid::parse_str(text)
                     .ok()
                     .filter(|id| id.as_hyphenated().to_string() == text)
@@ -49,17 +49,17 @@ identifiers! {
     CalibrationId,
     /// A measurement: one or more snapshots taken with one calibration.
     MeasurementId,
-    /// A model: an end-to-end network that is registered for a calibration.
+    /// A model: an end-to-end network registered for a calibration.
     ModelId,
     /// A job: the reconstruction of some snapshots of one measurement.
     JobId,
-    /// A task: the piece of a job that one worker does in one go.
+    /// A task: a unit of work of one worker.
     TaskId,
-    /// An upload that comes in pieces.
+    /// A resumable upload that is not complete.
     PartialId,
-    /// A token; not its secret.
+    /// A token. This is not its secret.
     TokenId,
-    /// A worker process, from its start to its end.
+    /// A worker process.
     WorkerId,
 }
 
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn only_one_spelling_is_an_id() {
+    fn only_the_canonical_spelling_is_accepted() {
         let id = JobId::new().to_string();
         for bad in [id.to_uppercase(), id.replace('-', ""), format!("{{{id}}}"), String::new()] {
             assert!(bad.parse::<JobId>().is_err(), "{bad}");

@@ -1,34 +1,34 @@
-//! How much memory a worker needs for a job: planned when the job is asked for, not hoped for.
+//! The memory plan of a job: an upper bound of a worker's resident memory, checked at submission.
 
 use super::{JobModel, JobSpec};
 use reconstruction::preview;
 use reconstruction::prior::Memory;
 use reconstruction::schedule::Method;
 
-/// The program, its thread stacks and, with the deep denoiser, ONNX Runtime and the network.
+/// The program, its thread stacks and, for schedules with a network, ONNX Runtime and the weights.
 const BASE_BYTES: u64 = 128 << 20;
-/// Arrays of the solver for each voxel of a tile (measured: 16 bytes; 4 more hold the frames after its first stage).
+/// Solver arrays per voxel of a tile. Measured: 16 bytes, and 4 more for the frames after the first stage.
 const SOLVER_BYTES_PER_VOXEL: u64 = 24;
-/// The solver's start of a projection, with momentum or ADMM; and ADMM's multiplier.
+/// One further array per voxel: the extrapolated point with momentum, or the multiplier of ADMM.
 const START_BYTES_PER_VOXEL: u64 = 4;
-/// Where a stage may be run twice: what it starts from, or the frames of its first run. In schedules with a network
-/// the bound has that already: a network's arrays are gone by then (320x320, Cr 10: 318 MiB, and 316 with one run).
-const TWICE_BYTES_PER_VOXEL: u64 = 8;
-/// Pixels that the network takes at once, or one frame of the tile if that is larger.
+/// Arrays per voxel of a stage that may run twice: its initial frames, or those of the first run. Schedules with a
+/// network need no extra memory for it, because the network's arrays are free by then (320x320, B = 10: 318 MiB with
+/// two runs, 316 MiB with one).
+const RERUN_BYTES_PER_VOXEL: u64 = 8;
+/// Pixels in one batch of a network. A larger tile is one batch per frame.
 const NETWORK_PIXELS: u64 = 1 << 17;
 
-/// Previews of the four sub-images of a mosaic, for each voxel of one.
+/// Previews of the four sub-images of a mosaic, per voxel of one sub-image.
 const COARSE_BYTES_PER_VOXEL: u64 = 16;
-/// A frame of a mosaic as it is assembled: twice, its three colours, and those of its PNG.
+/// A colour frame during assembly: two raw copies, three colours, and the colours of its PNG.
 const COLOUR_BYTES_PER_PIXEL: u64 = 40;
-/// The encoder of a movie, for each sample of a frame of it, with the frames of a group; and the rows that are
-/// read at a time.
+/// The movie encoder with a group of frames, per sample of a frame.
 const MOVIE_BYTES_PER_SAMPLE: u64 = 128;
+/// The movie encoder and its input rows, independent of the size.
 const MOVIE_BYTES: u64 = 48 << 20;
 
 impl JobSpec {
-    /// The planned cost of a tile in CPU-nanoseconds per voxel: of the schedule, or of a network as
-    /// its trial took it.
+    /// Planned cost of a tile in CPU nanoseconds per voxel, from the schedule or from the trial run of the model.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn planned_ns_per_voxel(&self) -> f64 {
         match &self.model {
@@ -40,21 +40,21 @@ impl JobSpec {
         }
     }
 
-    /// An upper bound of the resident memory, in bytes, of a worker that does any task of this job.
+    /// Upper bound, in bytes, of the resident memory of a worker that performs any task of this job.
     pub fn worker_bytes(&self) -> u64 {
-        // A preview by blocks takes far less than a tile.
+        // A preview by blocks takes much less than a tile.
         let (height, width) = self.shape.solved();
         let voxels = height * width * self.shape.frames;
         let whole = if voxels <= preview::WHOLE { voxels as u64 } else { 0 };
-        let preview = whole * (SOLVER_BYTES_PER_VOXEL + self.mosaic(COARSE_BYTES_PER_VOXEL));
+        let preview = whole * (SOLVER_BYTES_PER_VOXEL + self.if_mosaic(COARSE_BYTES_PER_VOXEL));
         let pixels = (self.shape.height * self.shape.width) as u64;
-        let colours = pixels * self.mosaic(COLOUR_BYTES_PER_PIXEL);
+        let colours = pixels * self.if_mosaic(COLOUR_BYTES_PER_PIXEL);
         let movie = MOVIE_BYTES + self.movie_samples() * MOVIE_BYTES_PER_SAMPLE;
         self.tile_bytes().max(BASE_BYTES + preview.max(colours).max(movie))
     }
 
-    /// What a mosaic alone takes.
-    fn mosaic(&self, bytes: u64) -> u64 {
+    /// The bytes for a mosaic, 0 for a grey sensor.
+    fn if_mosaic(&self, bytes: u64) -> u64 {
         if self.shape.mosaic.is_some() { bytes } else { 0 }
     }
 
@@ -65,7 +65,7 @@ impl JobSpec {
         let run = self.run.length.min(self.snapshots.count);
         let voxels = pixels * self.shape.frames as u64 * u64::from(run);
         if let Some(model) = &self.model {
-            // What the trial took grows with the picture at most.
+            // The memory of a network grows at most in proportion to the picture.
             let trial = (model.trial.pixels() as u64).max(1);
             let network = model.trial.peak_rss_bytes.saturating_mul(pixels.div_ceil(trial).max(1));
             return BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL + network;
@@ -77,17 +77,17 @@ impl JobSpec {
         if self.schedule.stages.iter().any(|stage| stage.momentum > 0.0) {
             per_voxel += START_BYTES_PER_VOXEL;
         }
-        let twice = self.schedule.stages.iter().any(|stage| stage.temporal_shrinkage.is_some());
-        if twice && !self.schedule.needs_network() {
-            per_voxel += TWICE_BYTES_PER_VOXEL;
+        let may_rerun = self.schedule.stages.iter().any(|stage| stage.temporal_shrinkage.is_some());
+        if may_rerun && !self.schedule.needs_network() {
+            per_voxel += RERUN_BYTES_PER_VOXEL;
         }
-        // A prior's arrays go with its stage, but networks stay loaded.
-        let most = |with_network: bool| {
+        // The arrays of a prior are freed after its stage, but networks stay loaded.
+        let largest = |with_network: bool| {
             let priors = self.schedule.stages.iter().map(|stage| stage.prior);
             let needs = priors.filter(|prior| prior.network().is_some() == with_network);
             needs.map(|prior| prior.memory()).fold(Memory::default(), Memory::most)
         };
-        let (plain, network) = (most(false), most(true));
+        let (plain, network) = (largest(false), largest(true));
         per_voxel += plain.per_voxel + network.per_voxel;
         BASE_BYTES + voxels * per_voxel + network.per_network_pixel * pixels.max(NETWORK_PIXELS)
     }
@@ -97,8 +97,8 @@ impl JobSpec {
 mod tests {
     use super::{BASE_BYTES, SOLVER_BYTES_PER_VOXEL};
     use crate::job::{
-        Algorithm, CalibrationId, Cut, JobSpec, MeasurementId, RunSpec, SceneShape, Sequence,
-        SnapshotRange, TileSpec,
+        Algorithm, CalibrationId, Cut, CutRequest, JobSpec, MeasurementId, RunSpec, SceneShape,
+        Sequence, SnapshotRange, TileSpec,
     };
 
     fn megabytes(algorithm: Algorithm, side: usize, frames: usize) -> u64 {
@@ -124,35 +124,39 @@ mod tests {
     }
 
     #[test]
-    fn a_preview_of_the_whole_picture_may_need_more_than_a_tile() {
+    fn whole_previews_may_need_more_memory_than_small_tiles() {
         let small_tiles = TileSpec { size: 64, overlap: 8 };
         let small = JobSpec { tile: small_tiles, ..spec(Algorithm::GapTv, 900, 10) };
         let voxels = 900 * 900 * 10;
         assert_eq!(small.worker_bytes(), BASE_BYTES + voxels * SOLVER_BYTES_PER_VOXEL);
         let large = JobSpec { tile: small_tiles, ..spec(Algorithm::GapTv, 1000, 10) };
-        assert!(large.worker_bytes() < small.worker_bytes(), "previews by blocks are small");
+        assert!(large.worker_bytes() < small.worker_bytes(), "previews by blocks take less memory");
     }
 
     #[test]
-    fn a_sequence_takes_no_more_than_a_long_snapshot() {
+    fn sequences_take_no_more_memory_than_long_snapshots() {
         for algorithm in [Algorithm::GapTv, Algorithm::GapTv3d, Algorithm::PnpTvFastdvdnet] {
             let large = |frames, snapshots: u32| {
-                let tile = (algorithm.default_tile(), false);
-                let schedule = algorithm.default_schedule();
-                let sequence = (Sequence::Contiguous, snapshots);
-                let cut = Cut::new(sequence, &schedule, tile, (frames, 3200, 3200)).unwrap();
+                let request = CutRequest {
+                    sequence: Sequence::Contiguous,
+                    snapshots,
+                    size: (frames, 3200, 3200),
+                    tile: algorithm.default_tile(),
+                    tile_is_fixed: false,
+                };
+                let cut = Cut::new(request, &algorithm.default_schedule()).unwrap();
                 let spec = spec(algorithm, 3200, frames);
                 let snapshots = SnapshotRange { first: 0, count: snapshots };
                 JobSpec { snapshots, tile: cut.tile, run: cut.run, ..spec }
             };
             let (sequence, single) = (large(10, 10), large(30, 1));
-            let (needed, today) = (sequence.worker_bytes() >> 20, single.worker_bytes() >> 20);
-            assert!(needed <= today, "{algorithm:?}: {needed} MiB, {today} MiB at Cr 30");
+            let [sequence, single] = [sequence, single].map(|spec| spec.worker_bytes() >> 20);
+            assert!(sequence <= single, "{algorithm:?}: {sequence} MiB, {single} MiB at B = 30");
         }
     }
 
     #[test]
-    fn the_bound_holds_for_what_was_measured_and_is_near_it() {
+    fn the_bound_is_between_one_and_two_times_the_measured_memory() {
         use Algorithm::{GapTv, PnpTvFastdvdnet};
         for (algorithm, side, frames, measured) in [
             (GapTv, 1024, 20, 368),

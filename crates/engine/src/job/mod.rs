@@ -1,4 +1,4 @@
-//! What a job is: identifiers, the validated request, states and their legal transitions. No I/O.
+//! The data model of jobs: identifiers, validated requests, states and their transitions. No I/O.
 
 mod access;
 mod algorithm;
@@ -20,7 +20,7 @@ mod text;
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
 pub use assessment::Assessment;
-pub use captures::{Captures, MOST_MASKS, MOST_SECONDS, planned_seconds};
+pub use captures::{Captures, MAX_CALIBRATION_SECONDS, MAX_MASKS, planned_seconds};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
 };
@@ -29,13 +29,14 @@ pub use optics::{MARGIN, Mosaic};
 pub use pool::{InvalidPool, Pool};
 pub use reconstruction::schedule::Schedule;
 pub use report::{
-    CalibrationReport, CaptureReport, Finding, Grade, MaskReport, PatternReport, Severity,
+    CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, PatternReport,
+    Severity,
 };
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
-pub use shape::{Cut, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
+pub use shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
 pub use task::{
-    LEAST_MOVIE_SIDE, MOVIE_SIDE, ResultFile, TaskKind, TaskProgress, TaskStage, TaskState,
+    MIN_MOVIE_SIDE, MOVIE_SIDE, ResultFile, TaskKind, TaskProgress, TaskStage, TaskState,
     movie_step,
 };
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

@@ -1,54 +1,56 @@
-//! End-to-end networks: what is known of one, and what a job takes of it.
+//! End-to-end networks: the result of their check, and their use in a job.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Algorithm, CalibrationId, InvalidField, Label, ModelId, SceneShape, Sha256, TileSpec};
 use reconstruction::schedule::Schedule;
 
-/// A tensor that a network takes or gives.
+/// An input or output tensor of a network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ModelTensor {
     pub name: String,
-    /// Its sides; null for one that may have any length.
+    /// Length of each axis; null for a variable one.
     pub shape: Vec<Option<usize>>,
 }
 
-/// A run on zeros: what it took, for the plans of jobs.
+/// Cost of a trial run on zeros, for planning jobs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ModelTrial {
     pub height: usize,
     pub width: usize,
-    /// Processor seconds of the run, without loading the network.
+    /// CPU seconds of the run, without loading the network.
     pub cpu_seconds: f64,
-    /// Largest resident memory of the process that ran it.
+    /// Peak resident memory of the process, in bytes.
     pub peak_rss_bytes: u64,
 }
 
-/// What the check of a network has found.
+/// The result of the check of a network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ModelFacts {
     pub inputs: Vec<ModelTensor>,
     pub outputs: Vec<ModelTensor>,
-    /// True if it takes pictures of the calibration's size only, so that they can't be cut.
+    /// True if the network accepts only the size of the calibration, so that pictures can't be tiled.
     pub fixed_size: bool,
     pub trial: ModelTrial,
 }
 
-/// The outcome of a check, as the checking process tells it.
+/// The outcome of the check of a network, as the checking process reports it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelVerdict {
+    /// The network can be used.
     Fits(ModelFacts),
-    /// It can't, and why.
+    /// The network can't be used, for this reason.
     Refused(String),
 }
 
+/// The network of a job with the algorithm [`Algorithm::Learned`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobModel {
     pub id: ModelId,
     pub calibration: CalibrationId,
     pub name: Option<Label>,
-    /// Hash of its ONNX file.
+    /// Hash of the ONNX file.
     pub sha256: Sha256,
     /// See [`ModelFacts::fixed_size`].
     pub fixed_size: bool,
@@ -62,7 +64,7 @@ impl ModelTrial {
     }
 }
 
-/// What a request says that concerns a network.
+/// The fields of a request that concern a network.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ModelChoice<'a> {
     pub(super) algorithm: Algorithm,
@@ -72,7 +74,7 @@ pub(super) struct ModelChoice<'a> {
 }
 
 impl ModelChoice<'_> {
-    /// What is wrong with it, for a measurement of this shape taken with this calibration.
+    /// Checks the fields against the calibration and the shape of the measurement. Returns all errors.
     pub(super) fn errors(
         &self,
         calibration: CalibrationId,
@@ -80,48 +82,53 @@ impl ModelChoice<'_> {
     ) -> Vec<InvalidField> {
         let (height, width) = shape.solved();
         let mut errors = Vec::new();
-        let mut wrong = |pointer: &str, detail: String| {
+        let mut refuse = |pointer: &str, detail: String| {
             errors.push(InvalidField::new(pointer, detail));
         };
         let learned = self.algorithm == Algorithm::Learned;
         match self.model {
-            None if learned => wrong(
+            None if learned => refuse(
                 "/model",
-                "learned needs the network of a model: register one with POST /v1/models".into(),
+                "the algorithm learned needs a model: register one with POST /v1/models".into(),
             ),
             Some(_) if !learned => {
-                let detail =
-                    format!("{} takes no model; ask for learned", self.algorithm.into_str());
-                wrong("/model", detail);
+                let detail = format!(
+                    "{} takes no model: use the algorithm learned, or omit the model",
+                    self.algorithm.into_str()
+                );
+                refuse("/model", detail);
             }
-            Some(model) if model.calibration != calibration => wrong(
+            Some(model) if model.calibration != calibration => refuse(
                 "/model",
                 format!(
-                    "the model was registered for calibration {}; the measurement was taken with \
-                     {calibration}",
+                    "the model was registered for calibration {}, but the measurement belongs to \
+                     calibration {calibration}",
                     model.calibration
                 ),
             ),
             _ => {}
         }
         if learned && self.schedule.is_some() {
-            wrong("/schedule", "learned runs one network once: it has no schedule".into());
+            refuse(
+                "/schedule",
+                "the algorithm learned runs a network once and has no schedule: omit it".into(),
+            );
         }
         if let (Some(model), Some(tile)) = (self.model, self.tile)
             && model.fixed_size
             && tile.size < height.max(width)
         {
             let detail = format!(
-                "the network takes pictures of {height}x{width} pixels only, so they can't be cut into \
-                 tiles of {}: leave the tiles out",
+                "the network accepts only {height}x{width} pixels, so the picture can't be cut into tiles of \
+                 {}: omit `tile`",
                 tile.size
             );
-            wrong("/tile", detail);
+            refuse("/tile", detail);
         }
         errors
     }
 
-    /// The tiles where the request names none: for a network of one size, the whole picture.
+    /// The tiles of the request or, if it states none, the default: the whole picture for a network of fixed size.
     pub(super) fn tile(&self, shape: SceneShape) -> TileSpec {
         let (height, width) = shape.solved();
         let whole = TileSpec::whole(height, width);

@@ -5,26 +5,26 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// The name of a pool: those of its workers have the same rights and get the same tiles.
+/// The name of a worker pool. All workers of a pool have the same rights and receive the same kind of tiles.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Pool(String);
 
 impl Pool {
-    /// The longest name.
+    /// Longest name in characters.
     pub const MAX_LENGTH: usize = 32;
 
-    /// The name.
+    /// The name as text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
 }
 
-/// The text is no name of a pool.
+/// A text is not a valid pool name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{0:?} is no name of a pool: it should have 1 to {max} characters of a to z, 0 to 9 and -",
+    "{0:?} is not a valid pool name: use 1 to {max} characters of a-z, 0-9 and -",
     max = Pool::MAX_LENGTH
 )]
 pub struct InvalidPool(String);
@@ -66,7 +66,7 @@ mod tests {
     use super::Pool;
 
     #[test]
-    fn a_pool_has_a_name_that_can_stand_in_a_subject() {
+    fn pool_names_are_valid_nats_subject_tokens() {
         for good in ["gpu", "lab-2", "0"] {
             assert_eq!(good.parse::<Pool>().unwrap().as_str(), good);
         }

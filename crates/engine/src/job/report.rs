@@ -1,52 +1,65 @@
-//! What a check of a calibration or measurement has found, and the report of a calibration, as they
-//! are stored and shown.
+//! Findings and calibration reports in the form that is stored and shown.
 
 use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 
-pub use optics::Severity;
-use optics::{self, CaptureFigures, MaskFigures, PatternFigures};
+use optics::{CaptureFigures, MaskFigures, PatternFigures};
+pub use optics::{FindingCode, Severity};
 
-/// Something that is wrong.
+/// A problem that a check has found. [`FindingCode`] is the registry of all codes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Finding {
-    /// Its name, which never changes, for programs to rely on.
+    /// Stable identifier; a text, because stored findings may have codes of other versions.
     pub code: String,
     pub severity: Severity,
-    /// What was seen, with its numbers.
+    /// The observation with its numbers, for people.
     pub detail: String,
+    /// Recommended action for the user.
     pub remedy: String,
-    /// The patterns or frames that it is about, counted from 0.
+    /// The affected patterns or frames, counted from 0.
     pub frames: Vec<usize>,
-    /// The snapshot that it is about, counted from 0; none for a calibration.
+    /// The affected snapshot, counted from 0; `None` if the finding is not about one snapshot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub snapshot: Option<u32>,
 }
 
-impl From<optics::Finding> for Finding {
-    fn from(finding: optics::Finding) -> Self {
-        let optics::Finding { code, severity, detail, remedy, frames } = finding;
-        Self { code: code.into(), severity, detail, remedy: remedy.into(), frames, snapshot: None }
+impl Finding {
+    /// A finding of the usual severity that concerns no particular frame or snapshot.
+    pub fn new(code: FindingCode, detail: impl Into<String>) -> Self {
+        optics::Finding::new(code, detail).into()
+    }
+
+    /// True if this finding has the code.
+    pub fn is(&self, code: FindingCode) -> bool {
+        self.code == code.as_str()
     }
 }
 
-/// A verdict on a calibration.
+impl From<optics::Finding> for Finding {
+    fn from(finding: optics::Finding) -> Self {
+        let optics::Finding { code, severity, detail, frames } = finding;
+        let remedy = code.entry().remedy.to_owned();
+        Self { code: code.to_string(), severity, detail, remedy, frames, snapshot: None }
+    }
+}
+
+/// The grade of a calibration or a result.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, IntoStaticStr,
 )]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
 pub enum Grade {
-    /// Nothing is wrong with it.
+    /// No findings.
     Good,
-    /// It can be used, with what the warnings say.
+    /// Usable, with the limitations that the warnings state.
     Usable,
-    /// Results will be wrong.
+    /// Results are wrong.
     Bad,
 }
 
 impl Grade {
-    /// The grade that findings give.
+    /// The grade that follows from the worst finding.
     pub fn of(findings: &[Finding]) -> Self {
         match findings.iter().map(|finding| finding.severity).max() {
             None => Self::Good,
@@ -56,10 +69,10 @@ impl Grade {
     }
 }
 
-/// What is known of the masks of a calibration.
+/// The report on a calibration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CalibrationReport {
-    /// Name and version of this form.
+    /// Name and version of this schema.
     pub schema: String,
     pub grade: Grade,
     pub findings: Vec<Finding>,
@@ -67,98 +80,99 @@ pub struct CalibrationReport {
     pub height: usize,
     pub width: usize,
     pub masks: MaskReport,
-    /// Figures of the captures that they were made of; none for masks that were sent.
+    /// Statistics of the captures; `None` if masks were uploaded.
     pub captures: Option<CaptureReport>,
+    /// Names of the maps that accompany the report.
     pub maps: Vec<String>,
 }
 
-/// Figures of masks on \[0,1\].
+/// Statistics of masks on \[0,1\].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MaskReport {
     pub mean: f64,
-    /// Mean over the pixels of the standard deviation over the frames.
+    /// Standard deviation over the masks, averaged over all pixels.
     pub deviation: f64,
-    /// 1 % of all values lie below this.
+    /// 1st percentile of all values.
     pub percentile_1: f64,
-    /// 99 % of all values lie below this.
+    /// 99th percentile of all values.
     pub percentile_99: f64,
     pub frame_means: Vec<f64>,
-    /// Correlation of each mask with each other.
+    /// Correlation between the masks \[B\]\[B\].
     pub correlation: Vec<Vec<f64>>,
-    /// Mean over all pairs; none for one mask.
+    /// Mean correlation over all pairs; `None` for a single mask.
     pub correlation_mean: Option<f64>,
-    /// Largest of all pairs; none for one mask.
+    /// Largest correlation of all pairs; `None` for a single mask.
     pub correlation_largest: Option<f64>,
-    /// Smallest, mean and largest sum of squares of a pixel: the gram diagonal.
+    /// Smallest, mean and largest value of the Gram diagonal, the sum of squares of a pixel over the masks.
     pub gram: [f64; 3],
+    /// Number of pixels that are dark in every mask.
     pub dead_pixels: u64,
-    /// Pixels that are open in all masks.
+    /// Number of pixels that are open in every mask.
     pub stuck_pixels: u64,
-    /// Values that are 0 (or were below and set to 0).
+    /// Number of values that are 0, or were below 0 and set to 0.
     pub values_at_zero: u64,
 }
 
-/// Figures of captures. Levels are numbers as stored.
+/// Statistics of captures. Levels are stored values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CaptureReport {
-    /// Share of the light of the open aperture without a mask that passes, in the mean.
+    /// Mean share of the light of the open aperture that the masks transmit.
     pub light_throughput: f64,
-    /// The share where a mask is 1: masks were divided by it.
+    /// Share of that light where a mask is 1: the divisor of the normalisation.
     pub mask_scale: f64,
-    /// Standard deviation that noise gives a mask value in the mean; none without repeats.
+    /// Mean standard deviation of a mask value due to noise; `None` without repeats.
     pub noise: Option<f64>,
-    /// Mean deviation over the frames over that noise, in decibels: what is left of the dynamic range.
+    /// Dynamic range in dB: `deviation` of the masks over `noise`.
     pub dynamic_range_db: Option<f64>,
+    /// Mean of the white image.
     pub white_level: f64,
+    /// Mean of the black image.
     pub black_level: f64,
-    /// Mean of the black with mask; none for Eq. 7.
+    /// Mean of the black image with the lithography mask in place; `None` if Eq. 7 was used.
     pub black_with_mask_level: Option<f64>,
-    /// Darkest over brightest part of the illumination.
+    /// Illumination of the darkest part over that of the brightest.
     pub illumination_flatness: Option<f64>,
-    /// Share of full pixels of the white.
+    /// Share of saturated pixels of the white image.
     pub white_saturated: Option<f64>,
-    /// Share of pixels whose white is not above their black.
+    /// Share of the pixels whose white is not above their black.
     pub denominator_not_positive: f64,
-    /// Share of further pixels whose white is hardly above their black.
+    /// Share of the pixels whose white is above their black, but by too little to divide by.
     pub denominator_too_dark: f64,
     pub patterns: Vec<PatternReport>,
 }
 
-/// Figures of the captures of one pattern.
+/// Statistics of the captures of one pattern.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PatternReport {
-    /// Mean share of the white's light.
+    /// Mean share of the light of the white image.
     pub light: f64,
-    /// Share of pixels at or below 0.
+    /// Share of the pixels at or below 0.
     pub not_positive: f64,
-    /// Share of pixels too far below 0 for noise.
+    /// Share of the pixels below 0 by more than noise explains.
     pub negative: f64,
-    /// Standard deviation that noise gives a mask value.
+    /// Standard deviation of a mask value due to noise.
     pub noise: Option<f64>,
+    /// Share of saturated pixels.
     pub saturated: Option<f64>,
-    /// Change of the light during the repeats, as a share.
+    /// Relative change of the light during the repeats.
     pub drift: f64,
 }
 
-/// Name and version of this form of report.
+/// Name and version of the schema of [`CalibrationReport`].
 const SCHEMA: &str = "sci-recon/calibration-report/1";
 
 impl CalibrationReport {
-    /// What jobs are to be told of a calibration that is bad.
+    /// The finding that jobs of a bad calibration carry.
     pub fn warning(&self) -> Option<Finding> {
-        let grave = self.findings.iter().filter(|finding| finding.severity == Severity::Error);
-        let reasons: Vec<&str> = grave.map(|finding| finding.code.as_str()).collect();
-        (self.grade == Grade::Bad).then(|| Finding {
-            code: "bad_calibration".into(),
-            severity: Severity::Error,
-            detail: format!("the calibration is bad: {}", reasons.join(", ")),
-            remedy: "read its report, mend what it names, and calibrate again".into(),
-            frames: Vec::new(),
-            snapshot: None,
+        let errors = self.findings.iter().filter(|finding| finding.severity == Severity::Error);
+        let codes: Vec<&str> = errors.map(|finding| finding.code.as_str()).collect();
+        (self.grade == Grade::Bad).then(|| {
+            let detail = format!("the calibration is graded bad because of {}", codes.join(", "));
+            Finding::new(FindingCode::BadCalibration, detail)
         })
     }
 
-    /// Of figures and what was found in them. `captures` come with the scale of the masks.
+    /// A report on statistics and the findings in them. `captures` includes the divisor of the masks' normalisation.
     pub fn new(
         figures: &MaskFigures,
         captures: Option<(&CaptureFigures, f32)>,
@@ -190,20 +204,20 @@ impl MaskReport {
         Self {
             mean: figures.overall_mean(),
             deviation: figures.mean_deviation(),
-            percentile_1: figures.percentiles.0.into(),
-            percentile_99: figures.percentiles.1.into(),
+            percentile_1: figures.percentile_1.into(),
+            percentile_99: figures.percentile_99.into(),
             frame_means: figures.frame_means.clone(),
             correlation: figures.correlation.outer_iter().map(|row| row.to_vec()).collect(),
-            correlation_mean: correlations.map(|(mean, _)| mean),
-            correlation_largest: correlations.map(|(_, largest)| largest),
+            correlation_mean: correlations.map(|correlations| correlations.mean),
+            correlation_largest: correlations.map(|correlations| correlations.largest),
             gram: [
                 gram().fold(f64::INFINITY, f64::min),
                 gram().sum::<f64>() / pixels,
                 gram().fold(0.0, f64::max),
             ],
-            dead_pixels: figures.dead,
-            stuck_pixels: figures.stuck_open,
-            values_at_zero: figures.zeros,
+            dead_pixels: figures.dead_pixels,
+            stuck_pixels: figures.stuck_pixels,
+            values_at_zero: figures.values_at_zero,
         }
     }
 }
@@ -213,7 +227,7 @@ impl CaptureReport {
         let noise: Option<Vec<f64>> =
             figures.patterns.iter().map(|pattern| pattern.noise).collect();
         let count = figures.patterns.len().max(1) as f64;
-        // Of the masks as they are: divided by their scale.
+        // The noise of the normalised masks.
         let noise = noise.map(|noise| noise.iter().sum::<f64>() / count / scale);
         let range = noise.filter(|noise| *noise > 0.0 && masks.deviation > 0.0);
         Self {
@@ -221,9 +235,9 @@ impl CaptureReport {
             mask_scale: scale,
             noise,
             dynamic_range_db: range.map(|noise| 20.0 * (masks.deviation / noise).log10()),
-            white_level: figures.levels.0,
-            black_level: figures.levels.1,
-            black_with_mask_level: figures.levels.2,
+            white_level: figures.white_level,
+            black_level: figures.black_level,
+            black_with_mask_level: figures.black_with_mask_level,
             illumination_flatness: figures.flatness,
             white_saturated: figures.white_saturated,
             denominator_not_positive: figures.denominator_not_positive,

@@ -1,4 +1,4 @@
-//! The request for a job as a user writes it, and the job as it is done after all checks.
+//! Job requests as users write them, and job specifications after all checks.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,33 +6,33 @@ use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
 use super::report::Finding;
-use super::shape::{Cut, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
+use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
 use reconstruction::ReconError;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::TilePlan;
 
-/// The most tasks of one job; a larger one should be sent as several ranges of snapshots.
+/// Largest number of tasks of one job. Larger jobs can be submitted as several ranges of snapshots.
 pub const MAX_TASKS: usize = 50_000;
 
-/// Bytes of a voxel in a stored tile: one 32-bit float.
+/// Bytes per voxel of a stored tile: one 32-bit float.
 const TILE_BYTES: u64 = 4;
-/// Bytes of a voxel in the results: EXR frames and stack, NumPy (32 bit each) and PNG (16 bit). EXR
-/// and PNG are compressed, but noise is not.
+/// Bytes per voxel of the results: EXR frames, EXR stack and NumPy (32 bits each), and PNG (16 bits). Compression is
+/// ignored, because noise does not compress.
 const RESULT_BYTES: u64 = 4 + 4 + 4 + 2;
-/// The same of the frames of a mosaic: three colours, and what was seen.
+/// Bytes per voxel of the results behind a mosaic: three colours, and the raw values.
 const COLOUR_BYTES: u64 = 3 * RESULT_BYTES + 4;
-/// Headers, manifests and rows, for each snapshot.
+/// Bytes of headers, manifests and database rows per snapshot.
 const SNAPSHOT_BYTES: u64 = 1 << 20;
 
-/// Which snapshots a request means: `"all"`, one index, or `[first, last]` with both ends in.
+/// The snapshots of a request: `"all"`, one index, or `[first, last]` with both ends included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(try_from = "SelectionJson", into = "SelectionJson")]
 pub enum SnapshotSelection {
     #[default]
     All,
-    /// The snapshot with this index, from 0.
+    /// The snapshot with this index, counted from 0.
     One(u32),
     /// From the first to the last index, both included.
     Range(u32, u32),
@@ -52,9 +52,9 @@ impl TryFrom<SelectionJson> for SnapshotSelection {
     fn try_from(json: SelectionJson) -> Result<Self, &'static str> {
         match json {
             SelectionJson::Word(word) if word == "all" => Ok(Self::All),
-            SelectionJson::Word(_) => {
-                Err("snapshots must be \"all\", one index, or [first, last] with both ends in")
-            }
+            SelectionJson::Word(_) => Err(
+                "snapshots must be \"all\", one index, or [first, last] with both ends included",
+            ),
             SelectionJson::One(index) => Ok(Self::One(index)),
             SelectionJson::Range([first, last]) => Ok(Self::Range(first, last)),
         }
@@ -76,52 +76,51 @@ impl From<SnapshotSelection> for SelectionJson {
 #[serde(deny_unknown_fields)]
 pub struct JobRequest {
     pub measurement: MeasurementId,
-    /// If given, it must be the measurement's own calibration: a check, not a choice.
+    /// If stated, it must be the calibration of the measurement. It is a check, not a choice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<CalibrationId>,
-    /// The snapshots; all where it is left out.
+    /// The snapshots; by default all.
     #[serde(default)]
     pub snapshots: SnapshotSelection,
-    /// Whether the snapshots follow one another; what the measurement says where it is left out.
+    /// Temporal relation of the snapshots; by default that of the measurement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sequence: Option<Sequence>,
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub model: Option<ModelId>,
-    /// The schedule; the algorithm's own where it is left out.
+    /// The schedule; by default that of the algorithm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub schedule: Option<Schedule>,
-    /// The tiles; [`Algorithm::default_tile`] where it is left out, or the whole picture for a network
-    /// that takes no other.
+    /// The tiles; by default [`Algorithm::default_tile`], or the whole picture for a network of fixed size.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
-    /// Jobs of higher priority are served first; from -100 to 100.
+    /// From -100 to 100. Jobs of higher priority are served first.
     #[serde(default)]
     pub priority: i32,
-    /// A name to find the job by.
+    /// A name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub label: Option<Label>,
 }
 
-/// A job after all checks: nothing is left open, and it is stored and recorded as it stands here.
+/// A job after all checks, with all defaults filled in. It is stored and recorded in this form.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobSpec {
     pub calibration: CalibrationId,
     pub measurement: MeasurementId,
     pub shape: SceneShape,
     pub snapshots: SnapshotRange,
-    /// Whether the snapshots follow one another.
+    /// Temporal relation of the snapshots.
     #[serde(default = "separate")]
     pub sequence: Sequence,
-    /// How they are reconstructed together.
+    /// How contiguous snapshots are reconstructed together.
     #[serde(default)]
     pub run: RunSpec,
     pub algorithm: Algorithm,
-    /// The network of [`Algorithm::Learned`]; none for all others.
+    /// The network of [`Algorithm::Learned`]; `None` for other algorithms.
     #[serde(default)]
     pub model: Option<JobModel>,
-    /// The schedule; without stages for [`Algorithm::Learned`].
+    /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
     pub priority: i32,
@@ -130,15 +129,16 @@ pub struct JobSpec {
     pub warnings: Vec<Finding>,
 }
 
-/// Jobs of before there were sequences.
+/// The default for stored jobs that do not have the field.
 fn separate() -> Sequence {
     Sequence::Separate
 }
 
 impl JobRequest {
-    /// Checks the request against the measurement and the model that it names, and fills in the
-    /// defaults. `sequence` is what is known of the measurement.
-    /// Errors: all that is wrong, each with its place in the request.
+    /// Checks the request against its measurement and model, and fills in the defaults. `calibration`, `shape` and
+    /// `sequence` are those of the measurement.
+    ///
+    /// Errors: every violation, each with its JSON pointer in the request.
     pub fn resolve(
         self,
         calibration: CalibrationId,
@@ -147,8 +147,10 @@ impl JobRequest {
         model: Option<JobModel>,
     ) -> Result<JobSpec, Vec<InvalidField>> {
         let mut errors = Vec::new();
-        if self.calibration.is_some_and(|given| given != calibration) {
-            let detail = format!("the measurement was taken with calibration {calibration}");
+        if self.calibration.is_some_and(|stated| stated != calibration) {
+            let detail = format!(
+                "the measurement belongs to calibration {calibration}: state that one, or omit the field"
+            );
             errors.push(InvalidField::new("/calibration", detail));
         }
         let snapshots = self.snapshots.within(shape.snapshots).unwrap_or_else(|error| {
@@ -165,7 +167,7 @@ impl JobRequest {
         let tile = choice.tile(shape);
         let schedule = self.schedule.unwrap_or_else(|| self.algorithm.default_schedule());
         if self.algorithm != Algorithm::Learned {
-            let faults = InvalidField::of_schedule(&schedule);
+            let faults = InvalidField::schedule_errors(&schedule);
             if faults.is_empty() {
                 let misfit = self.algorithm.misfit(&schedule);
                 errors.extend(misfit.map(|detail| InvalidField::new("/algorithm", detail)));
@@ -174,12 +176,16 @@ impl JobRequest {
         }
         let sequence = self.sequence.unwrap_or(sequence);
         let (height, width) = shape.solved();
-        let size = (shape.frames, height, width);
-        let tile = (tile, self.tile.is_some());
-        let cut = Cut::new((sequence, snapshots.count), &schedule, tile, size);
-        let Cut { tile, run } = cut.unwrap_or_else(|error| {
+        let request = CutRequest {
+            sequence,
+            snapshots: snapshots.count,
+            size: (shape.frames, height, width),
+            tile,
+            tile_is_fixed: self.tile.is_some(),
+        };
+        let Cut { tile, run } = Cut::new(request, &schedule).unwrap_or_else(|error| {
             errors.push(InvalidField::new("/tile", error.to_string()));
-            Cut { tile: tile.0, run: RunSpec::ALONE }
+            Cut { tile, run: RunSpec::ALONE }
         });
         errors.extend(priority_error(self.priority));
         if !errors.is_empty() {
@@ -202,14 +208,14 @@ impl JobRequest {
             label,
             warnings: Vec::new(),
         };
-        match too_many(&spec) {
+        match excess_tasks(&spec) {
             Some(error) => Err(vec![error]),
             None => Ok(spec),
         }
     }
 }
 
-/// What is wrong with a priority.
+/// Checks a priority.
 pub fn priority_error(priority: i32) -> Option<InvalidField> {
     (!(-100..=100).contains(&priority)).then(|| {
         let detail = format!("priority is {priority}; it must be from -100 to 100");
@@ -217,23 +223,23 @@ pub fn priority_error(priority: i32) -> Option<InvalidField> {
     })
 }
 
-/// A job of more tasks than are taken.
-fn too_many(spec: &JobSpec) -> Option<InvalidField> {
+/// The error of a job with more than [`MAX_TASKS`] tasks.
+fn excess_tasks(spec: &JobSpec) -> Option<InvalidField> {
     let tiles = spec.tile_plan().ok()?.len() as u64;
     let (runs, snapshots) = (spec.sequence_plan().ok()?.runs().len() as u64, spec.snapshots.count);
-    // Besides tiles a preview and an assembly of each snapshot, and three of the job.
+    // Each snapshot has a preview and an assembly; the job has prepare, pilot and manifest.
     let tasks = tiles * runs + 2 * u64::from(snapshots) + 3;
     (tasks > MAX_TASKS as u64).then(|| {
         let detail = format!(
-            "{tiles} tiles in each of {runs} runs of {snapshots} snapshots make {tasks} tasks; at \
-             most {MAX_TASKS} fit into one job: use larger tiles or fewer snapshots"
+            "the job would have {tasks} tasks ({tiles} tiles in each of {runs} runs, {snapshots} snapshots), but at \
+             most {MAX_TASKS} are accepted: use larger tiles or fewer snapshots"
         );
         InvalidField::new("/tile", detail)
     })
 }
 
 impl SnapshotSelection {
-    /// The snapshots meant, of `available` in the measurement.
+    /// The selected range out of `available` snapshots.
     fn within(self, available: u32) -> Result<SnapshotRange, InvalidField> {
         let (first, last) = match self {
             Self::All => (0, available.saturating_sub(1)),
@@ -241,9 +247,9 @@ impl SnapshotSelection {
             Self::Range(first, last) => (first, last),
         };
         let detail = if last < first {
-            format!("the range ends at {last} before it starts at {first}")
+            format!("the range ends at snapshot {last}, before its start at {first}: swap the two")
         } else if last >= available {
-            format!("snapshot {last} is asked for, but the measurement has {available}, from 0")
+            format!("there is no snapshot {last}: the measurement has {available}, counted from 0")
         } else {
             return Ok(SnapshotRange { first, count: last - first + 1 });
         };
@@ -252,34 +258,35 @@ impl SnapshotSelection {
 }
 
 impl JobSpec {
-    /// The tile plan of every snapshot of the job; an error only if the spec was changed by hand.
+    /// The tile plan, the same for all snapshots.
+    ///
+    /// Errors: none for a spec from [`JobRequest::resolve`].
     pub fn tile_plan(&self) -> Result<TilePlan, ReconError> {
         self.shape.tile_plan(self.tile)
     }
 
-    /// The runs of snapshots that are reconstructed together; an error only if the spec was changed by
-    /// hand.
+    /// The runs of snapshots that are reconstructed together.
+    ///
+    /// Errors: none for a spec from [`JobRequest::resolve`].
     pub fn sequence_plan(&self) -> Result<SequencePlan, ReconError> {
         let SnapshotRange { first, count } = self.snapshots;
         self.run.plan(first as usize..first as usize + count as usize)
     }
 
-    /// Snapshots that are computed, those that two runs share counted twice.
+    /// Number of computed snapshots. Those that two runs share count twice.
     pub(super) fn snapshots_computed(&self) -> u64 {
-        // A spec is checked before it is stored: its runs can be planned.
-        let of = |plan: SequencePlan| plan.runs().iter().map(|run| run.len() as u64).sum();
-        self.sequence_plan().map_or(u64::from(self.snapshots.count), of)
+        let total = |plan: SequencePlan| plan.runs().iter().map(|run| run.len() as u64).sum();
+        self.sequence_plan().map_or(u64::from(self.snapshots.count), total)
     }
 
-    /// An upper bound of the bytes that the job writes to the disk. Tiles are kept until it has
-    /// succeeded, so both count.
+    /// Upper bound of the bytes that the job writes to disk. Tiles are kept until the job has succeeded, so tiles and
+    /// results both count.
     pub fn disk_bytes(&self) -> u64 {
         let frames = self.shape.frames as u64;
         let voxels = (self.shape.height * self.shape.width) as u64 * frames;
         let area = |plan: TilePlan| {
             plan.tiles().map(|tile| (tile.height * tile.width) as u64).sum::<u64>()
         };
-        // A spec is checked before it is stored: its tiles can be planned.
         let tiles = self.tile_plan().map_or(0, area) * frames;
         let bytes = if self.shape.mosaic.is_some() { COLOUR_BYTES } else { RESULT_BYTES };
         let results = voxels * bytes + SNAPSHOT_BYTES;
@@ -327,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn selections_are_one_index_or_both_ends() {
+    fn snapshots_are_selected_by_index_range_or_all() {
         for (json, first, count) in [(json!(2), 2, 1), (json!([1, 3]), 1, 3), (json!("all"), 0, 6)]
         {
             let request = request(json!({ "snapshots": json })).unwrap();
@@ -340,46 +347,46 @@ mod tests {
     }
 
     #[test]
-    fn a_job_may_override_what_the_measurement_says() {
-        let run = |fields: Value, measured| {
+    fn jobs_may_override_the_sequence_of_the_measurement() {
+        let sequence_and_run = |fields: Value, measured| {
             let request = request(fields).unwrap();
             let spec = request.resolve(CalibrationId::new(), SHAPE, measured, None).unwrap();
             (spec.sequence, spec.run.length)
         };
         let deep = json!({"algorithm": "pnp-tv-fastdvdnet"});
-        assert_eq!(run(deep.clone(), Sequence::Contiguous), (Sequence::Contiguous, 5));
-        assert_eq!(run(deep, Sequence::Separate), (Sequence::Separate, 1));
-        let mut asked = json!({"algorithm": "pnp-tv-fastdvdnet", "sequence": "separate"});
-        assert_eq!(run(asked.clone(), Sequence::Contiguous), (Sequence::Separate, 1));
-        asked["sequence"] = json!("contiguous");
-        assert_eq!(run(asked, Sequence::Separate), (Sequence::Contiguous, 5));
-        // Total variation of each frame alone gains nothing.
-        assert_eq!(run(json!({}), Sequence::Contiguous), (Sequence::Contiguous, 1));
+        assert_eq!(sequence_and_run(deep.clone(), Sequence::Contiguous), (Sequence::Contiguous, 5));
+        assert_eq!(sequence_and_run(deep, Sequence::Separate), (Sequence::Separate, 1));
+        let mut stated = json!({"algorithm": "pnp-tv-fastdvdnet", "sequence": "separate"});
+        assert_eq!(sequence_and_run(stated.clone(), Sequence::Contiguous), (Sequence::Separate, 1));
+        stated["sequence"] = json!("contiguous");
+        assert_eq!(sequence_and_run(stated, Sequence::Separate), (Sequence::Contiguous, 5));
+        // Spatial total variation gains nothing from neighbouring snapshots.
+        assert_eq!(sequence_and_run(json!({}), Sequence::Contiguous), (Sequence::Contiguous, 1));
     }
 
     #[test]
-    fn runs_that_overlap_count_twice_on_the_disk() {
+    fn shared_snapshots_of_runs_count_twice_on_disk() {
         let spec = |sequence: &str| {
             let fields = json!({"algorithm": "pnp-tv-fastdvdnet", "sequence": sequence,
                 "tile": {"size": 304, "overlap": 0}});
             let request = request(fields).unwrap();
             request.resolve(CalibrationId::new(), SHAPE, Sequence::Separate, None).unwrap()
         };
-        let (separate, together) = (spec("separate"), spec("contiguous"));
+        let (separate, contiguous) = (spec("separate"), spec("contiguous"));
         let frames = (8 * 256 * 300 * 4) as u64;
         // Six snapshots in two runs of four.
-        assert_eq!(together.sequence_plan().unwrap().runs(), [0..4, 2..6]);
-        assert_eq!(together.disk_bytes() - separate.disk_bytes(), 2 * frames);
+        assert_eq!(contiguous.sequence_plan().unwrap().runs(), [0..4, 2..6]);
+        assert_eq!(contiguous.disk_bytes() - separate.disk_bytes(), 2 * frames);
         let tiles = |spec: &super::JobSpec| {
             let tasks = spec.tasks().unwrap();
             tasks.into_iter().filter(|(kind, _)| kind.tile().is_some()).collect::<Vec<_>>()
         };
-        assert_eq!((tiles(&separate).len(), tiles(&together).len()), (6, 2));
-        assert!((tiles(&together)[0].1 / tiles(&separate)[0].1 - 4.0).abs() < 1e-9, "the cost");
+        assert_eq!((tiles(&separate).len(), tiles(&contiguous).len()), (6, 2));
+        assert!((tiles(&contiguous)[0].1 / tiles(&separate)[0].1 - 4.0).abs() < 1e-9, "the cost");
     }
 
     #[test]
-    fn all_errors_are_told_at_once_with_their_places() {
+    fn all_errors_are_reported_at_once_with_their_pointers() {
         let wrong = json!({
             "snapshots": [4, 6],
             "priority": 101,
@@ -387,9 +394,9 @@ mod tests {
             "tile": {"size": 64, "overlap": 40},
             "schedule": {"stages": [{"prior": "tv", "iterations": 0, "tv_weight": 0.1}]},
         });
-        let places =
+        let expected =
             ["/calibration", "/snapshots", "/schedule/stages/0/iterations", "/tile", "/priority"];
-        assert_eq!(pointers(wrong), places);
+        assert_eq!(pointers(wrong), expected);
         assert_eq!(pointers(json!({"snapshots": [3, 2]})), ["/snapshots"]);
         let deep = json!({"prior": "fastdvdnet", "iterations": 2, "sigma": [0.1, 0.1]});
         assert_eq!(pointers(json!({"schedule": {"stages": [deep]}})), ["/algorithm"]);

@@ -1,9 +1,9 @@
-//! The states of a job and the steps between them that are legal.
+//! The states of a job and the legal transitions between them.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
-/// Where a job stands, in the order of its life.
+/// The state of a job, in the order of its life.
 #[derive(
     Debug,
     Clone,
@@ -21,35 +21,35 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
 pub enum JobState {
-    /// Accepted; no task of it was claimed yet.
+    /// Accepted; no task has been claimed.
     Queued,
-    /// At least one task was claimed.
+    /// At least one task has been claimed.
     Running,
-    /// All tasks are done and the results are there.
+    /// All tasks are done and the results are complete.
     Succeeded,
-    /// A task could not be done; `error` says why.
+    /// A task has failed; the field `error` has the reason.
     Failed,
-    /// Cancel was asked for and some tasks are still in a worker's hands.
+    /// Cancelled by the user, but workers still hold some tasks.
     Cancelling,
-    /// Cancelled, and no worker is at it any more.
+    /// Cancelled, and no worker holds a task.
     Cancelled,
 }
 
-/// A step between two states that does not exist.
+/// A transition between two states that is not legal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("a job that is {from} can't become {to}")]
+#[error("a job in the state {from} can't change to {to}")]
 pub struct IllegalTransition {
     pub from: JobState,
     pub to: JobState,
 }
 
 impl JobState {
-    /// True if nothing happens to the job any more unless a user asks for it.
+    /// True if only a user's request can change the state.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)
     }
 
-    /// The state `to`, if the step there is legal.
+    /// Returns `to` if the transition is legal.
     pub fn step(self, to: Self) -> Result<Self, IllegalTransition> {
         use JobState::{Cancelled, Cancelling, Failed, Queued, Running, Succeeded};
         let legal = matches!(
@@ -57,7 +57,7 @@ impl JobState {
             (Queued, Running | Cancelled | Failed)
                 | (Running, Succeeded | Failed | Cancelling | Cancelled)
                 | (Cancelling, Cancelled)
-                // A job whose results were damaged on the disk is done again.
+                // A retry repeats a job, for example after its results were damaged on disk.
                 | (Failed | Cancelled | Succeeded, Queued)
         );
         if legal { Ok(to) } else { Err(IllegalTransition { from: self, to }) }
@@ -71,7 +71,7 @@ mod tests {
     use super::JobState;
 
     #[test]
-    fn names_are_one_to_one() {
+    fn states_are_parsed_back_from_their_names() {
         for state in JobState::VARIANTS.iter().copied() {
             assert_eq!(state.into_str().parse::<JobState>().unwrap(), state);
             assert_eq!(serde_json::to_value(state).unwrap(), state.into_str());
@@ -79,10 +79,10 @@ mod tests {
     }
 
     #[test]
-    fn ends_can_be_retried_and_lead_nowhere_else() {
-        for end in [JobState::Succeeded, JobState::Failed, JobState::Cancelled] {
+    fn final_states_can_only_be_retried() {
+        for state in [JobState::Succeeded, JobState::Failed, JobState::Cancelled] {
             for to in JobState::VARIANTS.iter().copied() {
-                assert_eq!(end.step(to).is_ok(), to == JobState::Queued);
+                assert_eq!(state.step(to).is_ok(), to == JobState::Queued);
             }
         }
         assert!(JobState::Cancelling.step(JobState::Running).is_err());

@@ -1,4 +1,4 @@
-//! Tasks: what workers do. A job is cut into many; a calibration is one.
+//! Tasks, the units of work of workers. A job has many tasks, a calibration has one.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
@@ -8,58 +8,55 @@ use super::shape::SceneShape;
 use super::text::Sha256;
 use reconstruction::{ReconError, joints, pilot, preview};
 
-/// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
+/// CPU seconds per voxel that is read (measured).
 const READ_S: f64 = 12e-9;
+/// CPU seconds per voxel that is blended and written in all formats (measured).
 const WRITE_S: f64 = 110e-9;
-/// The same of a preview by blocks, and of one that is done whole (measured).
+/// CPU seconds per voxel of a preview by blocks (measured).
 const PREVIEW_BLOCKS_S: f64 = 10e-9;
+/// CPU seconds per voxel of a preview at full resolution (measured).
 const PREVIEW_WHOLE_S: f64 = 120e-9;
-/// The same for each sample of a movie (measured; of noise it is twice as much).
+/// CPU seconds per sample of a movie (measured; noise takes twice as long).
 const MOVIE_S: f64 = 700e-9;
-/// No side of a movie is longer, or shorter: AV1's encoder takes no smaller ones.
+/// Longest side of a movie in pixels.
 pub const MOVIE_SIDE: usize = 1920;
-pub const LEAST_MOVIE_SIDE: usize = 16;
+/// Shortest side of a movie in pixels; the AV1 encoder accepts no smaller ones.
+pub const MIN_MOVIE_SIDE: usize = 16;
 
-/// What a task does. Snapshots are counted from 0 within the measurement, tiles within the tile plan.
+/// The kind of a task. Snapshots are counted from 0 within the measurement, tiles from 0 within the tile plan.
 ///
-/// The order of work is prepare, then previews, the pilot of an adaptive schedule or a sequence, and all
-/// tiles, run by run; a snapshot is assembled when the tiles of the runs that hold it are done, and the
-/// manifest is written when all snapshots are assembled.
+/// A job starts with prepare. Previews, the pilot (for an adaptive schedule or a sequence) and the tiles of all runs
+/// follow. A snapshot is assembled when the tiles of all runs that contain it are done. The manifest comes last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantNames)]
 #[strum(serialize_all = "snake_case", const_into_str)]
 pub enum TaskKind {
-    /// Estimate the scene's scale, once a job, so that no two tiles differ in it.
+    /// Estimates the white level of the scene once per job, so that all tiles use the same one.
     Prepare,
-    /// Reconstruct one snapshot coarsely, to be looked at until its tiles are done.
-    Preview {
-        snapshot: u32,
-    },
-    /// Find out how many iterations of an adaptive schedule pay, and which snapshots belong together. Tiles
-    /// wait for it.
+    /// Reconstructs one snapshot coarsely, for display until its tiles are done.
+    Preview { snapshot: u32 },
+    /// Decides the iterations of an adaptive schedule, and which neighbouring snapshots are reconstructed together.
+    /// Tiles wait for it.
     Pilot,
-    /// Reconstruct one tile of a run of snapshots.
+    /// Reconstructs one tile of a run of snapshots.
     Tile {
-        /// The run's first snapshot.
+        /// First snapshot of the run.
         snapshot: u32,
-        /// How many there are in the run.
+        /// Number of snapshots in the run.
         snapshots: u32,
         tile: u32,
     },
-    /// Blend the tiles of one snapshot and write its frames.
-    Assemble {
-        snapshot: u32,
-    },
+    /// Blends the tiles of one snapshot and writes its frames.
+    Assemble { snapshot: u32 },
+    /// Writes the manifest of the job.
     Manifest,
-    /// Make the masks of a calibration from its captures, and the report on them.
+    /// Computes the masks of a calibration from its captures, and the report.
     Calibration,
-    /// Make a movie of the frames of a snapshot, or of all of a job, which somebody has asked for.
-    Movie {
-        snapshot: Option<u32>,
-    },
+    /// Encodes a requested movie of one snapshot, or of all snapshots of a job.
+    Movie { snapshot: Option<u32> },
 }
 
 impl TaskKind {
-    /// The snapshot that the task belongs to, or the first of its run, if it belongs to one.
+    /// The snapshot of the task, or the first of its run; `None` for tasks of the whole job.
     pub fn snapshot(self) -> Option<u32> {
         match self {
             Self::Preview { snapshot }
@@ -70,7 +67,7 @@ impl TaskKind {
         }
     }
 
-    /// How many snapshots the task does at once.
+    /// Number of snapshots that the task processes together.
     pub fn snapshots(self) -> u32 {
         match self {
             Self::Tile { snapshots, .. } => snapshots,
@@ -78,7 +75,7 @@ impl TaskKind {
         }
     }
 
-    /// The tile's index, for a tile.
+    /// Index of the tile; `None` for other tasks.
     pub fn tile(self) -> Option<u32> {
         match self {
             Self::Tile { tile, .. } => Some(tile),
@@ -86,7 +83,7 @@ impl TaskKind {
         }
     }
 
-    /// The kind with this name and these indices: the inverse of the functions above and `into_str`.
+    /// The kind with this name and these indices. It is the inverse of the accessors and of `into_str`.
     pub fn from_parts(
         name: &str,
         (snapshot, snapshots): (Option<u32>, u32),
@@ -107,7 +104,9 @@ impl TaskKind {
 }
 
 impl JobSpec {
-    /// The tasks of the job with their planned CPU-seconds, in the order in which they are handed out.
+    /// The tasks of the job with their planned CPU seconds, in the order in which workers claim them.
+    ///
+    /// Errors: none for a spec from [`JobRequest::resolve`](super::JobRequest::resolve).
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn tasks(&self) -> Result<Vec<(TaskKind, f64)>, ReconError> {
         let (tiles, runs) = (self.tile_plan()?, self.sequence_plan()?);
@@ -116,35 +115,36 @@ impl JobSpec {
         let per_voxel = self.planned_ns_per_voxel() * 1e-9;
         let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
         let (height, width) = self.shape.solved();
-        let whole = preview::block(self.shape.frames, height, width) == 1;
+        let full_resolution = preview::block(self.shape.frames, height, width) == 1;
         let write_s = WRITE_S * self.shape.channels().count() as f64;
-        let preview = pixels * frames * if whole { PREVIEW_WHOLE_S } else { PREVIEW_BLOCKS_S };
+        let preview =
+            pixels * frames * if full_resolution { PREVIEW_WHOLE_S } else { PREVIEW_BLOCKS_S };
         let snapshots = self.snapshots.indices();
         tasks.extend(snapshots.map(|snapshot| (TaskKind::Preview { snapshot }, preview)));
         let joints = runs.joints().len() as f64;
         if self.schedule.adaptive || joints > 0.0 {
             let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
-            let decided = if self.schedule.adaptive {
+            let schedule_s = if self.schedule.adaptive {
                 self.schedule.pilot_ns_per_voxel() * 1e-9
             } else {
                 0.0
             };
-            // Of each joint both snapshots together, and the second one alone.
-            let compared =
+            // Each joint compares both snapshots together with the second one alone.
+            let joints_s =
                 if joints > 0.0 { (3.0 * joints + 1.0) / joints::SHORTER as f64 } else { 0.0 };
-            // The preview of the first snapshot is there at once; the others may wait.
-            tasks.insert(2, (TaskKind::Pilot, voxels * (decided + per_voxel * compared)));
+            // The pilot follows the preview of the first snapshot; the other previews can wait.
+            tasks.insert(2, (TaskKind::Pilot, voxels * (schedule_s + per_voxel * joints_s)));
         }
         let mut assembled = self.snapshots.first;
         for (index, run) in runs.runs().iter().enumerate() {
             let (snapshot, snapshots) = (run.start as u32, run.len() as u32);
             let mut areas: Vec<_> = (0..).zip(tiles.tiles()).collect();
-            areas.sort_by(|(a, _), (b, _)| place(*a).total_cmp(&place(*b)));
+            areas.sort_by(|(a, _), (b, _)| work_order(*a).total_cmp(&work_order(*b)));
             for (tile, area) in areas {
                 let voxels = (area.height * area.width * run.len()) as f64 * frames;
                 tasks.push((TaskKind::Tile { snapshot, snapshots, tile }, voxels * per_voxel));
             }
-            // What no later run holds is complete.
+            // Snapshots that no later run contains are complete.
             let complete = runs.runs().get(index + 1).map_or(run.end, |next| next.start) as u32;
             let snapshots = std::mem::replace(&mut assembled, complete)..complete;
             let assemble = |snapshot| (TaskKind::Assemble { snapshot }, pixels * frames * write_s);
@@ -154,7 +154,7 @@ impl JobSpec {
         Ok(tasks)
     }
 
-    /// Planned CPU-seconds of the movie of a snapshot or, with none, of all of them.
+    /// Planned CPU seconds of the movie of one snapshot, or of all snapshots for `None`.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn movie_cost(&self, snapshot: Option<u32>) -> f64 {
         let SceneShape { frames, height, width, .. } = self.shape;
@@ -163,19 +163,19 @@ impl JobSpec {
         samples as f64 * READ_S + self.movie_bytes(snapshot) as f64 * MOVIE_S
     }
 
-    /// Samples of the movie of a snapshot or, with none, of all of them: more bytes than it takes.
+    /// Upper bound, in bytes, of the movie of one snapshot, or of all snapshots for `None`: one byte per sample.
     pub fn movie_bytes(&self, snapshot: Option<u32>) -> u64 {
         let snapshots = if snapshot.is_some() { 1 } else { u64::from(self.snapshots.count) };
         snapshots * self.shape.frames as u64 * self.movie_samples()
     }
 
-    /// Whether the frames are large enough for a movie.
+    /// True if the frames are large enough for a movie.
     pub fn has_movie(&self) -> bool {
         let SceneShape { height, width, .. } = self.shape;
-        height.min(width).div_ceil(movie_step(height, width)) >= LEAST_MOVIE_SIDE
+        height.min(width).div_ceil(movie_step(height, width)) >= MIN_MOVIE_SIDE
     }
 
-    /// Samples of a frame of a movie.
+    /// Number of samples in a frame of a movie.
     pub(super) fn movie_samples(&self) -> u64 {
         let step = movie_step(self.shape.height, self.shape.width);
         let side = |length: usize| length.div_ceil(step) as u64;
@@ -183,19 +183,19 @@ impl JobSpec {
     }
 }
 
-/// Every so many rows and columns of pictures of this size are one of their movie: a power of two.
+/// Subsampling factor, a power of two, that fits pictures of this size into [`MOVIE_SIDE`].
 pub fn movie_step(height: usize, width: usize) -> usize {
     let fits = |step: &usize| height.max(width).div_ceil(*step) <= MOVIE_SIDE;
     (0..usize::BITS).map(|level| 1 << level).find(fits).unwrap_or(1)
 }
 
-/// The place of a tile in the order of work. Multiples of the golden ratio go all over the picture: it
-/// gets sharper everywhere, and the first tiles tell what the others may take.
-fn place(tile: u32) -> f64 {
+/// Sort key of a tile in the order of work. Multiples of the golden ratio spread the first tiles over the picture, so
+/// that it becomes sharp everywhere, and the first tiles give a good estimate of the remaining time.
+fn work_order(tile: u32) -> f64 {
     (f64::from(tile) * 0.618_033_988_75).fract()
 }
 
-/// Where a task stands, in the order of its life.
+/// The state of a task, in the order of its life.
 #[derive(
     Debug,
     Clone,
@@ -215,21 +215,21 @@ fn place(tile: u32) -> f64 {
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
 pub enum TaskState {
-    /// Waits for other tasks of its job.
+    /// Waits for other tasks of the job.
     Blocked,
     /// Can be claimed.
     Ready,
-    /// Claimed by a worker, whose lease may have run out.
+    /// Claimed by a worker. The lease may have expired.
     Running,
-    /// Its result is stored.
+    /// The result is stored.
     Done,
-    /// Given up; its job or calibration has failed with it.
+    /// Failed after all attempts, and with it the job or calibration.
     Failed,
-    /// The job was cancelled or failed before this task was done.
+    /// Not done because the job was cancelled or failed.
     Cancelled,
 }
 
-/// The part of its work that a task is in.
+/// The phase of a running task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Display, EnumString)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
@@ -244,29 +244,29 @@ pub enum TaskStage {
     Writing,
 }
 
-/// How far a running task is.
+/// Progress of a running task.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TaskProgress {
     pub stage: TaskStage,
-    /// Solver iterations done so far.
+    /// Number of finished solver iterations.
     pub iterations: u32,
-    /// Passes of the deep denoiser done so far.
+    /// Number of finished passes of the deep denoiser.
     pub passes: u32,
-    /// The share of the planned work that is done, on [0, 1], by cost and not by count: one deep
-    /// pass costs as much as thousands of TV iterations ([`super::Schedule::share_done`]).
+    /// Finished share of the planned cost, on \[0,1\]; see [`super::Schedule::share_done`]. One deep pass costs as much
+    /// as thousands of TV iterations.
     pub fraction: f64,
 }
 
 impl TaskProgress {
-    /// Nothing is done yet.
+    /// The progress at the start of a task.
     pub const START: Self =
         Self { stage: TaskStage::Reading, iterations: 0, passes: 0, fraction: 0.0 };
 }
 
-/// A file that a task has made.
+/// A file of a result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ResultFile {
-    /// Its path below the folder of the snapshot or job, such as `frames/frame_0001.exr`.
+    /// Path below the folder of the snapshot or job, such as `frames/frame_0001.exr`.
     pub name: String,
     pub size: u64,
     pub sha256: Sha256,

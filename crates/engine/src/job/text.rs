@@ -1,5 +1,4 @@
-//! Small values as text: labels and hashes, each checked once when it is made; times; and what is
-//! wrong with a text.
+//! Validated text values: labels, hashes and times, and the errors of invalid ones.
 
 use std::fmt;
 use std::io::{self, BufReader, Read};
@@ -12,7 +11,7 @@ use serde_with::{DeserializeFromStr, SerializeDisplay};
 
 use reconstruction::schedule::Schedule;
 
-/// A text from a user that does not have the form it should have.
+/// The error of a text that can't be parsed. It explains the expected form.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct InvalidText(String);
@@ -23,11 +22,12 @@ impl InvalidText {
     }
 }
 
-/// One thing wrong with a request, and where it stands.
+/// A violation in a request, and its place.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct InvalidField {
     /// JSON pointer (RFC 6901) into the request.
     pub pointer: String,
+    /// The problem, and the expected value.
     pub detail: String,
 }
 
@@ -36,25 +36,25 @@ impl InvalidField {
         Self { pointer: pointer.into(), detail: detail.into() }
     }
 
-    /// All that is wrong with a schedule, with places in it.
-    pub fn of_schedule(schedule: &Schedule) -> Vec<Self> {
+    /// All violations of a schedule, with pointers relative to it.
+    pub fn schedule_errors(schedule: &Schedule) -> Vec<Self> {
         let faults = schedule.faults().into_iter();
         faults.map(|(pointer, error)| Self::new(pointer, error.to_string())).collect()
     }
 
-    /// The same error seen from one level further up.
+    /// Prepends `parent` to the pointer.
     pub fn under(mut self, parent: &str) -> Self {
         self.pointer.insert_str(0, parent);
         self
     }
 }
 
-/// A name that a user gives to a thing. It is shown and searched for, and never becomes a path.
+/// A name that a user gives to a resource. It is never used as a path.
 #[derive(Debug, Clone, PartialEq, Eq, Display, SerializeDisplay, DeserializeFromStr)]
 pub struct Label(String);
 
 impl Label {
-    /// The most characters that a label has.
+    /// Longest label in characters.
     pub const MAX_CHARS: usize = 200;
 
     pub fn as_str(&self) -> &str {
@@ -68,24 +68,26 @@ impl FromStr for Label {
     fn from_str(text: &str) -> Result<Self, InvalidText> {
         let length = text.chars().count();
         if text.trim().is_empty() {
-            return Err(InvalidText("a name must not be blank; leave it out instead".into()));
+            return Err(InvalidText(
+                "the name is blank: omit it, or use at least one visible character".into(),
+            ));
         }
         if length > Self::MAX_CHARS {
             return Err(InvalidText(format!(
-                "the name has {length} characters; at most {} are taken",
+                "the name has {length} characters; at most {} are accepted",
                 Self::MAX_CHARS
             )));
         }
         match text.chars().position(char::is_control) {
-            Some(at) => Err(InvalidText(format!(
-                "the name holds a control character at position {at}; names are printable text"
+            Some(position) => Err(InvalidText(format!(
+                "the name contains a control character at position {position}: use printable characters only"
             ))),
             None => Ok(Self(text.to_owned())),
         }
     }
 }
 
-/// The SHA-256 hash of a file's bytes, which is also the file's address in the store.
+/// The SHA-256 hash of a file, which is also its address in the store.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, SerializeDisplay, DeserializeFromStr,
 )]
@@ -101,7 +103,7 @@ impl Sha256 {
         self.0
     }
 
-    /// The hash and the number of the bytes that are left to read.
+    /// Hashes all remaining bytes of a reader, and counts them.
     pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
         use sha2::Digest;
         let mut hasher = sha2::Sha256::new();
@@ -109,6 +111,7 @@ impl Sha256 {
         Ok((Self(hasher.finalize().into()), size))
     }
 
+    /// The hash of these bytes.
     pub fn of(bytes: &[u8]) -> Self {
         use sha2::Digest;
         Self(sha2::Sha256::digest(bytes).into())
@@ -129,7 +132,7 @@ impl FromStr for Sha256 {
         let upper = text.bytes().any(|digit| digit.is_ascii_uppercase());
         if upper || hex::decode_to_slice(text, &mut bytes).is_err() {
             return Err(InvalidText(format!(
-                "{:?} is not a SHA-256 hash; it should be 64 lower-case hexadecimal digits",
+                "{:?} is not a SHA-256 hash: 64 lower-case hexadecimal digits are expected",
                 text.chars().take(80).collect::<String>()
             )));
         }
@@ -137,7 +140,7 @@ impl FromStr for Sha256 {
     }
 }
 
-/// A moment: milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text, always in UTC.
+/// A time in milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text in UTC.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay, DeserializeFromStr,
 )]
@@ -147,10 +150,10 @@ impl FromStr for Timestamp {
     type Err = InvalidText;
 
     fn from_str(text: &str) -> Result<Self, InvalidText> {
-        let moment: Result<jiff::Timestamp, _> = text.parse();
-        moment.map(|moment| Self(moment.as_millisecond())).map_err(|_| {
+        let time: Result<jiff::Timestamp, _> = text.parse();
+        time.map(|time| Self(time.as_millisecond())).map_err(|_| {
             InvalidText(format!(
-                "{:?} is no moment; it should be like 2026-11-21T10:39:01Z",
+                "{:?} is not a time: RFC 3339 is expected, such as 2026-11-21T10:39:01Z",
                 text.chars().take(80).collect::<String>()
             ))
         })
@@ -158,28 +161,28 @@ impl FromStr for Timestamp {
 }
 
 impl Timestamp {
-    /// The wall clock's time.
+    /// The current time of the system clock.
     pub fn now() -> Self {
         Self(jiff::Timestamp::now().as_millisecond())
     }
 
-    fn moment(self) -> jiff::Timestamp {
+    fn to_jiff(self) -> jiff::Timestamp {
         jiff::Timestamp::from_millisecond(self.0).unwrap_or(jiff::Timestamp::MAX)
     }
 
-    /// As in the headers of HTTP (RFC 9110).
+    /// The time in the format of HTTP headers (RFC 9110).
     pub fn http_date(self) -> String {
         let printer = jiff::fmt::rfc2822::DateTimePrinter::new();
         // Fails only before the year 0.
-        printer.timestamp_to_rfc9110_string(&self.moment()).unwrap_or_default()
+        printer.timestamp_to_rfc9110_string(&self.to_jiff()).unwrap_or_default()
     }
 
-    /// The moment that is so much later.
-    pub fn after(self, time: Duration) -> Self {
-        Self(self.0.saturating_add(i64::try_from(time.as_millis()).unwrap_or(i64::MAX)))
+    /// The time that is `delay` later.
+    pub fn after(self, delay: Duration) -> Self {
+        Self(self.0.saturating_add(i64::try_from(delay.as_millis()).unwrap_or(i64::MAX)))
     }
 
-    /// Seconds from `earlier` to this moment, not below zero.
+    /// Seconds since `earlier`, at least 0.
     #[allow(clippy::cast_precision_loss)]
     pub fn seconds_since(self, earlier: Self) -> f64 {
         (self.0 - earlier.0).max(0) as f64 / 1000.0
@@ -188,17 +191,17 @@ impl Timestamp {
 
 impl fmt::Display for Timestamp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:.3}", self.moment())
+        write!(f, "{:.3}", self.to_jiff())
     }
 }
 
-/// The text with each absolute path in it cut down to its last part: how the folders of the service
-/// are named is nobody's business, and what failed can still be told.
+/// Replaces each absolute path in a text by its last component. Error messages stay useful, and do not reveal the
+/// folders of the service.
 pub fn without_paths(text: &str) -> String {
     let mut clean = String::with_capacity(text.len());
     let mut rest = text;
-    while let Some(at) = start_of_path(rest) {
-        let (before, path) = rest.split_at(at);
+    while let Some(start) = start_of_path(rest) {
+        let (before, path) = rest.split_at(start);
         let end = path.find(ends_path).unwrap_or(path.len());
         let (path, after) = path.split_at(end);
         clean.push_str(before);
@@ -208,14 +211,14 @@ pub fn without_paths(text: &str) -> String {
     clean + rest
 }
 
-/// Where the first path with at least two parts begins.
+/// Byte index of the first path with at least two components.
 fn start_of_path(text: &str) -> Option<usize> {
     let slashes = text.match_indices('/').map(|(at, _)| at);
     slashes.into_iter().find(|&at| {
         let before = text[..at].chars().next_back();
         let path = &text[at + 1..];
         let end = path.find(ends_path).unwrap_or(path.len());
-        // "and/or" and "s/m" are no paths; the slashes of "file:///x/y" and "/x/y" begin one.
+        // "and/or" and "m/s" are not paths; the slashes of "file:///x/y" and "/x/y" start one.
         !before.is_some_and(|c| c.is_alphanumeric()) && path[..end].trim_matches('/').contains('/')
     })
 }
@@ -229,7 +232,7 @@ mod tests {
     use super::{Label, Sha256, Timestamp, without_paths};
 
     #[test]
-    fn times_are_written_as_rfc_3339() {
+    fn times_are_formatted_as_rfc_3339() {
         assert_eq!(Timestamp(0).to_string(), "1970-01-01T00:00:00.000Z");
         assert_eq!(Timestamp(951_827_696_789).to_string(), "2000-02-29T12:34:56.789Z");
         assert_eq!(Timestamp(1_798_761_599_999).to_string(), "2026-12-31T23:59:59.999Z");
@@ -252,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_are_printable_and_short() {
+    fn labels_are_short_printable_text() {
         assert!("run 7, f/8, \u{3b1} = 3".parse::<Label>().is_ok());
         assert!("../../etc/passwd".parse::<Label>().is_ok(), "a label is not a path");
         for bad in ["", "  ", "a\nb", "a\0b", "\u{1b}[31m", &"x".repeat(201)] {
@@ -261,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn paths_go_and_what_failed_stays() {
+    fn paths_are_reduced_to_their_last_component() {
         for (text, clean) in [
             ("can't write /srv/sci/tmp/019a: No space left", "can't write 019a: No space left"),
             ("there is no file /nowhere/lib.so; name it", "there is no file lib.so; name it"),

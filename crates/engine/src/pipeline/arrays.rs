@@ -1,4 +1,4 @@
-//! The prepared arrays of a job, read window by window.
+//! The prepared arrays of a job, which are read window by window.
 
 use std::fs::File;
 use std::ops::Range;
@@ -14,18 +14,19 @@ use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use reconstruction::tile::Window;
 
-/// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], their full scale
-/// divided out.
+/// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], divided by their full scale.
 #[derive(Debug, Clone)]
 pub struct Arrays {
-    /// The masks and the hash that they should have.
+    /// The file of the masks and its recorded hash.
     pub masks: (PathBuf, Sha256),
-    /// The snapshots and the hash that they should have.
+    /// The file of the snapshots and its recorded hash.
     pub snapshots: (PathBuf, Sha256),
 }
 
 impl Arrays {
-    /// Refuses files whose bytes are not those that were stored.
+    /// Checks the hashes of both files.
+    ///
+    /// Errors: [`PipelineError::Corrupt`] if a file is missing or changed.
     pub fn verify(&self) -> Result<()> {
         for (what, (path, sha256)) in [("masks", &self.masks), ("snapshots", &self.snapshots)] {
             if !is_intact(path, *sha256)? {
@@ -39,7 +40,7 @@ impl Arrays {
         Reader::open(&self.masks.0, &Limits::default())
     }
 
-    /// The sum \[H,W\] of all masks; memory holds two planes.
+    /// The sum of all masks \[H,W\]. It reads one mask at a time.
     pub fn light(&self, monitor: &Monitor) -> Result<Array2<f32>> {
         let masks = self.masks()?;
         let mut light = Array2::zeros((masks.info().height, masks.info().width));
@@ -56,7 +57,7 @@ impl Arrays {
         plane(&reader, index as usize)
     }
 
-    /// A piece of a run of snapshots with its masks, to be solved as one clip.
+    /// A window of consecutive snapshots and of the masks, as the input of a tile that solves them as one clip.
     pub fn window(
         &self,
         snapshots: Range<u32>,
@@ -64,16 +65,16 @@ impl Arrays {
         white: f32,
     ) -> Result<TileInput, FormatError> {
         let masks = self.masks()?;
-        let which = snapshots.start as usize..snapshots.end as usize;
+        let frames = snapshots.start as usize..snapshots.end as usize;
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
-        let y = window(&snapshots, which, place)?;
+        let y = window(&snapshots, frames, place)?;
         let masks = window(&masks, 0..masks.info().frames, place)?;
         let whole = 0..y.dim().0;
         Ok(TileInput { masks, y, white, pieces: vec![whole] })
     }
 }
 
-/// A window of some frames of a prepared array.
+/// Reads a window of some frames of a prepared array.
 pub fn window(
     reader: &Reader,
     frames: Range<usize>,
@@ -82,14 +83,14 @@ pub fn window(
     reader.read_lattice(frames, (place.rows.clone(), place.columns.clone()), place.step)
 }
 
-/// One frame \[H,W\] of a prepared array.
+/// Reads one frame \[H,W\] of a prepared array.
 pub(super) fn plane(reader: &Reader, frame: usize) -> Result<Array2<f32>, FormatError> {
     let (height, width) = (reader.info().height, reader.info().width);
     let window = reader.read_window(frame..frame + 1, 0..height, 0..width)?;
     Ok(window.index_axis_move(Axis(0), 0))
 }
 
-/// Whether a file is there and has the bytes that were stored.
+/// True if a file exists and has the recorded hash.
 pub(super) fn is_intact(path: &Path, sha256: Sha256) -> Result<bool, FormatError> {
     if !path.exists() {
         return Ok(false);

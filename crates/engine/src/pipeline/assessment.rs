@@ -1,10 +1,10 @@
-//! How good a result is, told without a truth: a predicted PSNR with its interval, a grade in words, and a
-//! map of the expected error.
+//! The predicted quality of a result without ground truth: PSNR with an interval, a grade, and a map of the expected
+//! error.
 
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
-use crate::job::{Assessment, Finding, Grade, Severity};
+use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
 pub use reconstruction::assessment::{BLOCK, blocks};
 use reconstruction::assessment::{Evidence, Model, unfamiliar_masks};
 use reconstruction::motion::fastest;
@@ -13,32 +13,31 @@ use reconstruction::sequence::RunShare;
 use reconstruction::solver::Outcome;
 use reconstruction::tile::TilePlan;
 
-/// What a tile's frames let expect, as it is kept with the record of its task.
+/// The predicted quality of a tile, which is stored with the record of its task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TileAssessment {
-    /// Rows and columns of blocks.
+    /// Number of block rows and block columns.
     size: (usize, usize),
-    /// The expected PSNR of each block \[S B, rows, columns\] on the scale on which the scene is on \[0,1\], in steps
-    /// of a quarter of a decibel from 0.
+    /// Expected PSNR of each block \[S B, rows, columns\] on the unit scale of the solver, in steps of 0.25 dB from 0
+    /// dB.
     #[serde(with = "hex::serde")]
     levels: Vec<u8>,
-    /// How fast the frames move at most, in pixels a frame.
+    /// Largest motion in pixels per frame.
     #[serde(default)]
     motion: f32,
-    /// Whether predictions are uncertain behind its masks.
+    /// True if predictions are unreliable behind the masks.
     #[serde(default)]
     unfamiliar: bool,
 }
 
-/// Levels in a decibel.
-const STEPS: f32 = 4.0;
-/// The level where no light is, and no error.
+/// Number of levels per decibel.
+const LEVELS_PER_DB: f32 = 4.0;
+/// The level of blocks without light, which have no error.
 const DARK: u8 = u8::MAX;
 
 impl TileAssessment {
-    /// Of a tile solved by this schedule, with what the pilot tells of it, and the scene's white level; none for a
-    /// schedule that predictions were not fitted to. Of a tile that no light reaches, whose frames are 0, no error is
-    /// expected.
+    /// Assesses a tile from the schedule that solved it, the pilot's evidence, and the white level of the scene. `None`
+    /// for schedules for which the model is not fitted. A tile without light has frames of 0 and no expected error.
     pub fn of(
         outcome: &Outcome,
         (schedule, evidence, white): (&Schedule, Option<&Evidence>, f32),
@@ -53,8 +52,9 @@ impl TileAssessment {
         let errors = model.log_errors(features, outcome.evidence.as_ref().or(evidence), white);
         let unfamiliar = unfamiliar_masks(features);
         let offset = if unfamiliar { model.unfamiliar.offset } else { 0.0 };
-        let level =
-            |error: &f32| ((-10.0 * error + offset) * STEPS).round().clamp(0.0, 254.0) as u8;
+        let level = |error: &f32| {
+            ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, 254.0) as u8
+        };
         let (_, rows, columns) = errors.dim();
         let motion = fastest(outcome.frames.view(), white);
         let levels = errors.iter().map(level).collect();
@@ -83,31 +83,32 @@ impl TileAssessment {
         self.levels.iter().all(|level| *level == DARK)
     }
 
-    /// Expected squared error of a block, on the scale on which the scene is on \[0,1\].
+    /// Expected squared error of a block, on the unit scale of the solver.
     fn error(&self, frame: usize, row: usize, column: usize) -> f64 {
         let (rows, columns) = self.size;
         let level = self.levels.get((frame * rows + row) * columns + column);
-        10f64.powf(-f64::from(*level.unwrap_or(&DARK)) / f64::from(10.0 * STEPS))
+        10f64.powf(-f64::from(*level.unwrap_or(&DARK)) / f64::from(10.0 * LEVELS_PER_DB))
     }
 }
 
-/// What is expected of a snapshot.
+/// The predicted quality of a snapshot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Expected {
     pub assessment: Assessment,
-    /// Root of the mean squared error of each block \[B, rows, columns\], on the scale of the frames.
+    /// Expected root-mean-square error of each block \[B, rows, columns\], on the scale of the frames.
     pub error: Array3<f32>,
 }
 
-/// Better is not told apart, in dB: nobody sees it.
-const BEST: f64 = 40.0;
+/// Largest reported PSNR in dB. Differences above it are not visible.
+const MAX_PSNR_DB: f64 = 40.0;
 
-/// From here on frames are good, and bad if even the upper end of the interval is below that, in dB.
-const GOOD: f64 = 28.0;
-const BAD: f64 = 22.0;
+/// Expected PSNR in dB from which frames are graded good.
+const GOOD_DB: f64 = 28.0;
+/// Frames are graded bad if the upper end of the interval is below this PSNR in dB.
+const BAD_DB: f64 = 22.0;
 
-/// What the tiles of a snapshot tell together: of each run that has a share in it those of its tiles, in the
-/// plan's order. None if one of them tells nothing.
+/// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
+/// with the assessments of its tiles in the plan's order. `None` if a tile has none, or if no tile has light.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
@@ -119,7 +120,7 @@ pub fn expected(
     let (height, width) = plan.dim();
     let (rows, columns) = blocks(height, width);
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
-    let middle = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
+    let block_centre = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
     let (mut lit, mut motion, mut unfamiliar) = (false, 0.0f32, false);
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
@@ -132,9 +133,11 @@ pub fn expected(
                 at.checked_sub(first).filter(|at| *at < length)
             };
             for row in 0..rows {
-                let Some(i) = inside(middle(row, height), tile.row, tile.height) else { continue };
+                let Some(i) = inside(block_centre(row, height), tile.row, tile.height) else {
+                    continue;
+                };
                 for column in 0..columns {
-                    let at = inside(middle(column, width), tile.column, tile.width);
+                    let at = inside(block_centre(column, width), tile.column, tile.width);
                     let Some(j) = at else { continue };
                     for k in 0..frames {
                         let weight = f64::from(share.weights[k] * weights[[i, j]]);
@@ -153,14 +156,14 @@ pub fn expected(
         -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * white * white).log10()
     };
     let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
-    let end = |further: f64| (psnr_db + further).min(BEST);
+    let bound = |offset: f64| (psnr_db + offset).min(MAX_PSNR_DB);
     let interval = if unfamiliar { model.unfamiliar.interval } else { model.interval };
-    let [low, high] = interval.map(end);
+    let [low, high] = interval.map(bound);
     let error = squares.mapv(|square| (square.sqrt() * white) as f32);
-    let psnr_db = psnr_db.min(BEST);
+    let psnr_db = psnr_db.min(MAX_PSNR_DB);
     let mut reasons = reasons(&error, (psnr_db, white), warnings);
-    reasons.extend(too_fast(motion));
-    reasons.extend(unfamiliar.then(other_masks));
+    reasons.extend(fast_motion(motion));
+    reasons.extend(unfamiliar.then(unfamiliar_masks_finding));
     let assessment = Assessment {
         grade: grade((psnr_db, high), &reasons),
         psnr_db: Assessment::round(psnr_db),
@@ -171,49 +174,44 @@ pub fn expected(
     Some(Expected { assessment, error })
 }
 
-/// What is expected, but never better than the findings allow. Frames are called bad only where the whole
-/// interval says so, lest somebody throws away a usable picture.
+/// The grade of the expected PSNR, limited by the findings. Frames are graded bad only if the whole interval is below
+/// [`BAD_DB`], so that usable pictures are not discarded.
 fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
     let expected = match psnr_db {
-        GOOD.. => Grade::Good,
-        _ if high >= BAD => Grade::Usable,
+        GOOD_DB.. => Grade::Good,
+        _ if high >= BAD_DB => Grade::Usable,
         _ => Grade::Bad,
     };
-    let worst = reasons.iter().filter(|reason| reason.code != UNEVEN).map(|reason| reason.severity);
-    match worst.max() {
+    let severities = reasons
+        .iter()
+        .filter(|reason| !reason.is(FindingCode::UnevenError))
+        .map(|reason| reason.severity);
+    match severities.max() {
         Some(Severity::Error) => Grade::Bad,
         Some(Severity::Warning) if expected == Grade::Good => Grade::Usable,
         _ => expected,
     }
 }
 
-const UNEVEN: &str = "uneven_error";
-/// A part of the picture whose error is so far above that of the whole is named, in dB.
+/// A part of the picture is reported if its PSNR is this much below that of the whole picture, in dB.
 const UNEVEN_DB: f64 = 4.0;
 
-const LEVEL: &str = "level";
-/// A scene whose white is below this is hardly exposed, or its full scale is another one.
-const DIM: f64 = 0.12;
+/// A white level below this share of the full scale indicates underexposure, or a wrong full scale.
+const MIN_WHITE_LEVEL: f64 = 0.12;
 
-/// The findings of the checks, a scale that looks wrong, and the part of the picture that is worst.
+/// The findings of the checks, an implausible white level, and the worst part of the picture.
 fn reasons(
     error: &Array3<f32>,
     (psnr_db, white): (f64, f64),
     warnings: &[Finding],
 ) -> Vec<Finding> {
     let mut reasons = warnings.to_vec();
-    if white < DIM && reasons.iter().all(|reason| reason.code != LEVEL) {
-        reasons.push(Finding {
-            code: LEVEL.to_owned(),
-            severity: Severity::Warning,
-            detail: format!(
-                "the brightest parts of the scene are at {white:.3} times the full scale, and errors are told on that \
-                 scale"
-            ),
-            remedy: "State the measurement's full_scale for its exposure and its bits.".to_owned(),
-            frames: Vec::new(),
-            snapshot: None,
-        });
+    if white < MIN_WHITE_LEVEL && !reasons.iter().any(|reason| reason.is(FindingCode::Level)) {
+        let detail = format!(
+            "the brightest parts of the scene reach only {white:.3} of the full scale, so errors relative to the full \
+             scale look small"
+        );
+        reasons.push(Finding::new(FindingCode::Level, detail));
     }
     let (_, rows, columns) = error.dim();
     if rows < 3 || columns < 3 {
@@ -222,88 +220,67 @@ fn reasons(
     let thirds = |length: usize| {
         [0..length / 3, length / 3..length - length / 3, length - length / 3..length]
     };
-    let mut worst = (f64::INFINITY, "");
-    for (band, names) in thirds(rows).into_iter().zip(PARTS) {
-        for (across, name) in thirds(columns).into_iter().zip(names) {
-            let part = error.slice(ndarray::s![.., band.clone(), across]);
+    let (mut worst_db, mut worst_part) = (f64::INFINITY, "");
+    for (part_rows, names) in thirds(rows).into_iter().zip(PARTS) {
+        for (part_columns, name) in thirds(columns).into_iter().zip(names) {
+            let part = error.slice(ndarray::s![.., part_rows.clone(), part_columns]);
             let mean = part.iter().map(|e| f64::from(*e).powi(2)).sum::<f64>() / part.len() as f64;
             let decibels = -10.0 * mean.max(1e-12).log10();
-            if decibels < worst.0 {
-                worst = (decibels, name);
+            if decibels < worst_db {
+                (worst_db, worst_part) = (decibels, name);
             }
         }
     }
-    if worst.0 < psnr_db - UNEVEN_DB {
-        reasons.push(Finding {
-            code: UNEVEN.to_owned(),
-            severity: Severity::Warning,
-            detail: format!(
-                "{} is expected at {:.0} dB, the whole picture at {psnr_db:.0} dB: there is fine texture or fast motion \
-                 that the masks do not resolve",
-                worst.1, worst.0
-            ),
-            remedy: "Look at the map of the expected error before relying on this part.".to_owned(),
-            frames: Vec::new(),
-            snapshot: None,
-        });
+    if worst_db < psnr_db - UNEVEN_DB {
+        let detail = format!(
+            "{worst_part} of the picture has an expected PSNR of {worst_db:.0} dB, the whole picture one of \
+             {psnr_db:.0} dB: the masks do not resolve fine texture or fast motion there"
+        );
+        reasons.push(Finding::new(FindingCode::UnevenError, detail));
     }
     reasons
 }
 
-/// Frames that move by so much, in pixels a frame, may be smoother than the scene. Motion by 4 is told as up
-/// to 5.3, motion by 10 as 7 to 14 (`research/NOTEBOOK.md`).
-const FAST: f32 = 6.0;
+/// Motion, in pixels per frame, above which frames may be smoother than the scene. A motion of 4 is estimated as at
+/// most 5.3, one of 10 as 7 to 14 (`research/NOTEBOOK.md`).
+const FAST_MOTION: f32 = 6.0;
 
-fn too_fast(motion: f32) -> Option<Finding> {
-    (motion > FAST).then(|| Finding {
-        code: "fast_motion".to_owned(),
-        severity: Severity::Warning,
-        detail: format!(
-            "there is motion of about {motion:.0} pixels from frame to frame: what moves so fast may come out smoother than \
-             it is, and no measurement tells"
-        ),
-        remedy: "Take shorter frames, or fewer of them in a snapshot.".to_owned(),
-        frames: Vec::new(),
-        snapshot: None,
+fn fast_motion(motion: f32) -> Option<Finding> {
+    (motion > FAST_MOTION).then(|| {
+        let detail = format!(
+            "the scene moves by about {motion:.0} pixels from frame to frame: moving parts may be reconstructed too \
+             smooth, which the measurement can't reveal"
+        );
+        Finding::new(FindingCode::FastMotion, detail)
     })
 }
 
-fn other_masks() -> Finding {
-    Finding {
-        code: "unfamiliar_masks".to_owned(),
-        severity: Severity::Warning,
-        detail: "the masks are much alike and not sharp: they are blurred, or their closed pixels let light through. Behind \
-                 such masks the expected PSNR is often far from the truth, and the interval wider"
-            .to_owned(),
-        remedy:
-            "Don't rely on the expected PSNR here; simulate a scene like yours behind these masks."
-                .to_owned(),
-        frames: Vec::new(),
-        snapshot: None,
-    }
+fn unfamiliar_masks_finding() -> Finding {
+    let detail = "the masks are highly correlated and not sharp: they are blurred, or closed pixels let light through. \
+                  The expected PSNR is often far from the true one behind such masks, so its interval is wider";
+    Finding::new(FindingCode::UnfamiliarMasks, detail)
 }
 
+/// Names of the ninths of the picture, by row and column.
+
 const PARTS: [[&str; 3]; 3] = [
-    ["the upper left", "the upper middle", "the upper right"],
-    ["the left", "the middle", "the right"],
-    ["the lower left", "the lower middle", "the lower right"],
+    ["the top left", "the top centre", "the top right"],
+    ["the left", "the centre", "the right"],
+    ["the bottom left", "the bottom centre", "the bottom right"],
 ];
 
 #[cfg(test)]
 mod tests {
     use super::{DARK, TileAssessment, expected, grade};
-    use crate::job::{Assessment, Finding, Grade, Severity};
+    use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
     use reconstruction::schedule::Schedule;
     use reconstruction::sequence::SequencePlan;
     use reconstruction::tile::TilePlan;
 
     fn finding(severity: Severity) -> Finding {
-        let text = String::new;
-        let code = "any".to_owned();
-        Finding { code, severity, detail: text(), remedy: text(), frames: vec![], snapshot: None }
+        Finding { severity, ..Finding::new(FindingCode::Level, "") }
     }
 
-    /// A tile of 2 frames of 32x32 pixels with this level in dB.
     #[test]
     fn an_assessment_fits_the_frames_that_it_is_of() {
         let one = tile(30);
@@ -317,38 +294,39 @@ mod tests {
         assert!(one.agrees_with(&tile(31)) && !one.agrees_with(&tile(32)));
     }
 
+    /// A tile of 2 frames of 32x32 pixels with this expected PSNR.
     fn tile(decibels: u8) -> TileAssessment {
         let (levels, motion) = (vec![4 * decibels; 8], 4.0);
         TileAssessment { size: (2, 2), levels, motion, unfamiliar: false }
     }
 
     #[test]
-    fn what_the_checks_found_bounds_the_grade() {
-        let of = |psnr, found: &[Finding]| grade((psnr, psnr + 1.5), found);
+    fn findings_limit_the_grade() {
+        let grade_of = |psnr, reasons: &[Finding]| grade((psnr, psnr + 1.5), reasons);
         assert_eq!(
-            [30.0, 25.0, 21.0].map(|psnr| of(psnr, &[])),
+            [30.0, 25.0, 21.0].map(|psnr| grade_of(psnr, &[])),
             [Grade::Good, Grade::Usable, Grade::Usable]
         );
-        assert_eq!(of(20.0, &[]), Grade::Bad);
-        assert_eq!(of(30.0, &[finding(Severity::Warning)]), Grade::Usable);
-        assert_eq!(of(20.0, &[finding(Severity::Warning)]), Grade::Bad);
-        assert_eq!(of(30.0, &[finding(Severity::Error)]), Grade::Bad);
+        assert_eq!(grade_of(20.0, &[]), Grade::Bad);
+        assert_eq!(grade_of(30.0, &[finding(Severity::Warning)]), Grade::Usable);
+        assert_eq!(grade_of(20.0, &[finding(Severity::Warning)]), Grade::Bad);
+        assert_eq!(grade_of(30.0, &[finding(Severity::Error)]), Grade::Bad);
     }
 
     #[test]
-    fn tiles_are_joined_and_the_worst_part_is_named() {
-        // Two by two, which share 16 pixels.
+    fn tiles_are_combined_and_the_worst_part_is_reported() {
+        // 2x2 tiles with an overlap of 16 pixels.
         let plan = TilePlan::new(48, 48, 32, 16).unwrap();
         assert_eq!(plan.len(), 4);
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
-        let of = |white, tiles: Vec<Option<TileAssessment>>| {
-            let of_run = [(shares[0].clone(), tiles)];
-            expected(&plan, &of_run, &Schedule::gap_tv(), (2, white), &[])
+        let assess_at = |white, tiles: Vec<Option<TileAssessment>>| {
+            let shares = [(shares[0].clone(), tiles)];
+            expected(&plan, &shares, &Schedule::gap_tv(), (2, white), &[])
         };
-        let map = |tiles| of(0.5, tiles);
+        let assess = |tiles| assess_at(0.5, tiles);
         let tiles =
             |decibels: [u8; 4]| -> Vec<_> { decibels.map(|level| Some(tile(level))).into() };
-        let even = map(tiles([25; 4])).unwrap();
+        let even = assess(tiles([25; 4])).unwrap();
         assert_eq!(even.error.dim(), (2, 3, 3));
         let first = even.error[[0, 0, 0]];
         assert!(
@@ -356,45 +334,46 @@ mod tests {
             "{}",
             even.error
         );
-        // The mean of the map is what is predicted.
+        // The predicted PSNR is the mean of the map.
         let rms = -20.0 * f64::from(first).log10();
         assert!((rms - even.assessment.psnr_db).abs() < 0.06, "{rms}: {:?}", even.assessment);
         assert!(even.assessment.reasons.is_empty());
-        let uneven = map(tiles([15, 35, 35, 35])).unwrap().assessment;
-        assert!(uneven.reasons[0].detail.starts_with("the upper left"), "{uneven:?}");
-        // On a scale that is ten times too large every error is small.
-        let dim = of(0.05, tiles([25; 4])).unwrap().assessment;
+        let uneven = assess(tiles([15, 35, 35, 35])).unwrap().assessment;
+        assert!(uneven.reasons[0].detail.starts_with("the top left"), "{uneven:?}");
+        // With a full scale that is ten times too large all errors look small.
+        let dim = assess_at(0.05, tiles([25; 4])).unwrap().assessment;
         assert_eq!((dim.reasons[0].code.as_str(), dim.grade), ("level", Grade::Usable), "{dim:?}");
-        // One tile that moves is enough.
+        // One moving tile suffices.
         let mut fast = tiles([25; 4]);
         fast[1] = fast[1].clone().map(|tile| TileAssessment { motion: 8.6, ..tile });
-        let fast = map(fast).unwrap().assessment;
+        let fast = assess(fast).unwrap().assessment;
         assert_eq!((fast.reasons[0].code.as_str(), fast.grade), ("fast_motion", Grade::Usable));
         assert!(fast.reasons[0].detail.contains("about 9 pixels"), "{fast:?}");
-        // Behind masks that are much alike and not sharp there is more to doubt.
+        // The interval is wider behind unfamiliar masks.
         let other = tiles([25; 4]).into_iter().flatten();
         let other = other.map(|tile| Some(TileAssessment { unfamiliar: true, ..tile })).collect();
-        let other = map(other).unwrap().assessment;
+        let other = assess(other).unwrap().assessment;
         assert_eq!(
             (other.reasons[0].code.as_str(), other.grade),
             ("unfamiliar_masks", Grade::Usable)
         );
         assert!(other.psnr_db - other.psnr_low_db > 5.9, "{other:?}");
-        // A tile of an older version tells nothing; one without light has no part in what is seen.
-        let mut partly = tiles([25; 4]);
-        partly[2] = None;
-        assert!(map(partly).is_none());
+        // Without the assessment of one tile there is none of the snapshot.
+        let mut incomplete = tiles([25; 4]);
+        incomplete[2] = None;
+        assert!(assess(incomplete).is_none());
+        // Tiles without light do not contribute.
         let (levels, motion) = (vec![DARK; 8], 0.0);
         let dark = TileAssessment { size: (2, 2), levels, motion, unfamiliar: false };
-        assert!(map(vec![Some(dark.clone()); 4]).is_none());
+        assert!(assess(vec![Some(dark.clone()); 4]).is_none());
         let mut lit = tiles([25; 4]);
         lit[3] = Some(dark);
-        let lit = map(lit).unwrap();
+        let lit = assess(lit).unwrap();
         assert!(lit.error[[0, 2, 2]] < 0.1 * lit.error[[0, 0, 0]]);
     }
 
     #[test]
-    fn a_job_is_as_good_as_its_worst_snapshot() {
+    fn jobs_get_the_grade_of_their_worst_snapshot() {
         let one = |psnr_db, grade, reasons: &[Finding]| Assessment {
             grade,
             psnr_db,
@@ -404,9 +383,9 @@ mod tests {
         };
         let warned = [finding(Severity::Warning)];
         let all = [one(30.0, Grade::Good, &warned), one(20.05, Grade::Bad, &warned)];
-        let job = Assessment::of_all(all.iter().map(Some)).unwrap();
+        let job = Assessment::combined(all.iter().map(Some)).unwrap();
         assert_eq!((job.grade, job.psnr_db, job.reasons.len()), (Grade::Bad, 25.0, 1));
-        assert_eq!(Assessment::of_all([Some(&all[0]), None].into_iter()), None);
-        assert_eq!(Assessment::of_all(std::iter::empty()), None);
+        assert_eq!(Assessment::combined([Some(&all[0]), None].into_iter()), None);
+        assert_eq!(Assessment::combined(std::iter::empty()), None);
     }
 }

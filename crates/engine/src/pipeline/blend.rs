@@ -1,4 +1,4 @@
-//! Frames of the whole picture, blended from those of its tiles, and of the runs that have a part in them.
+//! Blends tiles into frames of the whole picture, and the frames of overlapping runs into those of a snapshot.
 
 use std::convert::Infallible;
 use std::path::PathBuf;
@@ -19,7 +19,7 @@ use reconstruction::tile::{Tile, TilePlan};
 /// The stored frames \[S B,h,w\] of a tile of a run of snapshots.
 #[derive(Debug, Clone)]
 pub struct StoredTile {
-    /// The index of the run's first snapshot in the measurement.
+    /// Index of the run's first snapshot in the measurement.
     pub run: u32,
     pub tile: u32,
     pub path: PathBuf,
@@ -27,12 +27,13 @@ pub struct StoredTile {
     pub record: TileTaskRecord,
 }
 
-/// Refuses tiles of a run of which one is missing, or whose bytes are not those that were stored.
-/// Errors: [`PipelineError::Damaged`] with the tiles that should be done again.
+/// Checks that all tiles of a run are present and that their files have the recorded hashes.
+///
+/// Errors: [`PipelineError::Damaged`] with the tiles to repeat; [`PipelineError::Record`] if tiles are missing.
 pub fn verify(plan: &TilePlan, tiles: &[StoredTile], monitor: &Monitor) -> Result<()> {
     let expected = (0..plan.len() as u64).eq(tiles.iter().map(|tile| u64::from(tile.tile)));
     if !expected {
-        let problem = format!("{} tiles are stored of {}", tiles.len(), plan.len());
+        let problem = format!("{} of {} tiles are stored", tiles.len(), plan.len());
         return Err(PipelineError::Record { what: "tiles", problem });
     }
     let mut damaged = Vec::new();
@@ -45,48 +46,48 @@ pub fn verify(plan: &TilePlan, tiles: &[StoredTile], monitor: &Monitor) -> Resul
     if damaged.is_empty() { Ok(()) } else { Err(PipelineError::Damaged(damaged)) }
 }
 
-/// Frame `k` \[H,W\] of a snapshot, of which each stored tile's part is read when it is needed. Of each
-/// run that has a share in the snapshot `tiles` tells the tiles, in the plan's order.
+/// Blends frame `k` \[H,W\] of a snapshot from stored tiles, which are read one at a time. `shares` has the runs that
+/// contain the snapshot, each with its tiles in the plan's order.
 pub fn stored_frame(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<StoredTile>)],
     k: usize,
 ) -> Result<Array2<f32>, FormatError> {
-    let of_run = |(share, tiles): &(RunShare, Vec<StoredTile>)| {
+    let weighted_frame = |(share, tiles): &(RunShare, Vec<StoredTile>)| {
         let index = share.frame(k);
-        let frame = blended(plan, |tile| {
-            // Opened anew for each frame: a large picture has more tiles than a process may have files.
+        let frame = blend_tiles(plan, |tile| {
+            // Opened for each frame: a large picture has more tiles than a process may have open files.
             let reader = Reader::open(&tiles[tile.index].path, &Limits::default())?;
             let window = reader.read_window(index..index + 1, 0..tile.height, 0..tile.width)?;
             Ok(window.index_axis_move(Axis(0), 0).into())
         })?;
         Ok((share.weights[k], frame))
     };
-    in_time(plan, shares.iter().map(of_run))
+    blend_runs(plan, shares.iter().map(weighted_frame))
 }
 
-/// Frame `k` \[H,W\] of a snapshot from the tiles of all runs in memory.
+/// Blends frame `k` \[H,W\] of a snapshot from the tiles of all runs in memory.
 pub fn frame(plan: &TilePlan, shares: &[RunShare], runs: &[Vec<Outcome>], k: usize) -> Array2<f32> {
-    let of_run = |share: &RunShare| {
+    let weighted_frame = |share: &RunShare| {
         let part = |tile: &Tile| -> ArrayView2<'_, f32> {
             runs[share.run][tile.index].frames.index_axis(Axis(0), share.frame(k))
         };
-        blended(plan, |tile| Ok::<_, Infallible>(part(tile).into()))
+        blend_tiles(plan, |tile| Ok::<_, Infallible>(part(tile).into()))
             .map(|frame| (share.weights[k], frame))
     };
-    let Ok(frame) = in_time(plan, shares.iter().map(of_run));
+    let Ok(frame) = blend_runs(plan, shares.iter().map(weighted_frame));
     frame
 }
 
-/// A frame \[H,W\] from those of the runs, with their weights.
-fn in_time<E>(
+/// The weighted sum \[H,W\] of the frames of all runs.
+fn blend_runs<E>(
     plan: &TilePlan,
     parts: impl Iterator<Item = Result<(f32, Array2<f32>), E>>,
 ) -> Result<Array2<f32>, E> {
     let mut whole: Option<Array2<f32>> = None;
     for part in parts {
         let (weight, mut frame) = part?;
-        // A run alone is taken as it is.
+        // Avoids rounding if there is only one run.
         if weight != 1.0 {
             frame *= weight;
         }
@@ -98,8 +99,8 @@ fn in_time<E>(
     Ok(whole.unwrap_or_else(|| Array2::zeros(plan.dim())))
 }
 
-/// A frame \[H,W\] from the parts of its tiles, in the plan's order.
-fn blended<'a, E>(
+/// Blends a frame \[H,W\] from its tiles, in the plan's order.
+fn blend_tiles<'a, E>(
     plan: &TilePlan,
     mut part: impl FnMut(&Tile) -> Result<CowArray<'a, f32, Ix2>, E>,
 ) -> Result<Array2<f32>, E> {

@@ -1,4 +1,4 @@
-//! Why a step of the pipeline did not come to its end.
+//! Errors of the pipeline.
 
 use std::io;
 
@@ -9,56 +9,57 @@ use reconstruction::ReconError;
 
 pub type Result<T, E = PipelineError> = std::result::Result<T, E>;
 
-/// Why a step did not come to its end.
+/// The reason why a step of the pipeline did not finish.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // the messages say it
+#[allow(missing_docs)] // the messages describe the variants
 pub enum PipelineError {
-    #[error("stopped")]
+    /// The task was cancelled, or the worker is shutting down.
+    #[error("the task was stopped before its end")]
     Stopped,
-    /// The solver refused or failed.
+    /// The solver refused its input or failed.
     #[error(transparent)]
     Recon(ReconError),
-    /// There is no network.
+    /// A network can't be loaded or run.
     #[error(transparent)]
     Network(#[from] NetworkError),
     /// An array or a frame can't be read or written.
     #[error(transparent)]
     Format(#[from] FormatError),
-    #[error("the result's {name}: {source}")]
+    #[error("{name} of the result can't be read or written: {source}")]
     File { name: String, source: io::Error },
-    /// The output folder holds something that is not an earlier result.
+    /// The output folder contains files that do not belong to an earlier result.
     #[error(
-        "the output folder already holds {name:?}, which no earlier run of this program left \
-         there: name a new folder"
+        "the output folder already contains {name:?}, which is not from an earlier run of this program: use a new \
+         folder"
     )]
     Foreign { name: String },
-    /// Of runs, given by their first snapshot, these tiles.
-    #[error("the stored results of tiles are damaged (first snapshot of the run, tile): {0:?}")]
+    /// Stored tiles are damaged: the first snapshot of the run, and the tile, of each.
+    #[error("stored tiles are damaged: (first snapshot of the run, tile) = {0:?}")]
     Damaged(Vec<(u32, u32)>),
-    /// A prepared array is not what was stored.
+    /// A prepared array does not have its recorded hash.
     #[error(
-        "the stored {what} (blob {sha256}) are damaged: send the files again, and make the \
-         calibration and the measurement anew"
+        "the stored {what} (blob {sha256}) are damaged: upload the files again, and create a new calibration and a new \
+         measurement"
     )]
     Corrupt { what: &'static str, sha256: Sha256 },
-    /// A result file has other bytes than it was written with.
-    #[error("the stored {0} is damaged: retry the job, and it is made again")]
+    /// A result file does not have its recorded hash.
+    #[error("the stored {0} is damaged: retry the job to create it again")]
     Result(String),
     #[error("snapshot {snapshot}: {source}")]
     Snapshot { snapshot: u32, source: ReconError },
-    #[error("the record of the {what} can't be used: {problem}")]
+    #[error("the stored record of the {what} is invalid: {problem}")]
     Record { what: &'static str, problem: String },
-    #[error("a computing thread ended unexpectedly")]
+    #[error("a worker thread panicked")]
     Thread,
 }
 
 impl PipelineError {
-    /// A record that can't be read or written as JSON; for `map_err`.
+    /// Converts a JSON error of a stored record, for use with `map_err`.
     pub fn record(what: &'static str) -> impl Fn(serde_json::Error) -> Self {
         move |error| Self::Record { what, problem: error.to_string() }
     }
 
-    /// True if the disk is full or a quota is used up.
+    /// True if the disk is full or a quota is exhausted.
     pub fn is_disk_full(&self) -> bool {
         use io::ErrorKind::{QuotaExceeded, StorageFull};
         match self {
@@ -68,7 +69,7 @@ impl PipelineError {
         }
     }
 
-    /// Whether another attempt may succeed: the machine failed, not the data.
+    /// True if another attempt may succeed, because the machine failed and not the data.
     pub fn is_retryable(&self) -> bool {
         match self {
             Self::Recon(error) => matches!(error, ReconError::Runtime(_)),

@@ -1,8 +1,7 @@
-//! The record that stands beside every result: of a snapshot, and of a whole job.
+//! Manifests: the records of snapshots and jobs.
 //!
-//! Both have a `content` that depends on inputs, parameters and the arithmetic alone: doing the same
-//! work again on the same kind of machine gives the same content, whatever the number of workers
-//! and however often they died. What belongs to one run (time, machine, ids) is in `run`.
+//! Each has a `content` that depends only on inputs, parameters and arithmetic. Repeating a job on the same kind of
+//! machine gives the same content, for any number of workers and crashes. Time, machine and identifiers are in `run`.
 
 use std::collections::BTreeMap;
 
@@ -19,45 +18,46 @@ use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
 use reconstruction::tile::TilePlan;
 
+/// Version of this program.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// What the names of all our records begin with.
+/// Common prefix of the schema names of this program.
 pub(super) const SCHEMA_FAMILY: &str = "sci-recon/";
-/// Name and version of the record of a snapshot.
+/// Schema name and version of the manifest of a snapshot.
 const SNAPSHOT_SCHEMA: &str = "sci-recon/snapshot/1";
-/// Name and version of the record of a job.
+/// Schema name and version of the manifest of a job.
 const JOB_SCHEMA: &str = "sci-recon/job/1";
 
-/// What the manifests of a job and of its snapshots have in common.
+/// The part that the manifests of a job and of its snapshots share.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Recipe {
     pub program_version: &'static str,
     pub algorithm: Algorithm,
-    /// As the tiles run it, with all defaults; without stages for an end-to-end network.
+    /// The schedule as the tiles run it, with all defaults. It has no stages for an end-to-end network.
     pub schedule: Schedule,
-    /// How an adaptive schedule became this one.
+    /// The decisions of the pilot that led to this schedule.
     pub pilot: Option<PilotRecord>,
     pub inputs: Inputs,
-    /// The networks that the schedule names, or that of a job with a model.
+    /// The networks of the schedule, or the model of the job.
     pub models: Vec<ModelRecord>,
     pub scale: ScaleRecord,
     #[serde(serialize_with = "tile_plan")]
     pub tile_plan: TilePlan,
-    /// The snapshots that were reconstructed together, before joints were taken apart.
+    /// The planned runs of snapshots. The pilot may have cut some of them.
     #[serde(serialize_with = "runs")]
     pub runs: SequencePlan,
-    /// What the check of the measurement against its calibration found.
+    /// Findings of the check of the measurement against its calibration.
     pub warnings: Vec<Finding>,
-    /// How the frames got their colours; null for a grey sensor. Also tells their size.
+    /// The size, which is not serialised here, and the mosaic with the demosaicking method; null for a grey sensor.
     #[serde(rename = "colour", serialize_with = "colour")]
     pub shape: SceneShape,
-    /// Snapshots a second, and seconds that one is exposed, where the camera told.
+    /// Snapshots per second, and exposure time of a snapshot in seconds, where known.
     #[serde(skip)]
     pub camera: (Option<f64>, Option<f64>),
 }
 
-/// Size and overlap, and the places of tiles as \[row, column, height, width\] in the plan's order: of a mosaic
-/// four tiles, one of each sub-image, have a part in a place. The size is that in the sub-image then.
+/// Serialises size and overlap, and the positions of the tiles as \[row, column, height, width\] in the plan's order.
+/// Behind a mosaic the size counts pixels of a sub-image, and four tiles, one of each sub-image, share a position.
 fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::Error> {
     #[derive(Serialize)]
     struct Record {
@@ -69,7 +69,7 @@ fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::
     Record { size: plan.size(), overlap: plan.overlap(), tiles }.serialize(serializer)
 }
 
-/// The sensor's mosaic, and how the colours between its pixels were found.
+/// Serialises the mosaic of the sensor and the demosaicking method.
 fn colour<S: Serializer>(shape: &SceneShape, serializer: S) -> Result<S::Ok, S::Error> {
     #[derive(Serialize)]
     struct Record {
@@ -80,28 +80,28 @@ fn colour<S: Serializer>(shape: &SceneShape, serializer: S) -> Result<S::Ok, S::
     shape.mosaic.map(record).serialize(serializer)
 }
 
-/// The first and the last snapshot of each run.
+/// Serialises the first and the last snapshot of each run.
 fn runs<S: Serializer>(plan: &SequencePlan, serializer: S) -> Result<S::Ok, S::Error> {
     let runs = plan.runs().iter().map(|run| [run.start, run.end - 1]);
     runs.collect::<Vec<_>>().serialize(serializer)
 }
 
 impl Recipe {
-    /// What the frames of a snapshot take from the runs that hold it.
+    /// The runs that contain a snapshot, with their weights for its frames.
     pub fn shares(&self, snapshot: usize) -> Vec<RunShare> {
         let cuts = self.pilot.as_ref().map(PilotRecord::cuts).unwrap_or_default();
         self.runs.shares(snapshot, &cuts, self.shape.frames)
     }
 
-    /// What the checks found of a snapshot, by its index in the measurement.
+    /// The findings that concern a snapshot, given by its index in the measurement.
     fn warnings_of(&self, snapshot: usize) -> Vec<Finding> {
         let concerns = |warning: &Finding| warning.snapshot.is_none_or(|s| s as usize == snapshot);
         self.warnings.iter().filter(|warning| concerns(warning)).cloned().collect()
     }
 
-    /// What the tiles of a snapshot, by its index in the measurement, let expect of its frames: of each run that
-    /// has a share in it those of its tiles, in the plan's order. None of a mosaic, whose colours no prediction was
-    /// fitted to.
+    /// Predicts the quality of a snapshot, given by its index in the measurement. `shares` has the runs that contain
+    /// it, each with the assessments of its tiles in the plan's order. `None` behind a mosaic, for which the model is
+    /// not fitted.
     pub fn expected(
         &self,
         snapshot: usize,
@@ -114,7 +114,7 @@ impl Recipe {
         expected(&self.tile_plan, shares, &self.schedule, scale, &self.warnings_of(snapshot))
     }
 
-    /// The manifest of a snapshot, by its index in the measurement, but for its files.
+    /// The manifest of a snapshot, given by its index in the measurement. Its list of files is empty.
     pub fn snapshot(
         &self,
         snapshot: usize,
@@ -139,7 +139,7 @@ impl Recipe {
         Manifest { schema: SNAPSHOT_SCHEMA, content, run }
     }
 
-    /// The manifest of a job from what its tasks have left.
+    /// The manifest of a job, from the records of its tasks.
     pub fn job(self, job: JobId, spec: &JobSpec, tasks: JobTasks) -> JobManifest {
         let JobTasks { snapshots, seconds, attempts } = tasks;
         let cost = CostRecord::sum(snapshots.iter().map(|(_, record)| &record.run.cost));
@@ -169,17 +169,18 @@ impl Recipe {
     }
 }
 
-/// What the tasks of a job have left when only its manifest is to be written.
+/// The records of all tasks of a job except that of the manifest.
 #[derive(Debug, Clone)]
 pub struct JobTasks {
-    /// The assembled snapshots by their index in the measurement.
+    /// The assembled snapshots, each with its index in the measurement.
     pub snapshots: Vec<(u32, SnapshotRecord)>,
+    /// Seconds that each task took.
     pub seconds: Vec<(TaskKind, f64)>,
-    /// How often workers took one up, that of the manifest among them.
+    /// Number of times that workers have claimed a task, that of the manifest included.
     pub attempts: u64,
 }
 
-/// `manifest.json` of a snapshot.
+/// The manifest of a snapshot, `manifest.json`.
 #[derive(Debug, Serialize)]
 pub struct Manifest {
     schema: &'static str,
@@ -187,7 +188,7 @@ pub struct Manifest {
     pub run: RunRecord,
 }
 
-/// What follows from inputs and parameters.
+/// The part of a manifest that depends only on inputs, parameters and arithmetic.
 #[derive(Debug, Serialize)]
 pub struct Content {
     #[serde(flatten)]
@@ -195,59 +196,57 @@ pub struct Content {
     pub frames: usize,
     pub height: usize,
     pub width: usize,
-    /// The snapshot's index in the measurement, from 0.
+    /// Index of the snapshot in the measurement, counted from 0.
     snapshot: usize,
-    /// What came of each tile that has a part in the snapshot: run by run, in the plan's order.
+    /// The records of all tiles of the snapshot, run by run, in the plan's order.
     tiles: Vec<TileRecord>,
     pub summary: Summary,
-    /// How good the frames are, as far as that can be told without a truth; null where it can't.
+    /// The predicted quality of the frames; null where there is no prediction.
     pub assessment: Option<Assessment>,
     camera: Option<CameraRecord>,
-    /// The files that came out, without this one.
+    /// The files of the result, except the manifest.
     pub files: Vec<ResultFile>,
 }
 
-/// The files that went in.
+/// The inputs of a job.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Inputs {
     pub masks_sha256: Sha256,
-    /// How the axes of the array were read; none for pictures.
+    /// Order of the axes in which the masks were read; null for pictures.
     pub masks_axes: Option<String>,
     pub measurement_sha256: Sha256,
+    /// Order of the axes in which the measurement was read; null for pictures.
     pub measurement_axes: Option<String>,
 }
 
-/// Every factor between the stored numbers and the solver's \[0,1\]. All are undone in the
-/// frames but the masks', which defines what a mask is: frames are on the measurement's scale
-/// after division by its full scale.
+/// All factors between stored values and the unit scale of the solver. Frames are on the scale of the measurement
+/// divided by its full scale: the white level is undone. The full scale of the masks defines a mask value of 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ScaleRecord {
-    /// Value in the masks' file that means 1.
+    /// Stored mask value that means 1.
     pub masks_full_scale: f32,
-    /// Value in the measurement's file that means 1.
+    /// Stored measurement value that means 1.
     pub measurement_full_scale: f32,
-    /// White level of the scene, estimated once for all tiles: the solver worked on frames
-    /// divided by it.
+    /// White level of the scene, estimated once per job. The solver works on frames divided by it.
     pub white: f32,
 }
 
-/// What the camera told about time.
+/// The timing of the camera.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CameraRecord {
-    /// Snapshots a second.
+    /// Snapshots per second.
     pub fps: Option<f64>,
-    /// Seconds that one snapshot is exposed.
+    /// Exposure time of a snapshot in seconds.
     pub exposure_s: Option<f64>,
-    /// Start of each frame in seconds after the start of snapshot 0; none where it does not
-    /// follow from the two.
+    /// Start of each frame in seconds after the start of snapshot 0; null where it is unknown.
     pub frame_times_s: Option<Vec<f64>>,
 }
 
 impl CameraRecord {
-    /// The times of the `frames` frames of a snapshot.
+    /// The timing of the `frames` frames of a snapshot; `None` if neither frame rate nor exposure time is known.
     ///
-    /// The masks share the exposure evenly; an unknown exposure is taken to fill the camera's
-    /// whole period. Without a frame rate only snapshot 0 has times. None if neither is known.
+    /// The masks divide the exposure evenly. An unknown exposure time is assumed to fill the period of the camera.
+    /// Without a frame rate only the frames of snapshot 0 have times.
     pub fn new(
         (fps, exposure_s): (Option<f64>, Option<f64>),
         snapshot: usize,
@@ -264,13 +263,14 @@ impl CameraRecord {
         Some(Self { fps, exposure_s, frame_times_s: start.map(|start| time(start).collect()) })
     }
 
-    /// Seconds that each of `frames` frames lasts.
+    /// Exposure time of each of `frames` frames in seconds.
     pub fn frame_exposure_s(&self, frames: usize) -> Option<f64> {
         let exposure = self.exposure_s.or_else(|| self.fps.map(|fps| 1.0 / fps))?;
         Some(exposure / frames as f64)
     }
 }
 
+/// The manifest of a job.
 #[derive(Debug, Serialize)]
 pub struct JobManifest {
     schema: &'static str,
@@ -291,7 +291,7 @@ struct SnapshotEntry {
     snapshot: u32,
     summary: Summary,
     assessment: Option<Assessment>,
-    /// Without the snapshot's own manifest, whose times differ from run to run.
+    /// The files of the snapshot except its manifest, which has times that differ from run to run.
     files: Vec<ResultFile>,
 }
 
@@ -302,14 +302,15 @@ struct JobRun {
     label: Option<Label>,
     calibration: CalibrationId,
     measurement: MeasurementId,
-    /// Tasks of the job, and how often workers took one up.
+    /// Number of tasks.
     tasks: usize,
+    /// Number of times that workers have claimed a task.
     attempts: u64,
-    /// Seconds that each kind of task took, over all tasks.
+    /// Total seconds of each kind of task.
     seconds_by_task: BTreeMap<&'static str, f64>,
 }
 
-/// What each EXR frame says about itself.
+/// The attributes of each EXR frame.
 pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
     let recipe = &content.recipe;
     let mut shared = vec![
@@ -374,7 +375,7 @@ mod tests {
     use formats::{Channels, exr};
 
     #[test]
-    fn frames_tell_where_they_come_from() {
+    fn exr_attributes_record_the_provenance() {
         let content = super::sample(3).content;
         let attributes = super::frame_attributes(&content);
         assert_eq!(attributes.len(), 3);
@@ -387,14 +388,14 @@ mod tests {
         assert_eq!(text("model fastdvdnet-gray-int8").map(str::len), Some(64));
         assert!((attributes[2].frame_time_s.unwrap() - 0.028).abs() < 1e-12);
         assert!((attributes[2].frames_per_second.unwrap() - 250.0).abs() < 1e-9);
-        // They must be names that OpenEXR takes.
+        // OpenEXR must accept all attribute names.
         let file = tempfile::NamedTempFile::new().unwrap();
         let frame = ndarray::Array2::zeros((2, 2));
         exr::write_frame(file.path(), frame.view(), Channels::Grey, &attributes[2]).unwrap();
     }
 
     #[test]
-    fn frame_times_share_the_exposure() {
+    fn frame_times_divide_the_exposure_evenly() {
         let camera = CameraRecord::new((Some(50.0), Some(0.016)), 2, 4).unwrap();
         let times = camera.frame_times_s.clone().unwrap();
         let expected = [0.040, 0.044, 0.048, 0.052];

@@ -1,7 +1,7 @@
-//! From snapshots to their frames: white level, pilot, tiles, blending, and the files of a result.
+//! The steps from snapshots to frames: white level, pilot, tiles, blending, and the files of a result.
 //!
-//! The command line and the workers share these steps, so that a job gives the same frames
-//! whichever way it came. They know arrays and files, not the store or the queue.
+//! The command line and the workers share these steps, so both give the same frames. The steps work on arrays and
+//! files, and know neither the store nor the queue.
 
 pub mod arrays;
 pub mod assessment;

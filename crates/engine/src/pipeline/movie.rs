@@ -1,4 +1,4 @@
-//! The frames of one snapshot, or of several one after the other, as a movie.
+//! Movies of the frames of one snapshot, or of several consecutive ones.
 
 use std::fs::File;
 use std::io::{BufWriter, Seek, Write};
@@ -13,24 +13,25 @@ use formats::movie::{self, Clip, MovieWriter};
 use formats::{Channels, Limits, WindowReader, npy, png};
 
 const NAME: &str = "movie.mp4";
-/// Samples that are read at a time: 16 MiB.
-const BAND: usize = 4 << 20;
+/// Number of samples that are read at a time: 16 MiB.
+const BAND_SAMPLES: usize = 4 << 20;
 
-/// What a movie is made of.
+/// The input of a movie.
 #[derive(Debug)]
 pub struct MovieTask {
     pub shape: SceneShape,
-    /// What is shown as white; black is 0, as in the PNGs of the frames.
+    /// Value that is displayed as white; 0 is black, as in the PNGs of the frames.
     pub white: f32,
-    /// Frames of a second of the scene, if they are known.
+    /// Frames per second of the scene, if known.
     pub scene_fps: Option<f64>,
-    /// The frames of each snapshot (`frames.npy`), and the hash that the file should have.
+    /// The file `frames.npy` of each snapshot, and its recorded hash.
     pub clips: Vec<(PathBuf, Sha256)>,
 }
 
-/// Writes the movie to `path`, an empty file. Sides above [`crate::job::MOVIE_SIDE`] are halved, until none is; a pixel
-/// is then the mean of those that it stands for. One frame is held at a time.
-/// Errors: [`PipelineError::Result`] if a file is damaged; I/O.
+/// Writes the movie to `path`, an existing empty file. Pictures with sides above [`crate::job::MOVIE_SIDE`] are
+/// averaged over blocks. One frame at a time is in memory.
+///
+/// Errors: [`PipelineError::Result`] if a file is damaged; I/O; a stop by the monitor.
 pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
     let SceneShape { frames, height, width, .. } = task.shape;
     let channels = task.shape.channels();
@@ -48,7 +49,7 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
     let file = file.map_err(|source| PipelineError::File { name: NAME.into(), source })?;
     let mut writer = movie::writer(BufWriter::new(file), &clip)?;
     for (index, (array, sha256)) in task.clips.iter().enumerate() {
-        let reader = checked(array, *sha256)?;
+        let reader = open_checked(array, *sha256)?;
         monitor.check()?;
         for k in 0..frames {
             write_frame(&mut writer, &reader, k, (channels, step, task.white))?;
@@ -61,12 +62,12 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
     Ok(())
 }
 
-/// Opens the frames of a snapshot, whose bytes are those on record.
-fn checked(path: &Path, expected: Sha256) -> Result<WindowReader> {
+/// Opens the frames of a snapshot after a check of their hash.
+fn open_checked(path: &Path, expected: Sha256) -> Result<WindowReader> {
     let name = || "frames.npy".to_owned();
     let unreadable = |source| PipelineError::File { name: name(), source };
-    let found = Sha256::of_reader(&mut File::open(path).map_err(unreadable)?);
-    if found.map_err(unreadable)?.0 != expected {
+    let hashed = Sha256::of_reader(&mut File::open(path).map_err(unreadable)?);
+    if hashed.map_err(unreadable)?.0 != expected {
         return Err(PipelineError::Result(name()));
     }
     Ok(npy::open_windows(path, &Limits::default())?)
@@ -83,19 +84,19 @@ fn write_frame<W: Write + Seek>(
     let width = samples / channels.count();
     let size = (height.div_ceil(step), width.div_ceil(step) * channels.count());
     let mut levels = Array2::zeros(size);
-    let band = (BAND / (step * samples)).max(1);
+    let band = (BAND_SAMPLES / (step * samples)).max(1);
     for start in (0..size.0).step_by(band) {
         let end = (start + band).min(size.0);
         let rows = start * step..(end * step).min(height);
         let values = reader.read_window(k..k + 1, rows, 0..samples)?;
-        let values = reduced(values.index_axis_move(Axis(0), 0), channels, step);
+        let values = block_means(values.index_axis_move(Axis(0), 0), channels, step);
         levels.slice_mut(s![start..end, ..]).assign(&values.map(png::level_u8(0.0, white)));
     }
     Ok(writer.write_frame(levels.view())?)
 }
 
-/// Means of `step` x `step` pixels; fewer at the last row and column.
-fn reduced(values: Array2<f32>, channels: Channels, step: usize) -> Array2<f32> {
+/// Means of blocks of `step` x `step` pixels. Blocks at the last row and column may be smaller.
+fn block_means(values: Array2<f32>, channels: Channels, step: usize) -> Array2<f32> {
     if step == 1 {
         return values;
     }
@@ -118,14 +119,14 @@ mod tests {
     use shiguredo_mp4::boxes::SampleEntry;
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-    use super::{MovieTask, reduced, write};
+    use super::{MovieTask, block_means, write};
     use crate::job::{SceneShape, Sha256};
     use crate::pipeline::PipelineError;
     use crate::pipeline::progress::Monitor;
     use formats::{Channels, npy};
 
     #[test]
-    fn large_pictures_are_halved_and_damaged_ones_refused() {
+    fn large_pictures_are_reduced_and_damaged_files_refused() {
         let folder = tempfile::tempdir().unwrap();
         let array = folder.path().join("frames.npy");
         let frames = Array3::from_shape_fn((2, 77, 3841), |(k, i, j)| ((k + i + j) % 5) as f32);
@@ -162,14 +163,14 @@ mod tests {
     }
 
     #[test]
-    fn each_pixel_is_the_mean_of_those_it_stands_for() {
+    fn block_means_average_each_channel() {
         let values = array![[1.0, 2.0, 3.0], [5.0, 6.0, 7.0], [9.0, 10.0, 11.0]];
-        assert_eq!(reduced(values, Channels::Grey, 2), array![[3.5, 5.0], [9.5, 11.0]]);
+        assert_eq!(block_means(values, Channels::Grey, 2), array![[3.5, 5.0], [9.5, 11.0]]);
         let colours = Array2::from_shape_fn((5, 21), |(i, j)| (100 * (j % 3) + i + j / 3) as f32);
-        let found = reduced(colours.clone(), Channels::Rgb, 4);
+        let means = block_means(colours.clone(), Channels::Rgb, 4);
         for c in 0..3 {
-            let grey = reduced(colours.slice(s![.., c..;3]).to_owned(), Channels::Grey, 4);
-            assert_eq!(found.slice(s![.., c..;3]), grey);
+            let grey = block_means(colours.slice(s![.., c..;3]).to_owned(), Channels::Grey, 4);
+            assert_eq!(means.slice(s![.., c..;3]), grey);
         }
     }
 }

@@ -1,5 +1,4 @@
-//! Networks: those that the program carries, those of a folder, end-to-end networks of a user's own,
-//! and the libonnxruntime that runs them.
+//! Networks: the embedded ones, those of a folder, users' end-to-end networks, and the libonnxruntime that runs them.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -17,15 +16,15 @@ use reconstruction::prior::network::{ClipDenoiser, ClipEncoder};
 use reconstruction::prior::onnx::{Device, EndToEndNetwork, Runtime};
 use reconstruction::prior::{Denoiser, Encoder, Network, Networks};
 
-/// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
+/// A network embedded in the program as ONNX files, so that only libonnxruntime has to be installed.
 #[derive(Debug, Clone, Copy)]
 pub struct Model {
     pub name: &'static str,
-    /// The files, in the order in which a frame goes through them: name and content.
+    /// Name and content of each file, in the order of execution.
     pub files: &'static [(&'static str, &'static [u8])],
 }
 
-/// The model of a network, trained for this project (see its model card in `models/`).
+/// The embedded model of a network, trained for this project; see its model card in `models/`.
 pub const fn carried(network: Network) -> Model {
     match network {
         Network::FastDvdNet => FASTDVDNET_GRAY,
@@ -50,7 +49,8 @@ const FASTDVDNET_GRAY_INT8: Model = Model {
     ],
 };
 
-/// What results are assessed by. It is always the one that the program carries: predictions are fitted to what it sees.
+/// The encoder whose features the quality model uses. It can't be replaced, because the model is fitted to its
+/// features.
 const FASTDVDNET_GRAY_ENCODER: &[u8] =
     include_bytes!("../../../../models/fastdvdnet-gray-encoder/model.onnx");
 
@@ -59,27 +59,28 @@ const FFDNET_GRAY: Model = Model {
     files: &[("model.onnx", include_bytes!("../../../../models/ffdnet-gray/model.onnx"))],
 };
 
-/// A network, as it stands in manifests.
+/// A network as manifests record it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ModelRecord {
     pub name: String,
-    /// SHA-256 of its ONNX files, one after the other.
+    /// SHA-256 of the concatenated ONNX files.
     pub sha256: String,
 }
 
 impl ModelRecord {
-    /// That of a network that the program carries.
+    /// The record of an embedded network.
     pub fn carried(network: Network) -> Self {
         let model = carried(network);
         Self::new(&model, model.files.iter().map(|(_, content)| *content))
     }
 
-    /// Those of a schedule that the program carries, in a fixed order.
+    /// The records of the embedded networks of a schedule, in a fixed order.
     pub fn of(schedule: &Schedule) -> Vec<Self> {
         schedule.networks().into_iter().map(Self::carried).collect()
     }
 
-    pub fn of_job(spec: &JobSpec) -> Vec<Self> {
+    /// The records of all networks of a job: those of its schedule, or its model.
+    pub fn for_job(spec: &JobSpec) -> Vec<Self> {
         let model = spec.model.as_ref().map(|model| Self {
             name: model.name.as_ref().map_or("learned", Label::as_str).to_owned(),
             sha256: model.sha256.to_string(),
@@ -87,7 +88,7 @@ impl ModelRecord {
         Self::of(&spec.schedule).into_iter().chain(model).collect()
     }
 
-    /// That of a model with these contents of its files.
+    /// The record of a model whose files have these contents.
     fn new<'a>(model: &Model, contents: impl Iterator<Item = &'a [u8]>) -> Self {
         let digest = contents.fold(sha2::Sha256::new(), Digest::chain_update);
         let sha256 = Sha256::new(digest.finalize().into()).to_string();
@@ -95,7 +96,7 @@ impl ModelRecord {
     }
 }
 
-/// An end-to-end network in its ONNX file.
+/// The ONNX file of an end-to-end network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelFile {
     path: PathBuf,
@@ -103,30 +104,33 @@ pub struct ModelFile {
 }
 
 impl ModelFile {
-    /// A file that should have this hash.
+    /// A file with its recorded hash, which [`Self::content`] checks.
     pub fn new(path: PathBuf, sha256: Sha256) -> Self {
         Self { path, sha256 }
     }
 
+    /// Hashes a file.
     pub fn open(path: &Path) -> Result<Self, NetworkError> {
         let bytes = read(path)?;
         Ok(Self { path: path.to_owned(), sha256: Sha256::of(&bytes) })
     }
 
-    /// The hash of the file.
+    /// The recorded hash of the file.
     pub fn sha256(&self) -> Sha256 {
         self.sha256
     }
 
-    /// The file's bytes.
-    /// Errors: it can't be read, or is not what its hash says.
+    /// Reads the file.
+    ///
+    /// Errors: [`NetworkError::Model`] if it can't be read, [`NetworkError::Damaged`] if it does not have the recorded
+    /// hash.
     pub fn content(&self) -> Result<Vec<u8>, NetworkError> {
         let bytes = read(&self.path)?;
-        let found = Sha256::of(&bytes);
-        if found == self.sha256 {
+        let actual = Sha256::of(&bytes);
+        if actual == self.sha256 {
             return Ok(bytes);
         }
-        Err(NetworkError::Damaged { expected: self.sha256, found })
+        Err(NetworkError::Damaged { expected: self.sha256, actual })
     }
 }
 
@@ -134,30 +138,32 @@ fn read(path: &Path) -> Result<Vec<u8>, NetworkError> {
     fs::read(path).map_err(|reason| NetworkError::Model { path: path.to_owned(), reason })
 }
 
-/// The library's name.
+/// File name of the library.
 const LIBRARY: &str = "libonnxruntime.so";
-/// Where it is looked for, from the folder of the program: beside it, where `make install` puts it, in the
-/// lib folder of a system, and where scripts/fetch-onnxruntime.sh does in a source tree.
-const PLACES: [&str; 4] = [".", "../lib/sci-recon", "../lib", "../../runtime"];
+/// Folders that are searched for the library, relative to that of the program: the same folder, the destinations of
+/// `make install` and of system packages, and the destination of scripts/fetch-onnxruntime.sh in a source tree.
+const LIBRARY_FOLDERS: [&str; 4] = [".", "../lib/sci-recon", "../lib", "../../runtime"];
 
-/// Why there is no denoiser.
+/// Errors of loading a network.
 #[derive(Debug, thiserror::Error)]
 pub enum NetworkError {
     #[error(
-        "no libonnxruntime: {0}; name it with --onnxruntime or ORT_DYLIB_PATH, or fetch it with \
-         scripts/fetch-onnxruntime.sh FOLDER of the source tree and put it beside the program"
+        "libonnxruntime was not found: {0}. State its path with --onnxruntime or ORT_DYLIB_PATH, or download it with \
+         scripts/fetch-onnxruntime.sh FOLDER from the source tree and put it into the folder of the program"
     )]
     Missing(String),
-    #[error("model {}: {reason}", path.display())]
+    #[error("the model file {} can't be read: {reason}", path.display())]
     Model { path: PathBuf, reason: io::Error },
-    #[error("the network's file is damaged: its hash should be {expected}, but is {found}")]
-    Damaged { expected: Sha256, found: Sha256 },
-    /// It was found, but the network does not run on it.
+    #[error(
+        "the file of the network is damaged: its SHA-256 is {actual}, but should be {expected}"
+    )]
+    Damaged { expected: Sha256, actual: Sha256 },
+    /// The library was found, but does not load or run the network.
     #[error(transparent)]
     Runtime(#[from] ReconError),
 }
 
-/// Loads denoisers. Nothing is opened before the first one is asked for: TV needs no library.
+/// Loads networks. The library is opened on first use, because total variation does not need it.
 #[derive(Debug, Clone)]
 pub struct NetworkSource {
     library: Option<PathBuf>,
@@ -167,39 +173,40 @@ pub struct NetworkSource {
 }
 
 impl NetworkSource {
-    /// `library` is a libonnxruntime, or none for the one near the executable ([`find_library`]).
+    /// A source that uses this libonnxruntime or, for `None`, the one that [`find_library`] finds.
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
         Self { library, models: None, device, version: Arc::default() }
     }
 
-    /// The same with the networks in `folder`, one folder of ONNX files each as in `models/`,
-    /// instead of those that the program carries.
+    /// Uses the networks in `folder`, which is organised like `models/`, instead of the embedded ones.
     pub fn with_models(self, folder: Option<PathBuf>) -> Self {
         Self { models: folder, ..self }
     }
 
+    /// The records of the networks that a schedule uses on this device.
     pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;
             Ok(ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref)))
         };
-        let used: BTreeSet<_> = schedule.networks().into_iter().map(|n| self.used(n)).collect();
-        used.into_iter().map(record).collect()
+        let networks: BTreeSet<_> =
+            schedule.networks().into_iter().map(|network| self.for_device(network)).collect();
+        networks.into_iter().map(record).collect()
     }
 
-    /// The network that stands for `asked` on the device: 8 bits pay on a CPU only.
-    fn used(&self, asked: Network) -> Network {
-        match (asked, self.device) {
+    /// The variant of a network for the device. 8-bit networks are faster on CPUs only.
+    fn for_device(&self, network: Network) -> Network {
+        match (network, self.device) {
             (Network::FastDvdNetInt8, Device::Cuda(_)) => Network::FastDvdNet,
-            _ => asked,
+            _ => network,
         }
     }
 
-    /// The bytes of the files of a network, in their order.
-    fn contents(&self, which: Network) -> Result<Vec<Cow<'static, [u8]>>, NetworkError> {
-        let Model { name, files } = carried(which);
-        let content = |&(file, carried): &(&str, &'static [u8])| match &self.models {
-            None => Ok(Cow::Borrowed(carried)),
+    /// The contents of the files of a network, in order.
+    fn contents(&self, network: Network) -> Result<Vec<Cow<'static, [u8]>>, NetworkError> {
+        let Model { name, files } = carried(network);
+        let content = |&(file, embedded): &(&str, &'static [u8])| match &self.models {
+            None => Ok(Cow::Borrowed(embedded)),
             Some(folder) => read(&folder.join(name).join(file)).map(Cow::Owned),
         };
         files.iter().map(content).collect()
@@ -221,18 +228,19 @@ impl NetworkSource {
         Ok(self.version.get_or_init(read).clone())
     }
 
-    /// A network with sessions of its own, for one thread.
-    fn load(&self, which: Network) -> Result<ClipDenoiser, NetworkError> {
-        Ok(ClipDenoiser::load(&self.runtime()?, which, &self.contents(which)?)?)
+    /// Loads a network with separate sessions for one thread.
+    fn load(&self, network: Network) -> Result<ClipDenoiser, NetworkError> {
+        Ok(ClipDenoiser::load(&self.runtime()?, network, &self.contents(network)?)?)
     }
 
-    /// The encoder with a session of its own, for one thread.
+    /// Loads the encoder with a separate session for one thread.
     fn encoder(&self) -> Result<ClipEncoder, NetworkError> {
         Ok(ClipEncoder::load(&self.runtime()?, FASTDVDNET_GRAY_ENCODER)?)
     }
 
-    /// An end-to-end network with a session of its own, for one thread.
-    /// Errors: no library; these bytes of an ONNX file hold no network that can be run.
+    /// Loads an end-to-end network from an ONNX file, with a separate session for one thread.
+    ///
+    /// Errors: [`NetworkError::Missing`] without a library, [`NetworkError::Runtime`] if the network can't be loaded.
     pub fn end_to_end(&self, content: &[u8]) -> Result<EndToEndNetwork, NetworkError> {
         Ok(EndToEndNetwork::load(&self.runtime()?, content)?)
     }
@@ -246,72 +254,75 @@ impl NetworkSource {
     }
 }
 
-/// The libonnxruntime that is named, or else the one near the program. It is not opened.
-/// Errors: there is none.
-pub fn find_library(named: Option<&Path>) -> Result<PathBuf, NetworkError> {
-    // An empty variable is one that is not set.
-    if let Some(library) = named.filter(|path| !path.as_os_str().is_empty()) {
+/// Path of libonnxruntime: the stated one or, for `None`, the first one in [`LIBRARY_FOLDERS`]. It is not opened.
+///
+/// Errors: [`NetworkError::Missing`].
+pub fn find_library(stated: Option<&Path>) -> Result<PathBuf, NetworkError> {
+    // An empty environment variable counts as not set.
+    if let Some(library) = stated.filter(|path| !path.as_os_str().is_empty()) {
         return existing(library).ok_or_else(|| {
             NetworkError::Missing(format!("there is no file {}", library.display()))
         });
     }
     let executable = std::env::current_exe().and_then(|path| path.canonicalize());
-    let executable = executable
-        .map_err(|error| NetworkError::Missing(format!("the program's own path: {error}")))?;
-    near(&executable).ok_or_else(|| {
+    let executable = executable.map_err(|error| {
+        NetworkError::Missing(format!("the path of the program is unknown ({error})"))
+    })?;
+    find_near(&executable).ok_or_else(|| {
         let folder = executable.parent().unwrap_or(Path::new("/")).display();
         NetworkError::Missing(format!(
-            "none is named, and none is in {folder} or, from there, in {}",
-            PLACES[1..].join(", ")
+            "no path is stated, and it is neither in {folder} nor, relative to that folder, in {}",
+            LIBRARY_FOLDERS[1..].join(", ")
         ))
     })
 }
 
-/// The library at the first place from an executable where there is one.
-fn near(executable: &Path) -> Option<PathBuf> {
+/// The library in the first of [`LIBRARY_FOLDERS`] that contains it.
+fn find_near(executable: &Path) -> Option<PathBuf> {
     let folder = executable.parent()?;
-    PLACES.iter().find_map(|place| existing(&folder.join(place).join(LIBRARY)))
+    LIBRARY_FOLDERS.iter().find_map(|place| existing(&folder.join(place).join(LIBRARY)))
 }
 
-/// Networks of one thread: each is loaded at its first use and stays warm.
+/// The networks of one thread. Each one is loaded on first use and kept.
 pub struct WarmNetworks {
     source: NetworkSource,
     loaded: Vec<(Network, ClipDenoiser)>,
     encoder: Option<ClipEncoder>,
-    /// The last end-to-end network.
+    /// The most recently used end-to-end network.
     end_to_end: Option<(Sha256, EndToEndNetwork)>,
 }
 
 impl WarmNetworks {
-    /// Networks from `source`, none of them loaded yet.
+    /// An empty cache of networks from `source`.
     pub fn new(source: NetworkSource) -> Self {
         Self { source, loaded: Vec::new(), encoder: None, end_to_end: None }
     }
 
-    /// The end-to-end network in this file, which is kept until another one is asked for.
+    /// The end-to-end network in this file. It replaces the one that was used before.
     pub fn end_to_end(&mut self, file: &ModelFile) -> Result<&mut EndToEndNetwork, NetworkError> {
-        let warm = self.end_to_end.take().filter(|(sha256, _)| *sha256 == file.sha256());
-        let network = match warm {
+        let loaded = self.end_to_end.take().filter(|(sha256, _)| *sha256 == file.sha256());
+        let network = match loaded {
             Some((_, network)) => network,
             None => self.source.end_to_end(&file.content()?)?,
         };
         Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
 
+    /// The source of the networks.
     pub fn source(&self) -> &NetworkSource {
         &self.source
     }
 }
 
 impl Networks for WarmNetworks {
-    fn network(&mut self, asked: Network) -> Result<&mut dyn Denoiser, ReconError> {
-        let which = self.source.used(asked);
-        let index = match self.loaded.iter().position(|(kind, _)| *kind == which) {
+    fn network(&mut self, network: Network) -> Result<&mut dyn Denoiser, ReconError> {
+        let network = self.source.for_device(network);
+        let index = match self.loaded.iter().position(|(key, _)| *key == network) {
             Some(index) => index,
             None => {
-                let network = self.source.load(which);
-                let network = network.map_err(|error| ReconError::Runtime(error.to_string()))?;
-                self.loaded.push((which, network));
+                let denoiser = self.source.load(network);
+                let denoiser = denoiser.map_err(|error| ReconError::Runtime(error.to_string()))?;
+                self.loaded.push((network, denoiser));
                 self.loaded.len() - 1
             }
         };
@@ -334,12 +345,12 @@ fn existing(path: &Path) -> Option<PathBuf> {
     path.is_file().then(|| path.to_path_buf())
 }
 
-/// The version that a libonnxruntime gives to its symbols, such as `1.31.1`. What it tells of
-/// its build through its own interface names a commit only.
+/// The version in the symbol versions of a libonnxruntime, such as `1.31.1`. The build information from its API
+/// contains only a commit.
 fn version_in(library: &[u8]) -> Option<String> {
     const MARK: &[u8] = b"\0VERS_";
-    let at = library.windows(MARK.len()).position(|window| window == MARK)?;
-    let rest = &library[at + MARK.len()..];
+    let start = library.windows(MARK.len()).position(|window| window == MARK)?;
+    let rest = &library[start + MARK.len()..];
     let is_version = |byte: &u8| byte.is_ascii_digit() || *byte == b'.';
     let version: Vec<u8> = rest.iter().copied().take_while(is_version).collect();
     String::from_utf8(version).ok().filter(|version| version.contains('.'))
@@ -350,15 +361,15 @@ mod tests {
     use std::fs;
 
     use super::{
-        FASTDVDNET_GRAY_ENCODER, LIBRARY, ModelFile, NetworkSource, PLACES, carried, near,
-        version_in,
+        FASTDVDNET_GRAY_ENCODER, LIBRARY, LIBRARY_FOLDERS, ModelFile, NetworkSource, carried,
+        find_near, version_in,
     };
     use crate::job::{Algorithm, Sha256};
     use reconstruction::prior::Network;
     use reconstruction::prior::onnx::Device;
 
     #[test]
-    fn the_version_is_that_of_the_symbols() {
+    fn the_version_is_read_from_the_symbols() {
         let library = b"\x7fELF\0VERS_1.31.1\0OrtGetApiBase\0";
         assert_eq!(version_in(library).as_deref(), Some("1.31.1"));
         assert_eq!(version_in(b"\0VERS_\0"), None);
@@ -366,21 +377,21 @@ mod tests {
     }
 
     #[test]
-    fn a_library_is_found_where_it_is_put() {
-        for place in PLACES {
+    fn the_library_is_found_in_each_folder() {
+        for place in LIBRARY_FOLDERS {
             let root = tempfile::tempdir().unwrap();
             let folder = root.path().join("target/release");
             fs::create_dir_all(&folder).unwrap();
             let program = folder.join("sci-recon");
-            assert_eq!(near(&program), None);
+            assert_eq!(find_near(&program), None);
             fs::create_dir_all(folder.join(place)).unwrap();
             fs::write(folder.join(place).join(LIBRARY), "").unwrap();
-            assert_eq!(near(&program), Some(folder.join(place).join(LIBRARY)));
+            assert_eq!(find_near(&program), Some(folder.join(place).join(LIBRARY)));
         }
     }
 
     #[test]
-    fn a_missing_library_is_named() {
+    fn the_error_names_the_missing_library() {
         let source = NetworkSource::new(Some("/nowhere/libonnxruntime.so".into()), Device::Cpu);
         let error = source.load(Network::FfdNet).err().unwrap().to_string();
         assert!(error.contains("/nowhere/libonnxruntime.so"), "{error}");
@@ -388,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gpu_computes_with_floating_point_and_the_records_say_so() {
+    fn gpus_use_floating_point_networks() {
         let schedule = Algorithm::PnpFastdvdnet.default_schedule();
         let names = |device| -> Vec<String> {
             let records = NetworkSource::new(None, device).records(&schedule).unwrap();
@@ -399,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn networks_of_a_folder_replace_the_carried_ones_and_are_recorded() {
+    fn networks_of_a_folder_replace_the_embedded_ones_and_are_recorded() {
         let carried = NetworkSource::new(None, Device::Cpu);
         let folder = tempfile::tempdir().unwrap();
         let own = carried.clone().with_models(Some(folder.path().into()));
@@ -419,18 +430,18 @@ mod tests {
     }
 
     #[test]
-    fn the_twin_with_8_bits_was_made_from_these_weights() {
+    fn the_8_bit_network_is_quantized_from_these_weights() {
         let (exact, quick) = (carried(Network::FastDvdNet), carried(Network::FastDvdNetInt8));
         for ((name, exact), (_, quick)) in exact.files.iter().zip(quick.files) {
-            // `research/training/quantize.py` writes it among the file's properties.
+            // `research/training/quantize.py` writes the hash into the metadata of the file.
             let source = Sha256::of(exact).to_string();
-            let found = quick.windows(source.len()).any(|window| window == source.as_bytes());
-            assert!(found, "{name}: make the twin anew with research/training/quantize.py");
+            let is_current = quick.windows(source.len()).any(|window| window == source.as_bytes());
+            assert!(is_current, "{name}: quantize again with research/training/quantize.py");
         }
     }
 
     #[test]
-    fn predictions_are_fitted_to_this_encoder() {
+    fn the_quality_model_is_fitted_to_this_encoder() {
         let models: serde_json::Value =
             serde_json::from_str(include_str!("../../../reconstruction/src/assessment.json"))
                 .unwrap();
@@ -441,13 +452,13 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_file_is_not_run() {
+    fn damaged_model_files_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("network.onnx");
-        std::fs::write(&path, "as it was").unwrap();
+        std::fs::write(&path, "original").unwrap();
         let file = ModelFile::open(&path).unwrap();
-        assert_eq!(file.content().unwrap(), b"as it was");
-        std::fs::write(&path, "as it is").unwrap();
+        assert_eq!(file.content().unwrap(), b"original");
+        std::fs::write(&path, "changed").unwrap();
         assert!(file.content().unwrap_err().to_string().contains("damaged"));
     }
 }

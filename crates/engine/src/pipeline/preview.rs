@@ -1,4 +1,4 @@
-//! The frames of one snapshot, coarsely.
+//! Coarse previews of a snapshot.
 
 use ndarray::{Array3, Axis, s};
 
@@ -9,8 +9,10 @@ use crate::job::{SceneShape, TaskStage};
 use reconstruction::preview::{self, Blocks};
 use reconstruction::tile::Window;
 
-/// Coarse frames \[B,h,w\] of a snapshot on the scale of the measurement: as large as the snapshot
-/// where it is small, else one pixel a block. Those of a mosaic are mosaics, too.
+/// Coarse frames \[B,h,w\] of a snapshot, on the scale of the measurement. Small snapshots keep their size; large ones
+/// have one pixel per block. Frames behind a mosaic are raw mosaics.
+///
+/// Errors: those of reading and of the solver; a stop by the monitor.
 pub fn frames(
     arrays: &Arrays,
     shape: SceneShape,
@@ -20,16 +22,16 @@ pub fn frames(
 ) -> Result<Array3<f32>> {
     let SceneShape { frames, height, width, .. } = shape;
     if shape.mosaic.is_none() {
-        let tell = |share| monitor.reach(TaskStage::Tv, share);
+        let report = |share| monitor.reach(TaskStage::Tv, share);
         let place = Window::whole(height, width);
-        return of_window(arrays, (frames, snapshot, white), &place, monitor, tell);
+        return window_frames(arrays, (frames, snapshot, white), &place, monitor, report);
     }
     let mut whole = Array3::zeros((0, 0, 0));
     for plane in 0..4 {
         let first = (plane / 2, plane % 2);
         let place = Window::of_plane(0..height / 2, 0..width / 2, first);
-        let tell = |share| monitor.reach(TaskStage::Tv, (plane as f64 + share) / 4.0);
-        let part = of_window(arrays, (frames, snapshot, white), &place, monitor, tell)?;
+        let report = |share| monitor.reach(TaskStage::Tv, (plane as f64 + share) / 4.0);
+        let part = window_frames(arrays, (frames, snapshot, white), &place, monitor, report)?;
         let (frames, rows, columns) = part.dim();
         if whole.is_empty() {
             whole = Array3::zeros((frames, 2 * rows, 2 * columns));
@@ -39,13 +41,13 @@ pub fn frames(
     Ok(whole)
 }
 
-/// The same of a window.
-fn of_window(
+/// Coarse frames \[B,h,w\] of a window of a snapshot.
+fn window_frames(
     arrays: &Arrays,
     (frames, snapshot, white): (usize, u32, f32),
     place: &Window,
     monitor: &Monitor,
-    tell: impl Fn(f64),
+    report: impl Fn(f64),
 ) -> Result<Array3<f32>> {
     let step = place.step;
     let (height, width) = (place.rows.len().div_ceil(step), place.columns.len().div_ceil(step));
@@ -59,16 +61,16 @@ fn of_window(
         });
     }
     let mut blocks = Blocks::new(frames, side);
-    let (rows, columns) = (height.div_ceil(side), width.div_ceil(side));
-    let mut coarse = Array3::zeros((frames, rows, columns));
+    let (block_rows, block_columns) = (height.div_ceil(side), width.div_ceil(side));
+    let mut coarse = Array3::zeros((frames, block_rows, block_columns));
     for (index, mut row) in coarse.axis_iter_mut(Axis(1)).enumerate() {
-        let at = |row: usize| place.rows.start + row * step;
-        let lines = at(index * side)..at((index + 1) * side).min(place.rows.end);
-        let blocks_place = Window { rows: lines, ..place.clone() };
-        let input = arrays.window(snapshot..snapshot + 1, &blocks_place, white)?;
+        let sensor_row = |row: usize| place.rows.start + row * step;
+        let rows = sensor_row(index * side)..sensor_row((index + 1) * side).min(place.rows.end);
+        let strip = Window { rows, ..place.clone() };
+        let input = arrays.window(snapshot..snapshot + 1, &strip, white)?;
         let y = input.y.index_axis_move(Axis(0), 0) / white;
         row.assign(&blocks.row(input.masks.view(), y.view())?);
-        tell((index + 1) as f64 / rows as f64);
+        report((index + 1) as f64 / block_rows as f64);
         monitor.check()?;
     }
     preview::smooth(&mut coarse);

@@ -1,5 +1,4 @@
-//! How good frames are where the truth is known: PSNR and SSIM, frame by frame, so that memory holds
-//! one of each.
+//! PSNR and SSIM against ground truth, computed frame by frame.
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 use serde::Serialize;
@@ -7,19 +6,22 @@ use serde::Serialize;
 use formats::Channels;
 use reconstruction::{ReconError, metrics};
 
+/// The quality of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FrameQuality {
-    /// The frame, from 1.
+    /// Number of the frame, counted from 1.
     pub frame: usize,
-    /// In dB; infinite if the frame equals its truth.
+    /// PSNR in dB; infinite if the frame equals its truth.
     pub psnr: f64,
-    /// None for a frame that is smaller than the window of SSIM.
+    /// SSIM; `None` if the frame is smaller than the SSIM window.
     pub ssim: Option<f64>,
 }
 
 impl FrameQuality {
-    /// Of the frame \[H,W\] with index `k`, from 0, on \[0,1\]; of colours \[H,3W\] over all samples of red, green and
-    /// blue, the SSIM as the mean of the three.
+    /// Compares frame `k` (counted from 0) with its truth, both \[H,W\] on \[0,1\]. Colour frames are \[H,3W\]: the
+    /// PSNR is over all samples, the SSIM is the mean of the three channels.
+    ///
+    /// Errors: [`ReconError::Shape`] if the sizes differ.
     pub fn of(
         k: usize,
         frame: ArrayView2<'_, f32>,
@@ -30,28 +32,29 @@ impl FrameQuality {
         let psnr = metrics::psnr(frame, truth)?;
         let count = channels.count();
         let ssim = |channel: usize| {
-            let of = s![.., .., channel..;count.cast_signed()];
-            metrics::ssim(frame.slice(of), truth.slice(of))
+            let samples = s![.., .., channel..;count.cast_signed()];
+            metrics::ssim(frame.slice(samples), truth.slice(samples))
         };
-        // Of frames that PSNR takes, SSIM refuses only those that are too small.
+        // The sizes are equal here, so SSIM fails only for frames that are too small.
         let ssim = (0..count).map(ssim).sum::<Result<f64, _>>().ok();
         Ok(Self { frame: k + 1, psnr, ssim: ssim.map(|sum| sum / count as f64) })
     }
 }
 
-/// How good all frames of a snapshot are.
+/// The quality of all frames of a snapshot.
 #[derive(Debug, Clone, Serialize)]
 pub struct Quality {
-    /// Mean over the frames, in dB.
+    /// Mean PSNR over the frames in dB.
     pub psnr: f64,
-    /// Mean over the frames; none if one of them has none.
+    /// Mean SSIM over the frames; `None` if a frame has none.
     pub ssim: Option<f64>,
     pub frames: Vec<FrameQuality>,
 }
 
 impl Quality {
-    /// Of frames \[H,W\], or of colours \[H,3W\], by their index, against as many true ones.
-    pub fn of_frames(
+    /// Compares frames \[H,W\], or colour frames \[H,3W\], with the truth \[B,H,W\] or \[B,H,3W\]. `frame` returns a
+    /// frame by its index.
+    pub fn compare(
         frame: impl Fn(usize) -> Array2<f32>,
         truth: ArrayView3<'_, f32>,
         channels: Channels,
@@ -77,10 +80,10 @@ mod tests {
     use formats::Channels;
     use ndarray::Array2;
 
-    /// Of the same frames scikit-image says `peak_signal_noise_ratio(truth, frame, data_range=1)` and
+    /// Reference values are from scikit-image: `peak_signal_noise_ratio(truth, frame, data_range=1)` and
     /// `structural_similarity(truth, frame, data_range=1, channel_axis=-1)`.
     #[test]
-    fn colours_are_compared_over_all_samples() {
+    fn colour_metrics_agree_with_scikit_image() {
         let wave = |i: usize, j: usize, c: usize, phase: f64| {
             let (i, j, c) = (i as f64, j as f64, c as f64);
             (0.5 + 0.4 * (0.3 * i + 0.2 * j + c + phase).sin() * (0.11 * i * j).cos()) as f32
@@ -90,8 +93,8 @@ mod tests {
                 wave(i, at / 3, at % 3, phase * (at % 3) as f64)
             })
         };
-        let (truth, found) = (frame(0.0), frame(0.2));
-        let quality = FrameQuality::of(4, found.view(), truth.view(), Channels::Rgb).unwrap();
+        let (truth, distorted) = (frame(0.0), frame(0.2));
+        let quality = FrameQuality::of(4, distorted.view(), truth.view(), Channels::Rgb).unwrap();
         assert_eq!(quality.frame, 5);
         assert!((quality.psnr - PSNR).abs() < 1e-4, "{}", quality.psnr);
         assert!((quality.ssim.unwrap() - SSIM).abs() < 1e-4, "{:?}", quality.ssim);

@@ -1,4 +1,4 @@
-//! One tile: the unit of work.
+//! Reconstruction of one tile, the unit of work.
 
 use std::ops::Range;
 
@@ -13,24 +13,24 @@ use reconstruction::sensing::SensingOperator;
 use reconstruction::solver::{self, Observer, Outcome, StopReason};
 use reconstruction::{ReconError, pilot};
 
-/// What a tile is made of: arrays alone, wherever they come from.
+/// The input of a tile.
 #[derive(Debug, Clone)]
 pub struct TileInput {
-    /// The masks' window \[B,h,w\] on \[0,1\].
+    /// Window of the masks \[B,h,w\] on \[0,1\].
     pub masks: Array3<f32>,
-    /// The measurement's window \[S,h,w\] of a run of snapshots.
+    /// Window of a run of snapshots \[S,h,w\].
     pub y: Array3<f32>,
-    /// White level of the scene, above 0: the same for all tiles of a job, or seams would show.
+    /// White level of the scene, above 0. It is the same for all tiles of a job, so that no seams appear.
     pub white: f32,
-    /// Which snapshots of the run are solved together, by their place in it. The frames of those that are in
-    /// no piece are 0.
+    /// Ranges of snapshots that are solved together, relative to the run. Frames of snapshots outside all pieces are 0.
     pub pieces: Vec<Range<usize>>,
 }
 
 impl TileInput {
-    /// The tile with the measurement divided by the white level, so that it is `sum_k C_k x_k` with
-    /// frames on \[0,1\], and the operator of one snapshot; none if no light reaches it through any mask (a
-    /// corner outside a round aperture, say).
+    /// Returns the operator of one snapshot, and the measurement divided by the white level: `sum_k C_k x_k` with
+    /// frames x on \[0,1\]. `None` if no mask lets light through, for example in a corner outside a round aperture.
+    ///
+    /// Errors: [`ReconError::Parameter`] for an invalid white level, [`ReconError::Shape`] for pieces outside the run.
     pub(super) fn on_unit_scale(
         self,
     ) -> Result<Option<(SensingOperator, Array3<f32>)>, ReconError> {
@@ -46,8 +46,8 @@ impl TileInput {
         if !self.pieces.iter().all(within) {
             return Err(ReconError::Shape {
                 what: "a tile",
-                found: format!("{snapshots} snapshots, to be solved as {:?}", self.pieces),
-                expected: "pieces of these snapshots".into(),
+                found: format!("{snapshots} snapshots with the pieces {:?}", self.pieces),
+                expected: "non-empty pieces of these snapshots".into(),
             });
         }
         let op = match SensingOperator::new(self.masks) {
@@ -64,10 +64,10 @@ impl TileInput {
         Self { pieces, ..self }
     }
 
-    /// Has the pieces of the tile solved on the unit scale, one after the other, and multiplies the frames
-    /// by the white level again. `solve` is told which share of all the work a piece is. A tile without
-    /// light has frames of 0 and no iterations.
-    fn solved<F>(self, mut solve: F) -> Result<Outcome, ReconError>
+    /// Solves the pieces of the tile one after another on the unit scale, and scales the frames back by the white
+    /// level. `solve` gets the range of each piece on \[0,1\], as a share of all the work. A tile without light has
+    /// frames of 0 and no iterations.
+    fn solve_pieces<F>(self, mut solve: F) -> Result<Outcome, ReconError>
     where
         F: FnMut(&SensingOperator, ArrayView3<'_, f32>, Range<f64>) -> Result<Outcome, ReconError>,
     {
@@ -83,25 +83,25 @@ impl TileInput {
             evidence: None,
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(whole) };
-        let all: usize = pieces.iter().map(Range::len).sum();
-        let share = |snapshots: usize| snapshots as f64 / all as f64;
+        let total: usize = pieces.iter().map(Range::len).sum();
+        let share = |snapshots: usize| snapshots as f64 / total as f64;
         let mut done = 0;
         for piece in pieces.iter().cloned() {
             op = op.over(piece.len())?;
-            let part = share(done)..share(done + piece.len());
+            let work = share(done)..share(done + piece.len());
             done += piece.len();
-            let outcome = solve(&op, y.slice(s![piece.clone(), .., ..]), part)?;
+            let outcome = solve(&op, y.slice(s![piece.clone(), .., ..]), work)?;
             if piece.len() == y.dim().0 {
                 whole = outcome;
                 continue;
             }
             let place = s![piece.start * frames..piece.end * frames, .., ..];
             whole.frames.slice_mut(place).assign(&outcome.frames);
-            if let Some(seen) = outcome.features {
-                let (features, _, rows, columns) = seen.dim();
-                let none = || Array4::zeros((features, whole.frames.dim().0, rows, columns));
+            if let Some(part) = outcome.features {
+                let (features, _, rows, columns) = part.dim();
+                let zeros = || Array4::zeros((features, whole.frames.dim().0, rows, columns));
                 let place = s![.., piece.start * frames..piece.end * frames, .., ..];
-                whole.features.get_or_insert_with(none).slice_mut(place).assign(&seen);
+                whole.features.get_or_insert_with(zeros).slice_mut(place).assign(&part);
             }
             whole.tv_iterations = whole.tv_iterations.max(outcome.tv_iterations);
             whole.denoiser_passes = whole.denoiser_passes.max(outcome.denoiser_passes);
@@ -116,12 +116,13 @@ impl TileInput {
     }
 }
 
-/// Iterations of total variation after which its error hardly changes. More would hold up those who cancel the job.
-const MOST_FOR_EVIDENCE: usize = 200;
+/// Iterations of total variation after which the error hardly changes. The evidence stops there, because it does not
+/// react to a cancellation.
+const MAX_EVIDENCE_ITERATIONS: usize = 200;
 
-/// Reconstructs one tile by the iterations of a schedule. The frames \[S B,h,w\] are on the scale of
-/// the measurement.
-/// Errors: as [`solver::reconstruct`]; [`ReconError::Cancelled`] when the observer says so.
+/// Reconstructs one tile with a schedule. The frames \[S B,h,w\] are on the scale of the measurement.
+///
+/// Errors: those of [`solver::reconstruct`]; [`ReconError::Cancelled`] if the observer cancels.
 pub fn reconstruct_tile(
     input: TileInput,
     schedule: &Schedule,
@@ -129,18 +130,18 @@ pub fn reconstruct_tile(
     observer: &mut dyn Observer,
 ) -> Result<Outcome, ReconError> {
     let assessed = Model::of(schedule).is_some();
-    // Of more than total variation the pilot tells.
-    let quick = schedule.stages.len() == 1;
+    // For longer schedules the pilot provides the evidence.
+    let is_tv_only = schedule.stages.len() == 1;
     let mut evidence = None;
-    let mut outcome = input.solved(|op, y, part| {
-        observer.part(part);
+    let mut outcome = input.solve_pieces(|op, y, work| {
+        observer.part(work);
         if !assessed {
             return solver::reconstruct(op, y, schedule, networks, observer);
         }
-        if quick && evidence.is_none() {
+        if is_tv_only && evidence.is_none() {
             let bounded = match schedule.planned_iterations() {
-                ..=MOST_FOR_EVIDENCE => schedule.clone(),
-                _ => schedule.clone().with_iterations(MOST_FOR_EVIDENCE),
+                ..=MAX_EVIDENCE_ITERATIONS => schedule.clone(),
+                _ => schedule.clone().with_iterations(MAX_EVIDENCE_ITERATIONS),
             };
             evidence = pilot::evidence(op, y, &bounded, networks)?;
         }
@@ -150,19 +151,21 @@ pub fn reconstruct_tile(
     Ok(outcome)
 }
 
-/// Reconstructs one tile by an end-to-end network, snapshot by snapshot.
+/// Reconstructs one tile with an end-to-end network, snapshot by snapshot.
+///
+/// Errors: those of the network and of [`SensingOperator`].
 pub fn run_network(
     input: TileInput,
     network: &mut dyn SnapshotNetwork,
 ) -> Result<Outcome, ReconError> {
-    input.snapshot_by_snapshot().solved(|op, y, _| {
+    input.snapshot_by_snapshot().solve_pieces(|op, y, _| {
         Ok(Outcome {
             features: None,
             evidence: None,
             frames: network.frames(y.index_axis(Axis(0), 0), op.masks())?,
             tv_iterations: 0,
             denoiser_passes: 1,
-            // `solved` computes the residual of the whole tile.
+            // `solve_pieces` computes the residual of the whole tile.
             residual: 0.0,
             stop_reason: StopReason::MaxIterations,
         })
@@ -170,7 +173,7 @@ pub fn run_network(
 }
 
 #[cfg(test)]
-#[allow(clippy::single_range_in_vec_init)] // lists of ranges, some of one
+#[allow(clippy::single_range_in_vec_init)] // some lists have one range
 mod tests {
     use super::{TileInput, reconstruct_tile, run_network};
     use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate, s};
@@ -179,7 +182,7 @@ mod tests {
     use reconstruction::learned::SnapshotNetwork;
     use reconstruction::schedule::Schedule;
 
-    /// One snapshot.
+    /// The input of a tile with one snapshot.
     fn input(masks: Array3<f32>, y: Array2<f32>, white: f32) -> TileInput {
         TileInput { masks, y: y.insert_axis(Axis(0)), white, pieces: vec![0..1] }
     }
@@ -193,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_come_back_on_the_scale_of_the_measurement() {
+    fn frames_are_on_the_scale_of_the_measurement() {
         let (masks, truth) = scene();
         let y = measure(masks.view(), truth.view()).unwrap();
         let solve = |y: Array2<f32>, white| {
@@ -203,13 +206,13 @@ mod tests {
         let plain = solve(y.clone(), 0.8);
         let error = (&plain - &truth).mapv(|d| d * d).mean().unwrap();
         assert!(error < 2e-3, "{error}");
-        // 64 times as bright: powers of two change no bit of a float's fraction.
+        // Scaling by a power of two is exact.
         let bright = solve(y * 64.0, 0.8 * 64.0);
         assert_eq!(bright, plain * 64.0);
     }
 
     #[test]
-    fn a_tile_without_light_is_black() {
+    fn tiles_without_light_are_black() {
         let input = input(Array3::zeros((3, 16, 16)), Array2::from_elem((16, 16), 0.1), 1.0);
         let outcome = reconstruct_tile(input, &Schedule::gap_tv(), &mut (), &mut ()).unwrap();
         assert!(outcome.frames.iter().all(|&v| v == 0.0));
@@ -217,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn white_must_be_above_zero() {
+    fn the_white_level_must_be_positive() {
         let (masks, _) = scene();
         for white in [0.0, -1.0, f32::NAN] {
             let input = input(masks.clone(), Array2::ones((32, 32)), white);
@@ -226,7 +229,7 @@ mod tests {
         }
     }
 
-    /// Knows the frames already, and what it should be given for them.
+    /// A network that returns known frames after a check of its input.
     struct Oracle(Array3<f32>);
 
     impl SnapshotNetwork for Oracle {
@@ -242,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn the_network_sees_a_scene_on_0_to_1_and_its_scale_is_undone() {
+    fn networks_work_on_the_unit_scale() {
         let masks = iid_masks(3, 20, 24, 1).unwrap();
         let frames = Array3::from_shape_fn((3, 20, 24), |(k, i, j)| (k + i + j) as f32 / 45.0);
         let measurement = measure(masks.view(), frames.view()).unwrap() * 4.0;
@@ -254,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_is_solved_in_its_pieces() {
+    fn pieces_of_a_run_are_solved_independently() {
         let (masks, frames) = scene();
         let y = measure(masks.view(), frames.view()).unwrap().insert_axis(Axis(0));
         let y = concatenate(Axis(0), &[y.view(), (0.5 * &y).view(), (0.8 * &y).view()]).unwrap();
@@ -262,20 +265,20 @@ mod tests {
             let input = TileInput { masks: masks.clone(), y, white: 0.9, pieces };
             reconstruct_tile(input, &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().frames
         };
-        let part = |snapshots: std::ops::Range<usize>| {
+        let solved_alone = |snapshots: std::ops::Range<usize>| {
             let alone = y.slice(s![snapshots, .., ..]).to_owned();
             let whole = 0..alone.dim().0;
             solve(alone, vec![whole])
         };
-        let taken_apart = solve(y.clone(), vec![0..2, 2..3]);
-        assert_eq!(taken_apart, concatenate![Axis(0), part(0..2), part(2..3)]);
-        let left_out = solve(y.clone(), vec![1..3]);
-        assert!(left_out.slice(s![..4, .., ..]).iter().all(|&value| value == 0.0));
-        assert_eq!(left_out.slice(s![4.., .., ..]), part(1..3));
+        let two_pieces = solve(y.clone(), vec![0..2, 2..3]);
+        assert_eq!(two_pieces, concatenate![Axis(0), solved_alone(0..2), solved_alone(2..3)]);
+        let last_piece = solve(y.clone(), vec![1..3]);
+        assert!(last_piece.slice(s![..4, .., ..]).iter().all(|&value| value == 0.0));
+        assert_eq!(last_piece.slice(s![4.., .., ..]), solved_alone(1..3));
     }
 
     #[test]
-    fn pieces_of_other_snapshots_are_refused() {
+    fn pieces_outside_the_run_are_refused() {
         let (masks, _) = scene();
         for pieces in [vec![0..2], vec![1..1]] {
             let y = Array3::ones((1, 32, 32));

@@ -1,44 +1,44 @@
-//! What this process has used of the machine.
+//! Resource usage of processes: CPU time, peak memory, and out-of-memory kills.
 
 use std::fs;
 
 use rustix::param::clock_ticks_per_second;
 use rustix::time::{ClockId, clock_gettime};
 
-/// Processor time, user and system together, of this process and of its children that have
-/// ended, in seconds.
+/// CPU time (user and system) in seconds of this process and its terminated children.
 pub fn cpu_seconds() -> f64 {
     let own = clock_gettime(ClockId::ProcessCPUTime);
     let own = own.tv_sec as f64 + own.tv_nsec as f64 * 1e-9;
-    own + ticks("/proc/self/stat", CUTIME)
+    own + seconds_in_fields("/proc/self/stat", CUTIME)
 }
 
-/// The same of another process without its children, to a hundredth of a second; 0 if it is gone.
+/// CPU time in seconds of another process without its children, with a resolution of 10 ms; 0 if the process does not
+/// exist.
 pub fn cpu_seconds_of(process: u32) -> f64 {
-    ticks(&format!("/proc/{process}/stat"), UTIME)
+    seconds_in_fields(&format!("/proc/{process}/stat"), UTIME)
 }
 
-/// The fields of a process's time in user mode and of that of its ended children, counted from the one after
-/// its name; the time in the kernel follows each.
+/// Index of the user time in `/proc/PID/stat`, counted after the process name. The system time follows it.
 const UTIME: usize = 11;
+/// Index of the user time of terminated children. Their system time follows it.
 const CUTIME: usize = 13;
 
-/// Seconds in two fields that count clock ticks; 0 where /proc can't be read.
-fn ticks(stat: &str, field: usize) -> f64 {
+/// Sum, in seconds, of a field in clock ticks and the next one; 0 if the file can't be read.
+fn seconds_in_fields(stat: &str, field: usize) -> f64 {
     let stat = fs::read_to_string(stat).unwrap_or_default();
-    // The name stands in parentheses and may hold spaces.
+    // The process name is in parentheses and may contain spaces.
     let after_name = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
     let fields = after_name.split_whitespace().skip(field).take(2);
     let ticks: u64 = fields.filter_map(|field| field.parse::<u64>().ok()).sum();
     ticks as f64 / clock_ticks_per_second() as f64
 }
 
-/// Largest resident memory of this process so far in bytes (VmHWM); 0 where /proc can't be read.
+/// Peak resident memory (VmHWM) of this process in bytes; 0 if /proc can't be read.
 pub fn peak_rss_bytes() -> u64 {
     peak_rss_in("/proc/self/status")
 }
 
-/// The same of another process; 0 if it is gone.
+/// Peak resident memory of another process in bytes; 0 if the process does not exist.
 pub fn peak_rss_of(process: u32) -> u64 {
     peak_rss_in(&format!("/proc/{process}/status"))
 }
@@ -50,8 +50,7 @@ fn peak_rss_in(status: &str) -> u64 {
     kibibytes.unwrap_or(0) * 1024
 }
 
-/// How often the kernel has killed a process of this control group for want of memory; none if it does not
-/// tell.
+/// Number of out-of-memory kills in the control group of this process; `None` if the kernel does not report it.
 pub fn kills_for_memory() -> Option<u64> {
     let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
     let file = groups.lines().find_map(|line| {
@@ -73,7 +72,7 @@ mod tests {
     use super::{cpu_seconds, cpu_seconds_of, peak_rss_bytes};
 
     #[test]
-    fn work_shows() {
+    fn cpu_time_and_peak_memory_grow_with_work() {
         let before = cpu_seconds();
         let mut sum = 0.0f64;
         let mut number = 0u32;
@@ -89,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn children_count_when_they_have_ended() {
+    fn terminated_children_are_included() {
         let before = cpu_seconds();
         let script = "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done";
         let status = std::process::Command::new("sh").args(["-c", script]).status().unwrap();

@@ -1,4 +1,4 @@
-//! The folder of a result: frames as EXR, npy and PNG, and the manifest.
+//! Writes the folder of a result: frames as EXR, npy and PNG, and the manifest.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
@@ -18,28 +18,29 @@ const FRAMES: &str = "frames";
 const PNGS: &str = "png";
 const STACK: &str = "stack.exr";
 const ARRAY: &str = "frames.npy";
-/// The frames as a colour sensor saw them.
-const SEEN: &str = "mosaic.npy";
-/// The expected error of blocks of the frames.
+/// The raw frames of a colour sensor.
+const RAW: &str = "mosaic.npy";
+/// The expected error of each block of the frames.
 const ERROR: &str = "error.npy";
 const MANIFEST: &str = "manifest.json";
-/// All that a result's folder holds, the manifest last.
-const NAMES: [&str; 7] = [FRAMES, PNGS, STACK, ARRAY, SEEN, ERROR, MANIFEST];
+/// All entries of a result folder, the manifest last.
+const ENTRIES: [&str; 7] = [FRAMES, PNGS, STACK, ARRAY, RAW, ERROR, MANIFEST];
 
-/// Writes `frames/frame_0001.exr` and so on, `png/frame_0001.png` and so on (white as in the
-/// manifest, black is 0), `stack.exr`, `frames.npy` (float32 \[B,H,W\]), and at last the manifest
-/// with the list of these files. All of them are on the disk (fsync) when this returns, and each
-/// was read once, for its hash.
+/// Writes all files of a result and returns their names, sizes and hashes, the manifest last.
 ///
-/// Frames of a mosaic get their colours: EXR has the channels R, G and B then, PNG has colours,
-/// `frames.npy` is \[B,H,W,3\], and `mosaic.npy` \[B,H,W\] has them as the sensor saw them.
+/// - `frames/frame_0001.exr` and so on
+/// - `png/frame_0001.png` and so on; white as in the manifest, black is 0
+/// - `stack.exr` and `frames.npy` (float32 \[B,H,W\])
+/// - `error.npy`: the expected error \[B, block rows, block columns\], if `error` is given
+/// - the manifest, with the list of the other files
 ///
-/// `error.npy` has the expected error of the frames \[B, rows, columns of blocks\], if there is one.
+/// Behind a mosaic frames are demosaicked: EXR has the channels R, G and B, PNG is in colour, `frames.npy` is
+/// \[B,H,W,3\], and `mosaic.npy` \[B,H,W\] has the raw values.
 ///
-/// `frame(k)` \[H,W\] is asked once for each frame, in order; memory holds one.
+/// `frame(k)` \[H,W\] is called once per frame, in order; one frame at a time is in memory. All files are synced to disk on
+/// return.
 ///
-/// Returns all files, the manifest last.
-/// Errors: those of `frame`, and those of writing. A folder that was begun stays behind.
+/// Errors: those of `frame` and of writing. An incomplete folder is left behind.
 pub fn write_result(
     folder: &Path,
     mut manifest: Manifest,
@@ -56,19 +57,19 @@ pub fn write_result(
     let shape = manifest.content.recipe.shape;
     let channels = shape.channels();
     let mut array = npy::writer(array, (count, height, width), channels)?;
-    let mut seen = match shape.mosaic {
+    let mut raw = match shape.mosaic {
         None => None,
         Some(mosaic) => {
-            let file = BufWriter::new(File::create(folder.join(SEEN)).map_err(failed(SEEN))?);
+            let file = BufWriter::new(File::create(folder.join(RAW)).map_err(failed(RAW))?);
             Some((mosaic, npy::writer(file, (count, height, width), Channels::Grey)?))
         }
     };
     let stack = folder.join(STACK);
     exr::write_stack(&stack, (height, width), channels, &attributes, |k| {
         let mut frame = frame(k)?;
-        if let Some((mosaic, seen)) = &mut seen {
-            seen.write_frame(frame.view())?;
-            frame = mosaic.colours(frame.view(), (0, 0));
+        if let Some((mosaic, raw)) = &mut raw {
+            raw.write_frame(frame.view())?;
+            frame = mosaic.demosaick(frame.view(), (0, 0));
         }
         exr::write_frame(&folder.join(frame_name(k)), frame.view(), channels, &attributes[k])?;
         png::write_u16(&folder.join(png_name(k)), frame.view(), channels, 0.0, white)?;
@@ -78,9 +79,9 @@ pub fn write_result(
     array.finish()?;
     let names = (0..count).map(frame_name).chain((0..count).map(png_name));
     let mut names: Vec<_> = names.chain([STACK.to_owned(), ARRAY.to_owned()]).collect();
-    if let Some((_, seen)) = seen {
-        seen.finish()?;
-        names.push(SEEN.to_owned());
+    if let Some((_, raw)) = raw {
+        raw.finish()?;
+        names.push(RAW.to_owned());
     }
     if let Some(error) = error {
         let file = BufWriter::new(File::create(folder.join(ERROR)).map_err(failed(ERROR))?);
@@ -90,8 +91,9 @@ pub fn write_result(
         names.push(ERROR.to_owned());
     }
     let files = &mut manifest.content.files;
-    // Side by side: a disk brings many files to safety in the time of a few.
-    *files = names.into_par_iter().map(|name| settle(folder, name)).collect::<Result<_, _>>()?;
+    // In parallel, because disks sync many files in about the time of a few.
+    *files =
+        names.into_par_iter().map(|name| sync_and_hash(folder, name)).collect::<Result<_, _>>()?;
     let mut all = files.clone();
     for name in [FRAMES, PNGS] {
         sync_dir(folder, name)?;
@@ -100,50 +102,52 @@ pub fn write_result(
     Ok(all)
 }
 
-/// Writes a `manifest.json`; it and its folder are on the disk (fsync) when this returns.
+/// Writes `manifest.json`. The file and its folder are synced to disk on return.
 pub fn write_manifest(folder: &Path, manifest: &impl Serialize) -> Result<ResultFile> {
     let text =
         serde_json::to_string_pretty(manifest).map_err(|error| failed(MANIFEST)(error.into()))?;
     fs::write(folder.join(MANIFEST), text + "\n").map_err(failed(MANIFEST))?;
-    let file = settle(folder, MANIFEST.to_owned())?;
+    let file = sync_and_hash(folder, MANIFEST.to_owned())?;
     sync_dir(folder, "")?;
     Ok(file)
 }
 
-/// Refuses a folder that holds files with the names of a result, but no manifest of ours.
+/// Checks that a folder can receive a result: it has a manifest of this program, or no files with the names of a
+/// result.
+///
+/// Errors: [`PipelineError::Foreign`].
 pub fn check_output(folder: &Path) -> Result<()> {
-    // Of any version of this program: the form of manifests changes.
+    // Manifests of all versions of this program are accepted.
     let manifest = fs::read(folder.join(MANIFEST)).ok();
     let manifest = manifest.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
     let schema = manifest.as_ref().and_then(|manifest| manifest["schema"].as_str());
     if schema.is_some_and(|schema| schema.starts_with(SCHEMA_FAMILY)) {
         return Ok(());
     }
-    match NAMES.into_iter().find(|name| folder.join(name).exists()) {
+    match ENTRIES.into_iter().find(|name| folder.join(name).exists()) {
         Some(name) => Err(PipelineError::Foreign { name: name.to_owned() }),
         None => Ok(()),
     }
 }
 
-/// Moves the result in `made` to `folder`, in place of an earlier result; other files there
-/// stay. Both must be on one file system.
-/// Errors: as [`check_output`], or a file can't be moved.
-pub fn replace_result(made: &Path, folder: &Path) -> Result<()> {
+/// Moves the result in `new` to `folder`, where it replaces an earlier result. Other files in `folder` are kept. Both
+/// folders must be on one file system.
+///
+/// Errors: those of [`check_output`]; [`PipelineError::File`] if a file can't be moved.
+pub fn replace_result(new: &Path, folder: &Path) -> Result<()> {
     check_output(folder)?;
-    // The old manifest goes last and the new one comes last: what lies beside a manifest
-    // is what it describes.
-    for name in NAMES {
+    // The manifest is removed last and moved last, so it always describes the files in its folder.
+    for name in ENTRIES {
         let old = folder.join(name);
         let removed = match old.symlink_metadata() {
-            Ok(old_one) if old_one.is_dir() => fs::remove_dir_all(old),
+            Ok(metadata) if metadata.is_dir() => fs::remove_dir_all(old),
             Ok(_) => fs::remove_file(old),
             Err(_) => Ok(()),
         };
         removed.map_err(failed(name))?;
     }
-    // Not every result has all of them.
-    for name in NAMES.into_iter().filter(|name| made.join(name).exists()) {
-        fs::rename(made.join(name), folder.join(name)).map_err(failed(name))?;
+    for name in ENTRIES.into_iter().filter(|name| new.join(name).exists()) {
+        fs::rename(new.join(name), folder.join(name)).map_err(failed(name))?;
     }
     Ok(())
 }
@@ -160,14 +164,14 @@ fn failed(name: &str) -> impl FnOnce(io::Error) -> PipelineError {
     move |source| PipelineError::File { name: name.to_owned(), source }
 }
 
-/// Brings a file to the disk and takes its size and hash.
-fn settle(folder: &Path, name: String) -> Result<ResultFile> {
-    let measured = || -> io::Result<(Sha256, u64)> {
+/// Syncs a file to disk, and determines its size and hash.
+fn sync_and_hash(folder: &Path, name: String) -> Result<ResultFile> {
+    let hashed = || -> io::Result<(Sha256, u64)> {
         let mut file = File::open(folder.join(&name))?;
         file.sync_all()?;
         Sha256::of_reader(&mut file)
     };
-    let (sha256, size) = measured().map_err(failed(&name))?;
+    let (sha256, size) = hashed().map_err(failed(&name))?;
     Ok(ResultFile { name, size, sha256 })
 }
 
@@ -194,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn every_file_is_there_and_as_the_list_says() {
+    fn all_files_are_written_as_listed() {
         let folder = tempfile::tempdir().unwrap();
         let files = write(folder.path(), 3);
         let names: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
@@ -217,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_a_mosaic_get_their_colours() {
+    fn mosaic_frames_are_written_raw_and_demosaicked() {
         let folder = tempfile::tempdir().unwrap();
         let mut manifest = sample(2);
         manifest.content.recipe.shape.mosaic = Some(Mosaic::Gbrg);
@@ -229,11 +233,11 @@ mod tests {
             let info = *windows.info();
             windows.read_window(0..info.frames, 0..info.height, 0..info.width).unwrap()
         };
-        let (seen, colours) = (array("mosaic.npy"), array("frames.npy"));
-        assert_eq!((seen.dim(), colours.dim()), ((2, 20, 24), (2, 20, 72)));
+        let (raw, colours) = (array("mosaic.npy"), array("frames.npy"));
+        assert_eq!((raw.dim(), colours.dim()), ((2, 20, 24), (2, 20, 72)));
         for k in 0..2 {
-            assert_eq!(seen.index_axis(Axis(0), k), frame(k));
-            let expected = Mosaic::Gbrg.colours(frame(k).view(), (0, 0));
+            assert_eq!(raw.index_axis(Axis(0), k), frame(k));
+            let expected = Mosaic::Gbrg.demosaick(frame(k).view(), (0, 0));
             assert_eq!(colours.index_axis(Axis(0), k), expected);
         }
         assert_eq!(exr::read_stack(&path("stack.exr"), &Limits::default()).unwrap().1, colours);
@@ -243,7 +247,7 @@ mod tests {
         let manifest: serde_json::Value = serde_json::from_slice(&text).unwrap();
         let colour = serde_json::json!({"mosaic": "gbrg", "demosaicking": Mosaic::DEMOSAICKING});
         assert_eq!(manifest["content"]["colour"], colour);
-        // Without a mosaic nothing of the earlier colours stays.
+        // A grey result removes the raw mosaic of the earlier one.
         let grey = tempfile::tempdir_in(folder.path()).unwrap();
         write(grey.path(), 2);
         replace_result(grey.path(), folder.path()).unwrap();
@@ -251,21 +255,21 @@ mod tests {
     }
 
     #[test]
-    fn an_earlier_result_is_replaced_and_nothing_else() {
+    fn only_the_files_of_an_earlier_result_are_replaced() {
         let folder = tempfile::tempdir().unwrap();
         let (first, second) = (folder.path().join("a"), folder.path().join("b"));
         fs::create_dir_all(&first).unwrap();
         fs::create_dir_all(&second).unwrap();
         write(&first, 5);
-        fs::write(first.join("notes.txt"), "mine").unwrap();
+        fs::write(first.join("notes.txt"), "kept").unwrap();
         write(&second, 2);
         replace_result(&second, &first).unwrap();
         assert_eq!(fs::read_dir(first.join("frames")).unwrap().count(), 2);
-        assert_eq!(fs::read_to_string(first.join("notes.txt")).unwrap(), "mine");
+        assert_eq!(fs::read_to_string(first.join("notes.txt")).unwrap(), "kept");
     }
 
     #[test]
-    fn folders_with_frames_of_somebody_else_are_refused() {
+    fn foreign_folders_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         fs::create_dir(folder.path().join("frames")).unwrap();
         let error = check_output(folder.path()).unwrap_err().to_string();

@@ -1,17 +1,17 @@
-//! The headers of a file that we wrote, attribute by attribute as they stand.
+//! Splits the headers of an EXR file into attributes.
 
 use std::io::{self, BufRead, Read};
 
-/// Magic number and version.
+/// Length of magic number and version, in bytes.
 const PROLOGUE_BYTES: usize = 8;
-/// The flag in the version for files of several parts, which end their headers with an empty one.
+/// Version flag of files with several parts. Their headers end with an empty one.
 const MULTI_PART: u8 = 0x10;
 
-/// What stands before the tables of chunks.
+/// The part of a file before the chunk tables.
 pub(super) struct Head {
     prologue: [u8; PROLOGUE_BYTES],
-    /// The attributes of each part. Each begins with its name and a zero, its type and a zero, and the four bytes
-    /// of its size.
+    /// The attributes of each part. An attribute starts with its name and a zero byte, its type and a zero byte, and
+    /// its size in four bytes.
     pub(super) parts: Vec<Vec<Vec<u8>>>,
 }
 
@@ -31,7 +31,7 @@ impl Head {
         }
     }
 
-    /// Whether chunks tell their part, too.
+    /// True for a file with several parts, in which chunks contain the number of their part.
     pub(super) fn has_several_parts(&self) -> bool {
         self.prologue[5] & MULTI_PART != 0
     }
@@ -49,7 +49,7 @@ impl Head {
     }
 }
 
-/// The attributes of a part, without the zero at their end.
+/// Reads the attributes of a part, without the final zero byte.
 fn read_attributes(reader: &mut impl BufRead) -> io::Result<Vec<Vec<u8>>> {
     let mut attributes = Vec::new();
     loop {

@@ -1,8 +1,7 @@
-//! A stored stack with a layer beside the channels of each part.
+//! Adds a channel to each part of a stored EXR stack while it is streamed.
 //!
-//! A line of a part is a chunk that is not compressed, so each line with a layer is the stored one with the
-//! layer's values behind it, and can be made without the lines around it. What parts say of their frames stays as
-//! it is.
+//! Each line of a part is an uncompressed chunk. A line with the additional channel is the stored line followed by the
+//! values of the channel, so lines can be produced independently. All other attributes stay unchanged.
 
 use std::io::{BufRead, Read};
 
@@ -10,34 +9,34 @@ use super::head::Head;
 use crate::error::Result;
 use crate::{Channels, FormatError};
 
-/// Channel `Y` of the layer `sigma`, in OpenEXR's way to name layers: the expected error.
+/// Name of the channel of the expected error: channel `Y` of the layer `sigma`, in OpenEXR's naming scheme.
 pub const SIGMA: &str = "sigma.Y";
 
-/// How the attribute of the channels begins. Its size follows, then the channels and a zero.
+/// Start of the attribute with the list of channels. Its size follows, then the channels, then a zero byte.
 const CHANNELS: &[u8] = b"channels\0chlist\0";
-/// What follows a channel's name: 32-bit float, in the given curve, a sample in every column and row.
+/// The description after a channel's name: 32-bit float, not perceptually linear, a sample in every column and row.
 const SAMPLES: [u8; 16] = [2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0];
 
-/// What a stack is made of when its parts get one more channel: a head, and then all lines of all parts.
+/// The layout of a stack with an additional channel: a head, followed by all lines of all parts.
 #[derive(Debug)]
 pub struct Layered {
-    /// All bytes before the first line.
+    /// All bytes before the first line of the new stack.
     pub head: Vec<u8>,
-    /// Where the lines begin in the stored stack.
+    /// Offset of the first line in the stored stack.
     pub start: u64,
-    /// Bytes of a line there.
+    /// Length of a line in the stored stack, in bytes.
     pub stored_bytes: usize,
-    /// Bytes of a line with the layer.
+    /// Length of a line in the new stack, in bytes.
     pub line_bytes: usize,
-    /// Bytes before the values of a line; the last four of them say how many bytes the values have.
-    place_bytes: usize,
+    /// Length of the prefix of a line, in bytes. Its last four bytes are the length of the values.
+    prefix_bytes: usize,
 }
 
 impl Layered {
-    /// Reads the head of a stack of this shape (frames, rows, columns) that [`super::write_stack`] wrote, for one more
-    /// channel of 32-bit floats. In the order of bytes its name comes behind those of the others.
+    /// Reads the head of a stack of this shape (frames, rows, columns) from [`super::write_stack`], and plans the stack
+    /// with an additional channel of 32-bit floats. Its name must sort after those of the other channels.
     ///
-    /// Errors: I/O; [`FormatError::Internal`] for a file of another form.
+    /// Errors: I/O; [`FormatError::Internal`] for a file with another layout.
     pub fn read(
         mut stored: impl BufRead,
         (frames, height, width): (usize, usize, usize),
@@ -46,16 +45,16 @@ impl Layered {
     ) -> Result<Self> {
         let io = FormatError::io("read the head of the EXR file");
         let mut head = Head::read(&mut stored).map_err(io)?;
-        let place_bytes = if head.has_several_parts() { 12 } else { 8 };
+        let prefix_bytes = if head.has_several_parts() { 12 } else { 8 };
         let channel_bytes = width * size_of::<f32>();
-        let stored_bytes = place_bytes + channels.count() * channel_bytes;
+        let stored_bytes = prefix_bytes + channels.count() * channel_bytes;
         let lines = frames * height;
         let (start, expected) = tables(&head.bytes(), lines, stored_bytes);
-        let mut found = Vec::with_capacity(expected.len());
+        let mut stored_tables = Vec::with_capacity(expected.len());
         let io = FormatError::io("read the tables of the EXR file");
-        stored.take(expected.len() as u64).read_to_end(&mut found).map_err(io)?;
-        if head.parts.len() != frames || found != expected {
-            return Err(other_form());
+        stored.take(expected.len() as u64).read_to_end(&mut stored_tables).map_err(io)?;
+        if head.parts.len() != frames || stored_tables != expected {
+            return Err(other_layout());
         }
         for part in &mut head.parts {
             add_channel(part, name)?;
@@ -63,44 +62,46 @@ impl Layered {
         let line_bytes = stored_bytes + channel_bytes;
         let mut head = head.bytes();
         head.extend(tables(&head, lines, line_bytes).1);
-        Ok(Self { head, start, stored_bytes, line_bytes, place_bytes })
+        Ok(Self { head, start, stored_bytes, line_bytes, prefix_bytes })
     }
 
-    /// Puts a line with the layer behind `made`, of the stored line and the bytes of the layer's values.
+    /// Appends a line of the new stack to `output`, from the stored line and the bytes of the additional channel.
     pub fn line<'a>(
         &self,
         stored: &[u8],
         layer: impl Iterator<Item = &'a [u8]>,
-        made: &mut Vec<u8>,
+        output: &mut Vec<u8>,
     ) {
-        let (place, values) = stored.split_at(self.place_bytes);
-        made.extend(&place[..self.place_bytes - 4]);
-        made.extend(((self.line_bytes - self.place_bytes) as u32).to_le_bytes());
-        made.extend(values);
-        layer.for_each(|values| made.extend(values));
+        let (prefix, values) = stored.split_at(self.prefix_bytes);
+        output.extend(&prefix[..self.prefix_bytes - 4]);
+        output.extend(((self.line_bytes - self.prefix_bytes) as u32).to_le_bytes());
+        output.extend(values);
+        layer.for_each(|values| output.extend(values));
     }
 }
 
-/// Where the lines begin behind these headers, and the tables between them, which say where each line stands.
+/// Offset of the first line after these headers, and the tables in between, which contain the offset of each line.
 fn tables(headers: &[u8], lines: usize, line_bytes: usize) -> (u64, Vec<u8>) {
     let start = headers.len() + lines * size_of::<u64>();
-    let places = (0..lines).map(|line| (start + line * line_bytes) as u64);
-    (start as u64, places.flat_map(u64::to_le_bytes).collect())
+    let offsets = (0..lines).map(|line| (start + line * line_bytes) as u64);
+    (start as u64, offsets.flat_map(u64::to_le_bytes).collect())
 }
 
 fn add_channel(part: &mut [Vec<u8>], name: &str) -> Result<()> {
     let attribute = part.iter_mut().find(|attribute| attribute.starts_with(CHANNELS));
-    let attribute = attribute.ok_or_else(other_form)?;
-    // Behind the size, without the zero at the end.
+    let attribute = attribute.ok_or_else(other_layout)?;
+    // After the size, without the final zero byte.
     let channels = attribute.get(CHANNELS.len() + 4..attribute.len().saturating_sub(1));
     let channels =
-        [channels.ok_or_else(other_form)?, name.as_bytes(), b"\0", &SAMPLES, b"\0"].concat();
+        [channels.ok_or_else(other_layout)?, name.as_bytes(), b"\0", &SAMPLES, b"\0"].concat();
     *attribute = [CHANNELS, &(channels.len() as u32).to_le_bytes(), &channels].concat();
     Ok(())
 }
 
-fn other_form() -> FormatError {
-    FormatError::Internal("an EXR stack of another form than stacks are written in".to_owned())
+fn other_layout() -> FormatError {
+    FormatError::Internal(
+        "the stored EXR stack does not have the layout of this program".to_owned(),
+    )
 }
 
 #[cfg(test)]
@@ -117,7 +118,7 @@ mod tests {
     use crate::test_support::ramp;
     use crate::{Channels, FormatError};
 
-    /// What the EXR crate reads in each part: its name, and its channels with their values.
+    /// Each part as the EXR crate reads it: its name, and its channels with their values.
     type Parts = Vec<(String, Vec<(String, Vec<f32>)>)>;
 
     fn write(path: &Path, frames: &Array3<f32>, channels: Channels) {
@@ -134,7 +135,7 @@ mod tests {
         BufReader::new(File::open(path).unwrap())
     }
 
-    /// The stored stack with a layer that is the place of each pixel.
+    /// The stored stack with an additional channel that encodes the position of each pixel.
     fn layered(path: &Path, shape: (usize, usize, usize), channels: Channels) -> Vec<u8> {
         let layered = Layered::read(open(path), shape, channels, SIGMA).unwrap();
         let stored = std::fs::read(path).unwrap();
@@ -168,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn every_part_gets_the_layer_and_keeps_what_it_has() {
+    fn all_parts_get_the_channel_and_keep_their_content() {
         let path = tempfile::NamedTempFile::new().unwrap();
         for (count, channels) in [(3, Channels::Grey), (1, Channels::Grey), (2, Channels::Rgb)] {
             let (height, width) = (5, 7);
@@ -178,9 +179,9 @@ mod tests {
             let made = layered(path.path(), (count, height, width), channels);
             let made = parts(&made);
             assert_eq!(made.len(), count);
-            for (k, ((name, mut found), expected)) in made.into_iter().zip(stored).enumerate() {
-                let (channel, values) = found.pop().unwrap();
-                assert_eq!((name, found), expected);
+            for (k, ((name, mut channels), expected)) in made.into_iter().zip(stored).enumerate() {
+                let (channel, values) = channels.pop().unwrap();
+                assert_eq!((name, channels), expected);
                 assert_eq!(channel, SIGMA);
                 let layer = Array2::from_shape_fn((height, width), |(row, column)| {
                     place(k * height + row, column)
@@ -191,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stack_of_another_shape_is_refused() {
+    fn stacks_of_another_shape_are_refused() {
         let path = tempfile::NamedTempFile::new().unwrap();
         write(path.path(), &ramp((3, 5, 7), 100), Channels::Grey);
         for shape in [(2, 5, 7), (3, 4, 7), (3, 5, 8)] {

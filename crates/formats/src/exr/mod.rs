@@ -1,6 +1,6 @@
-//! OpenEXR: 32-bit float frames, one a file or one a part, with their provenance as attributes.
+//! OpenEXR: 32-bit float frames, one per file or one per part, with their provenance as attributes.
 //!
-//! Every part has one channel `Y`, or the channels `R`, `G` and `B`, in scan lines. Values survive bit for bit.
+//! Every part has the channel `Y`, or the channels `R`, `G` and `B`, in scan lines. Values are stored bit for bit.
 
 mod head;
 mod layer;
@@ -14,17 +14,16 @@ pub use write::{Attributes, write_frame, write_stack};
 
 use super::Channels;
 
-/// What OpenEXR calls the channels, in the order of the alphabet, in which they lie in a file, and the place of
-/// each among the values of a pixel.
+/// Names of the channels in OpenEXR in their stored, alphabetical order, each with its index among the values of a
+/// pixel.
 fn names(channels: Channels) -> &'static [(&'static str, usize)] {
     match channels {
-        // Luminance.
         Channels::Grey => &[("Y", 0)],
         Channels::Rgb => &[("B", 2), ("G", 1), ("R", 0)],
     }
 }
 
-/// The attribute that holds a frame's time, a double, in seconds.
+/// Name of the attribute for the time of a frame in seconds (double).
 const FRAME_TIME: &str = "frameTime";
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Reading back what was written: EXR files whose parts are frames of one size.
+//! Reads EXR files that this program has written: their parts are frames of one size.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,24 +16,24 @@ use super::{FRAME_TIME, names};
 use crate::error::Result;
 use crate::{Channels, Format, FormatError, Limits};
 
-/// What a part says about its frame.
+/// The attributes of a part.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Part {
-    /// The part's name, empty where there is none.
+    /// Name of the part; empty if it has none.
     pub name: String,
-    /// The string attributes that OpenEXR does not define itself.
+    /// String attributes that are not defined by OpenEXR.
     pub texts: BTreeMap<String, String>,
-    /// The frame's time in seconds.
+    /// Time of the frame in seconds.
     pub frame_time_s: Option<f64>,
-    /// Numerator and denominator of the frames a second.
+    /// Frame rate as numerator and denominator.
     pub frames_per_second: Option<(i32, u32)>,
 }
 
-/// Reads all parts; the frames have the axes (frame, row, column), and those of colours red, green and blue of each
-/// pixel one after the other.
+/// Reads the frames (frame, row, column) of all parts, with their attributes. Colour frames have red, green and blue of
+/// each pixel in adjacent columns.
 ///
-/// Errors: I/O; [`FormatError::Unsupported`] for parts of differing sizes or with other channels
-/// than one `Y`, or `R`, `G` and `B`, all float32; limits and malformed files.
+/// Errors: I/O; [`FormatError::Unsupported`] for parts of different sizes, or with channels other than float32 `Y`, or
+/// `R`, `G` and `B`; [`FormatError::OverLimit`]; [`FormatError::Malformed`].
 pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32>)> {
     let file = File::open(path).map_err(FormatError::io("open the EXR file"))?;
     let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
@@ -41,7 +41,7 @@ pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32
     let strict = true;
     let reader = block::read(BufReader::new(file), strict).map_err(error)?;
     let headers = reader.headers().to_vec();
-    let (height, width, channels) = common_form(&headers)?;
+    let (height, width, channels) = common_layout(&headers)?;
     limits.check_shape(Format::Exr, headers.len() as u64, height as u64, width as u64)?;
     let count = channels.count();
     let mut stack = Array3::zeros((headers.len(), height, width * count));
@@ -51,7 +51,7 @@ pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32
         let (samples, _) = block.data.as_chunks::<4>();
         let first = block.index.pixel_position.1;
         let mut frame = stack.index_axis_mut(ndarray::Axis(0), block.index.layer);
-        // Of each row one channel after the other.
+        // A block stores the channels of a row one after another.
         for (index, line) in samples.chunks(width).enumerate() {
             let (row, channel) = (first + index / count, names(channels)[index % count].1);
             let pixels = frame.row_mut(row).into_iter().skip(channel).step_by(count);
@@ -63,27 +63,27 @@ pub fn read_stack(path: &Path, limits: &Limits) -> Result<(Vec<Part>, Array3<f32
     Ok((headers.iter().map(part).collect(), stack))
 }
 
-/// Rows, columns and channels.
-fn common_form(headers: &[Header]) -> Result<(usize, usize, Channels)> {
+/// Rows, columns and channels, which all parts must share.
+fn common_layout(headers: &[Header]) -> Result<(usize, usize, Channels)> {
     let channels_of = |header: &Header| {
-        let found = &header.channels.list;
+        let stored = &header.channels.list;
         let fits = |channels: &Channels| {
-            let mut pairs = found.iter().zip(names(*channels));
-            found.len() == channels.count()
+            let mut pairs = stored.iter().zip(names(*channels));
+            stored.len() == channels.count()
                 && pairs.all(|(c, (name, _))| c.name.eq(name) && c.sample_type == SampleType::F32)
         };
         [Channels::Grey, Channels::Rgb].into_iter().find(fits)
     };
-    let mut forms = headers.iter().map(|header| {
+    let mut layouts = headers.iter().map(|header| {
         let scan_lines = matches!(header.blocks, ::exr::meta::BlockDescription::ScanLines);
         let channels = channels_of(header).filter(|_| scan_lines)?;
         Some((header.layer_size.1, header.layer_size.0, channels))
     });
-    match forms.next() {
-        Some(Some(first)) if forms.all(|form| form == Some(first)) => Ok(first),
+    match layouts.next() {
+        Some(Some(first)) if layouts.all(|layout| layout == Some(first)) => Ok(first),
         _ => Err(FormatError::Unsupported {
             format: Format::Exr,
-            found: "other parts".to_owned(),
+            found: "parts with other sizes, channels or blocks".to_owned(),
             accepted: "parts of one size with one float32 channel Y, or R, G and B, in scan lines",
         }),
     }

@@ -4,7 +4,8 @@ use super::{Attributes, read_stack, write_frame, write_stack};
 use crate::test_support::{assert_names, bits, file, ramp};
 use crate::{Channels, FormatError, Limits};
 
-fn awkward() -> Array3<f32> {
+/// A stack with NaN, infinities, negative zero and subnormal values.
+fn special_values() -> Array3<f32> {
     let mut stack = ramp((3, 37, 21), 1 << 20).mapv(|v| (v * 0.37).sin() / 3.0);
     let special = [f32::NAN, -0.0, f32::INFINITY, f32::NEG_INFINITY, 1e-42, f32::MAX, f32::MIN];
     for (value, special) in stack.iter_mut().zip(special) {
@@ -27,8 +28,8 @@ fn attributes(k: usize) -> Attributes {
 }
 
 #[test]
-fn a_frame_survives_bit_for_bit_with_its_attributes() {
-    let stack = awkward();
+fn frames_are_stored_bit_for_bit_with_their_attributes() {
+    let stack = special_values();
     let path = tempfile::NamedTempFile::new().unwrap();
     write_frame(path.path(), stack.index_axis(ndarray::Axis(0), 0), Channels::Grey, &attributes(3))
         .unwrap();
@@ -43,17 +44,17 @@ fn a_frame_survives_bit_for_bit_with_its_attributes() {
 }
 
 #[test]
-fn a_stack_survives_bit_for_bit_and_asks_for_its_frames_in_order() {
-    let stack = awkward();
+fn stacks_are_stored_bit_for_bit_and_request_frames_in_order() {
+    let stack = special_values();
     let path = tempfile::NamedTempFile::new().unwrap();
     let parts: Vec<_> = (0..3).map(attributes).collect();
-    let mut asked = Vec::new();
+    let mut requested = Vec::new();
     write_stack(path.path(), (37, 21), Channels::Grey, &parts, |k| {
-        asked.push(k);
+        requested.push(k);
         Ok::<_, FormatError>(stack.index_axis(ndarray::Axis(0), k).to_owned())
     })
     .unwrap();
-    assert_eq!(asked, [0, 1, 2]);
+    assert_eq!(requested, [0, 1, 2]);
     let (parts, back) = read_stack(path.path(), &Limits::default()).unwrap();
     assert_eq!(bits(&back), bits(&stack));
     let names: Vec<_> = parts.iter().map(|p| p.name.as_str()).collect();
@@ -62,8 +63,8 @@ fn a_stack_survives_bit_for_bit_and_asks_for_its_frames_in_order() {
 }
 
 #[test]
-fn colours_survive_bit_for_bit() {
-    let stack = awkward();
+fn colours_are_stored_bit_for_bit() {
+    let stack = special_values();
     let path = tempfile::NamedTempFile::new().unwrap();
     let parts: Vec<_> = (0..3).map(attributes).collect();
     write_stack(path.path(), (37, 7), Channels::Rgb, &parts, |k| {
@@ -76,7 +77,7 @@ fn colours_survive_bit_for_bit() {
 }
 
 #[test]
-fn a_view_is_written_in_its_own_order() {
+fn transposed_views_are_written_in_logical_order() {
     let frame = array![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]];
     let path = tempfile::NamedTempFile::new().unwrap();
     write_frame(path.path(), frame.t(), Channels::Grey, &Attributes::default()).unwrap();
@@ -85,7 +86,7 @@ fn a_view_is_written_in_its_own_order() {
 }
 
 #[test]
-fn the_error_of_the_source_comes_through() {
+fn errors_of_the_source_are_returned() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let parts = vec![Attributes::default(); 2];
     let result = write_stack(path.path(), (2, 2), Channels::Grey, &parts, |k| match k {
@@ -99,7 +100,7 @@ fn the_error_of_the_source_comes_through() {
 }
 
 #[test]
-fn attributes_that_cannot_be_written_are_refused() {
+fn invalid_attributes_are_refused() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let frame = Array2::zeros((2, 2));
     let long = "x".repeat(256);
@@ -117,9 +118,9 @@ fn attributes_that_cannot_be_written_are_refused() {
 }
 
 #[test]
-fn cut_files_are_refused() {
+fn truncated_files_are_refused() {
     let path = tempfile::NamedTempFile::new().unwrap();
-    let stack = awkward();
+    let stack = special_values();
     let parts = vec![Attributes::default(); 3];
     write_stack(path.path(), (37, 21), Channels::Grey, &parts, |k| {
         Ok::<_, FormatError>(stack.index_axis(ndarray::Axis(0), k).to_owned())
@@ -136,11 +137,11 @@ fn cut_files_are_refused() {
 }
 
 #[test]
-fn the_same_frames_give_the_same_bytes() {
+fn equal_frames_give_equal_files() {
     let folder = tempfile::tempdir().unwrap();
-    let frames = awkward();
+    let frames = special_values();
     let attributes: Vec<Attributes> = (0..frames.dim().0).map(attributes).collect();
-    // A hash map has another order in each instance, so a few are enough to tell.
+    // The order of a hash map differs between instances, so a few files suffice to detect it.
     let files: Vec<(Vec<u8>, Vec<u8>)> = (0..4)
         .map(|_| {
             let path = folder.path().join("frame.exr");

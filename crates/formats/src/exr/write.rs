@@ -1,4 +1,4 @@
-//! Writing EXR frames and stacks.
+//! Writes EXR frames and stacks.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -20,28 +20,27 @@ use super::{FRAME_TIME, names};
 use crate::error::Result;
 use crate::{Channels, FormatError};
 
-/// The low bits of such floats are noise: on a camera clip with a little noise added (a stand-in for
-/// reconstructed frames) ZIP saved 3 % and took about 0.2 s a megapixel, this 0.02 s.
+/// Frames are not compressed, because the low bits of reconstructed floats are noise. On a camera clip with a little
+/// added noise, ZIP saves 3 % and takes about 0.2 s per megapixel, no compression 0.02 s.
 const COMPRESSION: Compression = Compression::Uncompressed;
 
-/// What a frame says about itself beside its pixels.
+/// The attributes of a frame.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Attributes {
-    /// Names and values of string attributes (provenance). Names: up to 255 bytes, none that
-    /// OpenEXR defines itself. Values are UTF-8.
+    /// Names and values of string attributes (provenance). Names have up to 255 bytes and differ from those that
+    /// OpenEXR defines. Values are UTF-8.
     pub texts: Vec<(String, String)>,
-    /// When the frame was seen, in seconds from the start of the sequence: `frameTime` (double).
+    /// Time of the frame in seconds after the start of the sequence: `frameTime` (double).
     pub frame_time_s: Option<f64>,
-    /// Frames a second, OpenEXR's `framesPerSecond` (rational, rounded to thousandths).
+    /// Frames per second: OpenEXR's `framesPerSecond` (rational, rounded to thousandths).
     pub frames_per_second: Option<f64>,
-    /// Exposure in seconds, OpenEXR's `expTime` (float).
+    /// Exposure time in seconds: OpenEXR's `expTime` (float).
     pub exposure_s: Option<f32>,
 }
 
-/// Writes (or overwrites) `path` with one frame (row, column), which has for each pixel as many values as there
-/// are channels.
+/// Writes one frame (row, column), and replaces an existing file. All channels of a pixel are in adjacent columns.
 ///
-/// Errors: I/O; [`FormatError::Internal`] for an empty frame or attributes that cannot be written.
+/// Errors: I/O; [`FormatError::Internal`] for an empty frame, and for attributes that can't be written.
 pub fn write_frame(
     path: &Path,
     frame: ArrayView2<'_, f32>,
@@ -54,10 +53,12 @@ pub fn write_frame(
     write_parts(path, parts, |writer, headers| write_part(writer, (headers, 0), channels, frame))
 }
 
-/// Writes (or overwrites) `path` with a part for each of `parts`, named `frame_0001` and so on.
+/// Writes a file with one part per element of `parts`, named `frame_0001` and so on, and replaces an existing file.
 ///
-/// `frame(k)` is asked for the frames in order (k from 0) and must give frames of this
-/// size (rows, columns); one at a time is held in memory. Errors: those of `frame`, and as [`write_frame`].
+/// `frame(k)` is called in order from 0, and must return frames of this size (rows, columns). One frame at a time is in
+/// memory.
+///
+/// Errors: those of `frame`; as [`write_frame`].
 pub fn write_stack<E: From<FormatError>>(
     path: &Path,
     size: (usize, usize),
@@ -70,7 +71,7 @@ pub fn write_stack<E: From<FormatError>>(
         .enumerate()
         .map(|(k, attributes)| header(size, channels, attributes, Some(part_name(k))))
         .collect::<Result<Vec<_>, _>>()?;
-    // The EXR crate's closure can only fail with its own error; ours waits here.
+    // The closure can only return errors of the EXR crate, so an error of `frame` is kept here.
     let mut failure = None;
     let written = write_parts(path, headers, |writer, headers| {
         for part in 0..headers.len() {
@@ -101,7 +102,7 @@ fn header(
     name: Option<String>,
 ) -> Result<Header> {
     if height == 0 || width == 0 {
-        return Err(FormatError::Internal(format!("an EXR frame of {height}x{width}")));
+        return Err(FormatError::Internal(format!("an EXR frame of {height}x{width} is empty")));
     }
     let channels = names(channels).iter().map(|(name, _)| *name);
     let channels = channels.map(|name| ChannelDescription::named(name, SampleType::F32));
@@ -116,11 +117,11 @@ fn header(
         own.other.insert(Text::from(FRAME_TIME), AttributeValue::F64(seconds));
     }
     for (name, value) in &attributes.texts {
-        // OpenEXR strings are bytes and its readers take them for UTF-8.
+        // OpenEXR strings are bytes, which readers interpret as UTF-8.
         let value = AttributeValue::Text(Text::from_slice_unchecked(value.as_bytes()));
         let name = Text::from_slice_unchecked(name.as_bytes());
         if own.other.insert(name, value).is_some() {
-            return Err(FormatError::Internal("an EXR attribute is given twice".to_owned()));
+            return Err(FormatError::Internal("two EXR attributes have the same name".to_owned()));
         }
     }
     Ok(header.with_attributes(own).with_encoding(
@@ -130,7 +131,7 @@ fn header(
     ))
 }
 
-/// Numerator and denominator of a frame rate.
+/// A frame rate as numerator and denominator.
 fn rational(frames_per_second: f64) -> (i32, u32) {
     if frames_per_second.fract() == 0.0 {
         (frames_per_second as i32, 1)
@@ -179,15 +180,15 @@ fn write_part(
                 pixel_size: Vec2(size.0, rows.nrows()),
                 level: Vec2(0, 0),
             },
-            data: lines_of(rows, channels),
+            data: block_bytes(rows, channels),
         };
         writer.write_chunk(index, block.compress_to_chunk(headers)?)?;
     }
     Ok(())
 }
 
-/// The values of some rows as they lie in a block: of each row one channel after the other.
-fn lines_of(rows: ArrayView2<'_, f32>, channels: Channels) -> Vec<u8> {
+/// The bytes of a block: each row stores its channels one after another.
+fn block_bytes(rows: ArrayView2<'_, f32>, channels: Channels) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(rows.len() * size_of::<f32>());
     for row in rows.rows() {
         for &(_, place) in names(channels) {

@@ -22,7 +22,7 @@ fn snapshots() -> Array3<f32> {
 }
 
 #[test]
-fn arrays_of_h5py_are_read() {
+fn h5py_arrays_are_read() {
     let (info, values) = read("h5py.h5", SceneArray::Masks).unwrap();
     assert_eq!((info.format, info.sample), (Format::Hdf5, SampleType::Bool));
     assert_eq!((info.default_full_scale, values), (Some(FullScale::ONE), masks()));
@@ -38,7 +38,7 @@ fn arrays_of_h5py_are_read() {
 }
 
 #[test]
-fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
+fn arrays_are_read_by_name_and_errors_list_the_names() {
     let open = |file: &str, name: &str| {
         let wanted = Wanted { name: Some(name), ..SceneArray::Measurements.into() };
         collect(&mut *open_array(&sample(file), wanted, &Limits::default())?)
@@ -57,7 +57,7 @@ fn an_array_of_any_name_is_read_and_the_error_lists_what_there_is() {
 }
 
 #[test]
-fn axes_in_every_order_are_read() {
+fn all_orders_of_axes_are_read() {
     for name in Axes::VARIANTS {
         let axes: Axes = name.parse().unwrap();
         for place in ["", "packed/", "matlab/"] {
@@ -73,7 +73,7 @@ fn axes_in_every_order_are_read() {
 }
 
 #[test]
-fn arrays_of_matlab_have_its_axes_and_scales() {
+fn matlab_arrays_have_its_axes_and_full_scales() {
     let (info, values) = read("matlab73.mat", SceneArray::Masks).unwrap();
     assert_eq!((info.sample, info.frames, info.height, info.width), (SampleType::Bool, 3, 4, 5));
     assert_eq!((info.default_full_scale, values), (Some(FullScale::ONE), masks()));
@@ -88,7 +88,7 @@ fn arrays_of_matlab_have_its_axes_and_scales() {
 }
 
 #[test]
-fn what_is_refused_says_what_would_be_right() {
+fn errors_state_what_is_supported() {
     let complex = read("types.h5", SceneArray::Truth).unwrap_err();
     assert_names(&complex.to_string(), &["HDF5", "complex", "integers and floats"]);
     let small = Limits { max_frames: 2, ..Limits::default() };
@@ -99,7 +99,7 @@ fn what_is_refused_says_what_would_be_right() {
 }
 
 #[test]
-fn whole_numbers_and_half_floats_of_numpy_are_read() {
+fn numpy_integers_and_half_floats_are_read() {
     for (name, sample_type) in [
         ("masks-int64.npy", SampleType::I64),
         ("masks-int32-big.npy", SampleType::I32),
@@ -115,9 +115,9 @@ fn whole_numbers_and_half_floats_of_numpy_are_read() {
 }
 
 proptest! {
-    /// Any result is right, but a read must end, and what it blames is the file.
+    /// Any values are acceptable, but an error must blame the file.
     #[test]
-    fn damaged_files_end_in_an_error_or_in_numbers(
+    fn damaged_files_are_read_or_refused(
         name in prop::sample::select(vec!["h5py.h5", "types.h5", "matlab73.mat"]),
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..8),
         keep in any::<prop::sample::Index>(),

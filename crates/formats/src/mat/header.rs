@@ -1,4 +1,4 @@
-//! The inner structure of an array: flags, dimensions, name, numbers.
+//! The inner structure of an array: flags, dimensions, name, samples.
 
 use std::io::BufRead;
 
@@ -11,28 +11,28 @@ const INT8: u32 = 1;
 const INT32: u32 = 5;
 const UINT32: u32 = 6;
 
-/// MATLAB's own limit is 63.
+/// Longest accepted name. MATLAB's limit is 63.
 const MAX_NAME_BYTES: u32 = 255;
-/// More axes than any sensible array has.
+/// Largest accepted number of axes.
 const MAX_AXES: u32 = 16;
-/// The largest class that begins with flags, dimensions and a name (15, uint64).
+/// The largest class with flags, dimensions and a name (uint64).
 const LAST_ORDINARY_CLASS: u8 = 15;
 
 const COMPLEX: u32 = 0x0800;
 const LOGICAL: u32 = 0x0200;
 
-/// What an array says before its numbers.
+/// The header of an array, before its samples.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct ArrayHeader {
     pub(super) name: String,
-    /// Sizes of the axes, the one that varies fastest first.
+    /// Lengths of the axes, the fastest one first.
     pub(super) dimensions: Vec<u64>,
     class: u8,
     flags: u32,
 }
 
 impl ArrayHeader {
-    /// Reads the header. Arrays without one (empty, or of MATLAB's opaque classes) have no name.
+    /// Reads the header. Empty arrays and those of opaque classes have no header, and so no name.
     pub(super) fn read<R: BufRead>(content: &mut Content<R>) -> Result<Self> {
         let mut header = Self { name: String::new(), dimensions: Vec::new(), class: 0, flags: 0 };
         if content.is_empty() {
@@ -48,23 +48,26 @@ impl ArrayHeader {
         let dimensions = Part::read(content, "dimensions", 4 * MAX_AXES)?.expect_type(INT32)?;
         header.dimensions = dimensions
             .words(content.order())
-            .map(|axis| u64::try_from(axis as i32).map_err(|_| malformed("a negative dimension")))
+            .map(|axis| {
+                u64::try_from(axis as i32)
+                    .map_err(|_| malformed("an array has a negative dimension"))
+            })
             .collect::<Result<_, _>>()?;
         let name = Part::read(content, "name", MAX_NAME_BYTES)?.expect_type(INT8)?;
         header.name = String::from_utf8_lossy(&name.bytes).into_owned();
         Ok(header)
     }
 
-    /// How the array's numbers are meant. Errors: a class that is not accepted.
+    /// The data type of the array. Errors: [`FormatError::Unsupported`] for other classes.
     pub(super) fn sample_type(&self) -> Result<SampleType> {
         let refused = match self.class {
-            // A sparse matrix may be complex, too: its line comes first.
+            // A sparse matrix may also be complex, so it is checked first.
             5 => {
-                "a sparse matrix (python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                "a sparse matrix (to convert it: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
                  scipy.io.loadmat('in.mat')['mask'].toarray())\")"
             }
             _ if self.flags & COMPLEX != 0 => {
-                "complex numbers (absolute values: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                "complex numbers (to convert to absolute values: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
                  numpy.moveaxis(abs(scipy.io.loadmat('in.mat')['mask']), -1, 0))\")"
             }
             6 => return Ok(SampleType::F64),
@@ -79,11 +82,11 @@ impl ArrayHeader {
             14 => return Ok(SampleType::I64),
             15 => return Ok(SampleType::U64),
             1 => {
-                "a cell array (of a frame each: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+                "a cell array (to convert cells with one frame each: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
                  numpy.stack(list(scipy.io.loadmat('in.mat')['mask'].ravel())))\")"
             }
             2 => {
-                "a struct (its first field: python -c \"import numpy, scipy.io; s = scipy.io.loadmat('in.mat', \
+                "a struct (to convert its first field: python -c \"import numpy, scipy.io; s = scipy.io.loadmat('in.mat', \
                  simplify_cells=True)['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0], -1, 0))\")"
             }
             3 => "an object",
@@ -98,8 +101,7 @@ impl ArrayHeader {
     }
 }
 
-/// Reads the tag of the numbers: how they are stored, and how many bytes follow, checked against
-/// the dimensions.
+/// Reads the tag of the samples: their storage type and number of bytes, which must match the dimensions.
 pub(super) fn read_data_tag<R: BufRead>(
     content: &mut Content<R>,
     header: &ArrayHeader,
@@ -109,62 +111,65 @@ pub(super) fn read_data_tag<R: BufRead>(
     if kind > 0xffff {
         return Err(FormatError::Unsupported {
             format: Format::Mat,
-            found: format!("'{name}' with at most four bytes of numbers"),
-            accepted: "frames of some size",
+            found: format!("'{name}' with at most four bytes of samples"),
+            accepted: "larger arrays",
         });
     }
     let storage = storage(kind)
-        .ok_or_else(|| malformed(format!("'{name}' stores numbers as type {kind}")))?;
+        .ok_or_else(|| malformed(format!("'{name}' has the unknown storage type {kind}")))?;
     let count = header.dimensions.iter().fold(1u64, |product, axis| product.saturating_mul(*axis));
     let promised = count.saturating_mul(storage.bytes() as u64);
     if promised != u64::from(bytes) {
         return Err(malformed(format!(
-            "'{name}' of {:?} needs {promised} bytes of numbers, but has {bytes}",
+            "'{name}' of {:?} needs {promised} bytes of samples, but has {bytes}",
             header.dimensions
         )));
     }
     Ok((storage, promised))
 }
 
-/// A part of an array's header with its bytes.
+/// A part of the header of an array.
 struct Part {
-    what: &'static str,
+    name: &'static str,
     kind: u32,
     bytes: Vec<u8>,
 }
 
 impl Part {
     /// Reads a part of at most `limit` bytes, and its padding.
-    fn read<R: BufRead>(content: &mut Content<R>, what: &'static str, limit: u32) -> Result<Self> {
+    fn read<R: BufRead>(content: &mut Content<R>, name: &'static str, limit: u32) -> Result<Self> {
         let (kind, size) = content.tag()?;
         if kind > 0xffff {
-            // At most four bytes: they stand in the tag, where the size would be.
+            // At most four bytes are packed into the tag, in the place of the size.
             let length = (kind >> 16) as usize;
             let packed = match content.order() {
                 ByteOrder::Little => size.to_le_bytes(),
                 ByteOrder::Big => size.to_be_bytes(),
             };
             let bytes = packed.get(..length).ok_or_else(|| {
-                malformed(format!("the {what} of an array: {length} bytes in the tag"))
+                malformed(format!("the {name} of an array has {length} bytes in the tag"))
             })?;
-            return Ok(Self { what, kind: kind & 0xffff, bytes: bytes.to_vec() });
+            return Ok(Self { name, kind: kind & 0xffff, bytes: bytes.to_vec() });
         }
         if size > limit {
             return Err(malformed(format!(
-                "the {what} of an array: {size} bytes, at most {limit} are expected"
+                "the {name} of an array has {size} bytes, but at most {limit} are expected"
             )));
         }
         let mut bytes = vec![0; size.next_multiple_of(8) as usize];
         content.fill(&mut bytes)?;
         bytes.truncate(size as usize);
-        Ok(Self { what, kind, bytes })
+        Ok(Self { name, kind, bytes })
     }
 
     fn expect_type(self, kind: u32) -> Result<Self> {
         if self.kind == kind {
             return Ok(self);
         }
-        Err(malformed(format!("the {} of an array: type {}, not {kind}", self.what, self.kind)))
+        Err(malformed(format!(
+            "the {} of an array has the type {}, not {kind}",
+            self.name, self.kind
+        )))
     }
 
     fn words(&self, order: ByteOrder) -> impl Iterator<Item = u32> + '_ {
@@ -176,7 +181,7 @@ impl Part {
     }
 }
 
-/// How numbers are stored, by the code of their type; MATLAB stores small whole doubles as integers.
+/// The storage type with this code. MATLAB stores doubles that are small integers as integers.
 fn storage(kind: u32) -> Option<SampleType> {
     Some(match kind {
         INT8 => SampleType::I8,

@@ -1,12 +1,11 @@
-//! MATLAB's files, as which the community's benchmark scenes come: they have the arrays `mask`,
-//! `meas`, `orig` (level 5; level 7.3 is HDF5, `hdf5.rs`).
+//! MATLAB level 5 files, the format of the public benchmark scenes, with the arrays `mask`, `meas` and `orig`. Level
+//! 7.3 files are HDF5 (`hdf5.rs`).
 //!
-//! The frame axis usually is the last one in MATLAB and is the first one here; rows and columns stay what they
-//! are. MATLAB stores columns one after another, so a frame is contiguous then and is read alone.
+//! In MATLAB the frame axis usually comes last, here it comes first. MATLAB stores arrays column by column, so such a
+//! frame is contiguous and can be read separately.
 //!
-//! The reader is our own: the crate `matfile` inflates compressed arrays without a bound, keeps
-//! all of them in memory, passes over damaged ones in silence and can panic on hostile sizes.
-//! It serves the tests as a second opinion.
+//! This module parses the files, because the crate `matfile` decompresses arrays without a limit, keeps all of them in
+//! memory, silently skips damaged ones, and can panic on hostile sizes. The tests use that crate as a reference.
 
 mod element;
 mod header;
@@ -25,8 +24,8 @@ use super::scene::list;
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
-/// Opens the array of this name. Errors: [`FormatError::MissingArray`]; a damaged file; an array of another class
-/// than double, single, logical and integers; too large.
+/// Opens the array with this name. Errors: [`FormatError::MissingArray`]; damaged files; [`FormatError::Unsupported`]
+/// for other classes than double, single, logical and integers; [`FormatError::OverLimit`].
 pub(super) fn open(
     file: File,
     length: u64,
@@ -37,7 +36,7 @@ pub(super) fn open(
     let mut elements = Elements::new(BufReader::new(file), length)?;
     let mut present = Vec::new();
     while let Some(element) = elements.next()? {
-        let header = ArrayHeader::read(&mut elements.look_into(element)?)?;
+        let header = ArrayHeader::read(&mut elements.content(element)?)?;
         if header.name == name {
             let order = elements.order();
             let content = elements.into_content(element)?;
@@ -51,10 +50,10 @@ pub(super) fn open(
     Err(FormatError::MissingArray { format, name, present: list(&present) })
 }
 
-/// The numbers of one array.
+/// The samples of one array.
 struct MatSamples {
     content: Content<BufReader<File>>,
-    /// The same file, to begin again.
+    /// Another handle to the file, for further passes.
     file: File,
     element: Element,
     order: ByteOrder,
@@ -74,7 +73,7 @@ impl MatSamples {
         let arranged = arranged.ok_or_else(|| FormatError::Unsupported {
             format: Format::Mat,
             found: format!(
-                "'{}' with {} dimensions (all pictures, one after the other: python -c \"import numpy, scipy.io; \
+                "'{}' with {} dimensions (to convert it to a stack of pictures: python -c \"import numpy, scipy.io; \
                  a = scipy.io.loadmat('in.mat')['mask']; numpy.save('out.npy', \
                  numpy.moveaxis(a.reshape(*a.shape[:2], -1, order='F'), -1, 0))\")",
                 header.name,

@@ -10,7 +10,7 @@ use super::SceneArray;
 use crate::test_support::{assert_names, every_order, file, ramp, read_as, refusal};
 use crate::{Axes, FormatError, Limits, SampleType, collect, open_array};
 
-/// The level 5 class and storage type of an array, and its numbers as bytes.
+/// The level 5 class and storage type of an array, and its samples as bytes.
 struct Numbers {
     class: u32,
     storage: u32,
@@ -59,7 +59,7 @@ fn mat(elements: &[Vec<u8>], big: bool) -> Vec<u8> {
     bytes
 }
 
-/// The numbers of a stack in MATLAB's order: rows vary fastest, then columns, then frames.
+/// The samples of a stack in MATLAB's order: rows vary fastest, then columns, then frames.
 fn matlab_order(stack: &Array3<f32>) -> Vec<f32> {
     stack.view().permuted_axes([0, 2, 1]).iter().copied().collect()
 }
@@ -90,7 +90,7 @@ fn refused(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn plain_and_compressed_scenes_are_read_as_another_library_reads_them() {
+fn plain_and_compressed_scenes_match_matfile() {
     let masks = ramp((3, 4, 5), 2);
     let measurements = ramp((2, 4, 5), 1000);
     let truth = ramp((6, 4, 5), 256);
@@ -113,7 +113,7 @@ fn plain_and_compressed_scenes_are_read_as_another_library_reads_them() {
 }
 
 #[test]
-fn every_class_and_storage_is_read_with_its_scale() {
+fn all_classes_and_storage_types_are_read_with_their_full_scale() {
     let stack = ramp((2, 3, 4), 24);
     let values = matlab_order(&stack);
     let as_u8: Vec<u8> = values.iter().map(|&v| v as u8).collect();
@@ -148,7 +148,7 @@ fn every_class_and_storage_is_read_with_its_scale() {
 }
 
 #[test]
-fn wrong_arrays_are_refused_by_name() {
+fn unsupported_arrays_are_refused_by_name() {
     let numbers = |class, storage| Numbers { class, storage, bytes: vec![0; 32] };
     for (class, storage, name) in [(2, 2, "a struct"), (4, 4, "text"), (6 | 0x800, 9, "complex")] {
         let message =
@@ -165,8 +165,8 @@ fn wrong_arrays_are_refused_by_name() {
 }
 
 #[test]
-fn axes_in_every_order_are_read() {
-    // More frames than are kept of one pass, more pixels than are read at a time.
+fn all_orders_of_axes_are_read() {
+    // The stack needs several passes and several blocks per pass.
     for shape in [(2, 3, 4), (40, 2, 3), (3, 11, 7)] {
         let stack = ramp(shape, 200);
         for (axes, permuted) in every_order(&stack) {
@@ -176,8 +176,8 @@ fn axes_in_every_order_are_read() {
             let plain = matrix("mask", &dimensions, &numbers, false);
             for element in [compressed(&plain), plain] {
                 let path = file(&mat(&[element], false));
-                let found = read_as(path.path(), axes).unwrap();
-                assert_eq!(found, (Some(axes), stack.clone()), "{axes}");
+                let result = read_as(path.path(), axes).unwrap();
+                assert_eq!(result, (Some(axes), stack.clone()), "{axes}");
             }
         }
     }
@@ -188,7 +188,7 @@ fn axes_in_every_order_are_read() {
 }
 
 #[test]
-fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
+fn large_claims_in_small_files_are_refused_before_allocation() {
     let claim = |dimensions: &[i32], bytes: u32| {
         let mut element = matrix(
             "mask",
@@ -204,7 +204,7 @@ fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
     for element in [honest.clone(), compressed(&honest)] {
         assert_names(&refused(&mat(&[element], false)), &["'mask'", "2147483648 bytes"]);
     }
-    // The outer size lies too, so that only the expansion of deflate can tell.
+    // The outer size is also wrong, so only the expansion limit of Deflate detects it.
     let mut outer = honest;
     outer[4..8].copy_from_slice(&u32::MAX.to_le_bytes());
     assert_names(&refused(&mat(&[compressed(&outer)], false)), &["2147483648 bytes"]);
@@ -217,14 +217,14 @@ fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
 }
 
 #[test]
-fn a_bomb_is_not_inflated_beyond_what_it_declares() {
+fn compressed_bombs_are_not_expanded_beyond_their_declared_size() {
     let mut element = element("mask", &ramp((1, 4, 4), 2));
     element.resize(50_000_000, 0);
     assert_names(&refused(&mat(&[compressed(&element)], false)), &["more bytes than its size"]);
 }
 
 #[test]
-fn damage_is_found() {
+fn damage_is_detected() {
     let whole = mat(&[compressed(&element("mask", &ramp((2, 8, 8), 97)))], false);
     for length in 128..whole.len() {
         assert!(read(&whole[..length], SceneArray::Masks).is_err(), "{length}");
@@ -239,7 +239,7 @@ fn damage_is_found() {
 
 proptest! {
     #[test]
-    fn a_damaged_file_is_read_or_refused(position in 0usize..10_000, value in any::<u8>(), packed in any::<bool>()) {
+    fn damaged_files_are_read_or_refused(position in 0usize..10_000, value in any::<u8>(), packed in any::<bool>()) {
         let plain = element("mask", &ramp((2, 3, 4), 97));
         let mut bytes = mat(&[if packed { compressed(&plain) } else { plain }], false);
         let position = position % bytes.len();
@@ -250,7 +250,7 @@ proptest! {
     }
 }
 
-/// A file of the shared data, where there is one.
+/// A file of the shared benchmark data, if it is available.
 fn shared(name: &str) -> Option<PathBuf> {
     let root = match std::env::var_os("SCI_RECON_SHARED") {
         Some(root) => PathBuf::from(root),
@@ -265,7 +265,7 @@ fn shared(name: &str) -> Option<PathBuf> {
 }
 
 #[test]
-fn the_benchmark_scene_fits_its_own_model() {
+fn the_benchmark_scene_satisfies_the_forward_model() {
     let Some(path) = shared("scenes/traffic48_cacti.mat") else { return };
     let read =
         |array| collect(&mut *open_array(&path, array, &Limits::default()).unwrap()).unwrap().1;
@@ -274,8 +274,7 @@ fn the_benchmark_scene_fits_its_own_model() {
     assert_eq!(masks.dim(), (8, 256, 256));
     assert_eq!(measurements.dim(), (6, 256, 256));
     assert_eq!(truth.dim(), (48, 256, 256));
-    // The file's own measurement is the sum over the masked frames: rows, columns and frames are
-    // where they belong.
+    // The measurement equals the sum of the masked frames only if all axes are read correctly.
     for (snapshot, measured) in measurements.outer_iter().enumerate() {
         let frames = truth.slice(ndarray::s![8 * snapshot..8 * snapshot + 8, .., ..]);
         let sum = (&frames * &masks).sum_axis(ndarray::Axis(0));

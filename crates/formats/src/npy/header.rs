@@ -1,19 +1,18 @@
-//! The header of an npy file.
+//! Parses the header of an npy file, a flat dictionary of three keys.
 //!
-//! The parser is our own: the one in `ndarray-npy` allocates whatever length the file claims and
-//! parses any Python literal recursively, so that a small file of nested brackets could end the
-//! process. A header that NumPy writes is one flat dictionary of three keys.
+//! The parser of the crate `ndarray-npy` allocates whatever length a file claims, and parses any Python literal
+//! recursively. A small file of nested brackets could overflow the stack.
 
 use crate::error::Result;
 use crate::samples::ByteOrder;
 use crate::{Format, FormatError, SampleType};
 
-/// NumPy itself refuses to parse headers above 10,000 bytes from strangers.
+/// Longest accepted header. NumPy has the same limit for untrusted files.
 pub(super) const MAX_HEADER_BYTES: u64 = 10_000;
 
 const ACCEPTED_TYPES: &str = "integers and floats of 8 to 64 bits and bool, in 2 or 3 dimensions";
 
-/// The three facts of an npy header.
+/// The content of an npy header.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Header {
     pub(super) sample: SampleType,
@@ -26,7 +25,7 @@ impl Header {
     /// Parses the dictionary, for example
     /// `{'descr': '<f4', 'fortran_order': False, 'shape': (8, 256, 256), }`.
     pub(super) fn parse(text: &[u8]) -> Result<Self> {
-        let mut cursor = Cursor { text, at: 0 };
+        let mut cursor = Cursor { text, position: 0 };
         let (mut descr, mut fortran_order, mut shape) = (None, None, None);
         cursor.expect(b'{')?;
         while !cursor.accept(b'}') {
@@ -52,24 +51,24 @@ impl Header {
     }
 }
 
-/// Walks over the header's text; whitespace between tokens is skipped.
+/// A position in the text of a header. Whitespace between tokens is skipped.
 struct Cursor<'a> {
     text: &'a [u8],
-    at: usize,
+    position: usize,
 }
 
 impl<'a> Cursor<'a> {
     fn peek(&mut self) -> Option<u8> {
-        while self.text.get(self.at).is_some_and(u8::is_ascii_whitespace) {
-            self.at += 1;
+        while self.text.get(self.position).is_some_and(u8::is_ascii_whitespace) {
+            self.position += 1;
         }
-        self.text.get(self.at).copied()
+        self.text.get(self.position).copied()
     }
 
     fn accept(&mut self, token: u8) -> bool {
-        let found = self.peek() == Some(token);
-        self.at += usize::from(found);
-        found
+        let matches = self.peek() == Some(token);
+        self.position += usize::from(matches);
+        matches
     }
 
     fn expect(&mut self, token: u8) -> Result<()> {
@@ -84,21 +83,21 @@ impl<'a> Cursor<'a> {
             Some(quote @ (b'\'' | b'"')) => quote,
             _ => return Err(self.error("a quoted string")),
         };
-        let start = self.at + 1;
+        let start = self.position + 1;
         let rest = self.text.get(start..).unwrap_or_default();
         let Some(length) = rest.iter().position(|&b| b == quote) else {
             return Err(self.error("a quoted string that ends"));
         };
-        self.at = start + length + 1;
+        self.position = start + length + 1;
         Ok(&rest[..length])
     }
 
-    /// The letters and digits at the cursor.
+    /// Reads the letters and digits at the cursor.
     fn word(&mut self) -> &'a [u8] {
         self.peek();
-        let rest = self.text.get(self.at..).unwrap_or_default();
+        let rest = self.text.get(self.position..).unwrap_or_default();
         let length = rest.iter().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(rest.len());
-        self.at += length;
+        self.position += length;
         &rest[..length]
     }
 
@@ -114,12 +113,12 @@ impl<'a> Cursor<'a> {
         let mut shape = Vec::new();
         self.expect(b'(')?;
         while !self.accept(b')') {
-            // Python 2 wrote long integers with a trailing L.
+            // Python 2 writes long integers with a trailing L.
             let word = self.word();
             let digits = word.strip_suffix(b"L").unwrap_or(word);
             let axis = str::from_utf8(digits).ok().and_then(|d| d.parse().ok());
             match axis {
-                // NumPy knows at most 64 axes.
+                // NumPy allows at most 64 axes.
                 Some(axis) if shape.len() < 64 => shape.push(axis),
                 _ => return Err(self.error("a tuple of non-negative integers")),
             }
@@ -162,20 +161,20 @@ impl<'a> Cursor<'a> {
     }
 
     fn error(&self, expected: &str) -> FormatError {
-        malformed(&format!("byte {} of the header is not {expected}", self.at))
+        malformed(&format!("expected {expected} at byte {} of the header", self.position))
     }
 }
 
-/// What people call the dtypes that are refused.
+/// The common name of an unsupported data type, with a conversion if there is one.
 fn dtype_name(code: &[u8], descr: &[u8]) -> String {
     let name = match code {
         b"O" => {
-            "object (a pickle) (arrays of one size: python -c \"import numpy; numpy.save('out.npy', \
+            "object, a pickle (to convert arrays of one size: python -c \"import numpy; numpy.save('out.npy', \
              numpy.stack(numpy.load('in.npy', allow_pickle=True)))\")"
         }
         b"c8" | b"c16" => {
-            "complex64 or complex128 (python -c \"import numpy; numpy.save('out.npy', \
-             numpy.abs(numpy.load('in.npy')))\" saves absolute values)"
+            "complex64 or complex128 (to convert to absolute values: python -c \"import numpy; numpy.save('out.npy', \
+             numpy.abs(numpy.load('in.npy')))\")"
         }
         b"f16" => "float128",
         _ => {

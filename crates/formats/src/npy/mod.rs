@@ -1,4 +1,4 @@
-//! NumPy's array files: stacks are read frame by frame, f32 stacks are written.
+//! NumPy array files: reads stacks frame by frame, and writes f32 stacks.
 
 mod header;
 mod read;

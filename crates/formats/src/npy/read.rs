@@ -1,4 +1,4 @@
-//! Reading npy stacks frame by frame.
+//! Reads npy stacks frame by frame.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -12,10 +12,11 @@ use crate::format::NPY_MAGIC;
 use crate::samples::{self, ByteOrder};
 use crate::{Channels, Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
-/// Opens an npy stack of shape (frame, row, column), or (frame, row, column, 3) whose frames are then three times as
-/// wide, float32, little-endian and in C order, of which windows are then read: the form in which this program
-/// writes frames.
-/// Errors: those of reading a header, and [`FormatError::Unsupported`] for another form.
+/// Opens an npy stack for reading windows. It must have the layout in which this program writes frames: little-endian
+/// float32 in C order, with the shape (frame, row, column) or (frame, row, column, 3). Frames of the latter are three
+/// times as wide.
+///
+/// Errors: those of reading a header; [`FormatError::Unsupported`] for another layout.
 pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {
     let mut file = File::open(path).map_err(FormatError::io("open the array"))?;
     let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
@@ -31,13 +32,13 @@ pub fn open_windows(path: &Path, limits: &Limits) -> Result<WindowReader> {
             return Err(unsupported(found));
         }
     };
-    let info = checked(shape, channels, SampleType::F32, limits)?;
+    let info = checked_info(shape, channels, SampleType::F32, limits)?;
     check_length(&info, length.saturating_sub(start))?;
     Ok(WindowReader::new(file, info, start))
 }
 
-/// Reads the header of an npy file (positioned at its start, `length` bytes long) and checks it against the limits,
-/// the length and what is expected. What errors call the format is `format`.
+/// Opens an npy file of `length` bytes, which is positioned at its start. The header is checked against the limits, the
+/// length and the expected shape. Errors name the file format `format`.
 pub(crate) fn open<R: Restart>(
     mut file: R,
     length: u64,
@@ -49,7 +50,7 @@ pub(crate) fn open<R: Restart>(
     let arranged = expected.arrange((format, writer), &shape)?;
     let arranged = arranged.ok_or_else(|| {
         unsupported(format!(
-            "an array of {} dimensions (without those of length 1: python -c \"import numpy; \
+            "an array of {} dimensions (to drop those of length 1: python -c \"import numpy; \
              numpy.save('out.npy', numpy.squeeze(numpy.load('in.npy')))\")",
             shape.len()
         ))
@@ -60,7 +61,7 @@ pub(crate) fn open<R: Restart>(
     Ok(ArrayReader::new(samples, info, arranged.layout))
 }
 
-/// The same of an array of shape (frame, row, column, 3) in C order; none for another shape.
+/// Opens a colour clip (frame, row, column, 3) in C order; `None` for another shape.
 pub(crate) fn open_colours<R: Restart>(
     mut file: R,
     length: u64,
@@ -71,14 +72,14 @@ pub(crate) fn open_colours<R: Restart>(
     if fortran_order {
         return Err(unsupported("colours in Fortran order".to_owned()));
     }
-    let info = checked([frames, height, width], Channels::Rgb, sample, limits)?;
+    let info = checked_info([frames, height, width], Channels::Rgb, sample, limits)?;
     check_length(&info, length.saturating_sub(start))?;
     let samples = RawSamples::new(file, start, (sample, order), Format::Npy);
     Ok(Some(ArrayReader::new(samples, info, Layout { interleaved: false, by_columns: false })))
 }
 
-/// A shape that is within the limits; the width is that of the rows.
-fn checked(
+/// The description of a stack after a check of the limits. Its width includes the channels.
+fn checked_info(
     [frames, height, width]: [u64; 3],
     channels: Channels,
     sample: SampleType,
@@ -90,7 +91,7 @@ fn checked(
     Ok(StackInfo::new(Format::Npy, sample, frames, height, width * channels.count()))
 }
 
-/// The header and the offset of the first sample.
+/// Reads the header, and returns it with the offset of the first sample.
 fn read_header(file: &mut impl Read, length: u64) -> Result<(Header, u64)> {
     let mut start = [0u8; 8];
     fill(file, &mut start)?;
@@ -128,7 +129,7 @@ fn read_header(file: &mut impl Read, length: u64) -> Result<(Header, u64)> {
     if header_bytes > MAX_HEADER_BYTES {
         return Err(FormatError::OverLimit {
             format: Format::Npy,
-            what: "the header's length in bytes",
+            what: "the length of the header in bytes",
             value: header_bytes,
             limit: MAX_HEADER_BYTES,
         });
@@ -148,7 +149,7 @@ fn fill(file: &mut impl Read, bytes: &mut [u8]) -> Result<()> {
     })
 }
 
-/// The file must hold exactly what the header promises.
+/// Checks that the file has exactly the promised length.
 fn check_length(info: &StackInfo, present: u64) -> Result<()> {
     let frame_bytes = (info.height as u64)
         .saturating_mul(info.width as u64)

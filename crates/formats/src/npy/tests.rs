@@ -22,7 +22,7 @@ fn array_file(descr: &str, fortran: &str, shape: &str, data: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn every_accepted_dtype_is_read_in_both_byte_orders() {
+fn all_data_types_are_read_in_both_byte_orders() {
     let expected = array![[[1.0f32, 2.0], [3.0, 250.0]]];
     let values = [1u8, 2, 3, 250];
     let cases: Vec<(&str, SampleType, Vec<u8>)> = vec![
@@ -71,7 +71,7 @@ fn every_accepted_dtype_is_read_in_both_byte_orders() {
 }
 
 #[test]
-fn frames_come_one_at_a_time_and_then_none() {
+fn readers_return_frames_and_then_none() {
     let data: Vec<u8> = (0..12).collect();
     let mut reader = open(&array_file("'|u1'", "False", "(3, 2, 2)", &data)).unwrap();
     for k in 0..3u8 {
@@ -85,7 +85,7 @@ fn frames_come_one_at_a_time_and_then_none() {
 
 #[test]
 fn fortran_order_is_read() {
-    // numpy.asfortranarray([[1, 2, 3], [4, 5, 6]]) lies in memory as 1 4 2 5 3 6.
+    // numpy.asfortranarray([[1, 2, 3], [4, 5, 6]]) is stored as 1 4 2 5 3 6.
     let two = array_file("'|u1'", "True", "(2, 3)", &[1, 4, 2, 5, 3, 6]);
     assert_eq!(read(&two).unwrap().1, array![[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]]);
     let three = array_file("'|u1'", "True", "(1, 2, 3)", &[1, 4, 2, 5, 3, 6]);
@@ -96,8 +96,8 @@ fn fortran_order_is_read() {
 }
 
 #[test]
-fn axes_in_every_order_are_read() {
-    // More frames than are kept of one pass, more pixels than are read at a time, more passes than are made.
+fn all_orders_of_axes_are_read() {
+    // The stack needs the largest number of passes, and several blocks per pass.
     for shape in [(2, 3, 4), (7, 3, 5), (40, 2, 3), (3, 11, 7), (50, 10, 9)] {
         let stack = ramp(shape, 60_000);
         for (axes, array) in every_order(&stack) {
@@ -107,8 +107,8 @@ fn axes_in_every_order_are_read() {
                     stored.iter().flat_map(|value| (*value as u16).to_le_bytes()).collect();
                 let (a, b, c) = array.dim();
                 let bytes = array_file("'<u2'", fortran, &format!("({a}, {b}, {c})"), &bytes);
-                let found = read_as(file(&bytes).path(), axes).unwrap();
-                assert_eq!(found, (Some(axes), stack.clone()), "{axes} {fortran}");
+                let result = read_as(file(&bytes).path(), axes).unwrap();
+                assert_eq!(result, (Some(axes), stack.clone()), "{axes} {fortran}");
                 let cut = read_as(file(&bytes[..bytes.len() - 1]).path(), axes).unwrap_err();
                 assert_names(&cut.to_string(), &["cut short"]);
             }
@@ -120,7 +120,7 @@ fn axes_in_every_order_are_read() {
 }
 
 #[test]
-fn other_dtypes_are_refused_by_name() {
+fn unsupported_data_types_are_refused_by_name() {
     for (descr, name) in [
         ("'<c16'", "complex128"),
         ("'|O'", "object (a pickle)"),
@@ -133,7 +133,7 @@ fn other_dtypes_are_refused_by_name() {
 }
 
 #[test]
-fn a_header_of_two_gigabytes_in_a_file_of_one_kilobyte_is_refused_with_both_numbers() {
+fn two_gigabyte_claims_in_small_files_are_refused_with_both_sizes() {
     let shape = array_file("'<f4'", "False", "(8, 8192, 8192)", &[0; 900]);
     assert_names(&refusal(&shape), &["8 frames", "8192x8192", "2147483648 bytes", "900 bytes"]);
     let mut header = b"\x93NUMPY\x02\x00\x00\x00\x00\x80".to_vec();
@@ -142,7 +142,7 @@ fn a_header_of_two_gigabytes_in_a_file_of_one_kilobyte_is_refused_with_both_numb
 }
 
 #[test]
-fn a_cut_file_names_the_frames_that_are_there() {
+fn errors_of_truncated_files_count_whole_frames() {
     let message = refusal(&array_file("'<u2'", "False", "(30, 10, 10)", &[0; 200 * 12 + 7]));
     assert_names(&message, &["30 frames of 10x10 uint16", "6000 bytes", "12 whole frames", "2407"]);
     let message = refusal(&array_file("'<u2'", "False", "(1, 10)", &[0; 23]));
@@ -150,7 +150,7 @@ fn a_cut_file_names_the_frames_that_are_there() {
 }
 
 #[test]
-fn claims_beyond_the_limits_are_refused_before_the_length_is_looked_at() {
+fn limits_are_checked_before_the_length() {
     for (shape, what) in [
         ("(5000, 2, 2)", "frames"),
         ("(1, 9000, 2)", "height"),
@@ -197,18 +197,18 @@ fn malformed_headers_are_refused() {
 }
 
 #[test]
-fn what_is_written_is_read_by_another_library() {
+fn written_stacks_are_read_by_ndarray_npy() {
     let stack = ramp((3, 4, 5), 1000) / 7.0;
     let path = tempfile::NamedTempFile::new().unwrap();
     write_f32(path.path(), stack.view()).unwrap();
-    let theirs: Array3<f32> = ndarray_npy::read_npy(path.path()).unwrap();
-    assert_eq!(theirs, stack);
+    let read: Array3<f32> = ndarray_npy::read_npy(path.path()).unwrap();
+    assert_eq!(read, stack);
     let bytes = std::fs::read(path.path()).unwrap();
     assert_eq!((bytes.len() - 3 * 4 * 5 * 4) % 64, 0);
 }
 
 #[test]
-fn a_writer_refuses_frames_that_do_not_fit() {
+fn writers_refuse_frames_that_do_not_fit() {
     let mut writer = super::writer(Vec::new(), (1, 2, 2), Channels::Grey).unwrap();
     assert!(writer.write_frame(Array2::zeros((2, 3)).view()).is_err());
     writer.write_frame(Array2::zeros((2, 2)).view()).unwrap();
@@ -219,7 +219,7 @@ fn a_writer_refuses_frames_that_do_not_fit() {
 
 proptest! {
     #[test]
-    fn any_f32_stack_survives_a_round_trip(
+    fn f32_stacks_survive_a_round_trip(
         (frames, height, width) in (1usize..4, 1usize..7, 1usize..7),
         seed in any::<u32>(),
     ) {
@@ -227,7 +227,7 @@ proptest! {
             f32::from_bits(seed.wrapping_mul(1 + (k * 49 + r * 7 + c) as u32) & 0x7f7f_ffff)
         });
         let path = tempfile::NamedTempFile::new().unwrap();
-        // A view that is not contiguous must be written in the right order too.
+        // The view is not contiguous.
         let flipped = stack.slice(ndarray::s![.., ..;-1, ..]);
         write_f32(path.path(), flipped).unwrap();
         let (info, back) = read_stack(path.path(), &Limits::default()).unwrap();
@@ -236,17 +236,17 @@ proptest! {
     }
 
     #[test]
-    fn no_header_text_panics(text in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn parsing_arbitrary_headers_never_panics(text in prop::collection::vec(any::<u8>(), 0..200)) {
         let _ = Header::parse(&text);
     }
 
     #[test]
-    fn no_header_of_near_syntax_panics(text in "[{}(),:'\"<>|ufb1248TrueFalsdcohp_ \\[\\]L-]{0,80}") {
+    fn parsing_nearly_valid_headers_never_panics(text in "[{}(),:'\"<>|ufb1248TrueFalsdcohp_ \\[\\]L-]{0,80}") {
         let _ = Header::parse(text.as_bytes());
     }
 
     #[test]
-    fn a_damaged_file_is_read_or_refused(position in 0usize..144, value in any::<u8>()) {
+    fn damaged_files_are_read_or_refused(position in 0usize..144, value in any::<u8>()) {
         let mut bytes = array_file("'<u2'", "False", "(2, 4, 5)", &[7; 80]);
         let position = position % bytes.len();
         bytes[position] = value;
@@ -256,7 +256,7 @@ proptest! {
 }
 
 #[test]
-fn windows_of_a_written_stack_are_read_alone() {
+fn windows_of_written_stacks_are_read() {
     let stack = ramp((3, 5, 7), 1000);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("frames.npy");
@@ -265,7 +265,7 @@ fn windows_of_a_written_stack_are_read_alone() {
     let window = reader.read_window(1..3, 2..4, 1..6).unwrap();
     assert_eq!(window, stack.slice(ndarray::s![1..3, 2..4, 1..6]));
     assert!(reader.read_window(0..1, 0..6, 0..1).is_err());
-    // Another form is refused and not read wrongly.
+    // Other layouts are refused.
     let bytes = std::fs::read(&path).unwrap();
     for (from, to) in [("<f4", ">f4"), ("False", "True "), ("(3, 5, 7)", "(3, 35)  ")] {
         let text = String::from_utf8_lossy(&bytes[..128]).replace(from, to);

@@ -1,4 +1,4 @@
-//! Writing f32 stacks as npy.
+//! Writes f32 stacks as npy.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -11,8 +11,8 @@ use crate::format::NPY_MAGIC;
 use crate::samples::StackWriter;
 use crate::{Channels, FormatError};
 
-/// The bytes before the frames of an npy file of shape (frame, row, column) or, of colours, (frame, row, column,
-/// 3), little-endian float32.
+/// The header of an npy file with the shape (frame, row, column), or (frame, row, column, 3) for colours, of
+/// little-endian float32.
 pub fn stack_header((frames, height, width): (usize, usize, usize), channels: Channels) -> Vec<u8> {
     header(&match channels {
         Channels::Grey => format!("({frames}, {height}, {width})"),
@@ -20,8 +20,9 @@ pub fn stack_header((frames, height, width): (usize, usize, usize), channels: Ch
     })
 }
 
-/// Writes the header of an npy file of this shape (frame, row, column) and, of colours, a fourth axis, little-endian
-/// float32; the frames come next. `to` should be buffered.
+/// Writes the header of [`stack_header`], and returns a writer for the frames. `to` should be buffered.
+///
+/// Errors: I/O.
 pub fn writer<W: Write>(
     mut to: W,
     (frames, height, width): (usize, usize, usize),
@@ -32,13 +33,16 @@ pub fn writer<W: Write>(
     Ok(StackWriter::new(to, frames, height, width * channels.count()))
 }
 
-/// Writes (or overwrites) the file `path` with `stack`, axes (frame, row, column).
+/// Writes a stack (frame, row, column), and replaces an existing file.
+///
+/// Errors: I/O.
 pub fn write_f32(path: &Path, stack: ArrayView3<'_, f32>) -> Result<()> {
     write_all(path, stack, stack.dim(), Channels::Grey)
 }
 
-/// Writes (or overwrites) the file `path` with frames of colours \[frame, row, 3 column\]: axes (frame, row, column,
-/// 3).
+/// Writes colour frames \[frame, row, 3 column\] with the shape (frame, row, column, 3), and replaces an existing file.
+///
+/// Errors: I/O.
 pub fn write_colours(path: &Path, stack: ArrayView3<'_, f32>) -> Result<()> {
     let (frames, height, width) = stack.dim();
     write_all(path, stack, (frames, height, width / Channels::Rgb.count()), Channels::Rgb)
@@ -59,7 +63,9 @@ fn write_all(
     Ok(())
 }
 
-/// Writes (or overwrites) the file `path` with one image, axes (row, column).
+/// Writes one image (row, column), and replaces an existing file.
+///
+/// Errors: I/O.
 pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<()> {
     let file = File::create(path).map_err(FormatError::io("create the npy file"))?;
     let (height, width) = image.dim();
@@ -73,8 +79,8 @@ pub fn write_image_f32(path: &Path, image: ArrayView2<'_, f32>) -> Result<()> {
     Ok(())
 }
 
-/// Writes (or overwrites) the file `path` with `count` frames (row, column) of `height` x `width`
-/// numbers, as they are made: shape (frame, row, column), little-endian uint16.
+/// Writes `count` frames (row, column) from `frame` as little-endian uint16 with the shape (frame, row, column), and
+/// replaces an existing file. One frame at a time is in memory.
 ///
 /// Errors: those of `frame`; I/O; [`FormatError::Internal`] for a frame of another size.
 pub fn write_u16<E: From<FormatError>>(
@@ -91,7 +97,8 @@ pub fn write_u16<E: From<FormatError>>(
         let frame = frame(index)?;
         if frame.dim() != (height, width) {
             let (rows, columns) = frame.dim();
-            let text = format!("a frame of {rows}x{columns} for a stack of {height}x{width}");
+            let text =
+                format!("a frame of {rows}x{columns} does not fit a stack of {height}x{width}");
             return Err(FormatError::Internal(text).into());
         }
         let bytes: Vec<u8> = frame.iter().flat_map(|value| value.to_le_bytes()).collect();
@@ -104,7 +111,7 @@ fn header(shape: &str) -> Vec<u8> {
     typed_header("<f4", shape)
 }
 
-/// A version 1.0 header, padded as NumPy does so that the data starts at a multiple of 64.
+/// A header of version 1.0. Like NumPy, it is padded so that the data start at a multiple of 64 bytes.
 fn typed_header(sample: &str, shape: &str) -> Vec<u8> {
     let mut text = format!("{{'descr': '{sample}', 'fortran_order': False, 'shape': {shape}, }}");
     let prefix = NPY_MAGIC.len() + 4;
@@ -114,7 +121,7 @@ fn typed_header(sample: &str, shape: &str) -> Vec<u8> {
     text.push('\n');
     let mut bytes = NPY_MAGIC.to_vec();
     bytes.extend([1, 0]);
-    // Four numbers of at most 20 digits: far below the 65535 bytes of version 1.0.
+    // Four numbers of at most 20 digits fit into the 65535 bytes of version 1.0.
     bytes.extend((text.len() as u16).to_le_bytes());
     bytes.extend(text.as_bytes());
     bytes

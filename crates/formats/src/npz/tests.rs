@@ -51,7 +51,7 @@ fn arrays_are_read_by_name() {
         let missing = read(&bytes, SceneArray::Truth, None).unwrap_err().to_string();
         assert_names(&missing, &["npz", "'orig'", "'meas', 'mask'"]);
         assert_names(&refusal(&bytes), &["several arrays"]);
-        // The only one needs no name, and a clip may be called frames.
+        // The only array needs no name, and a clip may be called frames.
         let only = archive(&[("arr_0.npy", array(&masks))], options);
         assert_eq!(read(&only, SceneArray::Masks, None).unwrap(), masks);
         let clip = [("frames.npy", array(&snapshots)), ("other.npy", array(&masks))];
@@ -64,14 +64,14 @@ fn arrays_are_read_by_name() {
 }
 
 #[test]
-fn damage_is_found() {
+fn damage_is_detected() {
     for options in options() {
         let bytes = archive(&[("mask.npy", array(&ramp((3, 4, 5), 251)))], options);
         for length in 1..bytes.len() {
             let error = read(&bytes[..length], SceneArray::Masks, None).expect_err("cut");
             assert!(error.is_callers_fault(), "{length}: {error:?}");
         }
-        // A value, and the checksum.
+        // Damage a value, and the checksum.
         let mut wrong = bytes.clone();
         let at = bytes.len() / 2;
         wrong[at] ^= 1;
@@ -80,7 +80,7 @@ fn damage_is_found() {
 }
 
 #[test]
-fn claims_beyond_the_file_are_refused_before_memory_is_taken() {
+fn claims_beyond_the_file_are_refused_before_allocation() {
     let bytes = archive(&[("mask.npy", array(&ramp((1, 2, 2), 9)))], options()[1]);
     let entry = bytes.windows(4).position(|part| part == b"PK\x01\x02").unwrap();
     let patched = |at: usize, value: u32| {
@@ -88,7 +88,7 @@ fn claims_beyond_the_file_are_refused_before_memory_is_taken() {
         bytes[at..at + 4].copy_from_slice(&value.to_le_bytes());
         bytes
     };
-    // More than Deflate can hold; a part of the file that isn't there; a directory of 2 GB.
+    // More than Deflate can expand, a section outside the file, a directory of 2 GB.
     let message = |bytes: &[u8]| read(bytes, SceneArray::Masks, None).unwrap_err().to_string();
     assert_names(&message(&patched(entry + 24, 0x7fff_ffff)), &["'mask.npy' of 2147483647 bytes"]);
     assert_names(&message(&patched(entry + 20, 0x7fff_ffff)), &["bytes in all"]);
@@ -103,7 +103,7 @@ fn claims_beyond_the_file_are_refused_before_memory_is_taken() {
 }
 
 #[test]
-fn a_bomb_is_not_unpacked_beyond_what_it_declares() {
+fn archive_bombs_are_not_expanded_beyond_their_declared_size() {
     let mut content = array(&ramp((1, 4, 4), 2));
     let honest = content.len();
     content.resize(20_000_000, 0);
@@ -116,7 +116,7 @@ fn a_bomb_is_not_unpacked_beyond_what_it_declares() {
 
 proptest! {
     #[test]
-    fn a_damaged_file_is_read_or_refused(position in 0usize..10_000, value in any::<u8>(), packed in any::<bool>()) {
+    fn damaged_files_are_read_or_refused(position in 0usize..10_000, value in any::<u8>(), packed in any::<bool>()) {
         let members = [("mask.npy", array(&ramp((2, 3, 4), 97))), ("b.npy", array(&ramp((1, 2, 2), 9)))];
         let mut bytes = archive(&members, options()[usize::from(packed)]);
         let position = position % bytes.len();

@@ -7,7 +7,7 @@ use crate::npz::tests::archive;
 use crate::test_support::{assert_names, file, ramp, read, read_as, refusal, sample, survive};
 use crate::{Axes, Channels, Format, Limits, SampleType, open_stack, png};
 
-/// The frames as PNG pictures of 8 bits.
+/// The frames as 8-bit PNG pictures.
 fn pictures(stack: &Array3<f32>) -> Vec<Vec<u8>> {
     stack
         .outer_iter()
@@ -19,7 +19,7 @@ fn zipped(members: &[(&str, Vec<u8>)]) -> Vec<u8> {
     archive(members, SimpleFileOptions::default())
 }
 
-/// A header of tar and its content.
+/// A tar header with its content.
 fn tar_member(name: &str, kind: u8, content: &[u8]) -> Vec<u8> {
     let mut head = vec![0; 512];
     head[..name.len()].copy_from_slice(name.as_bytes());
@@ -40,7 +40,7 @@ fn tar(members: &[(&str, Vec<u8>)]) -> Vec<u8> {
 }
 
 #[test]
-fn pictures_come_in_the_order_of_their_numbers() {
+fn pictures_are_read_in_numeric_order() {
     let stack = ramp((3, 4, 5), 200);
     let pngs = pictures(&stack);
     let members = |names: [&'static str; 3]| -> Vec<(&str, Vec<u8>)> {
@@ -54,12 +54,12 @@ fn pictures_come_in_the_order_of_their_numbers() {
         for (bytes, format) in
             [(zipped(&members(names)), Format::Zip), (tar(&members(names)), Format::Tar)]
         {
-            let (info, found) = read(&bytes).unwrap();
+            let (info, frames) = read(&bytes).unwrap();
             assert_eq!((info.format, info.sample, info.axes), (format, SampleType::U8, None));
-            assert_eq!(found, stack, "{names:?}");
+            assert_eq!(frames, stack, "{names:?}");
             assert!(read_as(file(&bytes).path(), Axes::FrameRowColumn).is_ok());
             let other = read_as(file(&bytes).path(), Axes::RowColumnFrame).unwrap_err();
-            assert_names(&other.to_string(), &["leave axes out"]);
+            assert_names(&other.to_string(), &["omit `axes`"]);
         }
     }
     let tiff = std::fs::read(sample("mask-1-bit.tif")).unwrap();
@@ -68,7 +68,7 @@ fn pictures_come_in_the_order_of_their_numbers() {
 }
 
 #[test]
-fn what_systems_add_is_left_out_and_all_else_refused() {
+fn hidden_files_are_skipped_and_other_files_refused() {
     let png = pictures(&ramp((1, 4, 5), 200)).remove(0);
     let several = |names: &[&'static str]| -> Vec<(&str, Vec<u8>)> {
         names.iter().map(|name| (*name, png.clone())).collect()
@@ -94,14 +94,17 @@ fn what_systems_add_is_left_out_and_all_else_refused() {
         assert_names(&refusal(&tar(&several(names))), &words[..1]);
     }
     assert_names(&refusal(&zipped(&[])), &["no pictures"]);
-    assert_names(&refusal(&zipped(&[("a1.txt", b"text".to_vec())])), &["'a1.txt'", "no PNG"]);
+    assert_names(
+        &refusal(&zipped(&[("a1.txt", b"text".to_vec())])),
+        &["'a1.txt'", "neither PNG nor TIFF"],
+    );
     let pages = std::fs::read(sample("masks-bool.tif")).unwrap();
     assert_names(&refusal(&zipped(&[("a1.tif", pages)])), &["3 pages"]);
     let other = pictures(&ramp((1, 5, 4), 200)).remove(0);
     let mixed = [("a1.png", png.clone()), ("a2.png", other)];
     assert_names(&refusal(&zipped(&mixed)), &["'a2.png' is 5x4 uint8, but 'a1.png' is 4x5"]);
     let damaged = [("a1.png", png[..40].to_vec())];
-    assert_names(&refusal(&zipped(&damaged)), &["'a1.png': PNG"]);
+    assert_names(&refusal(&zipped(&damaged)), &["'a1.png': the PNG"]);
     let path = file(&zipped(&several(&["a1.png", "a2.png", "a3.png"])));
     let limits = Limits { max_frames: 2, ..Limits::default() };
     let message = open_stack(path.path(), &limits).err().unwrap().to_string();
@@ -109,7 +112,7 @@ fn what_systems_add_is_left_out_and_all_else_refused() {
 }
 
 #[test]
-fn a_tar_is_held_to_its_length_and_its_sums() {
+fn tar_lengths_and_checksums_are_verified() {
     let png = pictures(&ramp((1, 4, 5), 200)).remove(0);
     let whole = tar(&[("a1.png", png.clone()), ("a2.png", png.clone())]);
     assert!(read(&whole).is_ok());
@@ -117,7 +120,7 @@ fn a_tar_is_held_to_its_length_and_its_sums() {
     wrong[0] = b'b';
     assert_names(&refusal(&wrong), &["header at byte 0 is damaged"]);
     assert_names(&refusal(&whole[..530]), &["cut short"]);
-    // Names of any length have a member of their own; links and folders are no frames.
+    // Long names are stored in separate members; links and folders are skipped.
     let long = format!("{}/a7.png", "folder".repeat(40));
     let pax = format!("{} path={long}\n", long.len() + 10);
     for (kind, name) in [(b'L', format!("{long}\0")), (b'x', pax)] {
@@ -137,7 +140,7 @@ fn a_tar_is_held_to_its_length_and_its_sums() {
 }
 
 #[test]
-fn the_last_number_of_a_name_counts() {
+fn the_last_number_of_a_name_determines_the_order() {
     assert_eq!(split("a/b2_003.tif"), Some(("a/b2_", 3, ".tif")));
     assert_eq!(split("17"), Some(("", 17, "")));
     assert_eq!(split("mp4.png"), Some(("mp", 4, ".png")));
@@ -149,7 +152,7 @@ fn the_last_number_of_a_name_counts() {
 
 proptest! {
     #[test]
-    fn a_damaged_file_is_read_or_refused(position in 0usize..10_000, value in any::<u8>(), zip in any::<bool>()) {
+    fn damaged_files_are_read_or_refused(position in 0usize..10_000, value in any::<u8>(), zip in any::<bool>()) {
         let pngs = pictures(&ramp((2, 4, 5), 200));
         let members = [("a1.png", pngs[0].clone()), ("a2.png", pngs[1].clone())];
         let mut bytes = if zip { zipped(&members) } else { tar(&members) };
@@ -160,7 +163,7 @@ proptest! {
     }
 
     #[test]
-    fn any_name_is_split_or_not(name in ".{0,20}") {
+    fn splitting_never_panics(name in ".{0,20}") {
         if let Some((before, _, after)) = split(&name) {
             assert!(name.starts_with(before) && name.ends_with(after));
         }

@@ -19,7 +19,7 @@ fn refusal(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn a_header_that_lies_is_refused_with_both_numbers() {
+fn inconsistent_headers_are_refused_with_both_sizes() {
     let good = planar(&ramp((2, 3, 4), 100));
     assert_eq!(good.len(), 32 + 96);
     assert_names(&refusal(&good[..100]), &["2 frames of 3x4", "128 bytes", "100 bytes"]);
@@ -40,7 +40,7 @@ fn a_header_that_lies_is_refused_with_both_numbers() {
 }
 
 #[test]
-fn a_window_outside_the_stack_is_our_error() {
+fn windows_outside_the_stack_are_internal_errors() {
     let path = file(&planar(&ramp((2, 3, 4), 100)));
     let limits = Limits::default();
     for (frames, rows, columns) in [(0..3, 0..3, 0..4), (0..2, 0..4, 0..4), (0..2, 0..3, 2..5)] {
@@ -53,7 +53,7 @@ fn a_window_outside_the_stack_is_our_error() {
 
 proptest! {
     #[test]
-    fn any_window_is_the_slice_of_the_whole(
+    fn windows_equal_slices_of_the_whole(
         (frames, height, width) in (1usize..4, 1usize..9, 1usize..9),
         a in 0usize..1000, b in 0usize..1000, c in 0usize..1000,
     ) {

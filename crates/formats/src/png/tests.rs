@@ -37,7 +37,7 @@ fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn grey_of_eight_and_sixteen_bit_is_read_as_stored() {
+fn grey_8_and_16_bit_values_are_read_as_stored() {
     let eight = png(ColorType::Grayscale, BitDepth::Eight, 3, 2, &[0, 1, 2, 253, 254, 255]);
     let (info, stack) = read(&eight).unwrap();
     assert_eq!((info.frames, info.height, info.width, info.sample), (1, 2, 3, SampleType::U8));
@@ -48,7 +48,7 @@ fn grey_of_eight_and_sixteen_bit_is_read_as_stored() {
 }
 
 #[test]
-fn levels_are_stretched_and_clipped() {
+fn levels_are_mapped_and_clipped() {
     let path = tempfile::NamedTempFile::new().unwrap();
     let frame = array![[-1.0, 0.0, 0.25], [0.5, 9.0, f32::NAN]];
     write_u16(path.path(), frame.view(), Channels::Grey, 0.0, 0.5).unwrap();
@@ -61,7 +61,7 @@ fn levels_are_stretched_and_clipped() {
 }
 
 #[test]
-fn other_kinds_are_refused_by_name() {
+fn unsupported_kinds_are_refused_by_name() {
     for (color, depth, bytes, name) in [
         (ColorType::Rgb, BitDepth::Eight, 12, "Rgb"),
         (ColorType::Rgba, BitDepth::Sixteen, 32, "Rgba"),
@@ -76,7 +76,7 @@ fn other_kinds_are_refused_by_name() {
 }
 
 #[test]
-fn every_cut_is_refused() {
+fn truncated_files_are_refused() {
     let whole = sixteen(9, 9);
     let data_ends = whole.len() - 12 - 4;
     for length in 0..data_ends {
@@ -87,7 +87,7 @@ fn every_cut_is_refused() {
 }
 
 #[test]
-fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
+fn large_claims_in_small_files_are_refused_before_allocation() {
     let claim = |width: u32, height: u32| {
         let mut header = width.to_be_bytes().to_vec();
         header.extend(height.to_be_bytes());
@@ -111,7 +111,7 @@ fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
 
 proptest! {
     #[test]
-    fn a_damaged_file_is_read_or_refused(position in 0usize..10_000, value in any::<u8>()) {
+    fn damaged_files_are_read_or_refused(position in 0usize..10_000, value in any::<u8>()) {
         let mut bytes = sixteen(7, 5);
         let position = position % bytes.len();
         bytes[position] = value;

@@ -1,7 +1,7 @@
-//! The page headers of a TIFF, checked before the decoder sees them.
+//! Checks the page headers of a TIFF before the decoder reads them.
 //!
-//! The `tiff` crate makes room for as many values as an entry claims, up to a limit that has to be
-//! as large as a frame. Here each claim is held against the file's length first.
+//! The `tiff` crate allocates memory for as many values as an entry claims, up to a limit that must be as large as a
+//! frame. This module checks each claim against the length of the file first.
 
 use std::collections::HashSet;
 use std::io::{Read, Seek, SeekFrom};
@@ -10,18 +10,18 @@ use crate::error::Result;
 use crate::samples::ByteOrder;
 use crate::{Format, FormatError, Limits};
 
-/// The tag of free text.
+/// The tag of the description.
 const IMAGE_DESCRIPTION: u16 = 270;
-/// Tags from here on belong to applications; the decoder does not read them.
+/// First tag that is reserved for applications. The decoder does not read these tags.
 const FIRST_PRIVATE_TAG: u16 = 32768;
-/// The most values of one entry: the tiles of 16x16 pixels of a page of 8192x8192.
+/// Largest number of values of one entry: tiles of 16x16 pixels of a page of 8192x8192.
 const MAX_VALUES: u64 = 1 << 18;
-/// Entries of one page. Pages have some twenty.
+/// Largest number of entries of one page. Pages usually have about twenty.
 const MAX_ENTRIES: u64 = 1000;
-/// An ImageJ description says what is needed in its first lines.
+/// Length of the part of a description that is searched. ImageJ states the number of images in the first lines.
 const DESCRIPTION_BYTES: u64 = 1024;
 
-/// Where the numbers of a page header stand.
+/// Access to the numbers in page headers.
 struct Layout<'a, R> {
     file: &'a mut R,
     length: u64,
@@ -37,48 +37,49 @@ struct Entry {
     offset: u64,
 }
 
-/// What the page headers say.
+/// The summary of all page headers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pages {
+    /// Number of pages.
     pub(super) count: usize,
-    /// Images that ImageJ has put behind the only page header, as it does above 4 GB: to read one frame of many
-    /// would be a silent loss.
-    pub(super) behind: Option<u64>,
+    /// Number of images that ImageJ has written after a single page header, as it does above 4 GB.
+    pub(super) imagej_frames: Option<u64>,
+    /// Byte order of the file.
     pub(super) order: ByteOrder,
 }
 
-/// Walks over all page headers.
+/// Reads all page headers.
 ///
-/// Errors: values that lie outside the file, pages in a circle, more pages than the limits allow.
+/// Errors: values outside the file; a cycle of pages; more pages than the limits allow.
 pub(super) fn count_pages<R: Read + Seek>(
     file: &mut R,
     length: u64,
     limits: &Limits,
 ) -> Result<Pages> {
     let (mut layout, mut next) = Layout::open(file, length)?;
-    let mut seen = HashSet::new();
+    let mut offsets = HashSet::new();
     let mut description = None;
     while next != 0 {
-        let page = seen.len();
-        if !seen.insert(next) {
-            return Err(malformed(format!("page {page} is one of the pages before it")));
+        let page = offsets.len();
+        if !offsets.insert(next) {
+            return Err(malformed(format!("page {page} refers back to an earlier page")));
         }
-        limits.check_shape(Format::Tiff, seen.len() as u64, 1, 1)?;
+        limits.check_shape(Format::Tiff, offsets.len() as u64, 1, 1)?;
         let (entries, following) = layout.page(page, next)?;
         if page == 0 {
             description = entries.into_iter().find(|entry| entry.tag == IMAGE_DESCRIPTION);
         }
         next = following;
     }
-    let behind = match (description, seen.len()) {
+    let imagej_frames = match (description, offsets.len()) {
         (Some(entry), 1) => layout.imagej_images(&entry)?,
         _ => None,
     };
-    Ok(Pages { count: seen.len(), behind, order: layout.order })
+    Ok(Pages { count: offsets.len(), imagej_frames, order: layout.order })
 }
 
 impl<'a, R: Read + Seek> Layout<'a, R> {
-    /// Reads the file's header; the second value is the place of the first page header.
+    /// Reads the header of the file. The second value is the offset of the first page header.
     fn open(file: &'a mut R, length: u64) -> Result<(Self, u64)> {
         let mut layout = Self { file, length, order: ByteOrder::Little, big: false };
         let head = layout.read(0, 8)?;
@@ -91,18 +92,18 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
         Ok((layout, first))
     }
 
-    /// The entries of the page header at `at`, and the place of the next one.
-    fn page(&mut self, page: usize, at: u64) -> Result<(Vec<Entry>, u64)> {
+    /// Reads the entries of the page header at `offset`, and the offset of the next one.
+    fn page(&mut self, page: usize, offset: u64) -> Result<(Vec<Entry>, u64)> {
         let (count_bytes, entry_bytes, pointer_bytes) =
             if self.big { (8, 20, 8) } else { (2, 12, 4) };
-        let count = self.read(at, count_bytes)?;
+        let count = self.read(offset, count_bytes)?;
         let count = self.number(&count);
         if count > MAX_ENTRIES {
             return Err(malformed(format!(
-                "page {page} claims {count} entries, at most {MAX_ENTRIES} are read"
+                "page {page} claims {count} entries, but at most {MAX_ENTRIES} are accepted"
             )));
         }
-        let start = at + count_bytes;
+        let start = offset + count_bytes;
         let table = self.read(start, count * entry_bytes)?;
         let entries = table
             .chunks_exact(entry_bytes as usize)
@@ -112,13 +113,13 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
         Ok((entries, self.number(&next)))
     }
 
-    /// Parses one entry and checks that its values lie in the file.
+    /// Parses one entry, and checks that its values are inside the file.
     fn entry(&self, page: usize, bytes: &[u8]) -> Result<Entry> {
         let inline = if self.big { 8 } else { 4 };
         let (head, offset) = bytes.split_at(bytes.len() - inline);
         let tag = self.number(&head[..2]) as u16;
         let count = self.number(&head[4..]);
-        // Of a type that nobody knows nothing is read.
+        // Values of unknown types are not read.
         let value_bytes = match self.number(&head[2..4]) {
             1 | 2 | 6 | 7 => 1,
             3 | 8 => 2,
@@ -149,7 +150,7 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
         Ok(entry)
     }
 
-    /// The images that ImageJ tells of, if they are several.
+    /// The number of images in an ImageJ description; `None` for one image.
     fn imagej_images(&mut self, description: &Entry) -> Result<Option<u64>> {
         if description.bytes <= 8 {
             return Ok(None);
@@ -161,23 +162,22 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
         Ok(images.filter(|count| *count > 1 && text.starts_with("ImageJ=")))
     }
 
-    fn read(&mut self, at: u64, count: u64) -> Result<Vec<u8>> {
-        if at.saturating_add(count) > self.length {
+    fn read(&mut self, offset: u64, count: u64) -> Result<Vec<u8>> {
+        if offset.saturating_add(count) > self.length {
             return Err(FormatError::Truncated {
                 format: Format::Tiff,
-                promised: format!("a page header of at least {count} bytes at byte {at}"),
+                promised: format!("a page header of at least {count} bytes at byte {offset}"),
                 present: format!("{} bytes in all", self.length),
             });
         }
         let mut bytes = vec![0; count as usize];
-        let place = self.file.seek(SeekFrom::Start(at));
-        place
-            .and_then(|_| self.file.read_exact(&mut bytes))
+        let seek = self.file.seek(SeekFrom::Start(offset));
+        seek.and_then(|_| self.file.read_exact(&mut bytes))
             .map_err(FormatError::io("read the TIFF page header"))?;
         Ok(bytes)
     }
 
-    /// A number of 2, 4 or 8 bytes.
+    /// Decodes a number of 2, 4 or 8 bytes.
     fn number(&self, bytes: &[u8]) -> u64 {
         let shift = |number: u64, byte: &u8| number << 8 | u64::from(*byte);
         match self.order {

@@ -98,7 +98,7 @@ fn with(mut tags: Vec<(u16, Value)>, tag: u16, value: Value) -> Vec<(u16, Value)
 }
 
 #[test]
-fn pages_of_every_type_and_compression_are_read() {
+fn all_types_and_compressions_are_read() {
     for compression in COMPRESSIONS {
         let stack = stack16();
         let (info, read16) =
@@ -122,7 +122,7 @@ fn pages_of_every_type_and_compression_are_read() {
 }
 
 #[test]
-fn frames_come_one_at_a_time_and_then_none() {
+fn readers_return_frames_and_then_none() {
     let mut reader = open(&uncompressed()).unwrap();
     for expected in stack16().outer_iter() {
         assert_eq!(reader.next_frame().unwrap().unwrap(), expected);
@@ -138,7 +138,7 @@ fn big_endian_pages_are_read() {
 }
 
 #[test]
-fn other_samples_are_refused_by_name() {
+fn unsupported_samples_are_refused_by_name() {
     let signed = with(grey(2, 2, 16, 8), 339, Value::Short(2));
     assert_names(&refusal(&page(false, &signed, &[0; 8])), &["signed 16-bit", "page 0"]);
     let half = with(grey(2, 2, 16, 8), 339, Value::Short(3));
@@ -169,7 +169,7 @@ fn pages_of_different_sizes_are_refused_with_both() {
 }
 
 #[test]
-fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
+fn large_claims_in_small_files_are_refused_before_allocation() {
     let whole = page(false, &grey(2, 2, 8, 4), &[0; 812]);
     let length = format!("{} bytes in all", whole.len());
     let outside = page(false, &grey(8192, 8192, 16, u32::MAX), &[0; 812]);
@@ -178,11 +178,11 @@ fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
     assert_names(&refusal(&page(false, &float, &[0; 800])), &["2147483656", "934 bytes in all"]);
     let honest = page(false, &grey(8192, 8192, 16, 100), &[0; 800]);
     assert_names(&refusal(&honest), &["8192x8192 uint16", "134217728 bytes", "100 stored bytes"]);
-    // 800 bytes of Deflate hold less than a megabyte.
+    // 800 bytes of Deflate expand to less than a megabyte.
     let deflated = with(grey(8192, 8192, 16, 800), 259, Value::Short(8));
     assert_names(&refusal(&page(false, &deflated, &[0; 800])), &["134217728 bytes", "800 stored"]);
     assert_names(&refusal(&page(false, &grey(70_000, 2, 8, 4), &[0; 8])), &["width", "70000"]);
-    // The number of strip offsets: first more than the file holds, then more than is read.
+    // The number of strip offsets exceeds first the file, then the limit.
     let entry = 8 + 812 + 2 + 5 * 12;
     let mut many = whole.clone();
     many[entry + 4..entry + 8].copy_from_slice(&2_000_000u32.to_le_bytes());
@@ -197,7 +197,7 @@ fn a_large_claim_in_a_small_file_is_refused_before_memory_is_taken() {
 }
 
 #[test]
-fn too_many_pages_and_endless_pages_are_refused() {
+fn too_many_pages_and_cycles_are_refused() {
     let path = file(&uncompressed());
     let limits = Limits { max_frames: 2, ..Limits::default() };
     let error = open_stack(path.path(), &limits).err().unwrap();
@@ -208,7 +208,7 @@ fn too_many_pages_and_endless_pages_are_refused() {
     assert!(open(&cycle).err().unwrap().is_callers_fault());
 }
 
-/// ImageJ's layout above 4 GB: one page of 2x3 pixels, big-endian, whose pixels begin at `start`, and an image count.
+/// A file with ImageJ's layout above 4 GB: a big-endian page of 2x3 pixels that start at `start`, and an image count.
 fn imagej(images: &str, bits: u16, start: u32) -> Vec<u8> {
     let text = format!("ImageJ=1.53\nimages={images}\nslices={images}\n\0");
     let mut data = vec![0; 4];
@@ -217,7 +217,7 @@ fn imagej(images: &str, bits: u16, start: u32) -> Vec<u8> {
     let tags = with(with(tags, 270, Value::Long(12)), 273, Value::Long(start));
     let tags = if bits == 32 { with(tags, 339, Value::Short(3)) } else { tags };
     let mut bytes = page(true, &tags, &data);
-    // The description: type ASCII, its length, its place.
+    // The description: type ASCII, length and offset.
     let entry = 8 + data.len() + 2 + 5 * 12;
     bytes[entry + 3] = 2;
     bytes[entry + 4..entry + 8].copy_from_slice(&(text.len() as u32).to_be_bytes());
@@ -225,7 +225,7 @@ fn imagej(images: &str, bits: u16, start: u32) -> Vec<u8> {
 }
 
 #[test]
-fn images_of_imagej_behind_one_header_are_read() {
+fn imagej_images_after_one_header_are_read() {
     let stack = ramp((30, 2, 3), 200);
     let whole = |bits: u16, pixels: &dyn Fn(f32) -> Vec<u8>| {
         let mut bytes = imagej("30", bits, 400);
@@ -255,7 +255,7 @@ fn images_of_imagej_behind_one_header_are_read() {
 }
 
 #[test]
-fn images_of_imagej_beyond_4_gb_are_read() {
+fn imagej_images_beyond_4_gb_are_read() {
     use std::io::{Seek, SeekFrom, Write};
     let stack = ramp((30, 2, 3), 200);
     let start = u32::MAX - 50;
@@ -263,13 +263,13 @@ fn images_of_imagej_beyond_4_gb_are_read() {
     path.seek(SeekFrom::Start(start.into())).unwrap();
     let pixels: Vec<u8> = stack.iter().flat_map(|value| (*value as u16).to_be_bytes()).collect();
     path.write_all(&pixels).unwrap();
-    let (info, found) = read_stack(path.path(), &Limits::default()).unwrap();
-    assert_eq!((info.frames, found), (30, stack));
+    let (info, frames) = read_stack(path.path(), &Limits::default()).unwrap();
+    assert_eq!((info.frames, frames), (30, stack));
     assert!(path.as_file().metadata().unwrap().len() > 1 << 32);
 }
 
 #[test]
-fn every_cut_is_refused() {
+fn truncated_files_are_refused() {
     for compression in COMPRESSIONS {
         let whole = pages!(new, colortype::Gray16, u16, stack16(), compression);
         for length in 0..whole.len() - 1 {
@@ -283,7 +283,7 @@ fn every_cut_is_refused() {
 
 proptest! {
     #[test]
-    fn a_damaged_file_is_read_or_refused(position in 0usize..10_000, value in any::<u8>(), which in 0usize..4) {
+    fn damaged_files_are_read_or_refused(position in 0usize..10_000, value in any::<u8>(), which in 0usize..4) {
         let mut bytes = pages!(new, colortype::Gray16, u16, stack16(), COMPRESSIONS[which]);
         let position = position % bytes.len();
         bytes[position] = value;
@@ -292,7 +292,7 @@ proptest! {
 }
 
 #[test]
-fn bits_and_doubles_of_others_are_read() {
+fn bits_and_doubles_from_other_programs_are_read() {
     let read = |name: &str| read_stack(&sample(name), &Limits::default()).unwrap();
     let masks = Array3::from_shape_fn((3, 4, 5), |(k, i, j)| ((k + 2 * i + 3 * j) % 2) as f32);
     let (info, values) = read("masks-bool.tif");

@@ -65,7 +65,7 @@ fn masks_are_scaled_clipped_and_counted() {
 }
 
 #[test]
-fn a_rounding_above_one_is_tolerated_and_no_more() {
+fn only_rounding_above_one_is_tolerated() {
     let (_, scaled) = masks(array![[[1.0 + 5e-7, 0.5]]], 1.0).unwrap();
     assert_eq!(scaled, array![[[1.0, 0.5]]]);
     let error = masks(array![[[0.1, 2.0]], [[7.0, 128.0]]], 1.0).unwrap_err();
@@ -85,13 +85,13 @@ fn nan_infinities_and_zero_masks_are_refused() {
 }
 
 #[test]
-fn a_mask_whose_square_vanishes_is_dead() {
+fn pixels_with_vanishing_squares_are_dead() {
     let (statistics, _) = masks(array![[[1e-30, 1.0]]], 1.0).unwrap();
     assert_eq!(statistics.dead_pixels, 1);
 }
 
 #[test]
-fn measurements_keep_their_sign_and_range() {
+fn measurements_may_be_negative_and_above_one() {
     let scaled = measurement(array![[[510.0, -51.0]]], 255.0).unwrap();
     assert_eq!(scaled, array![[[2.0, -0.2]]]);
 }
@@ -105,7 +105,7 @@ fn empty_snapshots_and_nan_are_refused() {
 }
 
 #[test]
-fn a_full_scale_is_finite_and_positive() {
+fn full_scales_must_be_finite_and_positive() {
     for value in [0.0, -1.0, f32::NAN, f32::INFINITY, 1e-40] {
         assert!(matches!(FullScale::new(value), Err(FormatError::FullScale(_))), "{value}");
     }
@@ -113,7 +113,7 @@ fn a_full_scale_is_finite_and_positive() {
 }
 
 #[test]
-fn the_error_of_a_sink_comes_through() {
+fn errors_of_the_sink_are_returned() {
     let mut stack = Stack::new(array![[[1.0]]]);
     let full = || FormatError::Io { action: "write", source: std::io::Error::other("disk full") };
     let error = check_masks(&mut stack, FullScale::ONE, |_| Err(full())).unwrap_err();

@@ -9,10 +9,9 @@ fn random(size: (usize, usize), seed: u64) -> Array2<f32> {
     Array2::from_shape_simple_fn(size, || rng.random::<f32>())
 }
 
-/// Where a ray crosses the mask plane, on one axis, in micrometres: from the aperture (the front
-/// focal plane of a lens of focal length f) at height `aperture` to the image plane (its back focal
-/// plane) at height `image`, by ray transfer matrices.
-fn crosses_mask(geometry: &Geometry, aperture: f64, image: f64) -> f64 {
+/// Position, in micrometres along one axis, at which a ray crosses the mask plane, by ray transfer matrices. The ray
+/// goes from height `aperture` in the front focal plane of the lens to height `image` in its back focal plane.
+fn crossing_at_mask(geometry: &Geometry, aperture: f64, image: f64) -> f64 {
     let focal = geometry.focal_length_mm * 1000.0;
     let travel = |(height, slope): (f64, f64), length: f64| (height + slope * length, slope);
     let lens = |(height, slope): (f64, f64)| (height, slope - height / focal);
@@ -21,13 +20,13 @@ fn crosses_mask(geometry: &Geometry, aperture: f64, image: f64) -> f64 {
         travel(after, focal - geometry.mask_distance_um).0
     };
     let image_plane = |slope: f64| travel(lens(travel((aperture, slope), focal)), focal).0;
-    // The image height is linear in the slope at the aperture: two rays give the one that is meant.
+    // The image height is linear in the slope at the aperture, so two rays determine the slope.
     let (at_zero, at_one) = (image_plane(0.0), image_plane(1.0));
     mask_plane((image - at_zero) / (at_one - at_zero))
 }
 
-/// The light of a sensor pixel by tracing `n^4` rays through each open cell.
-fn traced(
+/// Light of a sensor pixel, by tracing `n^4` rays through each open cell.
+fn trace(
     geometry: &Geometry,
     projector: &Projector,
     mask: &Array2<f32>,
@@ -37,7 +36,7 @@ fn traced(
 ) -> f64 {
     let sensor = geometry.sensor_pitch_um / geometry.magnification;
     let steps = || (0..n).map(|step| (step as f64 + 0.5) / n as f64);
-    // On each axis: the mask pixel of every pair of a place in the sensor pixel and one in the cell.
+    // Mask pixels along one axis, for all pairs of a point in the sensor pixel and a point in the cell.
     let hits = |pixel: usize, cell: usize, cells: usize, lcos: usize, phase: f64, origin: i64| {
         let size = lcos as f64 / cells as f64 * geometry.lcos_pitch_um;
         let mut hits = Vec::new();
@@ -45,7 +44,7 @@ fn traced(
             let image = (pixel as f64 + at) * sensor + phase * geometry.mask_pitch_um;
             for within in steps() {
                 let aperture = (cell as f64 + within - cells as f64 / 2.0) * size;
-                let at = crosses_mask(geometry, aperture, image) / geometry.mask_pitch_um;
+                let at = crossing_at_mask(geometry, aperture, image) / geometry.mask_pitch_um;
                 hits.push((at.floor() as i64 - origin) as usize);
             }
         }
@@ -58,17 +57,18 @@ fn traced(
             hits(row, r, rows, geometry.lcos_rows, geometry.phase_rows, projector.rows.origin);
         let (lcos, phase) = (geometry.lcos_columns, geometry.phase_columns);
         let column_hits = hits(column, c, columns, lcos, phase, projector.columns.origin);
-        let seen = row_hits
+        let transmissions = row_hits
             .iter()
             .flat_map(|&i| column_hits.iter().map(move |&j| (i, j)))
             .map(|at| f64::from(mask[at]));
-        light += f64::from(open) * seen.sum::<f64>() / (row_hits.len() * column_hits.len()) as f64;
+        light += f64::from(open) * transmissions.sum::<f64>()
+            / (row_hits.len() * column_hits.len()) as f64;
     }
     light
 }
 
 #[test]
-fn masks_are_those_of_traced_rays() {
+fn masks_agree_with_ray_tracing() {
     let paper = Geometry::default();
     let cases = [
         paper,
@@ -84,18 +84,18 @@ fn masks_are_those_of_traced_rays() {
         let mask = random(projector.mask_size(), 2).mapv(f32::round);
         let projected = projector.project(mask.view(), pattern.view()).unwrap();
         for (row, column) in [(0, 0), (2, 3), (4, 6), (1, 4)] {
-            let expected = traced(&geometry, &projector, &mask, &pattern, (row, column), 24);
-            let seen = f64::from(projected[[row, column]]);
+            let expected = trace(&geometry, &projector, &mask, &pattern, (row, column), 24);
+            let actual = f64::from(projected[[row, column]]);
             assert!(
-                (seen - expected).abs() < 0.02 * pattern.sum() as f64,
-                "case {index}, pixel {row},{column}: {seen} and {expected} by rays"
+                (actual - expected).abs() < 0.02 * pattern.sum() as f64,
+                "case {index}, pixel {row},{column}: {actual}, but {expected} by ray tracing"
             );
         }
     }
 }
 
 #[test]
-fn a_sum_of_shifted_masks_is_just_that() {
+fn whole_pixel_projection_sums_shifted_masks() {
     let geometry = Geometry::default();
     let projector =
         Projector::new(&geometry, (3, 4), Placement::WholePixels, Method::Shifts, (6, 8)).unwrap();
@@ -103,16 +103,16 @@ fn a_sum_of_shifted_masks_is_just_that() {
     let mask = random((8, 11), 3).mapv(f32::round);
     let pattern = array![[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
     let projected = projector.project(mask.view(), pattern.view()).unwrap();
-    for ((row, column), &seen) in projected.indexed_iter() {
+    for ((row, column), &actual) in projected.indexed_iter() {
         let expected =
             mask[[row, column]] + mask[[row + 1, column + 2]] + mask[[row + 2, column + 3]];
-        assert_eq!(seen, expected);
+        assert_eq!(actual, expected);
     }
 }
 
 #[test]
-fn finely_cut_patterns_give_the_convolution() {
-    // Each of 3x4 cells cut into 32x32 points is nearly its area.
+fn convolution_is_the_limit_of_many_shifts() {
+    // 32x32 points approximate the area of a cell.
     let geometry = Geometry { magnification: 2.0, ..Geometry::default() };
     let coarse = random((3, 4), 5);
     let fine = Array2::from_shape_fn((96, 128), |(i, j)| coarse[[i / 32, j / 32]] / 1024.0);
@@ -120,7 +120,7 @@ fn finely_cut_patterns_give_the_convolution() {
         let cells = pattern.dim();
         let projector =
             Projector::new(&geometry, cells, Placement::Geometric, method, (20, 20)).unwrap();
-        // The same mask, whatever part of it is seen.
+        // The mask is a function of the coordinates, so both projectors see the same one.
         let at = |row: i64, column: i64| ((row * 7 + column * 13).rem_euclid(5)) as f32 / 4.0;
         let (rows, columns) = (projector.rows.origin, projector.columns.origin);
         let mask = Array2::from_shape_fn(projector.mask_size(), |(i, j)| {
@@ -134,7 +134,7 @@ fn finely_cut_patterns_give_the_convolution() {
 }
 
 #[test]
-fn an_open_mask_passes_all_light_and_blur_takes_contrast_away() {
+fn blur_reduces_contrast_but_not_light() {
     let deviation = |blur_um: f64| {
         let geometry = Geometry { blur_um, ..Geometry::default() };
         let method = Method::Shifts;
@@ -148,12 +148,12 @@ fn an_open_mask_passes_all_light_and_blur_takes_contrast_away() {
         one[[1, 1]] = 1.0;
         projector.project(mask.view(), one.view()).unwrap().std(0.0)
     };
-    let seen = [0.0, 2.0, 4.5, 9.0].map(deviation);
-    assert!(seen.windows(2).all(|pair| pair[1] < 0.8 * pair[0]), "{seen:?}");
+    let deviations = [0.0, 2.0, 4.5, 9.0].map(deviation);
+    assert!(deviations.windows(2).all(|pair| pair[1] < 0.8 * pair[0]), "{deviations:?}");
 }
 
 #[test]
-fn what_can_not_be_placed_is_refused() {
+fn impossible_projections_are_refused() {
     let geometry = Geometry::default();
     let new = |cells, placement| {
         Projector::new(&geometry, cells, placement, Method::Shifts, (8, 8)).map(|_| ())
@@ -170,11 +170,11 @@ fn what_can_not_be_placed_is_refused() {
         Projector::new(&geometry, (3, 4), Placement::Geometric, Method::Shifts, (8, 8)).unwrap();
     let mask = Array2::zeros(projector.mask_size());
     let error = projector.project(mask.view(), Array2::zeros((4, 3)).view()).unwrap_err();
-    assert!(error.to_string().contains("4x3 cells"), "{error}");
+    assert!(error.to_string().contains("has 4x3 cells"), "{error}");
 }
 
 #[test]
-fn the_centre_of_a_mask_is_taken() {
+fn centre_takes_the_central_part() {
     let mask = Array2::from_shape_fn((5, 6), |(i, j)| (10 * i + j) as f32);
     assert_eq!(centre(mask.view(), (1, 2)), array![[22.0, 23.0]]);
     assert_eq!(centre(mask.view(), (5, 6)), mask);

@@ -1,0 +1,457 @@
+//! The registry of findings: every code that a check can report, with its severity, title and remedy.
+//!
+//! Checks report a [`Finding`] with a [`FindingCode`] and the numbers of the case. A new finding takes one entry in
+//! this file and the check that reports it. Running the tests with `SCI_RECON_WRITE_FINDINGS=1` then updates the
+//! lists in `docs/DATA.md` and `openapi.yaml`.
+
+use serde::{Deserialize, Serialize};
+use strum::{Display, EnumString, IntoStaticStr, VariantArray};
+
+/// How serious a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, Display)]
+#[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
+pub enum Severity {
+    /// Results are worse than they could be.
+    Warning,
+    /// Results are wrong.
+    Error,
+}
+
+/// The subject of a finding.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[strum(serialize_all = "snake_case")]
+pub enum Subject {
+    /// The masks of a calibration, or the captures they were computed from.
+    Calibration,
+    /// A measurement, checked against its calibration.
+    Measurement,
+    /// The reconstructed frames.
+    Result,
+}
+
+/// The stable identifier of a finding. Codes are part of the API and never change.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Display, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "snake_case")]
+#[allow(missing_docs)] // `entry` describes each code
+pub enum FindingCode {
+    DeadPixels,
+    StuckPixels,
+    OneDimensional,
+    MissingPattern,
+    UnevenPatterns,
+    RepeatedPattern,
+    SwappedOrder,
+    Correlated,
+    MaskScale,
+    WeakModulation,
+    Pedestal,
+    SaturatedWhite,
+    SaturatedPatterns,
+    DarkIllumination,
+    UnevenIllumination,
+    NoRepeats,
+    NoisyMasks,
+    LightDrift,
+    BadCalibration,
+    Saturated,
+    LeftAligned,
+    RightAligned,
+    Level,
+    NoDark,
+    WrongDark,
+    Negative,
+    NegativeOffset,
+    Mosaic,
+    ShiftedMasks,
+    ForeignMasks,
+    FastMotion,
+    UnfamiliarMasks,
+    UnevenError,
+}
+
+/// The description of a [`FindingCode`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Entry {
+    /// Where the finding can occur.
+    pub subjects: &'static [Subject],
+    /// The usual severity.
+    pub severity: Severity,
+    /// The severity of grave cases; equal to `severity` where there is no distinction.
+    pub worst: Severity,
+    /// The problem in a few words, without the numbers of a case.
+    pub title: &'static str,
+    /// Instruction for the user, without a capital letter and a full stop.
+    pub remedy: &'static str,
+}
+
+impl FindingCode {
+    /// The code as it appears in reports and in the API.
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+
+    /// The description of this code.
+    pub const fn entry(self) -> Entry {
+        use Severity::{Error, Warning};
+        use Subject::{Calibration, Measurement, Result};
+        const REPEAT_PATTERNS: &str =
+            "check the LCoS pattern sequence and its trigger, then record again";
+        const REDUCE_EXPOSURE: &str =
+            "reduce the exposure of the whole calibration and record all captures again";
+        const SEND_RAW_VALUES: &str = "send the raw camera values and name the dark frames as `dark`, so that the service subtracts them";
+        const NAME_A_DARK: &str = "record dark frames (scene_black) with the LCoS all black, at the \
+                                   measurement's exposure and gain, and name them as `dark`";
+        let (subjects, severity, worst, title, remedy): (&[Subject], _, _, _, _) = match self {
+            Self::DeadPixels => (
+                &[Calibration],
+                Warning,
+                Error,
+                "pixels are dark in every mask",
+                "look at the Gram map of the report: dust or a displaced mask darkens whole areas, too few repeats \
+                 darken single pixels",
+            ),
+            Self::StuckPixels => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "pixels are open in every mask",
+                "check the sensor for hot pixels and the captures for saturation",
+            ),
+            Self::OneDimensional => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the masks vary along one axis only",
+                "check that the file has the axes [frame, row, column], and that the lithography mask is in place",
+            ),
+            Self::MissingPattern => (
+                &[Calibration, Measurement],
+                Error,
+                Error,
+                "a pattern was not shown",
+                REPEAT_PATTERNS,
+            ),
+            Self::UnevenPatterns => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "a pattern is more than 30 % brighter or darker than the median",
+                REPEAT_PATTERNS,
+            ),
+            Self::RepeatedPattern => {
+                (&[Calibration], Error, Error, "two masks show the same pattern", REPEAT_PATTERNS)
+            }
+            Self::SwappedOrder => (
+                &[Calibration],
+                Error,
+                Error,
+                "the masks are not in the order of the patterns",
+                "list the captures in the order in which the LCoS shows the patterns during a measurement",
+            ),
+            Self::Correlated => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the masks are highly correlated",
+                "use patterns that overlap less, more sub-apertures, or a sharper projection (check the mask distance \
+                 and aberrations)",
+            ),
+            Self::MaskScale => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the largest mask value is far below the full scale",
+                "state the `full_scale` of the masks: 4095 for 12-bit values stored in 16 bits, 16383 for 14-bit \
+                 values",
+            ),
+            Self::WeakModulation => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the masks hardly differ from frame to frame",
+                "focus the projection of the lithography mask, and check that the LCoS pattern changes",
+            ),
+            Self::Pedestal => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "closed mask pixels let light through",
+                "record `black_with_mask` again with the LCoS running and all black, so that it contains the leakage",
+            ),
+            Self::SaturatedWhite => (
+                &[Calibration],
+                Warning,
+                Error,
+                "pixels of the white image are saturated",
+                REDUCE_EXPOSURE,
+            ),
+            Self::SaturatedPatterns => {
+                (&[Calibration], Error, Error, "pixels of a pattern are saturated", REDUCE_EXPOSURE)
+            }
+            Self::DarkIllumination => (
+                &[Calibration],
+                Warning,
+                Error,
+                "the white image is hardly brighter than the black one",
+                "illuminate the white board up to the corners, and check that white and black are not interchanged",
+            ),
+            Self::UnevenIllumination => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the illumination is uneven",
+                "illuminate the white board evenly, and check the aperture for vignetting",
+            ),
+            Self::NoRepeats => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "captures have no repeats, so the noise is unknown",
+                "record each capture several times; the paper uses 50 repeats",
+            ),
+            Self::NoisyMasks => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the masks are noisy",
+                "record more repeats or increase the exposure",
+            ),
+            Self::LightDrift => (
+                &[Calibration],
+                Warning,
+                Warning,
+                "the light changed during the repeats",
+                "let the lamp and the LCoS warm up, and fix exposure and gain",
+            ),
+            Self::BadCalibration => (
+                &[Measurement],
+                Error,
+                Error,
+                "the calibration is graded `bad`",
+                "read the calibration's report, correct the problems it lists, and calibrate again",
+            ),
+            Self::Saturated => (
+                &[Measurement],
+                Warning,
+                Error,
+                "pixels are saturated",
+                "reduce the exposure time or stop down the lens",
+            ),
+            Self::LeftAligned => (
+                &[Measurement],
+                Warning,
+                Warning,
+                "12-bit values are left-aligned in 16 bits",
+                "state 65520 as `full_scale` and as `saturation`",
+            ),
+            Self::RightAligned => (
+                &[Measurement],
+                Warning,
+                Warning,
+                "12-bit values are right-aligned in 16 bits",
+                "if the camera has 12 bits, state 4095 as `full_scale` and as `saturation`",
+            ),
+            Self::Level => (
+                &[Measurement, Result],
+                Warning,
+                Warning,
+                "the brightness of the scene is implausible, for example a mean below 0.05 or above 1.05 of the full scale",
+                "state the `full_scale` of the measurement for its exposure and bit depth",
+            ),
+            Self::NoDark => (
+                &[Measurement],
+                Warning,
+                Error,
+                "the masks do not explain 3 % or more of the light, and no dark frames were named",
+                NAME_A_DARK,
+            ),
+            Self::WrongDark => (
+                &[Calibration, Measurement],
+                Warning,
+                Error,
+                "the dark frames do not belong to these captures",
+                "record the dark frames (`black` and `black_with_mask`, or the measurement's `dark`) again with the LCoS \
+                 all black, at the exposure, gain and room light of the captures they are subtracted from",
+            ),
+            Self::Negative => (
+                &[Measurement],
+                Warning,
+                Error,
+                "parts of the image are below 0 by more than noise",
+                "record the dark frames again at the measurement's exposure; if dark frames were subtracted before the \
+                 upload, send the raw camera values and name the dark frames as `dark`",
+            ),
+            Self::NegativeOffset => (
+                &[Measurement],
+                Warning,
+                Error,
+                "too much was subtracted before the upload",
+                SEND_RAW_VALUES,
+            ),
+            Self::Mosaic => (
+                &[Measurement],
+                Error,
+                Error,
+                "the image looks like the raw mosaic of a colour sensor",
+                "state the `mosaic` of the sensor with the calibration, or export both captures and measurement in grey",
+            ),
+            Self::ShiftedMasks => (
+                &[Measurement],
+                Error,
+                Error,
+                "the masks fit better when shifted (by up to 4 pixels)",
+                "the optics moved since the calibration: calibrate again",
+            ),
+            Self::ForeignMasks => (
+                &[Measurement],
+                Error,
+                Error,
+                "the masks do not explain the measurement",
+                "name the calibration that belongs to this measurement, or calibrate again",
+            ),
+            Self::FastMotion => (
+                &[Result],
+                Warning,
+                Warning,
+                "fast motion may be reconstructed too smooth",
+                "shorten the frames, or use fewer frames in a snapshot",
+            ),
+            Self::UnfamiliarMasks => (
+                &[Result],
+                Warning,
+                Warning,
+                "the expected PSNR is unreliable behind these masks",
+                "do not rely on the expected PSNR; simulate a similar scene behind these masks instead",
+            ),
+            Self::UnevenError => (
+                &[Result],
+                Warning,
+                Warning,
+                "a part of the picture is expected to be much worse than the rest",
+                "look at the map of the expected error before relying on this part",
+            ),
+        };
+        Entry { subjects, severity, worst, title, remedy }
+    }
+}
+
+/// A problem that a check has found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Finding {
+    /// Which problem it is; it determines the title and the remedy.
+    pub code: FindingCode,
+    /// The severity of this case.
+    pub severity: Severity,
+    /// The observation with its numbers, for people.
+    pub detail: String,
+    /// The affected patterns or frames, counted from 0.
+    pub frames: Vec<usize>,
+}
+
+impl Finding {
+    /// A finding of the usual severity that concerns no particular frame.
+    pub fn new(code: FindingCode, detail: impl Into<String>) -> Self {
+        let severity = code.entry().severity;
+        Self { code, severity, detail: detail.into(), frames: Vec::new() }
+    }
+
+    /// Raises the severity to the worst one of the code if the case is grave.
+    pub(super) fn escalate_if(self, is_grave: bool) -> Self {
+        let severity = if is_grave { self.code.entry().worst } else { self.severity };
+        Self { severity, ..self }
+    }
+
+    /// Names the affected patterns or frames.
+    pub(super) fn with_frames(self, frames: Vec<usize>) -> Self {
+        Self { frames, ..self }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::fmt::Write;
+
+    use strum::VariantArray;
+
+    use super::FindingCode;
+
+    /// The lines between these two comments in `docs/DATA.md` and `openapi.yaml` are generated.
+    const BEGIN: &str = "findings: generated from crates/optics/src/finding.rs";
+    const END: &str = "findings: end";
+
+    fn table() -> String {
+        let mut table =
+            "| code | checked | severity | meaning | remedy |\n| --- | --- | --- | --- | --- |\n"
+                .to_owned();
+        for code in FindingCode::VARIANTS {
+            let entry = code.entry();
+            let subjects: Vec<_> =
+                entry.subjects.iter().map(|subject| subject.to_string()).collect();
+            let severities = BTreeSet::from([entry.severity, entry.worst]);
+            let severities: Vec<_> =
+                severities.into_iter().map(|severity| severity.to_string()).collect();
+            let (subjects, severities) = (subjects.join(", "), severities.join(" or "));
+            let (title, remedy) = (entry.title, entry.remedy);
+            writeln!(table, "| `{code}` | {subjects} | {severities} | {title} | {remedy} |")
+                .unwrap();
+        }
+        table
+    }
+
+    fn enumeration() -> String {
+        let codes = FindingCode::VARIANTS.iter().map(|code| format!("            - {code}\n"));
+        codes.collect()
+    }
+
+    /// The whole file with the generated part replaced.
+    fn regenerated(text: &str, generated: &str) -> String {
+        let begin = text.find(BEGIN).expect("the opening comment");
+        let begin = begin + text[begin..].find('\n').unwrap() + 1;
+        let end = begin + text[begin..].find(END).expect("the closing comment");
+        let end = text[..end].rfind('\n').unwrap() + 1;
+        format!("{}{generated}{}", &text[..begin], &text[end..])
+    }
+
+    #[test]
+    fn documents_list_every_code() {
+        for (file, generated) in [("docs/DATA.md", table()), ("openapi.yaml", enumeration())] {
+            let path = format!("{}/../../{file}", env!("CARGO_MANIFEST_DIR"));
+            let text = std::fs::read_to_string(&path).unwrap();
+            let expected = regenerated(&text, &generated);
+            if std::env::var_os("SCI_RECON_WRITE_FINDINGS").is_some() {
+                std::fs::write(&path, &expected).unwrap();
+                continue;
+            }
+            assert!(
+                text == expected,
+                "{file} does not list the findings as they are: run this test with SCI_RECON_WRITE_FINDINGS=1"
+            );
+        }
+    }
+
+    #[test]
+    fn codes_are_parsed_back_from_their_names() {
+        for code in FindingCode::VARIANTS {
+            assert_eq!(code.as_str().parse(), Ok(*code));
+        }
+    }
+
+    #[test]
+    fn remedies_are_instructions_without_a_full_stop() {
+        for code in FindingCode::VARIANTS {
+            let entry = code.entry();
+            assert!(entry.worst >= entry.severity && !entry.subjects.is_empty(), "{code}");
+            for text in [entry.title, entry.remedy] {
+                assert!(
+                    !text.is_empty() && !text.ends_with('.') && !text.contains('|'),
+                    "{code}: {text}"
+                );
+                assert!(!text.starts_with(|c: char| c.is_uppercase()), "{code}: {text}");
+            }
+        }
+    }
+}
