@@ -20,6 +20,7 @@ mod settings;
 mod shell;
 mod submission;
 mod supervisor;
+mod verdict;
 mod wait;
 
 pub mod backup;
