@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array3, ArrayView2, s};
 
 use super::IntakeError;
-use super::check::{Exposure, masks, measurement};
+use super::check::{Exposure, Passed, masks, measurement};
 use super::open::{Opened, Source};
 use crate::intake::error::Result;
 use formats::mat::SceneArray;
@@ -31,12 +31,24 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     Ok(Scaled { array: stack.into_array()?, full_scale, axes })
 }
 
-/// Snapshots \[S,H,W\] of a measurement, checked, and how many there are in all. They are given by the
-/// indices of the first and the last; without a last one, to its end.
+/// Some snapshots of a measurement, less their dark.
+#[derive(Debug)]
+pub struct Snapshots {
+    /// \[S,H,W\].
+    pub measurement: Scaled<Array3<f32>>,
+    /// Number of snapshots in the file.
+    pub count: usize,
+    /// Findings and saturation of these snapshots.
+    pub passed: Passed,
+}
+
+/// Snapshots of a measurement, checked. They are given by the indices of the first and the last; without a
+/// last one, to its end.
 pub fn read_snapshots(
     source: &Source<'_>,
+    exposure: &Exposure,
     (first, last): (usize, Option<usize>),
-) -> Result<(Scaled<Array3<f32>>, usize)> {
+) -> Result<Snapshots> {
     let opened = source.open()?;
     let (full_scale, axes) = (opened.full_scale.value(), opened.info.axes);
     let snapshots = opened.info.frames;
@@ -50,14 +62,18 @@ pub fn read_snapshots(
         return Err(IntakeError::content("", &detail));
     }
     let (mut next, mut found) = (0, Stack::default());
-    measurement(opened, &Exposure::default(), &source.limits, |snapshot| {
+    let mut passed = measurement(opened, exposure, &source.limits, |snapshot| {
         if (first..=last).contains(&next) {
             found.push(snapshot)?;
         }
         next += 1;
         Ok(())
     })?;
-    Ok((Scaled { array: found.into_array()?, full_scale, axes }, snapshots))
+    if let Some(shares) = &mut passed.saturated {
+        *shares = shares.get(first..=last).unwrap_or_default().to_vec();
+    }
+    let measurement = Scaled { array: found.into_array()?, full_scale, axes };
+    Ok(Snapshots { measurement, count: snapshots, passed })
 }
 
 /// The true frames \[S B,H,W\] of some snapshots of a measurement, of a file that has those of these
