@@ -1,5 +1,4 @@
-//! All settings of the service. The comments here are the help on the command line; each setting
-//! can also be given as the environment variable that the help names.
+//! All settings of the service. The comments here are the help on the command line.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -14,20 +13,20 @@ use engine::job::WorkerId;
 use engine::pipeline::networks::{NetworkError, find_library};
 use reconstruction::prior::onnx::Device;
 
-/// The version of the program, with the commit that it was built from where `make` has told it.
+/// The version of the program, with its commit if `make` built it.
 pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {
     Some(version) => version,
     None => env!("CARGO_PKG_VERSION"),
 };
 
-/// Serves the HTTP API and runs workers.
+/// Run the HTTP service, its dashboard and its workers.
 #[derive(Debug, Clone, Args)]
 pub struct ServeArguments {
-    /// Folder for the database, uploads and results; it is made if it is missing.
+    /// Folder for the database, uploads and results; created if it is missing.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     pub data: PathBuf,
 
-    /// Address to listen at; port 0 takes a free one.
+    /// Address to listen at; port 0 takes a free port.
     #[arg(
         long,
         env = "SCI_RECON_LISTEN",
@@ -36,18 +35,18 @@ pub struct ServeArguments {
     )]
     pub listen: SocketAddr,
 
-    /// Listen at an address that other machines reach though there are no tokens: whoever reaches it
+    /// Listen at an address that other machines reach although there are no tokens: everyone who reaches it
     /// may do everything.
     #[arg(long, env = "SCI_RECON_ALLOW_REMOTE")]
     pub allow_remote: bool,
 
-    /// Names, separated by commas, under which it is reached while there are no tokens, beside its addresses,
-    /// `localhost` and the name of the machine: a browser at a page with another name is refused.
+    /// Host names of the service, separated by commas, beside its addresses, `localhost` and the name of the
+    /// machine. While there are no tokens, requests of browsers with another name are refused.
     #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
     pub hosts: Vec<String>,
 
-    /// Worker processes to run; 0 runs none, for workers that are started by hand, or, with --nats, one
-    /// that leaves the tiles to other machines [default: one for each core].
+    /// Worker processes to run. 0 runs none, for workers that are started by hand; with --nats it runs one
+    /// that leaves the tiles to other machines [default: one per core].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
 
@@ -56,29 +55,29 @@ pub struct ServeArguments {
     #[command(flatten)]
     pub cluster: ClusterArguments,
 
-    /// Settings that the workers get.
+    /// Settings of the workers.
     #[command(flatten)]
     pub engine: EngineArguments,
 
-    /// Memory that one worker may need; jobs that need more are refused. A task that takes a quarter and 256 MiB
-    /// more than this fails.
+    /// Memory that a worker may need; jobs that need more are refused. A task fails if it takes more than 1.25
+    /// times this plus 256 MiB.
     #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 4 << 30)]
     pub worker_memory_bytes: u64,
 
-    /// Largest upload in bytes.
+    /// Largest size of an upload.
     #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 8 << 30)]
     pub max_upload_bytes: u64,
 
-    /// Uploads that are received at the same time; more are told to come back later. A lab has half of these
-    /// places at most, and one that has none always gets one.
+    /// Uploads that are received at the same time; further ones must try again later. A lab has at most half of
+    /// these places. A lab without an upload always gets one.
     #[arg(long, env = "SCI_RECON_MAX_UPLOADS", value_name = "N", default_value_t = 64)]
     pub max_uploads: usize,
 
-    /// Bytes of the disk that uploads leave free.
+    /// Bytes of the disk to keep free of uploads.
     #[arg(long, env = "SCI_RECON_MIN_FREE_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 1 << 30)]
     pub min_free_bytes: u64,
 
-    /// Seconds without a byte after which an upload is given up.
+    /// Seconds without a byte after which an upload is interrupted.
     #[arg(
         long,
         env = "SCI_RECON_UPLOAD_IDLE_SECONDS",
@@ -87,8 +86,7 @@ pub struct ServeArguments {
     )]
     pub upload_idle_seconds: u64,
 
-    /// Bytes in a second that an upload must bring in the mean of that time, so that slow ones don't keep the
-    /// places of others.
+    /// Lowest rate of an upload in bytes per second, averaged over --upload-idle-seconds.
     #[arg(
         long,
         env = "SCI_RECON_UPLOAD_BYTES_PER_SECOND",
@@ -122,24 +120,24 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
     pub request_seconds: u64,
 
-    /// Seconds that the check of a sent file may take, when it is made a calibration or a measurement.
+    /// Seconds that the check of a file for a calibration or measurement may take.
     #[arg(long, env = "SCI_RECON_CHECK_SECONDS", value_name = "SECONDS", default_value_t = 300.0, value_parser = seconds)]
     pub check_seconds: f64,
 
-    /// Jobs that may wait and run; more are told to come back later, but not those of a lab that has less than
-    /// an equal part of them.
+    /// Jobs that may wait and run; further ones must try again later, except those of a lab with less than an
+    /// equal share.
     #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
     pub max_jobs: u64,
 
-    /// Hours for which an upload that nothing refers to, or that is not complete, is kept.
+    /// Hours for which unused and incomplete uploads are kept.
     #[arg(long, env = "SCI_RECON_UPLOAD_HOURS", value_name = "HOURS", default_value_t = 72)]
     pub upload_hours: u64,
 
-    /// Days for which a job that has ended is kept, with its results [default: until it is deleted].
+    /// Days for which ended jobs are kept, with their results [default: until they are deleted].
     #[arg(long, env = "SCI_RECON_JOB_DAYS", value_name = "DAYS")]
     pub job_days: Option<u32>,
 
-    /// Days for which files are kept in quarantine/ that no record knows of, as a crash may leave them.
+    /// Days for which files without a record, such as those of a crash, are kept in quarantine/.
     #[arg(long, env = "SCI_RECON_QUARANTINE_DAYS", value_name = "DAYS", default_value_t = 7)]
     pub quarantine_days: u32,
 
@@ -148,51 +146,51 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_ROLLBACK_DAYS", value_name = "DAYS", default_value_t = 7)]
     pub rollback_days: u32,
 
-    /// Bytes in a second at which all stored files are compared with their hashes, in the background, at most
-    /// once a day; 0: never.
+    /// Bytes per second at which stored files are compared with their hashes in the background, at most once a
+    /// day; 0: never.
     #[arg(long, env = "SCI_RECON_SCRUB_BYTES", value_name = "BYTES", value_parser = bytes,
           default_value_t = 10 << 20)]
     pub scrub_bytes: u64,
 
-    /// Goes on where database and folder do not belong together: takes the database for right, and moves
-    /// files that it does not know to quarantine/. For one start, after the reason has been understood.
+    /// Start although database and folder do not belong together: trust the database, and move unknown files to
+    /// quarantine/. For a single start, once the reason is understood.
     #[arg(long)]
     pub accept_database: bool,
 
-    /// Free bytes of the disk below which unused uploads and the oldest ended jobs go before their
-    /// time; those of the last hour stay. 0: never.
+    /// Free bytes of the disk below which unused uploads and the oldest ended jobs are deleted early, except
+    /// those of the last hour; 0: never.
     #[arg(long, env = "SCI_RECON_LOW_WATER_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 0)]
     pub low_water_bytes: u64,
 
-    /// How log lines look.
+    /// Format of log lines.
     #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
 }
 
-/// Where a NATS server is, and who asks.
+/// Address of a NATS server, and a credential for it.
 #[cfg(feature = "nats")]
 #[derive(Debug, Clone, Default, Args)]
 pub struct NatsArguments {
-    /// Address of a NATS server with JetStream, such as nats://host:4222 or tls://host:4222; several are
-    /// separated by commas [default: that of the credential].
+    /// Addresses of a NATS server with JetStream, such as nats://host:4222 or tls://host:4222, separated by
+    /// commas [default: the address in the credential].
     #[arg(long, env = "SCI_RECON_NATS", value_name = "URL")]
     pub nats: Option<String>,
 
-    /// File with the credential for it.
+    /// File with a credential for the NATS server.
     #[arg(long, env = "SCI_RECON_NATS_CREDS", value_name = "FILE")]
     pub nats_creds: Option<PathBuf>,
 }
 
 #[cfg(feature = "nats")]
 impl NatsArguments {
-    /// Whether there is to be a connection at all.
+    /// True if a NATS server is configured.
     #[must_use]
     pub fn is_wanted(&self) -> bool {
         self.nats.is_some() || self.nats_creds.is_some()
     }
 }
 
-/// How tiles get to workers on other machines.
+/// Settings for workers on other machines.
 #[cfg(feature = "nats")]
 #[derive(Debug, Clone, Args)]
 pub struct ClusterArguments {
@@ -200,7 +198,7 @@ pub struct ClusterArguments {
     #[command(flatten)]
     pub nats: NatsArguments,
 
-    /// Seconds of silence after which another worker gets the tile of one on another machine.
+    /// Seconds of silence after which the tile of a worker on another machine is given to another worker.
     #[arg(long, env = "SCI_RECON_ACK_WAIT", value_name = "SECONDS", default_value_t = 30,
           value_parser = clap::value_parser!(u64).range(2..=3600))]
     pub ack_wait: u64,
@@ -212,7 +210,7 @@ pub struct ClusterArguments {
     pub verify_fraction: f64,
 }
 
-/// How a worker on another machine gets its tiles.
+/// Settings of a worker for a server elsewhere.
 #[cfg(feature = "nats")]
 #[derive(Debug, Clone, Default, Args)]
 pub struct RemoteArguments {
@@ -220,28 +218,28 @@ pub struct RemoteArguments {
     #[command(flatten)]
     pub nats: NatsArguments,
 
-    /// Folder for what later tiles need again; it may be empty, and may be removed afterwards [default:
-    /// one in the folder for temporary files].
+    /// Folder that caches inputs for later tiles; it may be removed afterwards [default: in the folder for
+    /// temporary files].
     #[arg(long, env = "SCI_RECON_CACHE", value_name = "DIR")]
     pub cache: Option<PathBuf>,
 
-    /// Bytes that the cache may hold.
+    /// Largest size of the cache.
     #[arg(long, env = "SCI_RECON_CACHE_BYTES", value_name = "N", value_parser = bytes, default_value_t = 4 << 30)]
     pub cache_bytes: u64,
 
-    /// Seconds without a tile after which the worker ends [default: it waits for ever].
+    /// Seconds without a tile after which the worker ends [default: never].
     #[arg(long, env = "SCI_RECON_EXIT_WHEN_IDLE", value_name = "SECONDS")]
     pub exit_when_idle: Option<u64>,
 
-    /// The pool that it works for [default: that of the credential].
+    /// The pool of the worker [default: the pool in the credential].
     #[arg(long, env = "SCI_RECON_POOL", value_name = "NAME")]
     pub pool: Option<Pool>,
 
-    /// File in which it notes what it has in hand.
+    /// File in which the worker records its current tile.
     #[arg(long, value_name = "FILE", hide = true)]
     pub hand: Option<PathBuf>,
 
-    /// How the process before it died, whose file that is.
+    /// Reason why the previous process of this file died.
     #[arg(long, value_name = "TEXT", hide = true)]
     pub died: Option<String>,
 }
@@ -255,8 +253,10 @@ impl RemoteArguments {
     }
 }
 
-/// Takes tasks and does them, until it is told to stop: those of a data folder on this machine, or,
-/// with --nats or --nats-creds, tiles of a server elsewhere.
+/// Run one more worker, here or on another machine.
+///
+/// It takes tasks of a data folder on this machine or, with --nats or --nats-creds, tiles of a server
+/// elsewhere, until it is stopped.
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArguments {
     /// Folder with the database, uploads and results; without effect for a server elsewhere.
@@ -265,32 +265,32 @@ pub struct WorkerArguments {
     #[cfg_attr(not(feature = "nats"), arg(required = true))]
     pub data: Option<PathBuf>,
 
-    /// For a server elsewhere.
+    /// Settings for a server elsewhere.
     #[cfg(feature = "nats")]
     #[command(flatten)]
     pub remote: RemoteArguments,
 
-    /// Leaves the tiles to workers on other machines.
+    /// Leave the tiles to workers on other machines.
     #[arg(long, hide = true)]
     pub without_tiles: bool,
 
-    /// The most memory that it may take; a task that wants more fails [default: no limit].
+    /// Memory limit; a task that needs more fails [default: no limit].
     #[arg(long, env = "SCI_RECON_WORKER_LIMIT_BYTES", value_name = "BYTES")]
     pub memory_bytes: Option<u64>,
 
-    /// Where and how it computes.
+    /// Where and how the worker computes.
     #[command(flatten)]
     pub engine: EngineArguments,
 
-    /// How log lines look.
+    /// Format of log lines.
     #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
 
-    /// Identifier under which it is on record [default: a new one].
+    /// Identifier of the worker [default: a new one].
     #[arg(long, value_name = "ID", hide = true)]
     pub id: Option<WorkerId>,
 
-    /// Ends when its standard input does: the server that started it is gone then.
+    /// End with standard input, which the server that started it holds open.
     #[arg(long, hide = true)]
     pub supervised: bool,
 }
@@ -298,29 +298,27 @@ pub struct WorkerArguments {
 /// Where and how workers compute.
 #[derive(Debug, Clone, Args)]
 pub struct EngineArguments {
-    /// The libonnxruntime [default: the one near the program: beside it, in ../lib/sci-recon, ../lib or
-    /// ../../runtime].
+    /// Path of libonnxruntime [default: beside the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
-    /// Where the network runs: cpu, or cuda:0 for the first GPU.
+    /// Device that runs networks: cpu, or cuda:0 for the first GPU.
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
 
-    /// How much workers stand back for others (0 to 19), so that the API answers at full load. They never raise the
-    /// priority that they are started with.
+    /// Nice value of workers (0 to 19), so that the API answers at full load. A process that is already nicer keeps
+    /// its value.
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,
 
-    /// Leaves workers, and the networks of users that they run, all files and connections that their user may have.
-    /// Otherwise workers of this machine see the data folder and the system's libraries alone, networks those
-    /// libraries alone, and neither makes connections.
+    /// Run workers and networks of users without confinement. Otherwise workers of this machine read only the data
+    /// folder and the system's libraries, networks only those libraries, and neither makes connections.
     #[arg(long, env = "SCI_RECON_UNCONFINED")]
     pub unconfined: bool,
 
-    /// Seconds without progress, on top of four times the planned time of a task, after which its
-    /// worker is held to hang: the worker ends, and another one tries the task.
+    /// Seconds without progress, beyond four times the planned time of a task, after which its worker is
+    /// ended and another worker tries the task.
     #[arg(long, env = "SCI_RECON_STALL_SECONDS", value_name = "SECONDS", default_value_t = 300)]
     pub stall_seconds: u64,
 }
@@ -345,7 +343,7 @@ pub fn bytes(text: &str) -> Result<u64, String> {
         .map_err(|_| format!("{text:?} is no size; it should be like 1000000, 10GB or 8GiB"))
 }
 
-/// How log lines look.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum LogFormat {
     /// For people.
@@ -367,7 +365,7 @@ pub enum ConfigError {
 }
 
 impl ServeArguments {
-    /// Checks what can't be checked field by field; `open` says that there are no tokens.
+    /// Checks combinations of settings; `open` means that there are no tokens.
     pub fn check(&self, open: bool) -> Result<(), ConfigError> {
         if open && !self.listen.ip().is_loopback() && !self.allow_remote {
             return Err(ConfigError::Remote(self.listen));
@@ -383,7 +381,7 @@ impl ServeArguments {
         self.workers.unwrap_or_else(cores).max(least)
     }
 
-    /// Whether the workers of this machine leave the tiles to others.
+    /// True if the workers of this machine leave the tiles to others.
     #[must_use]
     pub fn without_tiles(&self) -> bool {
         #[cfg(feature = "nats")]
@@ -403,7 +401,7 @@ impl ServeArguments {
         Duration::from_secs(self.download_stall_seconds)
     }
 
-    /// How long an upload is kept that nothing refers to, or that is not complete.
+    /// Time for which unused and incomplete uploads are kept.
     #[must_use]
     pub fn upload_age(&self) -> Duration {
         Duration::from_secs(self.upload_hours.saturating_mul(3600))
@@ -421,7 +419,7 @@ impl ServeArguments {
 }
 
 impl EngineArguments {
-    /// Whether there is a libonnxruntime.
+    /// Errors: libonnxruntime is missing.
     pub fn check_library(&self) -> Result<(), NetworkError> {
         find_library(self.onnxruntime.as_deref()).map(drop)
     }
@@ -435,8 +433,8 @@ impl EngineArguments {
 }
 
 impl WorkerArguments {
-    /// The data folder that the worker opens; none where it works for a server elsewhere, whatever `data` says.
-    /// The environment of a container and a configuration file name one for all commands.
+    /// Data folder that the worker opens. `None` for a worker of a server elsewhere, which ignores `data`: containers
+    /// and configuration files set it for all commands.
     #[must_use]
     pub fn data_folder(&self) -> Option<&Path> {
         #[cfg(feature = "nats")]
@@ -446,7 +444,7 @@ impl WorkerArguments {
         self.data.as_deref()
     }
 
-    /// The command line that makes these arguments again, for a worker process of this machine.
+    /// The command line with these arguments, for a worker process of this machine.
     #[must_use]
     pub fn command_line(&self) -> Vec<std::ffi::OsString> {
         let mut line: Vec<std::ffi::OsString> = vec!["worker".into()];

@@ -18,7 +18,7 @@ use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
 use strum::{VariantArray, VariantNames};
 
-/// Which algorithm, and how long.
+/// Algorithm and schedule.
 #[derive(Debug, Args)]
 pub(super) struct ScheduleArguments {
     /// The algorithm.
@@ -28,20 +28,18 @@ pub(super) struct ScheduleArguments {
     /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
     #[arg(long, value_name = "FILE")]
     schedule: Option<PathBuf>,
-    /// Do exactly N iterations, without the test for convergence: the last stage is cut or made
-    /// longer.
+    /// Do exactly N iterations, without the test for convergence; the last stage is shortened or extended.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     iterations: Option<u32>,
 }
 
-/// Where networks run.
+/// Runtime and device of networks.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
-    /// The libonnxruntime [default: the one near the program: beside it, in ../lib/sci-recon, ../lib or
-    /// ../../runtime].
+    /// Path of libonnxruntime [default: beside the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
-    /// Where the network runs: cpu, or cuda:0 for the first GPU.
+    /// Device that runs networks: cpu, or cuda:0 for the first GPU.
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     device: String,
 }
@@ -83,11 +81,11 @@ impl ScheduleArguments {
     }
 }
 
-/// Which snapshots of a file are meant: `all`, one index, or `FIRST-LAST` with both ends in.
+/// A selection of snapshots: `all`, one index, or `FIRST-LAST` with both ends in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Snapshots {
     pub(super) first: usize,
-    /// None for the last one that there is.
+    /// None for the last snapshot of the file.
     pub(super) last: Option<usize>,
 }
 
@@ -107,7 +105,7 @@ impl FromStr for Snapshots {
 }
 
 impl Snapshots {
-    /// As a request of a job has it.
+    /// The selection in a request for a job.
     pub(super) fn request(self) -> Value {
         match (self.first, self.last) {
             (0, None) => json!("all"),
@@ -118,10 +116,10 @@ impl Snapshots {
 }
 
 impl NetworkArguments {
-    /// Makes this the process of a user's network: with no more memory than that, no files but the system's, the
-    /// libonnxruntime and `readable`, unless it is to be left unconfined; and nothing to reach others by. What
-    /// the driver of a GPU opens is its own affair. Before the process starts any thread.
-    /// Errors: the memory can't be limited. What else can't be given up is said on standard error.
+    /// Confines this process, which runs a network of a user: limited memory, no connections, and no files but
+    /// the system's, libonnxruntime and `readable`. Must be called before the process starts a thread. GPUs and
+    /// `unconfined` skip all but the memory limit.
+    /// Errors: the memory can't be limited. Other failures are printed to standard error.
     pub(super) fn confine(
         &self,
         memory_bytes: Option<u64>,
@@ -143,13 +141,13 @@ impl NetworkArguments {
     }
 
     pub fn network(&self) -> Result<NetworkSource> {
-        // An empty variable is one that is not set.
+        // An empty variable counts as not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
         Ok(NetworkSource::new(library, Device::parse(&self.device)?))
     }
 }
 
-/// Names of algorithms that need no network of the user's.
+/// Names of algorithms that need no network of the user.
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
     let own = &Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1];
     named(own)

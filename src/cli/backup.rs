@@ -5,13 +5,15 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::CliError;
+use super::output::print_line;
 use super::wait::wait;
 use crate::cli::error::Result;
 use store::{Backup, Purpose, Store};
 
-/// Copies a data folder while the service runs, and compares every file with the record of it. The copy
-/// appears when it is whole; until then it is NAME.unfinished, which no service takes. To restore it, serve
-/// the copy (or a copy of it). Ends with 1 if a file is damaged or missing.
+/// Copy the data folder while the service runs.
+///
+/// Compares every file with its record. The copy is called NAME.unfinished until it is complete, and no service
+/// accepts that. To restore it, serve the copy (or a copy of it). Ends with 1 if a file is damaged or missing.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data.
@@ -35,10 +37,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Ok::<_, CliError>(backup)
     })?;
     let Backup { files, bytes, damaged, missing } = backup;
-    println!(
-        "{}",
-        serde_json::json!({"files": files, "bytes": bytes, "damaged": damaged, "missing": missing})
-    );
+    print_line(
+        serde_json::json!({"files": files, "bytes": bytes, "damaged": damaged, "missing": missing}),
+    )?;
     if damaged.is_empty() && missing.is_empty() {
         return Ok(());
     }

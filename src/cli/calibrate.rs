@@ -7,12 +7,14 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Deserialize;
 
+use super::output::print_line;
+use super::verdict;
 use super::{CliError, progress};
 use crate::cli::error::Result;
 use engine::intake::{CaptureFiles, Report, calibrate, report_page};
 use formats::{Channels, FormatError, Limits, StackInfo, npy};
 
-/// Make masks and a report from raw captures, without a server.
+/// Make masks and a report from raw captures.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The index of the captures, JSON as `simulate --captures` writes it: `masks` (a list of files for
@@ -78,13 +80,11 @@ fn write_report(arguments: &Arguments, made: &Report) -> Result<()> {
         fs::write(out.join("maps").join(format!("{name}.png")), png).map_err(failed)?;
     }
     if arguments.json {
-        println!("{text}");
+        print_line(&text)?;
     } else {
-        println!("grade: {}", made.report.grade.into_str());
-        for finding in &made.report.findings {
-            println!("{}: {}. What to do: {}.", finding.code, finding.detail, finding.remedy);
-        }
-        println!("masks.npy and report.html are in {}", out.display());
+        print_line(format!("grade: {}", made.report.grade.into_str()))?;
+        verdict::lines(&made.report.findings).iter().try_for_each(print_line)?;
+        print_line(format!("masks.npy and report.html are in {}", out.display()))?;
     }
     fs::write(out.join("report.json"), text + "\n").map_err(failed)
 }

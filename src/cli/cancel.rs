@@ -6,10 +6,13 @@ use serde_json::json;
 use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
+use super::output::print_line;
 use super::wait::wait;
 use engine::job::JobId;
 
-/// Cancel jobs: each stops within an iteration.
+/// Stop jobs.
+///
+/// Each stops within an iteration.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The jobs.
@@ -28,10 +31,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         for id in &arguments.jobs {
             let answer = client.post(&format!("/v1/jobs/{id}/cancel"), &json!({})).await?;
             match arguments.json {
-                true => println!("{answer}"),
+                true => print_line(answer)?,
                 false => {
                     let job = Job::new(answer)?;
-                    println!("{} {}", job.id, job.state);
+                    print_line(format!("{} {}", job.id, job.state))?;
                 }
             }
         }

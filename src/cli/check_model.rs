@@ -10,6 +10,7 @@ use ndarray::{Array2, Array3};
 
 use super::CliError;
 use super::arguments::NetworkArguments;
+use super::output::print_line;
 use crate::cli::error::Result;
 use engine::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
 use engine::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
@@ -24,8 +25,10 @@ const NICE: i32 = 10;
 /// Characters that are kept of a tensor's name.
 const NAME: usize = 100;
 
-/// Check whether a network can be used by `learned` for masks of a size, and run it once on a dark
-/// scene. Prints one JSON object: what was found, or why it is refused.
+/// Check a network of your own for `learned`.
+///
+/// Checks whether it fits masks of a size, and runs it once on a dark scene. Prints one JSON object: its
+/// properties, or why it is refused.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The ONNX file.
@@ -67,7 +70,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Err(other) => return Err(other.into()),
     };
     let text = serde_json::to_string(&verdict).map_err(|error| refused(&error))?;
-    println!("{text}");
+    print_line(text)?;
     Ok(())
 }
 

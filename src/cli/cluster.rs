@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use super::output::print_line;
 use super::wait::wait;
 use crate::config::{NatsArguments, VERSION};
 use engine::job::{Pool, Timestamp};
 use workers::nats::{Authority, Check, ClusterError, Node, Program, ServerVersion, configuration};
 
-/// Sets up the NATS server for workers on other machines, makes and revokes their credentials, and says
-/// what is missing.
+/// Set up workers on other machines: keys, credentials, connection.
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(subcommand)]
@@ -25,7 +25,7 @@ enum Command {
     Check(CheckArguments),
 }
 
-/// Makes keys, certificates, and a configuration of nats-server for each node.
+/// Make keys, certificates, and a configuration of nats-server for each node.
 #[derive(Debug, Args)]
 struct Init {
     #[command(flatten)]
@@ -53,7 +53,7 @@ struct Init {
     no_tls: bool,
 }
 
-/// Credentials of workers.
+/// Manage the credentials of workers.
 #[derive(Debug, Args)]
 struct Worker {
     #[command(subcommand)]
@@ -62,7 +62,7 @@ struct Worker {
 
 #[derive(Debug, Subcommand)]
 enum WorkerCommand {
-    /// Makes a credential for the workers of a pool: one file, which is all that they need.
+    /// Make a credential for the workers of a pool: one file, which is all that they need.
     Create {
         #[command(flatten)]
         folder: Folder,
@@ -79,12 +79,12 @@ enum WorkerCommand {
         #[arg(long, value_name = "FILE")]
         out: Option<PathBuf>,
     },
-    /// Lists the credentials that were made.
+    /// List all credentials.
     List {
         #[command(flatten)]
         folder: Folder,
     },
-    /// Revokes the credentials of a pool: who uses them is cut off at once.
+    /// Revoke the credentials of a pool: workers that use them are disconnected at once.
     Revoke {
         #[command(flatten)]
         folder: Folder,
@@ -97,7 +97,7 @@ enum WorkerCommand {
     },
 }
 
-/// Says in words whether a server, or a worker with its credential, can work, and what is missing.
+/// Check whether a server, or a worker with its credential, can work, and name what is missing.
 #[derive(Debug, Args)]
 struct CheckArguments {
     #[command(flatten)]
@@ -138,11 +138,14 @@ fn make(init: &Init) -> Result<(), CliError> {
     let disk = (store.as_path(), *store_bytes);
     let made = configuration::write(&authority, &folder.path, nodes, disk, tls, *nats_version)?;
     for file in made.files {
-        println!("nats-server -c {}", file.display());
+        print_line(format!("nats-server -c {}", file.display()))?;
     }
     let hub = folder.path.join(workers::nats::HUB_CREDENTIAL);
-    println!("sci-recon serve --nats-creds {} ...", hub.display());
-    println!("sci-recon cluster worker create --keys {} --pool NAME", folder.path.display());
+    print_line(format!("sci-recon serve --nats-creds {} ...", hub.display()))?;
+    print_line(format!(
+        "sci-recon cluster worker create --keys {} --pool NAME",
+        folder.path.display()
+    ))?;
     for warning in made.warnings {
         eprintln!("warning: {warning}");
     }
@@ -155,10 +158,10 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
             let name = name.as_deref().unwrap_or(pool.as_str());
             let out = out.clone().unwrap_or_else(|| PathBuf::from(format!("{name}.creds")));
             Authority::open(&folder.path)?.create_worker(pool, name, *days, &out)?;
-            println!("{}", out.display());
+            print_line(out.display())?;
         }
         WorkerCommand::List { folder } => {
-            println!("{:24} {:16} {:8} {:20} key", "name", "pool", "state", "ends");
+            print_line(format!("{:24} {:16} {:8} {:20} key", "name", "pool", "state", "ends"))?;
             let now = Timestamp::now().0 / 1000;
             for worker in Authority::open(&folder.path)?.workers() {
                 let state = match worker.revoked_at {
@@ -167,13 +170,13 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
                     None => "good",
                 };
                 let ends = Timestamp(worker.expires_at * 1000).to_string();
-                println!(
+                print_line(format!(
                     "{:24} {:16} {state:8} {:20} {}",
                     worker.name,
                     worker.pool.as_str(),
                     ends.get(..19).unwrap_or(&ends),
                     worker.key
-                );
+                ))?;
             }
         }
         WorkerCommand::Revoke { folder, pool, name } => {
@@ -182,7 +185,7 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
             // Also when all were revoked before: the message server may not have been told.
             wait(authority.publish())?;
             for name in revoked {
-                println!("revoked {name}");
+                print_line(format!("revoked {name}"))?;
             }
         }
     }
@@ -194,7 +197,7 @@ fn examine(check: &CheckArguments) -> Result<(), CliError> {
     let checks = wait(Check::run(nats.as_deref(), nats_creds.as_deref(), Program::of(VERSION)))?;
     let bad = checks.iter().filter(|check| !check.good).count();
     for Check { what, good, found } in checks {
-        println!("{} {what}: {found}", if good { "ok     " } else { "missing" });
+        print_line(format!("{} {what}: {found}", if good { "ok     " } else { "missing" }))?;
     }
     if bad == 0 { Ok(()) } else { Err(CliError::Failure(format!("{bad} things are missing"))) }
 }

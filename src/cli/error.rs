@@ -22,6 +22,12 @@ pub enum CliError {
     /// The machine or the program failed; exit code 1.
     #[error("{0}")]
     Failure(String),
+    /// The work is done, but the checks found errors in the input; exit code 3.
+    #[error("{0}")]
+    ErrorsFound(String),
+    /// The reader of standard output has closed it. This is no failure.
+    #[error("standard output is closed")]
+    Unread,
 }
 
 impl CliError {
@@ -29,6 +35,8 @@ impl CliError {
         match self {
             Self::Input(_) => ExitCode::from(2),
             Self::Failure(_) => ExitCode::FAILURE,
+            Self::ErrorsFound(_) => ExitCode::from(3),
+            Self::Unread => ExitCode::SUCCESS,
         }
     }
 

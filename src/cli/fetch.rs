@@ -8,21 +8,26 @@ use serde_json::json;
 use super::CliError;
 use super::client::{Client, ServiceArguments, Wanted};
 use super::error::Result;
+use super::output::print_line;
+use super::verdict;
 use super::wait::wait;
 use engine::job::{JobId, JobState};
 
-/// Fetch results of a job that has succeeded. What was cut goes on where it was; nothing is overwritten.
+/// Download the results of a job.
+///
+/// Interrupted downloads are resumed. No file is overwritten. Verdict and findings go to standard error; ends
+/// with 3 if the checks found errors.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The job.
     job: JobId,
     #[command(flatten)]
     service: ServiceArguments,
-    /// Folder for the files: those of each snapshot come into snapshot_0000 and so on [default: one with the
-    /// identifier of the job].
+    /// Folder for the files; each snapshot has a folder there, snapshot_0000 and so on [default: the identifier
+    /// of the job].
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// What to fetch; may be given several times.
+    /// Files to fetch, separated by commas; may be repeated.
     #[arg(long = "file", value_name = "NAME", value_delimiter = ',', value_enum,
           default_values = ["frames.npy", "stack.exr", "manifest.json"])]
     files: Vec<Wanted>,
@@ -40,11 +45,18 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             return Err(CliError::Failure(job.failure().unwrap_or(text)));
         }
         let folder = arguments.out.clone().unwrap_or_else(|| job.id.clone().into());
+        let findings = job.findings();
+        if !arguments.json {
+            eprintln!("{}", job.summary());
+        }
         let files = client.fetch(&job, &arguments.files, &folder).await?;
         match arguments.json {
-            true => println!("{}", json!({"job": job.id, "files": files})),
-            false => files.iter().for_each(|file| println!("{}", file.display())),
+            true => print_line(json!({
+                "job": job.id, "files": files,
+                "assessment": job.assessment, "findings": findings,
+            }))?,
+            false => files.iter().try_for_each(|file| print_line(file.display()))?,
         }
-        Ok(())
+        verdict::refuse_errors([&*findings])
     })
 }

@@ -9,13 +9,16 @@ use clap::Args;
 use serde::Deserialize;
 
 use super::CliError;
+use super::output::print_line;
 use super::wait::wait;
 use crate::cli::error::Result;
 
 /// The longest that an answer may take.
 const PATIENCE: Duration = Duration::from_secs(4);
 
-/// Asks the service of a data folder whether it is ready; ends with 1 if it is not.
+/// Ask the running service whether it is ready.
+///
+/// Ends with 1 if it is not.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data.
@@ -35,8 +38,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let text = fs::read_to_string(&path).map_err(|error| failed(&error))?;
     let announced: Announcement = serde_json::from_str(&text).map_err(|error| failed(&error))?;
-    println!("{}", wait(ask(announced.address))?);
-    Ok(())
+    print_line(wait(ask(announced.address))?)
 }
 
 /// What `/readyz` answers.

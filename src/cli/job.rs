@@ -9,7 +9,9 @@ use crate::cli::error::Result;
 use engine::job::{JobId, JobState, Lab, Label, priority_error};
 use store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
 
-/// Lists the jobs of all labs, cancels them, deletes them, and changes their priority. The service may be running.
+/// Manage the jobs of all labs.
+///
+/// The service may be running.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data.
@@ -21,7 +23,7 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Shows jobs, newest first.
+    /// List jobs, newest first.
     List {
         /// Only those of this lab.
         #[arg(long, value_name = "NAME")]
@@ -33,17 +35,17 @@ enum Action {
         #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
         limit: u32,
     },
-    /// Cancels a job that waits or runs.
+    /// Cancel a job that waits or runs.
     Cancel {
         /// The job's identifier.
         job: JobId,
     },
-    /// Takes up a job again that has failed or was cancelled.
+    /// Retry a job that has failed or was cancelled.
     Retry {
         /// The job's identifier.
         job: JobId,
     },
-    /// Changes the priority of a job that waits or runs.
+    /// Change the priority of a job that waits or runs.
     Priority {
         /// The job's identifier.
         job: JobId,
@@ -51,7 +53,7 @@ enum Action {
         #[arg(value_name = "N", allow_negative_numbers = true, value_parser = priority)]
         priority: i32,
     },
-    /// Deletes a job that has ended, and its results.
+    /// Delete a job that has ended, and its results.
     Delete {
         /// The job's identifier.
         job: JobId,

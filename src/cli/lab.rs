@@ -10,7 +10,7 @@ use crate::cli::error::Result;
 use engine::job::{Lab, Sha256};
 use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 
-/// Lists labs and their files, and sets their shares of the machine and their limits. The service may be running.
+/// Manage labs: shares, quotas and files.
 ///
 /// Tasks are handed out by priority, then to each lab in turn. While two labs have work waiting, one with
 /// twice the share gets twice the processor time.
@@ -25,26 +25,26 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Shows all labs with their share, and what they have waiting.
+    /// List all labs with their shares and waiting jobs.
     List,
-    /// Shows the files that a lab has sent, newest first.
+    /// List the uploads of a lab, newest first.
     Uploads {
         /// The lab's name.
         lab: Lab,
     },
-    /// Deletes a file that a lab has sent, if nothing of the lab needs it.
+    /// Delete an upload of a lab that nothing needs.
     DeleteUpload {
         /// The lab's name.
         lab: Lab,
         /// The SHA-256 of the file.
         sha256: Sha256,
     },
-    /// Takes a lab off the record, if it has no token that is not revoked, and no data.
+    /// Remove a lab that has no valid token and no data.
     Remove {
         /// The lab's name.
         lab: Lab,
     },
-    /// Sets what a lab is entitled to.
+    /// Set the share and the quotas of a lab.
     Set {
         /// The lab's name.
         lab: Lab,

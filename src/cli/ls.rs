@@ -6,18 +6,20 @@ use serde_json::{Value, json};
 use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
+use super::output::print_line;
+use super::verdict;
 use super::wait::wait;
 use engine::job::JobState;
 
-/// List the lab's jobs, newest first.
+/// List jobs with their verdicts, newest first.
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(flatten)]
     service: ServiceArguments,
-    /// Only those in this state; may be given several times.
+    /// Only jobs in these states, separated by commas; may be repeated.
     #[arg(long, value_name = "STATE", value_delimiter = ',')]
     state: Vec<JobState>,
-    /// The most that are listed.
+    /// Largest number of jobs.
     #[arg(long, value_name = "N", default_value_t = 50)]
     limit: usize,
     /// Print a JSON array of jobs, as the service shows them.
@@ -25,7 +27,7 @@ pub struct Arguments {
     json: bool,
 }
 
-/// Jobs in one answer.
+/// Jobs per request.
 const PAGE: usize = 100;
 
 pub fn run(arguments: &Arguments) -> Result<()> {
@@ -33,15 +35,20 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let client = Client::new(&arguments.service)?;
         let jobs = list(&client, &arguments.state, arguments.limit).await?;
         if arguments.json {
-            println!("{}", json!(jobs));
+            print_line(json!(jobs))?;
             return Ok(());
         }
         for job in jobs {
             let job = Job::new(job)?;
-            let label = job.label.unwrap_or_default();
+            let Job { id, state, created_at, algorithm, .. } = &job;
             let percent = job.progress.percent;
-            let (id, state, time, algorithm) = (job.id, job.state, job.created_at, job.algorithm);
-            println!("{id}  {state:9}  {percent:3.0} %  {time}  {algorithm:18}  {label}");
+            let verdict = job.verdict().unwrap_or_default();
+            let label = job.label.as_deref().unwrap_or_default();
+            let line = format!("{id}  {state:9}  {percent:3.0} %  {created_at}  {algorithm:18}");
+            print_line(format!("{line}  {label:20}  {verdict}").trim_end())?;
+            for finding in verdict::lines(&job.findings()) {
+                print_line(format!("    {finding}"))?;
+            }
         }
         Ok::<_, CliError>(())
     })

@@ -1,7 +1,11 @@
 //! The commands, one file each.
 
+// Only `output` prints: it handles a reader that closes the pipe.
+#![deny(clippy::print_stdout)]
+
 mod arguments;
 mod client;
+mod command_line;
 mod confine;
 mod error;
 #[cfg(feature = "nats")]
@@ -10,9 +14,13 @@ mod logging;
 mod maintenance;
 mod masks;
 mod model;
+mod output;
 mod progress;
+mod settings;
+mod shell;
 mod submission;
 mod supervisor;
+mod verdict;
 mod wait;
 
 pub mod backup;
@@ -32,8 +40,6 @@ pub mod reconstruct;
 pub mod run_model;
 pub mod schedule;
 pub mod serve;
-pub mod settings;
-pub mod shell;
 pub mod simulate;
 pub mod submit;
 pub mod token;
@@ -43,6 +49,7 @@ pub mod watch_folder;
 pub mod worker;
 
 pub use arguments::{NetworkArguments, algorithms};
+pub use command_line::run;
 pub use error::CliError;
 pub use masks::{MaskArguments, SimulatedMasks};
 pub use model::{Model, cut};

@@ -7,14 +7,16 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 
 use super::CliError;
+use super::output::{print_line, print_text};
 use crate::cli::error::Result;
 use optics::{ApertureGrid, Camera, Circle, Draw, Geometry, Method, Placement};
 
 /// The file of the defaults, with a comment for each number.
 const DEFAULTS: &str = include_str!("../../docs/optics.toml");
 
-/// Print the optical parameters of `simulate`: the defaults as a commented TOML file, or what
-/// follows from a file of your own.
+/// Print the optical parameters of `simulate`.
+///
+/// Prints the defaults as a commented TOML file, or the quantities that follow from a file of your own.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Check this file and print, as JSON, all parameters and what follows from them.
@@ -207,8 +209,7 @@ struct Derived {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     let Some(path) = &arguments.check else {
-        print!("{DEFAULTS}");
-        return Ok(());
+        return print_text(DEFAULTS);
     };
     let file = OpticsFile::read(Some(path))?;
     let geometry = file.geometry();
@@ -221,8 +222,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         blur_mask_pixels: geometry.blur_um / geometry.mask_pitch_um,
     };
     let value = serde_json::json!({ "optics": file, "derived": derived });
-    println!("{value:#}");
-    Ok(())
+    print_line(format!("{value:#}"))
 }
 
 #[cfg(test)]

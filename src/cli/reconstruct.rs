@@ -1,6 +1,7 @@
 //! `sci-recon reconstruct`: snapshots, without a server.
 
 use std::fs::{self, File};
+use std::io::BufWriter;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::thread;
@@ -13,10 +14,12 @@ use serde::Serialize;
 use super::CliError;
 use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, axes, mosaic, sequence};
 use super::model::{Model, cut};
+use super::output::print_line;
 use super::progress::SnapshotBar;
+use super::verdict;
 use crate::cli::error::Result;
-use engine::intake::{Scaled, Source, read_masks, read_snapshots, read_truth};
-use engine::job::{Algorithm, Assessment, Mosaic, SceneShape, Schedule, Sequence, Sha256};
+use engine::intake::{self, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth};
+use engine::job::{Algorithm, Assessment, Finding, Mosaic, SceneShape, Schedule, Sequence, Sha256};
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
@@ -27,12 +30,13 @@ use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{check_output, replace_result, write_result};
 use formats::mat::SceneArray;
-use formats::{Axes, Channels};
+use formats::{Axes, Channels, Limits, planar};
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::TilePlan;
 
-/// Reconstruct the frames of a snapshot, or of several that follow one another, from files, without a
-/// server.
+/// Reconstruct the frames of snapshots from files.
+///
+/// Runs the checks of the service. Ends with 3 if they found errors.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Masks, one frame each: npy, TIFF, PNG, or a scene's `mask`.
@@ -41,7 +45,7 @@ pub struct Arguments {
     /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a scene's `meas`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     measurement: Option<PathBuf>,
-    /// True frames, to be compared with: those of what is reconstructed, or of all snapshots.
+    /// True frames to compare with, of the reconstructed or of all snapshots.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// A scene, npz, .mat or HDF5, with `mask`, `meas` and perhaps `orig`, instead of the three files.
@@ -50,10 +54,16 @@ pub struct Arguments {
     /// The snapshots, counted from 0: one, a range with both ends in, or all.
     #[arg(long, alias = "snapshot", value_name = "N|FIRST-LAST|all", default_value = "0")]
     snapshots: Snapshots,
-    /// Whether several snapshots follow one another without a gap, and are reconstructed together where
-    /// that pays, or each alone.
+    /// `contiguous` snapshots follow one another without a gap and are reconstructed together where that helps,
+    /// `separate` ones each alone.
     #[arg(long, default_value_t = Sequence::Contiguous, value_parser = sequence())]
     sequence: Sequence,
+    /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
+    #[arg(long, value_name = "FILE")]
+    dark: Vec<PathBuf>,
+    /// The stored number from which on a pixel is saturated [default: the largest of its type].
+    #[arg(long, value_name = "NUMBER")]
+    saturation: Option<u32>,
     /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
     /// uint16, 1 for floats and .mat scenes].
     #[arg(long, value_name = "VALUE")]
@@ -65,17 +75,17 @@ pub struct Arguments {
     /// Value in the truth's file that means 1 [default: as for the measurement].
     #[arg(long, value_name = "VALUE")]
     truth_full_scale: Option<f32>,
-    /// The colours of the sensor's pixels, row by row of a cell of 2x2: the frames get their colours, and the truth
-    /// may have them ([frame, row, column, 3]) or be a mosaic, too [default: a grey sensor].
+    /// The colours of the sensor's pixels, row by row of a cell of 2x2. Frames have colours then; the truth may
+    /// have them ([frame, row, column, 3]) or be a mosaic [default: a grey sensor].
     #[arg(long, value_name = "NAME", value_parser = mosaic())]
     mosaic: Option<Mosaic>,
     /// The order of the axes in the masks' file [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     masks_axes: Option<Axes>,
-    /// The same of the measurement.
+    /// The order of the axes in the measurement's file.
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     measurement_axes: Option<Axes>,
-    /// The same of the truth.
+    /// The order of the axes in the truth's file.
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     truth_axes: Option<Axes>,
     #[command(flatten)]
@@ -87,25 +97,22 @@ pub struct Arguments {
     model: Option<PathBuf>,
     #[command(flatten)]
     engine: NetworkArguments,
-    /// Networks of your own instead of those in the program: a folder with
-    /// fastdvdnet-gray/stage1.onnx and stage2.onnx, or ffdnet-gray/model.onnx. The manifest names
-    /// them by their hash.
+    /// Networks of your own instead of the built-in ones: a folder with fastdvdnet-gray/stage1.onnx and
+    /// stage2.onnx, or ffdnet-gray/model.onnx. The manifest has their hashes.
     #[arg(long, value_name = "FOLDER")]
     models: Option<PathBuf>,
     /// Tiles solved at the same time [default: the number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Largest side of a tile, in pixels (with --mosaic those of a sub-image) [default: 320, 384 for those of
-    /// TV alone, 240 where that makes room for longer runs of snapshots; for learned 256, or the whole
-    /// picture for a network that takes no other].
+    /// Largest side of a tile in pixels (with --mosaic, of a sub-image) [default: 320; 384 for TV alone; 240 where
+    /// that allows longer runs of snapshots; for learned 256, or the whole picture if the network needs it].
     #[arg(long, value_name = "PIXELS")]
     tile: Option<usize>,
-    /// Least overlap of neighbouring tiles, in pixels [default: 32, 16 for those of TV alone, or 0
-    /// for the whole picture].
+    /// Least overlap of neighbouring tiles in pixels [default: 32; 16 for TV alone; 0 for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
-    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json; of several
-    /// snapshots each has its own folder there, snapshot_0000 and so on.
+    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json. If there are several
+    /// snapshots, each has a folder there, snapshot_0000 and so on.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object.
@@ -113,7 +120,7 @@ pub struct Arguments {
     json: bool,
 }
 
-/// What is to be done with the input.
+/// Algorithm and plan for the input.
 struct Setup {
     algorithm: Algorithm,
     schedule: Schedule,
@@ -199,6 +206,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
     let all = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
     report.assessment = Assessment::combined(all);
+    report.findings = verdict::merge(&input.findings, report.assessment.as_ref());
     for (snapshot, folder) in folders {
         let tiles = solved.records(&sequence, snapshot);
         let expected = expected.get(snapshot - input.first).cloned().flatten();
@@ -207,7 +215,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let frame = |k| solved.frame(&sequence, snapshot, k);
         write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
     }
-    report.print(arguments)
+    report.print(arguments)?;
+    verdict::refuse_errors([&*report.findings])
 }
 
 /// Where the frames of each snapshot go.
@@ -277,6 +286,7 @@ struct Input<'a> {
     first: usize,
     truth: Option<(Array3<f32>, Channels)>,
     mosaic: Option<Mosaic>,
+    findings: Vec<Finding>,
 }
 
 impl<'a> Input<'a> {
@@ -289,7 +299,10 @@ impl<'a> Input<'a> {
             truth.size = Some((height, width));
         }
         let Snapshots { first, last } = arguments.snapshots;
-        let (measurement, snapshots) = read_snapshots(&sources.measurement, (first, last))?;
+        let Arguments { dark, saturation, .. } = arguments;
+        let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
+        let read = read_snapshots(&sources.measurement, &exposure, (first, last))?;
+        let (measurement, snapshots) = (read.measurement, read.count);
         let (count, rows, columns) = measurement.array.dim();
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
@@ -313,7 +326,16 @@ impl<'a> Input<'a> {
             }
             None => None,
         };
-        Ok(Self { sources, masks, measurement, first, truth, mosaic })
+        let darkened = !dark.is_empty();
+        let both = (masks.array.view(), measurement.array.view());
+        let mut findings = read.passed.findings;
+        let judged = judge(both, mosaic, read.passed.saturated.as_deref(), darkened)?;
+        findings.extend(judged.into_iter().map(|finding| {
+            // Counted from the first snapshot of the file.
+            let snapshot = finding.snapshot.map(|index| index + first as u32);
+            Finding { snapshot, ..finding }
+        }));
+        Ok(Self { sources, masks, measurement, first, truth, mosaic, findings })
     }
 
     fn shape(&self) -> SceneShape {
@@ -356,10 +378,38 @@ impl<'a> Input<'a> {
             },
             tile_plan: setup.plan.clone(),
             runs: setup.runs.clone(),
-            warnings: Vec::new(),
+            warnings: self.findings.clone(),
             camera: (None, None),
         })
     }
+}
+
+/// Runs the checks of the service on masks \[B,H,W\] and snapshots \[S,H,W\]. They read prepared files, as
+/// the service has them.
+fn judge(
+    (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
+    mosaic: Option<Mosaic>,
+    saturated: Option<&[f64]>,
+    darkened: bool,
+) -> Result<Vec<Finding>> {
+    let limits = Limits::default();
+    let prepared = [prepare(masks)?, prepare(snapshots)?];
+    let both = (prepared[0].path(), prepared[1].path());
+    let mut findings = intake::judge(both, mosaic, saturated, darkened, &limits)?;
+    let report = intake::report(&planar::Reader::open(both.0, &limits)?, &mut |_| true)?;
+    findings.extend(report.report.warning());
+    Ok(findings)
+}
+
+fn prepare(frames: ArrayView3<'_, f32>) -> Result<tempfile::NamedTempFile> {
+    let failed = |error| CliError::Failure(format!("cannot write a temporary file: {error}"));
+    let file = tempfile::NamedTempFile::new().map_err(failed)?;
+    let (count, height, width) = frames.dim();
+    let mut writer = planar::writer(BufWriter::new(file), count, height, width)?;
+    for frame in frames.outer_iter() {
+        writer.write_frame(frame)?;
+    }
+    writer.finish()?.into_inner().map_err(|error| failed(error.into_error()))
 }
 
 fn write(
@@ -403,6 +453,8 @@ struct Report {
     runs: Vec<[usize; 2]>,
     /// How an adaptive schedule was decided, and which snapshots belong together.
     pilot: Option<PilotRecord>,
+    /// Findings of the checks, and further reasons of the assessment.
+    findings: Vec<Finding>,
 }
 
 impl Report {
@@ -440,6 +492,7 @@ impl Report {
             stop_reason: summary.stop_reason,
             runs: input.runs.runs().iter().map(|run| [run.start, run.end - 1]).collect(),
             pilot: recipe.pilot.clone(),
+            findings: Vec::new(),
         }
     }
 
@@ -447,10 +500,10 @@ impl Report {
         if arguments.json {
             let text = serde_json::to_string(self)
                 .map_err(|error| CliError::Failure(format!("the report: {error}")))?;
-            println!("{text}");
+            print_line(text)?;
             return Ok(());
         }
-        println!(
+        print_line(format!(
             "{}: {} frames of {}x{} in {:.1} s ({:.1} CPU-seconds), {} TV iterations, {} denoiser \
              passes, {}",
             self.algorithm,
@@ -462,15 +515,11 @@ impl Report {
             self.tv_iterations,
             self.denoiser_passes,
             self.stop_reason
-        );
-        if let Some(told) = &self.assessment {
-            println!(
-                "expected without a truth: {:.1} dB, four times of five from {:.1} to {:.1} dB",
-                told.psnr_db, told.psnr_low_db, told.psnr_high_db
-            );
-        }
+        ))?;
+        print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
+        verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for stage in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
-            println!(
+            print_line(format!(
                 "{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}{}",
                 stage.prior.name(),
                 stage.iterations,
@@ -479,26 +528,26 @@ impl Report {
                 stage.error_before,
                 stage.error_after,
                 stage.fates().iter().map(|fate| format!(", {fate}")).collect::<String>()
-            );
+            ))?;
         }
         for joint in self.pilot.iter().flat_map(|pilot| &pilot.joints) {
             let error =
                 |error: Option<f64>| error.map_or("none".into(), |error| format!("{error:.4}"));
-            println!(
+            print_line(format!(
                 "snapshots {} and {}: {}, error at held-out pixels {} alone, {} together",
                 joint.after,
                 joint.after + 1,
                 if joint.together { "together" } else { "apart" },
                 error(joint.error_alone),
                 error(joint.error_together),
-            );
+            ))?;
         }
         if let Some(psnr) = self.psnr_db {
             let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
-            println!("PSNR {psnr:.2} dB{ssim}");
+            print_line(format!("PSNR {psnr:.2} dB{ssim}"))?;
         }
         if let Some(out) = &arguments.out {
-            println!("frames are in {}", out.display());
+            print_line(format!("frames are in {}", out.display()))?;
         }
         Ok(())
     }

@@ -4,10 +4,13 @@ use clap::Args;
 use serde_json::json;
 
 use super::arguments::ScheduleArguments;
+use super::output::print_line;
 use crate::cli::error::Result;
 
-/// Print the schedule of an algorithm as JSON: the start of a file for `reconstruct --schedule`, or
-/// of the field `schedule` of a job. With --schedule it checks a file of your own.
+/// Print the schedule of an algorithm as JSON.
+///
+/// Edit it and pass it as --schedule, or as the field `schedule` of a job. With --schedule it checks a file of
+/// your own.
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(flatten)]
@@ -16,6 +19,5 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
-    println!("{:#}", json!(schedule));
-    Ok(())
+    print_line(format!("{:#}", json!(schedule)))
 }

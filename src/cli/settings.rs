@@ -1,215 +1,322 @@
-//! The configuration file: TOML whose keys are the long names of options. What stands in it is taken where
-//! neither the command line nor the environment says otherwise.
+//! The configuration file: TOML with long option names as keys. It supplies the options that neither the
+//! command line nor the environment sets.
 //!
-//! A key at the top is for every command that has the option; one in the table `[serve]`, say, for that
-//! command alone. No crate for layers of settings is used: those that are well kept read into structures of
-//! their own, and clap, which has all names, defaults and checks, can't tell them what it found.
+//! A key at the top applies to every command that has the option. A key in a table, such as `[serve]` or
+//! `[token.create]`, applies to that command and the commands below it, and wins over keys further up.
+//!
+//! Clap decides where the name of a command stands and which options are set. The file's options are inserted
+//! after that name. They can't be default values: clap ignores those in `required_unless_present`.
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::path::PathBuf;
 
-use clap::{Arg, ArgAction, Command};
+use clap::error::{ContextKind, ContextValue};
+use clap::parser::ValueSource;
+use clap::{Arg, ArgAction, ArgMatches, Command};
 use toml::{Table, Value};
 
 use super::CliError;
 use crate::cli::error::Result;
 
-/// The option and the variable that name the file.
-const OPTION: &str = "--config";
-const VARIABLE: &str = "SCI_RECON_CONFIG";
+/// Identifier of the root option that names the file.
+const CONFIG: &str = "config";
+/// Smallest Jaro similarity at which a valid name is suggested for an unknown one.
+const SIMILAR: f64 = 0.7;
 
-/// Where a setting comes from.
-#[derive(Debug, Clone, PartialEq, Eq)]
-enum Origin {
-    Line,
-    Variable(String),
-    File(PathBuf),
-    Default,
+/// A command line with the options that the configuration file adds to it.
+#[derive(Debug)]
+pub struct Expanded {
+    pub line: Vec<OsString>,
+    path: Option<PathBuf>,
+    added: Vec<String>,
 }
 
-/// The command line with what the configuration file, if there is one, adds to it.
-/// Errors: a file that can't be read; keys that no option has.
-pub fn expand(root: &Command, line: Vec<OsString>) -> Result<Vec<OsString>> {
-    let Some(path) = named(&line) else { return Ok(line) };
-    let entries = read(root, &path)?;
-    let Some((at, command)) = subcommand(root, &line) else { return Ok(line) };
-    let mut expanded = line[..=at].to_vec();
-    for (_, key, texts) in entries.iter().filter(|(of, ..)| of == command.get_name()) {
-        let Some(arg) = option(command, key) else { continue };
-        if origin(arg, &line[at + 1..]) == Origin::Default {
-            expanded.extend(texts.iter().filter_map(|text| tokens(arg, text)));
-        }
+impl Expanded {
+    /// Names the configuration file if `error` is about an option that comes from it.
+    pub fn origin_of(&self, error: &clap::Error) -> Option<String> {
+        let Some(ContextValue::String(argument)) = error.get(ContextKind::InvalidArg) else {
+            return None;
+        };
+        let name = argument.split([' ', '=']).next()?.strip_prefix("--")?;
+        let is_added = self.added.iter().any(|added| added == name);
+        let path = self.path.as_ref().filter(|_| is_added)?;
+        Some(format!("{name} is set by the configuration file {}", path.display()))
     }
-    expanded.extend_from_slice(&line[at + 1..]);
-    Ok(expanded)
 }
 
-/// A table of all options of a command with their values and where those come from; `rest` is what would
-/// stand on its command line.
-/// Errors: those of [`expand`].
+/// Adds the options of the configuration file, and moves options of the program that belong to a command, such
+/// as `--url`, behind the name of that command.
+/// Errors: a file that can't be read; unknown keys; values of the wrong type.
+pub fn expand(root: &Command, line: Vec<OsString>) -> Result<Expanded> {
+    // `--help` and `--version` end here; the caller's own parser prints them.
+    let Ok(matches) = lenient(root, &line) else {
+        return Ok(Expanded { line, path: None, added: Vec::new() });
+    };
+    let file = match path_in(&matches) {
+        Some(path) => Some(File::read(root, path)?),
+        None => None,
+    };
+    let mut expanded: Vec<OsString> = line.iter().take(1).cloned().collect();
+    let mut rest = line.get(1..).unwrap_or_default();
+    let (mut command, mut set, mut names) = (root, &matches, Vec::new());
+    let mut inherited = Vec::new();
+    let mut added = Vec::new();
+    while let Some(end) = end_of_name(command, &inherited, rest)
+        && let Some((name, set_below)) = set.subcommand()
+        && let Some(below) = command.find_subcommand(name)
+    {
+        expanded.extend_from_slice(&rest[..end]);
+        rest = &rest[end..];
+        let given = passed_on(command, set);
+        if let Some((option, _)) = given.iter().find(|(key, _)| option(below, key).is_none()) {
+            let text = format!("{name} takes no --{option}; see sci-recon {name} --help");
+            return Err(CliError::Input(text));
+        }
+        names.push(name);
+        for arg in options(below).filter(|arg| !is_set(arg, set_below)) {
+            let key = arg.get_long().unwrap_or_default();
+            if let Some((_, value)) = given.iter().find(|(given, _)| given == key) {
+                let mut token = OsString::from(format!("--{key}="));
+                token.push(value);
+                expanded.push(token);
+            } else if let Some(file) = file.as_ref().filter(|_| !is_excluded(below, arg, set_below))
+            {
+                let tokens = file.tokens(&names, arg)?;
+                added.extend((!tokens.is_empty()).then(|| key.to_owned()));
+                expanded.extend(tokens);
+            }
+        }
+        inherited.extend(command.get_arguments().filter(|arg| arg.is_global_set()).cloned());
+        (command, set) = (below, set_below);
+    }
+    expanded.extend_from_slice(rest);
+    Ok(Expanded { line: expanded, path: file.map(|file| file.path), added })
+}
+
+/// A table of all options of a command with their values and origins; `rest` stands for its command line.
+/// Errors: those of [`expand`]; an unknown command.
 pub fn show(
     root: &Command,
-    name: &str,
+    names: &[String],
     rest: &[OsString],
     path: Option<PathBuf>,
 ) -> Result<String> {
-    let path = path.or_else(|| named(rest));
-    let entries = path.as_ref().map_or(Ok(Vec::new()), |path| read(root, path))?;
-    let command = root.find_subcommand(name);
-    let command =
-        command.ok_or_else(|| CliError::Input(format!("there is no command {name:?}")))?;
+    let mut command = root;
+    for name in names {
+        let below = command.find_subcommand(name);
+        let nearest = || nearest(name, command.get_subcommands().map(Command::get_name));
+        command = below
+            .ok_or_else(|| CliError::Input(format!("there is no command {name:?}{}", nearest())))?;
+    }
+    let words = names.iter().map(OsString::from).chain(rest.iter().cloned());
+    let line: Vec<OsString> = [OsString::from(PROGRAM)].into_iter().chain(words).collect();
+    let matches = lenient(root, &line).map_err(|error| CliError::Input(error.to_string()))?;
+    let path = path.or_else(|| path_in(&matches));
+    let file = path.map(|path| File::read(root, path)).transpose()?;
+    let mut set = &matches;
+    while let Some((_, below)) = set.subcommand() {
+        set = below;
+    }
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let mut lines = vec![format!("{:24}{:40}from", "option", "value")];
-    let shown =
-        |arg: &&Arg| !arg.is_hide_set() && arg.get_long().is_some_and(|name| name != "help");
-    for arg in command.get_arguments().filter(shown) {
-        let key = arg.get_long().unwrap_or_default();
-        let in_file = entries.iter().find(|(of, found, _)| of == name && found == key);
-        let (value, from) = match (origin(arg, rest), in_file, &path) {
-            (Origin::Default, Some((.., texts)), Some(path)) => {
-                (texts.join(","), Origin::File(path.clone()))
-            }
-            (origin, ..) => (value(arg, rest, &origin), origin),
-        };
-        let secret = arg.is_hide_env_values_set() && from != Origin::Default;
+    for arg in options(command).filter(|arg| !arg.is_hide_set()) {
+        let (value, from) = setting(arg, set, file.as_ref(), &names);
+        let secret = arg.is_hide_env_values_set() && from != DEFAULT;
         let value = if secret { "(hidden)".to_owned() } else { value };
-        let from = match from {
-            Origin::Line => "the command line".to_owned(),
-            Origin::Variable(name) => format!("the variable {name}"),
-            Origin::File(path) => path.display().to_string(),
-            Origin::Default => "the default".to_owned(),
-        };
-        lines.push(format!("{key:24}{value:40}{from}"));
+        lines.push(format!("{:24}{value:40}{from}", arg.get_long().unwrap_or_default()));
     }
     Ok(lines.join("\n"))
 }
 
-/// The file that the command line or the environment names.
-fn named(line: &[OsString]) -> Option<PathBuf> {
-    let options = line.iter().take_while(|token| *token != "--");
-    let at = options.clone().position(|token| token == OPTION);
-    let joined = options.filter_map(|token| token.to_str()?.strip_prefix("--config="));
-    let variable = || std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
-    at.and_then(|at| line.get(at + 1).map(PathBuf::from))
-        .or_else(|| joined.last().map(PathBuf::from))
-        .or_else(|| variable().map(PathBuf::from))
-}
+/// Origin of an option that nobody sets.
+const DEFAULT: &str = "the default";
 
-/// The first word of the line that is a command, and where it stands.
-fn subcommand<'a>(root: &'a Command, line: &[OsString]) -> Option<(usize, &'a Command)> {
-    let mut words = line.iter().enumerate().skip(1);
-    words.find_map(|(at, word)| Some((at, root.find_subcommand(word)?)))
-}
-
-/// Command, option and values of each entry.
-fn read(root: &Command, path: &PathBuf) -> Result<Vec<(String, String, Vec<String>)>> {
-    let refused = |text: &dyn std::fmt::Display| {
-        CliError::Input(format!("the configuration file {}: {text}", path.display()))
+/// Value and origin of an option.
+fn setting(arg: &Arg, set: &ArgMatches, file: Option<&File>, names: &[&str]) -> (String, String) {
+    let joined = |values: &mut dyn Iterator<Item = &OsStr>| {
+        values.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(",")
     };
-    let text = fs::read_to_string(path).map_err(|error| refused(&error))?;
-    let table: Table = text.parse().map_err(|error: toml::de::Error| refused(&error))?;
-    let mut entries = Vec::new();
-    for (key, value) in &table {
-        match value {
-            Value::Table(own) => {
-                let command = root.find_subcommand(key);
-                let command = command.ok_or_else(|| refused(&format!("no command is {key:?}")))?;
-                for (key, value) in own {
-                    let name = command.get_name();
-                    option(command, key)
-                        .ok_or_else(|| refused(&format!("{name} has no option {key:?}")))?;
-                    let texts = texts(value).map_err(|what| refused(&format!("{key}: {what}")))?;
-                    entries.push((name.to_owned(), key.clone(), texts));
-                }
-            }
-            _ => {
-                let texts = texts(value).map_err(|what| refused(&format!("{key}: {what}")))?;
-                let commands = root.get_subcommands().filter(|of| option(of, key).is_some());
-                let names: Vec<_> = commands.map(|of| of.get_name().to_owned()).collect();
-                if names.is_empty() {
-                    return Err(refused(&format!("no command has an option {key:?}")));
-                }
-                let own = |name: &String| {
-                    let of_its_own = table.get(name).and_then(Value::as_table);
-                    of_its_own.is_some_and(|table| table.contains_key(key))
-                };
-                let names = names.into_iter().filter(|name| !own(name));
-                entries.extend(names.map(|name| (name, key.clone(), texts.clone())));
-            }
-        }
+    if is_set(arg, set) {
+        let value = joined(&mut set.get_raw(arg.get_id().as_str()).into_iter().flatten());
+        let variable = arg.get_env().map(OsStr::to_string_lossy).unwrap_or_default();
+        let from = match set.value_source(arg.get_id().as_str()) {
+            Some(ValueSource::EnvVariable) => format!("the variable {variable}"),
+            _ => "the command line".to_owned(),
+        };
+        return (value, from);
     }
-    Ok(entries)
+    let key = arg.get_long().unwrap_or_default();
+    if let Some(file) = file
+        && let Some(value) = file.value(names, key)
+    {
+        return (texts(value).unwrap_or_default().join(","), file.path.display().to_string());
+    }
+    let value = joined(&mut arg.get_default_values().iter().map(AsRef::as_ref));
+    (if value.is_empty() { "-".to_owned() } else { value }, DEFAULT.to_owned())
+}
+
+/// Parses as far as the line is right, so that it also works while required options are missing.
+fn lenient(root: &Command, line: &[OsString]) -> Result<ArgMatches, clap::Error> {
+    root.clone().ignore_errors(true).try_get_matches_from(line)
+}
+
+/// The path of the configuration file. A global option is found at the innermost command.
+fn path_in(matches: &ArgMatches) -> Option<PathBuf> {
+    let path = matches.try_get_one::<PathBuf>(CONFIG).ok().flatten();
+    let path = path.filter(|path| !path.as_os_str().is_empty()).cloned();
+    matches.subcommand().and_then(|(_, below)| path_in(below)).or(path)
+}
+
+/// Number of words up to and including the name of a subcommand. Without its subcommands, clap takes the first
+/// word that is no option for the name of an external program, and all words behind it for its arguments.
+fn end_of_name(command: &Command, inherited: &[Arg], words: &[OsString]) -> Option<usize> {
+    let arguments = command.get_arguments().chain(inherited).cloned();
+    let outer = Command::new("outer")
+        .no_binary_name(true)
+        .args(arguments.map(|arg| arg.required(false)))
+        .allow_external_subcommands(true)
+        .ignore_errors(true);
+    let matches = outer.try_get_matches_from(words).ok()?;
+    let (_, arguments) = matches.subcommand()?;
+    Some(words.len() - arguments.get_many::<OsString>("").map_or(0, Iterator::count))
+}
+
+/// Options with a long name.
+fn options(command: &Command) -> impl Iterator<Item = &Arg> {
+    command.get_arguments().filter(|arg| arg.get_long().is_some() && !arg.is_global_set())
 }
 
 fn option<'a>(command: &'a Command, key: &str) -> Option<&'a Arg> {
-    command.get_arguments().find(|arg| arg.get_long() == Some(key))
+    options(command).find(|arg| arg.get_long() == Some(key))
 }
 
-/// The values as they would stand on a command line.
-fn texts(value: &Value) -> Result<Vec<String>, &'static str> {
+/// True if the command line or the environment sets an option.
+fn is_set(arg: &Arg, set: &ArgMatches) -> bool {
+    let source = set.value_source(arg.get_id().as_str());
+    matches!(source, Some(ValueSource::CommandLine | ValueSource::EnvVariable))
+}
+
+/// Options before the name of a command, for that command, with their values.
+fn passed_on(command: &Command, set: &ArgMatches) -> Vec<(String, OsString)> {
+    let of_program = command.get_name() == PROGRAM;
+    let given = options(command).filter(|arg| of_program && is_set(arg, set));
+    let value = |arg: &Arg| set.get_raw(arg.get_id().as_str())?.next_back().map(OsStr::to_owned);
+    given.filter_map(|arg| Some((arg.get_long()?.to_owned(), value(arg)?))).collect()
+}
+
+/// Name of the root command.
+const PROGRAM: &str = "sci-recon";
+
+/// True if an option that is set excludes this one.
+fn is_excluded(command: &Command, arg: &Arg, set: &ArgMatches) -> bool {
+    let conflict = |a: &Arg, b: &Arg| {
+        command.get_arg_conflicts_with(a).iter().any(|other| other.get_id() == b.get_id())
+    };
+    options(command)
+        .filter(|other| is_set(other, set))
+        .any(|other| conflict(arg, other) || conflict(other, arg))
+}
+
+/// A configuration file with valid keys.
+#[derive(Debug)]
+struct File {
+    path: PathBuf,
+    table: Table,
+}
+
+impl File {
+    /// Errors: a file that can't be read, or isn't TOML; unknown keys.
+    fn read(root: &Command, path: PathBuf) -> Result<Self> {
+        let refused = |text: &dyn std::fmt::Display| {
+            CliError::Input(format!("the configuration file {}: {text}", path.display()))
+        };
+        let text = fs::read_to_string(&path).map_err(|error| refused(&error))?;
+        let table: Table = text.parse().map_err(|error: toml::de::Error| refused(&error))?;
+        check(&table, root, "").map_err(|fault| refused(&fault))?;
+        Ok(Self { path, table })
+    }
+
+    /// The value of an option of a command, from the innermost table that has it.
+    fn value(&self, names: &[&str], key: &str) -> Option<&Value> {
+        let mut tables = vec![&self.table];
+        for name in names {
+            let below = tables.last()?.get(*name).and_then(Value::as_table);
+            let Some(below) = below else { break };
+            tables.push(below);
+        }
+        let own = |table: &&Table| table.get(key).is_some_and(|value| !value.is_table());
+        tables.into_iter().rev().find(own).and_then(|table| table.get(key))
+    }
+
+    /// An option as it would stand on a command line; nothing if the file has no value for it.
+    /// Errors: a value of the wrong type.
+    fn tokens(&self, names: &[&str], arg: &Arg) -> Result<Vec<OsString>> {
+        let key = arg.get_long().unwrap_or_default();
+        let Some(value) = self.value(names, key) else { return Ok(Vec::new()) };
+        let wrong = |wanted: &str| {
+            let path = self.path.display();
+            CliError::Input(format!("the configuration file {path}: {key} must be {wanted}"))
+        };
+        if matches!(arg.get_action(), ArgAction::SetTrue) {
+            let flag = value.as_bool().ok_or_else(|| wrong("true or false"))?;
+            return Ok(flag.then(|| format!("--{key}").into()).into_iter().collect());
+        }
+        let texts = texts(value).ok_or_else(|| wrong("a text, a number or a list of them"))?;
+        if value.is_array() && !matches!(arg.get_action(), ArgAction::Append) {
+            return Err(wrong("one value"));
+        }
+        Ok(texts.into_iter().map(|text| format!("--{key}={text}").into()).collect())
+    }
+}
+
+/// Refuses keys that no command below `command` has. `place` is the heading of the table.
+fn check(table: &Table, command: &Command, place: &str) -> Result<(), String> {
+    for (key, value) in table {
+        if let (Some(below), Some(own)) = (command.find_subcommand(key), value.as_table()) {
+            let place = if place.is_empty() { key.clone() } else { format!("{place}.{key}") };
+            check(own, below, &place)?;
+            continue;
+        }
+        let keys = keys(command);
+        if value.is_table() {
+            let names = command.get_subcommands().map(Command::get_name);
+            return Err(format!("there is no command {key:?}{}", nearest(key, names)));
+        }
+        if !keys.contains(&key.as_str()) {
+            let who = if place.is_empty() { "no command" } else { place };
+            let has = if place.is_empty() { "has an option" } else { "has no option" };
+            return Err(format!("{who} {has} {key:?}{}", nearest(key, keys.into_iter())));
+        }
+    }
+    Ok(())
+}
+
+/// Long names of the options of a command and of those below it.
+fn keys(command: &Command) -> Vec<&str> {
+    let own = options(command).filter_map(Arg::get_long);
+    own.chain(command.get_subcommands().flat_map(keys)).collect()
+}
+
+/// A suggestion for a name that is not valid.
+fn nearest<'a>(name: &str, valid: impl Iterator<Item = &'a str>) -> String {
+    let scored = valid.map(|valid| (strsim::jaro(name, valid), valid));
+    let best = scored.max_by(|(a, _), (b, _)| a.total_cmp(b));
+    let similar = best.filter(|(score, _)| *score >= SIMILAR);
+    similar.map_or(String::new(), |(_, valid)| format!("; did you mean {valid:?}?"))
+}
+
+/// Values as they would stand on a command line; none for types that no option has.
+fn texts(value: &Value) -> Option<Vec<String>> {
     match value {
-        Value::String(text) => Ok(vec![text.clone()]),
-        Value::Integer(number) => Ok(vec![number.to_string()]),
-        Value::Float(number) => Ok(vec![number.to_string()]),
-        Value::Boolean(flag) => Ok(vec![flag.to_string()]),
+        Value::String(text) => Some(vec![text.clone()]),
+        Value::Integer(number) => Some(vec![number.to_string()]),
+        Value::Float(number) => Some(vec![number.to_string()]),
+        Value::Boolean(flag) => Some(vec![flag.to_string()]),
         Value::Array(values) => {
-            Ok(values.iter().map(texts).collect::<Result<Vec<_>, _>>()?.concat())
+            Some(values.iter().map(texts).collect::<Option<Vec<_>>>()?.concat())
         }
-        Value::Table(_) | Value::Datetime(_) => Err("a text, a number, true, false or a list fits"),
-    }
-}
-
-/// An option with a value, as it stands on a command line.
-fn tokens(arg: &Arg, text: &str) -> Option<OsString> {
-    let name = arg.get_long()?;
-    match (arg.get_action(), text) {
-        (ArgAction::SetTrue, "true") => Some(format!("--{name}").into()),
-        (ArgAction::SetTrue, "false") => None,
-        _ => Some(format!("--{name}={text}").into()),
-    }
-}
-
-/// Where an option comes from, apart from the file.
-fn origin(arg: &Arg, line: &[OsString]) -> Origin {
-    if on_line(arg, line).is_some() {
-        return Origin::Line;
-    }
-    match arg.get_env() {
-        Some(name) if std::env::var_os(name).is_some() => {
-            Origin::Variable(name.to_string_lossy().into_owned())
-        }
-        _ => Origin::Default,
-    }
-}
-
-/// The value of an option on a command line.
-fn on_line(arg: &Arg, line: &[OsString]) -> Option<String> {
-    let name = format!("--{}", arg.get_long()?);
-    let text = |token: &OsStr| token.to_string_lossy().into_owned();
-    line.iter().enumerate().find_map(|(at, token)| {
-        let token = text(token);
-        let rest = token.strip_prefix(&name)?;
-        match rest.strip_prefix('=') {
-            Some(value) => Some(value.to_owned()),
-            None if !rest.is_empty() => None,
-            None if matches!(arg.get_action(), ArgAction::SetTrue) => Some("true".into()),
-            None => Some(line.get(at + 1).map(|value| text(value)).unwrap_or_default()),
-        }
-    })
-}
-
-fn value(arg: &Arg, line: &[OsString], origin: &Origin) -> String {
-    let text = |value: &OsStr| value.to_string_lossy().into_owned();
-    match origin {
-        Origin::Line => on_line(arg, line).unwrap_or_default(),
-        Origin::Variable(name) => {
-            std::env::var_os(name).map(|value| text(&value)).unwrap_or_default()
-        }
-        Origin::File(_) => String::new(),
-        Origin::Default => {
-            let values: Vec<String> = arg.get_default_values().iter().map(|v| text(v)).collect();
-            if values.is_empty() { "-".into() } else { values.join(",") }
-        }
+        Value::Table(_) | Value::Datetime(_) => None,
     }
 }
 
@@ -218,71 +325,163 @@ mod tests {
     use std::ffi::OsString;
     use std::fs;
 
-    use clap::{Arg, ArgAction, Command};
+    use clap::{Arg, ArgAction, Command, value_parser};
+    use std::path::PathBuf;
 
     use super::{expand, show};
 
     fn root() -> Command {
         let data = || Arg::new("data").long("data");
+        let config = Arg::new("config").long("config").global(true);
+        let serve = Command::new("serve")
+            .arg(data())
+            .arg(Arg::new("open").long("open").action(ArgAction::SetTrue))
+            .arg(Arg::new("hosts").long("host").action(ArgAction::Append))
+            .arg(Arg::new("masks").long("masks").conflicts_with("calibration"))
+            .arg(Arg::new("calibration").long("calibration"))
+            .arg(Arg::new("most").long("most").default_value("7").env("SCI_TEST_MOST"));
+        let create = Command::new("create").arg(Arg::new("lab").long("lab"));
         Command::new("sci-recon")
-            .subcommand(
-                Command::new("serve")
-                    .arg(data())
-                    .arg(Arg::new("open").long("open").action(ArgAction::SetTrue))
-                    .arg(Arg::new("hosts").long("host").action(ArgAction::Append))
-                    .arg(Arg::new("most").long("most").default_value("7").env("SCI_TEST_MOST")),
-            )
-            .subcommand(Command::new("token").arg(data()))
+            .arg(config.value_parser(value_parser!(PathBuf)))
+            .arg(Arg::new("url").long("url"))
+            .subcommand(serve)
+            .subcommand(Command::new("worker").arg(Arg::new("nats").long("nats")))
+            .subcommand(Command::new("token").arg(data().required(true)).subcommand(create))
+            .subcommand(Command::new("ls").arg(Arg::new("url").long("url").env("SCI_TEST_URL")))
+    }
+
+    /// Expands a line in which `FILE` stands for the path of a file with this text.
+    fn with_file(text: &str, line: &[&str]) -> Result<Vec<String>, String> {
+        let folder = tempfile::tempdir().unwrap();
+        // The name of the file is the name of a command, too.
+        let file = folder.path().join("worker");
+        fs::write(&file, text).unwrap();
+        let file = file.to_str().unwrap();
+        let words = ["sci-recon"].iter().chain(line).map(|word| word.replace("FILE", file));
+        let line = words.map(OsString::from).collect();
+        let expanded = expand(&root(), line).map_err(|error| error.to_string())?;
+        let words = expanded.line.iter().skip(1).map(|word| word.to_str().unwrap().to_owned());
+        Ok(words.filter(|word| !word.contains(file)).collect())
     }
 
     fn with(text: &str, line: &[&str]) -> Result<Vec<String>, String> {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("sci.toml");
-        fs::write(&file, text).unwrap();
-        let option = format!("--config={}", file.display());
-        let mut all: Vec<OsString> = vec!["sci-recon".into(), option.into()];
-        all.extend(line.iter().map(|token| OsString::from(*token)));
-        let expanded = expand(&root(), all).map_err(|error| error.to_string())?;
-        Ok(expanded[2..].iter().map(|token| token.to_str().unwrap().to_owned()).collect())
+        with_file(text, &[&["--config=FILE"], line].concat())
     }
 
     #[test]
-    fn the_file_says_what_nobody_else_does() {
+    fn the_file_supplies_what_line_and_environment_leave_open() {
         let file = "data = \"/a\"\n[serve]\nopen = true\nhost = [\"x\", \"y\"]\nmost = 9\n";
         let serve = with(file, &["serve"]).unwrap();
-        assert_eq!(serve, ["serve", "--data=/a", "--host=x", "--host=y", "--most=9", "--open"]);
-        assert_eq!(with(file, &["token", "list"]).unwrap(), ["token", "--data=/a", "list"]);
+        assert_eq!(serve, ["serve", "--data=/a", "--open", "--host=x", "--host=y", "--most=9"]);
+        assert_eq!(with(file, &["token", "create"]).unwrap(), ["token", "--data=/a", "create"]);
+        assert_eq!(with(file, &["worker"]).unwrap(), ["worker"], "worker has none of these");
         let line = ["serve", "--data", "/b", "--most=3", "--host=z", "--open"];
         assert_eq!(with(file, &line).unwrap(), line, "the command line has the last word");
-        assert_eq!(
-            with("data = \"/a\"\n[token]\ndata = \"/c\"", &["token"]).unwrap(),
-            ["token", "--data=/c"]
-        );
         assert_eq!(with("[serve]\nopen = false", &["serve"]).unwrap(), ["serve"]);
+    }
+
+    #[test]
+    fn the_innermost_table_wins() {
+        let file =
+            "lab = \"top\"\ndata = \"/a\"\n[token]\ndata = \"/c\"\n[token.create]\nlab = \"in\"";
+        let line = with(file, &["token", "create"]).unwrap();
+        assert_eq!(line, ["token", "--data=/c", "create", "--lab=in"]);
+        let file = "data = \"/a\"\n[token]\nlab = \"outer\"";
+        let line = with(file, &["token", "--data", "create", "create"]).unwrap();
+        assert_eq!(line, ["token", "--data", "create", "create", "--lab=outer"]);
+    }
+
+    #[test]
+    fn values_that_equal_a_command_are_values() {
+        let file = "[serve]\ndata = \"/a\"\n[worker]\nnats = \"n\"";
+        for line in [
+            &["--config", "FILE", "serve"][..],
+            &["--config=FILE", "serve"],
+            &["serve", "--config", "FILE"],
+            &["--url", "worker", "--config", "FILE", "serve"],
+            &["serve", "--most", "worker", "--config=FILE"],
+        ] {
+            let expanded = with_file(file, line);
+            if line[0] == "--url" {
+                assert!(expanded.unwrap_err().contains("serve takes no --url"));
+                continue;
+            }
+            let expanded = expanded.unwrap();
+            assert!(expanded.contains(&"--data=/a".to_owned()), "{line:?}: {expanded:?}");
+            assert!(!expanded.contains(&"--nats=n".to_owned()), "{line:?}: {expanded:?}");
+        }
+        assert_eq!(
+            with(file, &["serve", "--data", "worker"]).unwrap(),
+            ["serve", "--data", "worker"]
+        );
+    }
+
+    #[test]
+    fn options_before_a_command_are_passed_on() {
+        let line = with("url = \"file\"", &["--url", "x", "ls"]).unwrap();
+        assert_eq!(line, ["--url", "x", "ls", "--url=x"]);
+        let line = with("url = \"file\"", &["--url", "x", "ls", "--url", "y"]).unwrap();
+        assert_eq!(line, ["--url", "x", "ls", "--url", "y"]);
+        assert_eq!(with("url = \"file\"", &["ls"]).unwrap(), ["ls", "--url=file"]);
+    }
+
+    #[test]
+    fn an_option_of_the_line_drops_those_it_excludes() {
+        let file = "[serve]\nmasks = \"m.npy\"";
+        assert_eq!(with(file, &["serve"]).unwrap(), ["serve", "--masks=m.npy"]);
+        let line = ["serve", "--calibration", "c"];
+        assert_eq!(with(file, &line).unwrap(), line);
     }
 
     #[test]
     fn what_is_wrong_in_the_file_is_named() {
         for (text, named) in [
-            ("dat = 1", "no command has an option \"dat\""),
+            ("dat = 1", "no command has an option \"dat\"; did you mean \"data\"?"),
             ("[serve]\nlist = 1", "serve has no option \"list\""),
-            ("[server]\nmost = 1", "no command is \"server\""),
-            ("[serve]\nmost = 2001-01-01", "most: a text, a number"),
+            ("[serve]\nmots = 1", "serve has no option \"mots\"; did you mean \"most\"?"),
+            (
+                "[token.create]\nlabs = 1",
+                "token.create has no option \"labs\"; did you mean \"lab\"?",
+            ),
+            ("[server]\nmost = 1", "there is no command \"server\"; did you mean \"serve\"?"),
+            ("[serve]\nmost = 2001-01-01", "most must be a text, a number"),
+            ("[serve]\nmost = [1, 2]", "most must be one value"),
+            ("[serve]\nopen = \"yes\"", "open must be true or false"),
+            ("config = \"x\"", "no command has an option \"config\""),
             ("most", "TOML"),
         ] {
             let error = with(text, &["serve"]).unwrap_err();
-            assert!(error.contains(named) && error.contains("sci.toml"), "{error}");
+            assert!(error.contains(named) && error.contains("the configuration file /"), "{error}");
         }
         let line = ["sci-recon", "--config", "/nowhere/x.toml", "serve"].map(OsString::from);
         assert!(expand(&root(), line.into()).unwrap_err().to_string().contains("/nowhere/x.toml"));
     }
 
     #[test]
+    fn a_refused_value_of_the_file_is_traced_to_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("sci.toml");
+        fs::write(&file, "[serve]\nmost = \"many\"").unwrap();
+        let number = |arg: Arg| arg.value_parser(value_parser!(u32));
+        let root = root().mut_subcommand("serve", |serve| serve.mut_arg("most", number));
+        let line = ["sci-recon", "serve", "--config", file.to_str().unwrap()].map(OsString::from);
+        let expanded = expand(&root, line.into()).unwrap();
+        let error = root.clone().try_get_matches_from(&expanded.line).unwrap_err();
+        let text = expanded.origin_of(&error).unwrap();
+        assert!(text.starts_with("most is set by") && text.contains("sci.toml"), "{text}");
+    }
+
+    #[test]
     fn a_table_says_where_each_value_comes_from() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("sci.toml");
-        fs::write(&file, "data = \"/a\"").unwrap();
-        let text = show(&root(), "serve", &["--open".into()], Some(file.clone())).unwrap();
+        fs::write(&file, "data = \"/a\"\nlab = \"l\"").unwrap();
+        let shown = |names: &[&str], rest: &[&str]| {
+            let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+            let rest: Vec<OsString> = rest.iter().map(OsString::from).collect();
+            show(&root(), &names, &rest, Some(file.clone())).unwrap()
+        };
+        let text = shown(&["serve"], &["--open", "--host", "a", "--host=b"]);
         let line = |key: &str| {
             let found = text.lines().find(|line| line.starts_with(key)).unwrap();
             found.split_whitespace().map(str::to_owned).collect::<Vec<_>>()
@@ -290,6 +489,10 @@ mod tests {
         assert_eq!(line("data"), ["data", "/a", file.to_str().unwrap()]);
         assert_eq!(line("open"), ["open", "true", "the", "command", "line"]);
         assert_eq!(line("most"), ["most", "7", "the", "default"]);
-        assert_eq!(line("host"), ["host", "-", "the", "default"]);
+        assert_eq!(line("host"), ["host", "a,b", "the", "command", "line"]);
+        assert_eq!(line("masks"), ["masks", "-", "the", "default"]);
+        assert!(shown(&["token", "create"], &[]).contains("lab                     l  "));
+        let error = show(&root(), &["sreve".to_owned()], &[], None).unwrap_err().to_string();
+        assert!(error.contains("did you mean \"serve\"?"), "{error}");
     }
 }

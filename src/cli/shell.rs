@@ -1,22 +1,22 @@
 //! What shells and man want: `sci-recon completions` and `sci-recon man`.
 
-use std::io;
 use std::path::PathBuf;
 
 use clap::{Args, Command};
 use clap_complete::Shell;
 
 use super::CliError;
+use super::output::print_text;
 use crate::cli::error::Result;
 
-/// Prints what a shell needs to complete commands and options.
+/// Print the completions of a shell.
 #[derive(Debug, Args)]
 pub struct Completions {
     /// The shell.
     shell: Shell,
 }
 
-/// Writes a man page for the program and each of its commands.
+/// Write man pages for the program and its commands.
 #[derive(Debug, Args)]
 pub struct Man {
     /// Folder for the pages; it must be there.
@@ -24,8 +24,11 @@ pub struct Man {
     out: PathBuf,
 }
 
-pub fn completions(arguments: &Completions, mut root: Command) {
-    clap_complete::generate(arguments.shell, &mut root, "sci-recon", &mut io::stdout());
+pub fn completions(arguments: &Completions, mut root: Command) -> Result<()> {
+    // The generator panics where it can't write, so it writes to memory.
+    let mut script = Vec::new();
+    clap_complete::generate(arguments.shell, &mut root, "sci-recon", &mut script);
+    print_text(String::from_utf8_lossy(&script))
 }
 
 pub fn man(arguments: &Man, root: Command) -> Result<()> {

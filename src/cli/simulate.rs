@@ -18,7 +18,7 @@ use engine::intake::{read_clip, read_colours};
 use formats::{Channels, npy};
 use optics::{Mosaic, OpticsError, illumination, measure, noisy};
 
-/// Simulate a snapshot: make masks and measure known frames through them.
+/// Simulate masks and measurements of a clip.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The scene: npy, npz, multi-page TIFF, a .mat scene's `orig`, or a folder of PNGs.

@@ -1,6 +1,6 @@
-//! What `submit` and `watch-folder` ask for: masks, scales and how to reconstruct.
+//! The options of `submit` and `watch-folder`, and the requests that follow from them.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use serde_json::{Map, Value, json};
@@ -11,64 +11,92 @@ use super::client::{Client, Result};
 use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
 use formats::Axes;
 
-/// How jobs are made of measurements.
+/// How calibrations, measurements and jobs are made of files.
 #[derive(Debug, Args)]
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
-    #[arg(long, value_name = "ID", required_unless_present = "masks", conflicts_with = "masks")]
+    #[arg(long, value_name = "ID", required_unless_present = "masks", help_heading = CALIBRATION)]
     calibration: Option<CalibrationId>,
     /// Masks [frame, row, column] instead of a calibration; the same file makes one calibration only.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
-    /// What the masks are called in an npz, .mat or HDF5 file [default: mask].
-    #[arg(long, value_name = "NAME", requires = "masks")]
+    /// Name of the masks in an npz, .mat or HDF5 file [default: mask].
+    #[arg(long, value_name = "NAME", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_array: Option<String>,
-    /// What the snapshots are called in an npz, .mat or HDF5 file [default: meas].
-    #[arg(long, value_name = "NAME")]
-    array: Option<String>,
     /// The order of the axes of the masks [default: the only one that fits].
-    #[arg(long, value_name = "ORDER", requires = "masks", value_parser = axes())]
+    #[arg(long, value_name = "ORDER", conflicts_with = "calibration", value_parser = axes(),
+          help_heading = CALIBRATION)]
     masks_axes: Option<Axes>,
-    /// The order of the axes of the snapshots [default: the only one that fits].
-    #[arg(long, value_name = "ORDER", value_parser = axes())]
-    axes: Option<Axes>,
-    /// The number in the masks that means 1 [default: that of their type].
-    #[arg(long, value_name = "NUMBER", requires = "masks")]
+    /// The stored number in the masks that means 1, fully open [default: that of their type].
+    #[arg(long, value_name = "NUMBER", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_full_scale: Option<f64>,
+    /// Name of the calibration [default: none].
+    #[arg(long, value_name = "TEXT", conflicts_with = "calibration", help_heading = CALIBRATION)]
+    masks_name: Option<String>,
     /// The colours of the sensor's pixels, row by row of a cell of 2x2 [default: a grey sensor].
-    #[arg(long, value_name = "NAME", requires = "masks", value_parser = mosaic())]
+    #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
+          help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
-    /// The number in the snapshots that means 1 [default: that of their type].
-    #[arg(long, value_name = "NUMBER")]
+    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas].
+    #[arg(long, value_name = "NAME", help_heading = MEASUREMENT)]
+    array: Option<String>,
+    /// The order of the axes of the snapshots [default: the only one that fits].
+    #[arg(long, value_name = "ORDER", value_parser = axes(), help_heading = MEASUREMENT)]
+    axes: Option<Axes>,
+    /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
+    #[arg(long, value_name = "FILE", help_heading = MEASUREMENT)]
+    dark: Vec<PathBuf>,
+    /// The stored number from which on a pixel is saturated [default: the largest of its type].
+    #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
+    saturation: Option<u32>,
+    /// The stored number in the snapshots that means 1 [default: that of their type].
+    #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
     full_scale: Option<f64>,
-    /// Snapshots that the camera takes in a second.
-    #[arg(long, value_name = "NUMBER")]
+    /// Snapshots per second.
+    #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
     camera_fps: Option<f64>,
-    /// Seconds that one snapshot is exposed.
-    #[arg(long, value_name = "SECONDS")]
+    /// Exposure time of a snapshot in seconds.
+    #[arg(long, value_name = "SECONDS", help_heading = MEASUREMENT)]
     exposure_s: Option<f64>,
+    /// `contiguous` if the snapshots follow one another without a gap, else `separate` [default: the camera's
+    /// times decide].
+    #[arg(long, value_name = "KIND", value_parser = sequence(), help_heading = MEASUREMENT)]
+    sequence: Option<Sequence>,
+    /// Name of the measurement [default: none].
+    #[arg(long, value_name = "TEXT", help_heading = MEASUREMENT)]
+    name: Option<String>,
     /// The algorithm.
     #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
-          value_parser = named_all())]
+          value_parser = named_all(), help_heading = JOB)]
     algorithm: Algorithm,
     /// The network of `learned`.
-    #[arg(long, value_name = "ID")]
+    #[arg(long, value_name = "ID", help_heading = JOB)]
     model: Option<String>,
     /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = JOB)]
     schedule: Option<PathBuf>,
     /// Which snapshots: all, an index from 0, or FIRST-LAST with both ends in.
-    #[arg(long, value_name = "WHICH", default_value = "all")]
+    #[arg(long, value_name = "WHICH", default_value = "all", help_heading = JOB)]
     snapshots: Snapshots,
-    /// Whether snapshots are reconstructed together [default: as the measurement's times say].
-    #[arg(long, value_name = "KIND", value_parser = sequence())]
-    sequence: Option<Sequence>,
-    /// From -100 to 100; higher ones go first.
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    /// Largest side of a tile in pixels [default: as the algorithm needs].
+    #[arg(long, value_name = "PIXELS", requires = "overlap", help_heading = JOB)]
+    tile: Option<u32>,
+    /// Least overlap of neighbouring tiles in pixels.
+    #[arg(long, value_name = "PIXELS", requires = "tile", help_heading = JOB)]
+    overlap: Option<u32>,
+    /// From -100 to 100; jobs of higher priority are served first.
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, help_heading = JOB)]
     priority: i32,
+    /// Label of the job [default: none; of watch-folder: the name of the file].
+    #[arg(long, value_name = "TEXT", help_heading = JOB)]
+    label: Option<String>,
 }
 
-/// What is asked for of each file: the requests without what differs from file to file.
+const CALIBRATION: &str = "Calibration";
+const MEASUREMENT: &str = "Measurement";
+const JOB: &str = "Job";
+
+/// The requests for a file, without the parts that differ from file to file.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(super) struct Recipe {
     measurement: Map<String, Value>,
@@ -76,35 +104,79 @@ pub(super) struct Recipe {
 }
 
 impl SubmissionArguments {
-    /// Where the masks lie, if they are a file.
-    pub(super) fn masks(&self) -> Option<&Path> {
-        self.masks.as_deref()
+    /// Files that belong to each snapshot: the masks and the dark captures.
+    pub(super) fn own_files(&self) -> impl Iterator<Item = &PathBuf> {
+        self.masks.iter().chain(&self.dark)
     }
 
-    /// Makes the calibration, if need be, and says what to ask for.
+    /// Uploads masks and dark captures, makes the calibration if need be, and returns what to request.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
         let calibration = match (&self.calibration, &self.masks) {
             (Some(id), _) => id.to_string(),
-            (None, Some(masks)) => self.calibrate(client, masks).await?,
+            (None, Some(masks)) => {
+                let body = self.calibration_request(client.sent(masks).await?);
+                // One file of masks makes one calibration for all clients.
+                let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
+                client.made("/v1/calibrations", &body, &key).await?
+            }
             (None, None) => {
                 let text = "give --masks FILE or --calibration ID";
                 return Err(CliError::Input(text.into()).into());
             }
         };
-        let mut measurement = Map::from_iter([("calibration".to_owned(), json!(calibration))]);
-        add(&mut measurement, "array", json!(self.array));
-        add(&mut measurement, "axes", json!(self.axes));
-        add(&mut measurement, "full_scale", json!(self.full_scale));
-        add(&mut measurement, "camera_fps", json!(self.camera_fps));
-        add(&mut measurement, "exposure_s", json!(self.exposure_s));
-        let mut job = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.into_str()))]);
-        add(&mut job, "model", json!(self.model));
-        add(&mut job, "schedule", schedule);
-        add(&mut job, "snapshots", self.snapshots.request());
-        add(&mut job, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
-        job.insert("priority".to_owned(), json!(self.priority));
-        Ok(Recipe { measurement, job })
+        let dark = self.send_dark(client).await?;
+        let measurement = self.measurement_request(&calibration, &dark);
+        Ok(Recipe { measurement, job: self.job_request(schedule) })
+    }
+
+    /// Uploads the dark captures that the service does not have, or has deleted as unused.
+    pub(super) async fn send_dark(&self, client: &Client) -> Result<Vec<Sha256>> {
+        let mut sent = Vec::with_capacity(self.dark.len());
+        for dark in &self.dark {
+            sent.push(client.sent(dark).await?);
+        }
+        Ok(sent)
+    }
+
+    fn calibration_request(&self, masks: Sha256) -> Value {
+        let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
+        add(&mut body, "array", json!(self.masks_array));
+        add(&mut body, "axes", json!(self.masks_axes));
+        add(&mut body, "full_scale", json!(self.masks_full_scale));
+        add(&mut body, "mosaic", json!(self.mosaic));
+        add(&mut body, "name", json!(self.masks_name));
+        Value::Object(body)
+    }
+
+    /// A request for a measurement, without its data.
+    fn measurement_request(&self, calibration: &str, dark: &[Sha256]) -> Map<String, Value> {
+        let mut body = Map::from_iter([("calibration".to_owned(), json!(calibration))]);
+        add(&mut body, "array", json!(self.array));
+        add(&mut body, "axes", json!(self.axes));
+        add(&mut body, "dark", if dark.is_empty() { Value::Null } else { json!(dark) });
+        add(&mut body, "saturation", json!(self.saturation));
+        add(&mut body, "full_scale", json!(self.full_scale));
+        add(&mut body, "camera_fps", json!(self.camera_fps));
+        add(&mut body, "exposure_s", json!(self.exposure_s));
+        add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
+        add(&mut body, "name", json!(self.name));
+        body
+    }
+
+    /// A request for a job, without its measurement.
+    fn job_request(&self, schedule: Value) -> Map<String, Value> {
+        let tile = self.tile.zip(self.overlap);
+        let tile = tile.map(|(size, overlap)| json!({"size": size, "overlap": overlap}));
+        let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.into_str()))]);
+        add(&mut body, "model", json!(self.model));
+        add(&mut body, "schedule", schedule);
+        add(&mut body, "snapshots", self.snapshots.request());
+        add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
+        add(&mut body, "tile", json!(tile));
+        add(&mut body, "priority", json!(self.priority));
+        add(&mut body, "label", json!(self.label));
+        body
     }
 
     fn schedule(&self) -> Result<Value, CliError> {
@@ -115,19 +187,6 @@ impl SubmissionArguments {
         let text = std::fs::read_to_string(path).map_err(|error| refused(&error))?;
         serde_json::from_str(&text).map_err(|error| refused(&error))
     }
-
-    async fn calibrate(&self, client: &Client, masks: &Path) -> Result<String> {
-        let sha256 = client.sent(masks).await?;
-        let mut body = Map::from_iter([("masks".to_owned(), json!(sha256))]);
-        add(&mut body, "array", json!(self.masks_array));
-        add(&mut body, "axes", json!(self.masks_axes));
-        add(&mut body, "full_scale", json!(self.masks_full_scale));
-        add(&mut body, "mosaic", json!(self.mosaic));
-        let body = Value::Object(body);
-        // The same masks are the same calibration, whoever asks.
-        let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-        client.made("/v1/calibrations", &body, &key).await
-    }
 }
 
 fn add(to: &mut Map<String, Value>, name: &str, value: Value) {
@@ -137,7 +196,8 @@ fn add(to: &mut Map<String, Value>, name: &str, value: Value) {
 }
 
 impl Recipe {
-    /// Makes a measurement and a job of a file that was sent. With the same key it is the same job.
+    /// Makes a measurement and a job of uploaded data. `label` is the default label.
+    /// With the same key it is the same job.
     pub(super) async fn submit(
         &self,
         client: &Client,
@@ -151,7 +211,110 @@ impl Recipe {
         let measurement = client.made("/v1/measurements", &body, key).await?;
         let mut job = self.job.clone();
         job.insert("measurement".to_owned(), json!(measurement));
-        add(&mut job, "label", json!(label));
+        if !job.contains_key("label") {
+            add(&mut job, "label", json!(label));
+        }
         client.create("/v1/jobs", &Value::Object(job), key).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::fs;
+
+    use clap::{Args, Command, FromArgMatches};
+    use serde_json::{Map, Value};
+
+    use super::SubmissionArguments;
+    use engine::job::Sha256;
+
+    fn command() -> Command {
+        SubmissionArguments::augment_args(Command::new("test"))
+    }
+
+    /// Names of the properties of a request in the contract, without some.
+    fn properties(schema: &str, without: &[&str]) -> BTreeSet<String> {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi.yaml");
+        let contract: Value = serde_yaml_ng::from_str(&fs::read_to_string(path).unwrap()).unwrap();
+        let properties = contract["components"]["schemas"][schema]["properties"].as_object();
+        let mut names: BTreeSet<String> = properties.unwrap().keys().cloned().collect();
+        for name in without {
+            assert!(names.remove(*name), "{schema} has no {name}");
+        }
+        names
+    }
+
+    fn names(request: &Map<String, Value>) -> BTreeSet<String> {
+        request.keys().cloned().collect()
+    }
+
+    /// With all options given, each request has every property of the contract that no command derives.
+    #[test]
+    fn options_cover_every_property_of_the_requests() {
+        let folder = tempfile::tempdir().unwrap();
+        let schedule = folder.path().join("schedule.json");
+        fs::write(&schedule, "{}").unwrap();
+        let values = [
+            ("masks", "m.npy"),
+            ("masks-array", "mask"),
+            ("masks-axes", "frame-row-column"),
+            ("masks-full-scale", "255"),
+            ("masks-name", "May"),
+            ("mosaic", "rggb"),
+            ("array", "meas"),
+            ("axes", "row-column-frame"),
+            ("dark", "d.npy"),
+            ("saturation", "4095"),
+            ("full-scale", "4095"),
+            ("camera-fps", "45"),
+            ("exposure-s", "0.02"),
+            ("sequence", "separate"),
+            ("name", "drop"),
+            ("algorithm", "gap-tv"),
+            ("model", "x"),
+            ("schedule", schedule.to_str().unwrap()),
+            ("snapshots", "0-3"),
+            ("tile", "128"),
+            ("overlap", "16"),
+            ("priority", "-3"),
+            ("label", "milk"),
+        ];
+        let mut known: BTreeSet<&str> = values.iter().map(|(name, _)| *name).collect();
+        // It stands for the masks.
+        known.insert("calibration");
+        let command = command();
+        let options: BTreeSet<&str> =
+            command.get_arguments().filter_map(|arg| arg.get_long()).collect();
+        assert_eq!(options, known, "an option is missing in this test");
+        let line = values.iter().map(|(name, value)| format!("--{name}={value}"));
+        let line = ["test".to_owned()].into_iter().chain(line);
+        let matches = command.try_get_matches_from(line).unwrap();
+        let arguments = SubmissionArguments::from_arg_matches(&matches).unwrap();
+
+        let sha256 = Sha256::of(b"file");
+        let calibration = arguments.calibration_request(sha256);
+        // Captures of many files are for `calibrate`, the dashboard and the client libraries.
+        let expected = properties("CalibrationRequest", &["captures"]);
+        assert_eq!(names(calibration.as_object().unwrap()), expected);
+        let measurement = arguments.measurement_request("id", &[sha256]);
+        assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
+        let job = arguments.job_request(arguments.schedule().unwrap());
+        // The measurement names the calibration.
+        assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
+        assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));
+    }
+
+    #[test]
+    fn options_of_masks_exclude_a_calibration() {
+        let parse = |line: &[&str]| command().try_get_matches_from([&["test"], line].concat());
+        assert!(parse(&[]).is_err() && parse(&["--masks-axes", "frame-row-column"]).is_err());
+        assert!(parse(&["--masks", "m.npy", "--mosaic", "rggb"]).is_ok());
+        let id = "00000000-0000-7000-8000-000000000000";
+        assert!(parse(&["--calibration", id, "--dark", "a", "--dark", "b"]).is_ok());
+        for option in ["--masks=m.npy", "--masks-full-scale=1", "--mosaic=rggb"] {
+            assert!(parse(&["--calibration", id, option]).is_err(), "{option}");
+        }
+        assert!(parse(&["--masks", "m.npy", "--tile", "64"]).is_err(), "without an overlap");
     }
 }

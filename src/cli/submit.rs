@@ -5,13 +5,17 @@ use std::path::PathBuf;
 use clap::Args;
 use uuid::Uuid;
 
-use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
+use super::output::print_line;
 use super::submission::SubmissionArguments;
+use super::verdict;
 use super::wait::wait;
 
-/// Send masks and snapshots to a service and ask for a job; prints its identifier.
+/// Upload masks and snapshots and submit a job.
+///
+/// Prints the identifier of the job. Findings of the checks go to standard error; ends with 3 if there are
+/// errors among them.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Snapshots [row, column] or [snapshot, row, column].
@@ -20,10 +24,7 @@ pub struct Arguments {
     service: ServiceArguments,
     #[command(flatten)]
     submission: SubmissionArguments,
-    /// What the job is called.
-    #[arg(long, value_name = "TEXT")]
-    label: Option<String>,
-    /// With the same key, the same request makes one job however often it is sent [default: a new one].
+    /// Requests with the same key make one job, however often they are sent [default: a new key].
     #[arg(long, value_name = "TEXT")]
     key: Option<String>,
     /// Print the job as a JSON object.
@@ -37,11 +38,15 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let recipe = arguments.submission.recipe(&client).await?;
         let data = client.sent(&arguments.measurement).await?;
         let key = arguments.key.clone().unwrap_or_else(|| Uuid::now_v7().to_string());
-        let job = recipe.submit(&client, data, arguments.label.as_deref(), &key).await?;
-        match arguments.json {
-            true => println!("{job}"),
-            false => println!("{}", Job::new(job)?.id),
+        let job = recipe.submit(&client, data, None, &key).await?;
+        if arguments.json {
+            print_line(&job)?;
         }
-        Ok::<_, CliError>(())
+        let job = Job::new(job)?;
+        if !arguments.json {
+            print_line(&job.id)?;
+            verdict::lines(&job.warnings).iter().for_each(|line| eprintln!("{line}"));
+        }
+        verdict::refuse_errors([&*job.warnings])
     })
 }

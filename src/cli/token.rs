@@ -1,18 +1,20 @@
 //! `sci-recon token`: lets labs in and out.
 
-use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use super::output::print_line;
 use super::wait::wait;
 use crate::cli::error::Result;
 use engine::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use store::{Purpose, Store, StoreError, Token};
 
-/// Makes, lists and revokes tokens. With the first one the service is closed to all without one.
+/// Create, list and revoke access tokens.
+///
+/// From the first token on, the service refuses requests without one.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data; the service may be running.
@@ -24,11 +26,11 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Makes a token and prints it: once, for it is stored nowhere.
+    /// Make a token and print it. It is stored nowhere, so it can't be printed again.
     Create(Create),
-    /// Shows all tokens, without their secrets.
+    /// List all tokens, without their secrets.
     List,
-    /// Revokes a token, at once and for ever.
+    /// Revoke a token, at once and for ever.
     Revoke {
         /// Its identifier, as `list` shows it.
         id: TokenId,
@@ -70,8 +72,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             store.advance_generation().await?;
         }
         store.close().await;
-        let mut stdout = std::io::stdout();
-        writeln!(stdout, "{text}").map_err(|error| CliError::Failure(error.to_string()))
+        print_line(text)
     })
 }
 

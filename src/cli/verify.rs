@@ -5,11 +5,14 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::CliError;
+use super::output::print_line;
 use crate::cli::error::Result;
 use store::{Audit, Purpose, Store};
 
-/// Compares all that is on record with the disk: every file's hash, and the database with itself. The folder
-/// may be a service's that runs, or a backup. Changes nothing. Ends with 1 if something is damaged or missing.
+/// Compare all stored files with their records.
+///
+/// Checks the hash of every file and the consistency of the database. The folder may be in use by a service, or
+/// be a backup. Changes nothing. Ends with 1 if something is damaged or missing.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of a service's data, or a backup of one.
@@ -33,6 +36,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         "files": files, "bytes": bytes, "database": database, "damaged": damaged,
         "missing": missing, "unknown": unknown,
     });
-    println!("{found}");
+    print_line(found)?;
     if good { Ok(()) } else { Err(CliError::Failure("the data are damaged".into())) }
 }

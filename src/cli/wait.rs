@@ -1,9 +1,9 @@
 //! Commands that wait for asynchronous work, without a pool of threads.
 
-use std::io::Write;
 use std::path::Path;
 
 use super::CliError;
+use super::output::print_line;
 use store::{Purpose, Store};
 
 /// Runs `work` to its end on this thread.
@@ -23,6 +23,6 @@ pub fn print_of_store(
         let acted = act(&store).await;
         store.close().await;
         let text = acted?;
-        writeln!(std::io::stdout(), "{text}").map_err(|error| CliError::Failure(error.to_string()))
+        print_line(text)
     })
 }

@@ -7,11 +7,15 @@ use serde_json::json;
 use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
+use super::output::print_line;
 use super::progress;
+use super::verdict;
 use super::wait::wait;
 use engine::job::JobId;
 
-/// Wait until jobs have ended; ends with 1 unless all have succeeded.
+/// Wait for jobs, and print verdicts and findings.
+///
+/// Ends with 1 unless all have succeeded, else with 3 if the checks found errors.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The jobs.
@@ -56,17 +60,24 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let jobs = futures_util::future::try_join_all(ends).await;
         // The bars are for looking at: that they can't be cleared is no failure.
         let _ = screen.clear();
-        told(&jobs?, arguments.json)
+        report(&jobs?, arguments.json)
     })
 }
 
-fn told(jobs: &[Job], as_json: bool) -> Result<()> {
+fn report(jobs: &[Job], as_json: bool) -> Result<()> {
     for job in jobs {
         match as_json {
-            true => println!("{}", json!({"id": job.id, "state": job.state, "error": job.error})),
-            false => println!("{} {}", job.id, job.state),
+            true => print_line(json!({
+                "id": job.id, "state": job.state, "error": job.error,
+                "assessment": job.assessment, "findings": job.findings(),
+            }))?,
+            false => print_line(job.summary())?,
         }
     }
     let failures: Vec<String> = jobs.iter().filter_map(Job::failure).collect();
-    if failures.is_empty() { Ok(()) } else { Err(CliError::Failure(failures.join("; "))) }
+    if !failures.is_empty() {
+        return Err(CliError::Failure(failures.join("; ")));
+    }
+    let findings: Vec<_> = jobs.iter().map(Job::findings).collect();
+    verdict::refuse_errors(findings.iter().map(Vec::as_slice))
 }

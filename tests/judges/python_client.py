@@ -34,12 +34,15 @@ def main():
             assert movie.read_bytes()[4:8] == b"ftyp" and movie.parent.parent == folder / "result"
         assert not list(stack.parent.glob("*.part"))
         assert result.manifest["content"]["schedule"]
+        text = repr(result)
+        assert result.job.verdict in text and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text, text
         # A rejection raises the service's message, without a retry.
         try:
             client.reconstruct(masks * 3, measurement, "gap-tv")
             raise AssertionError("masks above their full scale were accepted")
         except ApiError as error:
             assert error.code == "invalid_content" and "full_scale" in str(error), error
+            assert str(error).count("above the full scale") == 1, error
         # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
         assert later.state == "succeeded" and [job.id for job in client.jobs()] == [later.id]

@@ -98,6 +98,7 @@ fn a_simulated_snapshot_is_reconstructed() {
             "stop_reason",
             "pilot",
             "assessment",
+            "findings",
         ];
         expected.sort_unstable();
         assert_eq!(fields, expected);
@@ -323,6 +324,32 @@ fn settings_come_from_a_file() {
     assert!(rejection.contains("max-uploads-bytes"), "{rejection}");
     let rejection = sci_recon(&["serve", "--data", "/nowhere", "--max-upload-bytes", "10 apples"]);
     assert!(String::from_utf8_lossy(&rejection.stderr).contains("10GB"), "{rejection:?}");
+}
+
+/// As `| head -1` does, which has read enough.
+#[test]
+fn a_reader_that_closes_the_pipe_is_no_failure() {
+    for line in [&["completions", "bash"][..], &["config", "show"], &["schedule"], &["optics"]] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = command.args(line).stdout(writer).output().unwrap();
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && told.is_empty(), "{line:?}: {told}");
+    }
+}
+
+#[test]
+fn the_help_groups_the_commands() {
+    let output = sci_recon(&["--help"]);
+    let text = String::from_utf8(output.stdout).unwrap();
+    let place = |word: &str| text.find(word).unwrap_or_else(|| panic!("no {word} in {text}"));
+    let words = ["Lab machine:", "  submit ", "Server:", "  serve ", "Administration:"];
+    let words =
+        [&words[..], &["  token ", "Offline:", "  reconstruct ", "--url", "--config"]].concat();
+    assert!(words.is_sorted_by_key(|word| place(word)), "{text}");
+    let text = rejection(&["--url", "http://127.0.0.1:1", "serve", "--data", "/nowhere"]);
+    assert!(text.contains("serve takes no --url"), "{text}");
 }
 
 #[test]

@@ -46,6 +46,52 @@ async fn the_python_client_survives_cut_connections() {
     assert_eq!(report["frames"], serde_json::json!([16, 384, 384]));
 }
 
+#[test]
+fn keywords_of_python_are_the_properties_of_the_contract() {
+    let Some(python) = judges() else { return };
+    let contract = std::fs::read_to_string("openapi.yaml").unwrap();
+    let contract: Value = serde_yaml_ng::from_str(&contract).unwrap();
+    let names = |schema: &str| -> Vec<String> {
+        let properties = &contract["components"]["schemas"][schema]["properties"];
+        properties.as_object().unwrap().keys().cloned().collect()
+    };
+    let schemas = ["CalibrationRequest", "MeasurementRequest", "JobRequest"];
+    let properties: Value = schemas.iter().map(|schema| (*schema, names(schema))).collect();
+    let mut judge = std::process::Command::new(python);
+    judge.env("PYTHONPATH", "clients/python/src").arg("tests/judges/python_options.py");
+    let output = judge.arg(properties.to_string()).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// The hot folder in Python, started twice: a job for each file, a report with its results.
+#[tokio::test]
+async fn python_watches_a_folder() {
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    std::fs::write(path("masks.npy"), Scene::SMALL.masks()).unwrap();
+    std::fs::write(path("drop.npy"), Scene::SMALL.snapshots()).unwrap();
+    std::fs::write(path("small.npy"), constant(&[1, 8, 8], 0.5)).unwrap();
+    for _ in 0..2 {
+        let mut watch = tokio::process::Command::new(&python);
+        watch.env("PYTHONPATH", "clients/python/src");
+        watch.env("SCI_RECON_URL", format!("http://{}", app.address()));
+        watch.args(["-m", "sci_recon", "watch", "--algorithm=gap-tv", "--once"]);
+        watch.args(["--settle-seconds=0.1", "--masks"]).arg(path("masks.npy")).arg(folder.path());
+        let output = watch.output().await.unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    let report = std::fs::read_to_string(path("drop.npy.result/REPORT.txt")).unwrap();
+    let jobs = app.get("/v1/jobs").await.expect(200).json();
+    assert_eq!(jobs["items"].as_array().unwrap().len(), 1, "{jobs}");
+    assert!(report.contains(jobs["items"][0]["id"].as_str().unwrap()), "{report}");
+    assert!(path("drop.npy.result/snapshot_0000/frames.npy").exists());
+    let reason = std::fs::read_to_string(path("small.npy.failed.txt")).unwrap();
+    assert!(reason.contains("size_mismatch"), "{reason}");
+    assert!(!path("drop.npy.2.result").exists() && !path("small.npy.2.failed.txt").exists());
+}
+
 #[tokio::test]
 async fn the_notebook_runs_from_top_to_bottom() {
     let Some(python) = judges() else { return };

@@ -80,7 +80,8 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     let calibrations = app.get("/v1/calibrations").await.expect(200).json();
     assert_eq!(calibrations["items"].as_array().unwrap().len(), 1);
 
-    assert_eq!(lab.text(&["watch", &job]).await, format!("{job} succeeded"));
+    let watched = lab.text(&["watch", &job]).await;
+    assert!(watched.starts_with(&format!("{job} succeeded: ")), "{watched}");
     let everything = [
         "frames.npy,stack.exr,stack-sigma.exr,stack.tif,movie.mp4,frames,png,manifest.json",
         "sequence.npy,sequence.mp4",
@@ -126,7 +127,8 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     let listed = lab.json(&["ls", "--json", "--state", "succeeded"]).await;
     assert_eq!(listed[0]["id"], job);
     let listed = lab.text(&["ls"]).await;
-    assert!(listed.contains(&job) && listed.contains("first") && listed.lines().count() == 1);
+    let jobs: Vec<&str> = listed.lines().filter(|line| !line.starts_with(' ')).collect();
+    assert!(jobs.len() == 1 && jobs[0].contains(&job) && jobs[0].contains("first"), "{listed}");
     assert_eq!(lab.text(&["ls", "--state", "failed"]).await, "");
 }
 
@@ -254,6 +256,99 @@ async fn lasting_failures_end_a_command_at_once_and_others_are_announced() {
     assert!(child.try_wait().unwrap().is_none(), "it tries again");
 }
 
+/// Large enough for the checks.
+const SCENE: Scene = Scene { frames: 4, height: 128, width: 128, snapshots: 1 };
+
+/// Masks that are submitted as snapshots by mistake.
+#[tokio::test]
+async fn findings_are_printed_by_every_command_with_their_remedies() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new(format!("http://{}", app.address()), "");
+    lab.write("masks.npy", &SCENE.masks());
+    lab.write("oops.npy", &SCENE.masks());
+    let masks = ["--masks", "masks.npy", "--algorithm", "gap-tv"];
+    let submitted = lab.run(&[&["submit", "oops.npy"][..], &masks].concat()).await;
+    let told = String::from_utf8(submitted.stderr).unwrap();
+    assert_eq!(submitted.status.code(), Some(3), "{told}");
+    let errors = told.lines().filter(|line| line.starts_with("error ")).count();
+    assert!(errors > 0 && told.matches("Remedy: ").count() >= errors, "{told}");
+    assert!(told.contains("the checks found"), "{told}");
+    let job = String::from_utf8(submitted.stdout).unwrap().trim().to_owned();
+
+    let watched = lab.run(&["watch", &job]).await;
+    let text = String::from_utf8(watched.stdout).unwrap();
+    assert_eq!(watched.status.code(), Some(3), "{text}");
+    assert!(text.starts_with(&format!("{job} succeeded: bad")), "{text}");
+    assert!(text.lines().skip(1).any(|line| line.starts_with("    error ")), "{text}");
+    let fetched = lab.run(&["fetch", &job, "--out", "out", "--file", "frames.npy"]).await;
+    assert_eq!(fetched.status.code(), Some(3));
+    assert!(String::from_utf8(fetched.stderr).unwrap().contains("    error "));
+    assert!(lab.path("out/snapshot_0000/frames.npy").exists());
+    let listed = lab.text(&["ls"]).await;
+    assert!(listed.contains("  bad") && listed.contains("\n    error "), "{listed}");
+
+    std::fs::create_dir(lab.path("bench")).unwrap();
+    lab.write("bench/oops.npy", &SCENE.masks());
+    let watch = ["watch-folder", "bench", "--once", "--settle-seconds", "0.1"];
+    let watched = lab.run(&[&watch[..], &masks, &["--file", "manifest.json"]].concat()).await;
+    let text = String::from_utf8(watched.stdout).unwrap();
+    assert_eq!(watched.status.code(), Some(3), "{text}");
+    assert!(
+        text.contains("    error ") && text.contains("oops.npy is in oops.npy.result"),
+        "{text}"
+    );
+    let report = std::fs::read_to_string(lab.path("bench/oops.npy.result/REPORT.txt")).unwrap();
+    assert!(report.starts_with("oops.npy: bad") && report.contains("\nerror "), "{report}");
+    assert!(report.contains("Remedy: "), "{report}");
+
+    // Without a server the checks find the same.
+    let watched = lab.run(&["watch", &job, "--json"]).await;
+    let online: Value = serde_json::from_slice(&watched.stdout).unwrap();
+    let line = ["reconstruct", "--masks", "masks.npy", "--measurement", "oops.npy"];
+    let more = ["--snapshots", "all", "--algorithm", "gap-tv", "--json"];
+    let offline = lab.run(&[&line[..], &more].concat()).await;
+    assert_eq!(offline.status.code(), Some(3), "{}", String::from_utf8_lossy(&offline.stderr));
+    let offline: Value = serde_json::from_slice(&offline.stdout).unwrap();
+    assert!(!online["findings"].as_array().unwrap().is_empty(), "{online}");
+    assert_eq!(offline["findings"], online["findings"]);
+}
+
+#[tokio::test]
+async fn a_dark_is_subtracted_by_submit_and_without_a_server() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new("http://127.0.0.1:1".to_owned(), "");
+    lab.write("masks.npy", &SCENE.masks());
+    let pixels = SCENE.height * SCENE.width;
+    let bytes = SCENE.snapshots();
+    let values = bytes[bytes.len() - 4 * pixels..].chunks_exact(4);
+    let values = values.map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap()) + 0.4);
+    lab.write("shots.npy", &crate::samples::npy(&[SCENE.height, SCENE.width], values));
+    for name in ["dark_1.npy", "dark_2.npy"] {
+        let level = if name == "dark_1.npy" { 0.3 } else { 0.5 };
+        lab.write(name, &constant(&[SCENE.height, SCENE.width], level));
+    }
+    let url = format!("http://{}", app.address());
+    let submit = ["--url", &url, "submit", "shots.npy", "--masks", "masks.npy"];
+    let submit = [&submit[..], &["--algorithm", "gap-tv", "--name", "drop"]].concat();
+    let dark = ["--dark", "dark_1.npy", "--dark", "dark_2.npy", "--saturation", "3"];
+    let reconstruct = ["reconstruct", "--masks", "masks.npy", "--measurement", "shots.npy"];
+    let reconstruct = [&reconstruct[..], &["--algorithm", "gap-tv", "--json"]].concat();
+    for (more, is_dark) in [(&[][..], false), (&dark[..], true)] {
+        let output = lab.run(&[&submit[..], more].concat()).await;
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(told.contains("no_dark"), !is_dark, "{told}");
+        let job = String::from_utf8(output.stdout).unwrap().trim().to_owned();
+        let job = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
+        let place = format!("/v1/measurements/{}", job["measurement"].as_str().unwrap());
+        let measurement = app.get(&place).await.expect(200).json();
+        assert_eq!(measurement["name"], "drop");
+        assert_eq!(measurement["dark"].as_array().unwrap().len(), if is_dark { 2 } else { 0 });
+        let output = lab.run(&[&reconstruct[..], more].concat()).await;
+        let told = String::from_utf8_lossy(&output.stdout);
+        assert_eq!(told.contains("no_dark"), !is_dark, "{told}");
+    }
+}
+
 /// Arrays of other names, in files that other programs have written.
 #[tokio::test]
 async fn arrays_can_have_any_name() {
@@ -329,7 +424,7 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
     std::fs::write(bench.join("taken.npy"), shot(99)).unwrap();
     std::fs::write(bench.join("taken.npy.result"), "mine").unwrap();
     std::fs::write(bench.join("bad.npy"), "no array").unwrap();
-    assert!(start(true).wait().await.unwrap().success());
+    assert_eq!(start(true).wait().await.unwrap().code(), Some(1), "bad.npy has failed");
 
     let mut jobs = Vec::new();
     let mut cursor = String::new();
@@ -347,6 +442,8 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
     expected.push("taken.npy".into());
     assert_eq!(labels, expected);
     for label in &expected[..50] {
+        let report = bench.join(format!("{label}.result/REPORT.txt"));
+        assert!(std::fs::read_to_string(report).unwrap().starts_with(label.as_str()));
         let result = bench.join(format!("{label}.result/snapshot_0000/frames.npy"));
         let job = jobs.iter().find(|job| job["label"] == label.as_str()).unwrap();
         let path = format!("/v1/jobs/{}/snapshots/0/frames.npy", job["id"].as_str().unwrap());

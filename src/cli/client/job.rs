@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::{Client, Result, refused};
 use crate::cli::CliError;
 use crate::cli::progress;
-use engine::job::{JobState, Sha256, SnapshotRange, Timestamp};
+use engine::job::{Assessment, Finding, JobState, Sha256, SnapshotRange, Timestamp};
 
 #[derive(Debug, Clone, Deserialize)]
 pub(in crate::cli) struct Job {
@@ -21,6 +21,11 @@ pub(in crate::cli) struct Job {
     pub(in crate::cli) algorithm: String,
     pub(in crate::cli) error: Option<String>,
     pub(in crate::cli) created_at: Timestamp,
+    pub(in crate::cli) finished_at: Option<Timestamp>,
+    /// Findings of the checks.
+    pub(in crate::cli) warnings: Vec<Finding>,
+    /// None until the job has succeeded, and where the quality can't be predicted.
+    pub(in crate::cli) assessment: Option<Assessment>,
     pub(in crate::cli) snapshots: SnapshotRange,
     pub(in crate::cli) progress: Progress,
 }

@@ -17,6 +17,7 @@ use uuid::Uuid;
 use super::client::{Client, Wanted};
 use super::{CliError, progress};
 use crate::cli::error::Result;
+use crate::cli::output::print_line;
 use engine::intake::sample;
 use engine::job::{Algorithm, JobState};
 use formats::{Limits, exr};
@@ -32,7 +33,7 @@ const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastdvdnet];
 /// Time between looks at the jobs.
 const POLL: Duration = Duration::from_millis(250);
 
-/// Start the service, send a coded snapshot of a real clip, and compare what comes back.
+/// Run the service on a simulated snapshot, and compare the results.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder for all files; an earlier demo there is replaced.
@@ -51,18 +52,14 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
 async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
     let started = Instant::now();
-    let say = |text: String| {
-        if !arguments.json {
-            println!("{text}");
-        }
-    };
+    let say = |text: String| if arguments.json { Ok(()) } else { print_line(text) };
     // 1. A lab's files: masks and one snapshot.
     let truth = sample(&out.join("input"))?.frames;
     let (frames, height, width) = truth.dim();
-    say(format!("made masks and a snapshot of {frames} frames of {height}x{width}"));
+    say(format!("made masks and a snapshot of {frames} frames of {height}x{width}"))?;
     // 2. The service.
     let service = Service::start(out).await?;
-    say(format!("the service is at {}", service.url()));
+    say(format!("the service is at {}", service.url()))?;
     // 3. Over HTTP from here on, as a lab machine would.
     let client = Client::at(service.url(), None)?;
     let results = through_http(&client, out, &truth).await;

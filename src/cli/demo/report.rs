@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
+use crate::cli::output::print_line;
 use engine::pipeline::quality::{self, FrameQuality};
 use formats::Channels;
 
@@ -61,24 +62,25 @@ impl Report {
 
     pub(super) fn print(&self, json: bool) -> Result<()> {
         if json {
-            println!("{}", self.to_json()?);
-            return Ok(());
+            return print_line(self.to_json()?);
         }
         let (tv, pnp) = (&self.gap_tv, &self.pnp_tv_fastdvdnet);
-        println!("\n{:20}{:>10}{:>9}{:>14}", "", "PSNR", "SSIM", "CPU");
+        print_line(format!("\n{:20}{:>10}{:>9}{:>14}", "", "PSNR", "SSIM", "CPU"))?;
         for (name, quality) in self.rows() {
             let Quality { psnr_db, ssim, cpu_seconds } = quality;
-            println!("{name:20}{psnr_db:>7.2} dB{ssim:>9.4}{cpu_seconds:>12.1} s");
+            print_line(format!("{name:20}{psnr_db:>7.2} dB{ssim:>9.4}{cpu_seconds:>12.1} s"))?;
         }
-        println!(
+        print_line(format!(
             "\nPnP-TV-FastDVDNet is {:.2} dB above GAP-TV; {:.0} s in all.",
             pnp.psnr_db - tv.psnr_db,
             self.seconds
-        );
+        ))?;
         let out = self.output_dir.display();
-        println!("To look at them: {out}/{PAGE}. The dashboard on the same data:");
-        println!("sci-recon serve --data {out}/service");
-        println!("The downloaded frames are in {out}/frames, the true ones in {out}/input/clip.");
+        print_line(format!("To look at them: {out}/{PAGE}. The dashboard on the same data:"))?;
+        print_line(format!("sci-recon serve --data {out}/service"))?;
+        print_line(format!(
+            "The downloaded frames are in {out}/frames, the true ones in {out}/input/clip."
+        ))?;
         Ok(())
     }
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 import uuid
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -73,27 +74,73 @@ class Client:
         algorithm: str = "pnp-tv-fastdvdnet",
         *,
         masks_full_scale: float | None = None,
-        full_scale: float | None = None,
-        mosaic: str | None = None,
+        masks_array: str | None = None,
         masks_axes: str | None = None,
+        masks_name: str | None = None,
+        mosaic: str | None = None,
+        dark: Source | Sequence[Source] = (),
+        saturation: int | None = None,
+        full_scale: float | None = None,
+        array: str | None = None,
         axes: str | None = None,
+        camera_fps: float | None = None,
+        exposure_s: float | None = None,
+        sequence: str | None = None,
+        name: str | None = None,
+        snapshots: Snapshots = "all",
+        schedule: Mapping[str, Any] | None = None,
+        tile: Mapping[str, int] | None = None,
+        model: str | None = None,
+        priority: int = 0,
+        label: str | None = None,
+        key: str | None = None,
         folder: str | os.PathLike[str] | None = None,
-        **job: Any,
     ) -> Result:
         """Uploads, submits, waits and downloads.
 
         `masks` are [B, H, W], `measurement` is [H, W] or [S, H, W]; arrays or file names. Their full scale, the stored
         number that means 1, is by default the maximum of an integer type, and 1 for floats. Axes in another order are
-        stated where several fit: "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a `mosaic`: "rggb",
-        "bggr", "grbg" or "gbrg". `job` goes on to `submit`.
+        stated where several fit: "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a
+        `mosaic`: "rggb", "bggr", "grbg" or "gbrg". The average of the `dark` captures is subtracted.
+        The other arguments are those of `calibrate`, `measure` and `submit`.
         The frames come into `folder`, by default one that goes away with the result.
+        Errors that the checks found are issued as Python warnings, with their remedies.
         """
         if isinstance(masks, Calibration):
             calibration = masks
         else:
-            calibration = self.calibrate(masks, full_scale=masks_full_scale, axes=masks_axes, mosaic=mosaic)
-        taken = self.measure(calibration, measurement, full_scale=full_scale, axes=axes)
-        return self.submit(taken, algorithm, **job).wait().result(folder)
+            calibration = self.calibrate(
+                masks, full_scale=masks_full_scale, array=masks_array, axes=masks_axes, mosaic=mosaic, name=masks_name
+            )
+        taken = self.measure(
+            calibration,
+            measurement,
+            dark=dark,
+            saturation=saturation,
+            full_scale=full_scale,
+            array=array,
+            axes=axes,
+            camera_fps=camera_fps,
+            exposure_s=exposure_s,
+            sequence=sequence,
+            name=name,
+            key=key,
+        )
+        job = self.submit(
+            taken,
+            algorithm,
+            snapshots=snapshots,
+            schedule=schedule,
+            tile=tile,
+            model=model,
+            priority=priority,
+            label=label,
+            key=key,
+        ).wait()
+        for finding in job.findings:
+            if finding["severity"] == "error":
+                warnings.warn(describe(finding), stacklevel=2)
+        return job.result(folder)
 
     def calibrate(
         self,
@@ -152,11 +199,18 @@ class Client:
         saturation: int | None = None,
         camera_fps: float | None = None,
         exposure_s: float | None = None,
+        sequence: str | None = None,
         name: str | None = None,
+        key: str | None = None,
     ) -> Measurement:
-        """Makes a measurement of snapshots [H, W] or [S, H, W] that were taken with a calibration."""
+        """Makes a measurement of snapshots [H, W] or [S, H, W] that were taken with a calibration.
+
+        `sequence` is "contiguous" if the snapshots follow one another without a gap, else "separate"; by default the
+        camera's times decide.
+        """
         record = self._create(
             "measurements",
+            key=key,
             calibration=str(calibration),
             data=self.upload(data),
             dark=self._uploads(dark),
@@ -166,6 +220,7 @@ class Client:
             saturation=saturation,
             camera_fps=camera_fps,
             exposure_s=exposure_s,
+            sequence=sequence,
             name=name,
         )
         return Measurement(self, record).ready()
@@ -176,6 +231,7 @@ class Client:
         algorithm: str = "pnp-tv-fastdvdnet",
         *,
         snapshots: Snapshots = "all",
+        sequence: str | None = None,
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
@@ -196,6 +252,7 @@ class Client:
                 measurement=str(measurement),
                 algorithm=algorithm,
                 snapshots=list(snapshots) if isinstance(snapshots, tuple) else snapshots,
+                sequence=sequence,
                 schedule=schedule,
                 tile=tile,
                 model=model,
@@ -263,7 +320,7 @@ class Entity:
 
     @property
     def warnings(self) -> list[Record]:
-        """What checks have found: each has a `code`, a `detail` and a `remedy`."""
+        """Findings of the checks: each has a `code`, a `severity`, a `detail` and a `remedy`."""
         return list(self.record.get("warnings", []))
 
     def _ready(self, collection: str) -> None:
@@ -304,6 +361,21 @@ class Measurement(Entity):
 @dataclass
 class Job(Entity):
     """A reconstruction."""
+
+    @property
+    def findings(self) -> list[Record]:
+        """Findings of the checks, and further reasons of the assessment."""
+        reasons = (self.record.get("assessment") or {}).get("reasons", [])
+        known = {finding["code"] for finding in self.warnings}
+        return self.warnings + [reason for reason in reasons if reason["code"] not in known]
+
+    @property
+    def verdict(self) -> str:
+        """The grade of the frames, with the expected PSNR where it can be predicted."""
+        if assessment := self.record.get("assessment"):
+            psnr, low, high = (assessment[key] for key in ("psnr_db", "psnr_low_db", "psnr_high_db"))
+            return f"{assessment['grade']}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
+        return "bad" if any(finding["severity"] == "error" for finding in self.findings) else "not assessed"
 
     @property
     def state(self) -> str:
@@ -358,8 +430,16 @@ class Result:
 
     def __init__(self, job: Job, folder: str | os.PathLike[str] | None = None) -> None:
         self.job = job
-        self._temporary = TemporaryDirectory(prefix="sci-recon-") if folder is None else None
-        self.folder = Path(self._temporary.name if self._temporary else folder or "")
+        # Windows can't remove files that are mapped to memory.
+        temporary = TemporaryDirectory(prefix="sci-recon-", ignore_cleanup_errors=True) if folder is None else None
+        self._temporary = temporary
+        self.folder = Path(temporary.name if temporary else folder or "")
+
+    def __repr__(self) -> str:
+        shape = self.job.record["shape"]
+        frames = len(self.snapshots) * shape["frames"]
+        name = self.job.record.get("label") or self.job.id
+        return f"<Result {name!r}: {self.job.verdict}; {frames} frames of {shape['height']}x{shape['width']}>"
 
     @property
     def snapshots(self) -> range:
@@ -428,6 +508,13 @@ class Result:
     def manifest(self) -> Record:
         """What went into the job and what came of it."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/manifest.json")
+
+
+def describe(finding: Record) -> str:
+    """A finding as one line, with its remedy."""
+    place = f"snapshot {finding['snapshot']}: " if finding.get("snapshot") is not None else ""
+    detail, remedy = finding["detail"].rstrip("."), finding["remedy"].rstrip(".")
+    return f"{finding['severity']} {finding['code']}: {place}{detail}. Remedy: {remedy}."
 
 
 class Bar:

@@ -20,13 +20,16 @@ class ApiError(SciReconError):
         self.problem = problem
         self.code: str = problem.get("code", "")
         self.retryable = bool(problem.get("retryable"))
-        parts = [f"{status} {self.code}:".replace(" :", ":"), problem.get("detail") or problem.get("title") or ""]
-        parts += [f"{error['pointer']}: {error['detail']}" for error in problem.get("errors", [])]
-        super().__init__(" ".join(part for part in parts if part))
+        detail = problem.get("detail") or problem.get("title") or ""
+        errors = problem.get("errors", [])
+        # A detail that the errors repeat is said once.
+        summary = [] if any(detail in error["detail"] for error in errors) else [detail]
+        parts = summary + [f"{error['pointer']}: {error['detail']}" for error in errors]
+        super().__init__(f"{status} {self.code}".strip() + ": " + " ".join(part for part in parts if part))
 
 
 class CalibrationFailed(SciReconError):
-    """No masks could be made of the captures, for the reason that the message tells."""
+    """No masks could be made of the captures; the message has the reason."""
 
 
 class JobFailed(SciReconError):

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
@@ -80,10 +80,11 @@ def send(http: httpx.Client, method: str, path: str, **options: Any) -> httpx.Re
 def as_file(source: Source) -> Iterator[Path]:
     """The file itself, or an array as an npy file that goes away afterwards."""
     if isinstance(source, np.ndarray):
-        with NamedTemporaryFile(prefix="sci-recon-", suffix=".npy") as file:
-            np.save(file, np.ascontiguousarray(source))
-            file.flush()
-            yield Path(file.name)
+        # In a folder: Windows can't open a temporary file twice.
+        with TemporaryDirectory(prefix="sci-recon-") as folder:
+            path = Path(folder, "array.npy")
+            np.save(path, np.ascontiguousarray(source))
+            yield path
     else:
         path = Path(source)
         if not path.is_file():
@@ -128,7 +129,7 @@ def upload(http: httpx.Client, path: Path, progress: Progress | None = None) -> 
                 status = None
             attempt += 1
             if attempt == TRIES or status not in PASSING | {None}:
-                raise upload_refused(error) from error
+                raise upload_refused(error) from None
             pause(attempt)
     return digest
 

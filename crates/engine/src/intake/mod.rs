@@ -15,6 +15,8 @@ pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, 
 pub use check::{Exposure, Passed, judge, masks, measurement};
 pub use error::IntakeError;
 pub use open::{Opened, Source};
-pub use read::{Scaled, read_clip, read_colours, read_masks, read_snapshots, read_truth};
+pub use read::{
+    Scaled, Snapshots, read_clip, read_colours, read_masks, read_snapshots, read_truth,
+};
 pub use report_page::report_page;
 pub use sample::{Sample, sample};

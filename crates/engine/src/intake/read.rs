@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array3, ArrayView2, s};
 
 use super::IntakeError;
-use super::check::{Exposure, masks, measurement};
+use super::check::{Exposure, Passed, masks, measurement};
 use super::open::{Opened, Source};
 use crate::intake::error::Result;
 use formats::mat::SceneArray;
@@ -34,14 +34,25 @@ pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
     Ok(Scaled { array: stack.into_array()?, full_scale, axes })
 }
 
-/// Reads and checks the snapshots \[S,H,W\] from `first` to `last`, both included, or to the end for `None`. Returns
-/// them with the total number of snapshots.
+/// Some snapshots of a measurement, less their dark.
+#[derive(Debug)]
+pub struct Snapshots {
+    /// \[S,H,W\].
+    pub measurement: Scaled<Array3<f32>>,
+    /// Number of snapshots in the file.
+    pub count: usize,
+    /// Findings and saturation of these snapshots.
+    pub passed: Passed,
+}
+
+/// Reads and checks the snapshots from `first` to `last`, both included, or to the end for `None`.
 ///
 /// Errors: as [`measurement`]; [`IntakeError::Content`] for snapshots that do not exist.
 pub fn read_snapshots(
     source: &Source<'_>,
+    exposure: &Exposure,
     (first, last): (usize, Option<usize>),
-) -> Result<(Scaled<Array3<f32>>, usize)> {
+) -> Result<Snapshots> {
     let opened = source.open()?;
     let (full_scale, axes) = (opened.full_scale.value(), opened.info.axes);
     let snapshots = opened.info.frames;
@@ -56,14 +67,18 @@ pub fn read_snapshots(
         return Err(IntakeError::content("", &detail));
     }
     let (mut next, mut selected) = (0, Stack::default());
-    measurement(opened, &Exposure::default(), &source.limits, |snapshot| {
+    let mut passed = measurement(opened, exposure, &source.limits, |snapshot| {
         if (first..=last).contains(&next) {
             selected.push(snapshot)?;
         }
         next += 1;
         Ok(())
     })?;
-    Ok((Scaled { array: selected.into_array()?, full_scale, axes }, snapshots))
+    if let Some(shares) = &mut passed.saturated {
+        *shares = shares.get(first..=last).unwrap_or_default().to_vec();
+    }
+    let measurement = Scaled { array: selected.into_array()?, full_scale, axes };
+    Ok(Snapshots { measurement, count: snapshots, passed })
 }
 
 /// Reads the true frames \[S B,H,W\] of the snapshots `which`, from a file that has those of these snapshots or of all

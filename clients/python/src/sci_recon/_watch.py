@@ -1,0 +1,164 @@
+"""A hot folder on any system: each file that appears in a folder becomes a job.
+
+The folder is listed every second. `.sci-recon-watch.json` in it records what is done; a file is known by its name, size
+and time. Requests have keys that follow from these, so that a file makes one job however often the program is stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ._client import Client, Job, Result, describe
+from ._errors import ApiError, JobFailed, SciReconError
+
+ENDINGS = {".npy", ".tif", ".tiff", ".png", ".mat", ".h5", ".hdf5"}
+LEDGER = ".sci-recon-watch.json"
+ENDED = {"succeeded", "failed", "cancelled"}
+
+# Submits a file under a key.
+Submit = Callable[[Path, str], Job]
+
+
+class Watch:
+    """Watches `folder`: `submit` makes a job of a file, and its `files` come into NAME.result with a REPORT.txt.
+
+    If that fails, NAME.failed.txt has the reason. Files in `own`, such as masks, are not submitted.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        folder: str | os.PathLike[str],
+        submit: Submit,
+        *,
+        files: Sequence[str] = ("frames.npy", "manifest.json"),
+        own: Sequence[str | os.PathLike[str]] = (),
+        settle_seconds: float = 3.0,
+    ) -> None:
+        self.client = client
+        self.folder = Path(folder)
+        self.submit = submit
+        self.files = files
+        self.own = {Path(file).resolve() for file in own}
+        self.settle_seconds = settle_seconds
+        ledger = self.folder / LEDGER
+        self.done: dict[str, str] = json.loads(ledger.read_text("utf-8")) if ledger.exists() else {}
+        self.jobs: dict[str, tuple[Path, Job]] = {}
+        self.seen: dict[str, float] = {}
+
+    def run(self, once: bool = False) -> None:
+        """Watches until it is interrupted, or with `once` until all files are done."""
+        while True:
+            self.look()
+            if once and not self.jobs and not self.seen:
+                return
+            time.sleep(min(1.0, max(self.settle_seconds, 0.05)))
+
+    def look(self) -> None:
+        """Submits files that have stopped changing, and fetches results of jobs that have ended."""
+        now, seen = time.monotonic(), {}
+        for path in sorted(self.folder.iterdir(), key=lambda path: path.name):
+            key = self._key(path)
+            if key is None or key in self.done or key in self.jobs or path.resolve() in self.own:
+                continue
+            since = self.seen.get(key, now)
+            if now - since < self.settle_seconds:
+                seen[key] = since
+                continue
+            self._step(key, path, partial(self._begin, key, path))
+        self.seen = seen
+        for key, (path, job) in list(self.jobs.items()):
+            self._step(key, path, partial(self._advance, key, path, job))
+
+    def _step(self, key: str, path: Path, step: Callable[[], None]) -> None:
+        """Does a step for a file. A service that is full or unreachable is asked again at the next look."""
+        try:
+            step()
+        except ApiError as error:
+            if error.status in {401, 403}:
+                raise
+            if not error.retryable:
+                self._fail(key, path, error)
+        except SciReconError as error:
+            print(f"waiting: {error}", flush=True)
+
+    def _begin(self, key: str, path: Path) -> None:
+        job = self.submit(path, key)
+        self.jobs[key] = (path, job)
+        print(f"{path.name} is job {job.id}", flush=True)
+
+    def _key(self, path: Path) -> str | None:
+        """Identifies a file as it is now; None for other things than files with snapshots."""
+        if path.name.startswith(".") or path.suffix.lower() not in ENDINGS or path.is_symlink() or not path.is_file():
+            return None
+        try:
+            meta = path.stat()
+        except FileNotFoundError:
+            return None
+        text = f"{path.name} {meta.st_size} {meta.st_mtime_ns}"
+        return "watch-" + hashlib.sha256(text.encode()).hexdigest() if meta.st_size else None
+
+    def _advance(self, key: str, path: Path, job: Job) -> None:
+        if job.refresh().state not in ENDED:
+            return
+        if job.state != "succeeded":
+            self._fail(key, path, JobFailed(job.record))
+            return
+        # The folder gets its name when it is complete.
+        draft = path.with_name(f".{path.name}.{job.id}.part")
+        result = Result(job, draft)
+        for snapshot in result.snapshots:
+            for name in self.files:
+                result.download(name, snapshot)
+        lines = [f"{path.name}: {job.verdict}", "", *map(describe, job.findings), "", f"job {job.id}"]
+        draft.mkdir(exist_ok=True)
+        (draft / "REPORT.txt").write_text("\n".join(lines) + "\n", "utf-8")
+        folder = draft.rename(self._free(path, ".result"))
+        print(f"{path.name} is in {folder.name}: {job.verdict}", flush=True)
+        for finding in job.findings:
+            print(f"    {describe(finding)}", flush=True)
+        self._note(key, folder.name)
+
+    def _fail(self, key: str, path: Path, error: Exception) -> None:
+        place = self._free(path, ".failed.txt")
+        place.write_text(f"{path.name}: {error}\n\nTo try again, save the file again.\n", "utf-8")
+        print(f"{path.name} has failed: {error}", flush=True)
+        self._note(key, place.name)
+
+    def _free(self, path: Path, ending: str) -> Path:
+        """A path beside a file that nothing has yet."""
+        names = (f"{path.name}{number}{ending}" for number in ["", *(f".{k}" for k in range(2, 10_000))])
+        return next(place for place in map(path.with_name, names) if not place.exists())
+
+    def _note(self, key: str, place: str) -> None:
+        self.jobs.pop(key, None)
+        self.done[key] = place
+        draft = self.folder / f"{LEDGER}.part"
+        draft.write_text(json.dumps(self.done, indent=1), "utf-8")
+        draft.replace(self.folder / LEDGER)
+
+
+def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
+    """Makes the calibration, and returns how files are submitted; `options` are keywords of `Client.reconstruct`."""
+    of_masks = {"masks_full_scale": "full_scale", "masks_array": "array", "masks_axes": "axes", "masks_name": "name"}
+    calibration = client.calibrate(
+        masks,
+        mosaic=options.pop("mosaic", None),
+        **{keyword: options.pop(option, None) for option, keyword in of_masks.items()},
+    )
+    of_job = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "label"}
+    job = {name: value for name, value in options.items() if name in of_job}
+    measurement = {name: value for name, value in options.items() if name not in of_job}
+
+    def submit(path: Path, key: str) -> Job:
+        taken = client.measure(calibration, path, key=key, **measurement)
+        return client.submit(taken, key=key, **{"label": path.name, **job})
+
+    return submit

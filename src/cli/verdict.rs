@@ -1,0 +1,162 @@
+//! Findings and verdicts as text, the same for all commands.
+
+use std::fmt::Write;
+
+use super::CliError;
+use super::client::Job;
+use super::error::Result;
+use engine::job::{Assessment, Finding, JobState, Severity};
+
+/// Snapshots that a line of a finding names; further ones are counted.
+const NAMED_SNAPSHOTS: usize = 8;
+
+/// One line for each finding, with its remedy. Findings of several snapshots with one code share a line.
+pub(super) fn lines(findings: &[Finding]) -> Vec<String> {
+    let mut groups: Vec<(&Finding, Vec<u32>)> = Vec::new();
+    for finding in findings {
+        let same = groups.iter_mut().find(|(first, _)| {
+            first.code == finding.code && first.snapshot.is_some() && finding.snapshot.is_some()
+        });
+        match same {
+            Some((_, snapshots)) => snapshots.extend(finding.snapshot),
+            None => groups.push((finding, finding.snapshot.into_iter().collect())),
+        }
+    }
+    groups.into_iter().map(|(finding, snapshots)| line(finding, &snapshots)).collect()
+}
+
+fn line(finding: &Finding, snapshots: &[u32]) -> String {
+    let severity = match finding.severity {
+        Severity::Error => "error",
+        Severity::Warning => "warning",
+    };
+    let mut place = String::new();
+    if let [first, others @ ..] = snapshots {
+        let _ = write!(place, "snapshot {first}: ");
+        if !others.is_empty() {
+            let named: Vec<String> =
+                others.iter().take(NAMED_SNAPSHOTS).map(ToString::to_string).collect();
+            let further = others.len().saturating_sub(NAMED_SNAPSHOTS);
+            let further = if further > 0 { format!(" and {further} more") } else { String::new() };
+            place = format!("snapshots {first}, {}{further}: ", named.join(", "));
+        }
+    }
+    let Finding { code, detail, remedy, .. } = finding;
+    let (detail, remedy) = (detail.trim_end_matches('.'), remedy.trim_end_matches('.'));
+    format!("{severity} {code}: {place}{detail}. Remedy: {remedy}.")
+}
+
+/// The grade, with the expected PSNR where it can be predicted.
+pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> String {
+    match assessment {
+        Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, .. }) => format!(
+            "{}, expected PSNR {psnr_db:.1} dB ({psnr_low_db:.1} to {psnr_high_db:.1})",
+            grade.into_str()
+        ),
+        None if errors(findings) > 0 => "bad".to_owned(),
+        None => "not assessed".to_owned(),
+    }
+}
+
+/// The findings of the checks, and the further reasons of an assessment.
+pub(super) fn merge(checks: &[Finding], assessment: Option<&Assessment>) -> Vec<Finding> {
+    let mut findings = checks.to_vec();
+    for reason in assessment.iter().flat_map(|assessment| &assessment.reasons) {
+        if checks.iter().all(|known| known.code != reason.code) {
+            findings.push(reason.clone());
+        }
+    }
+    findings
+}
+
+fn errors(findings: &[Finding]) -> usize {
+    findings.iter().filter(|finding| finding.severity == Severity::Error).count()
+}
+
+/// Ends a command that is done with exit code 3 if the checks found errors.
+pub(super) fn refuse_errors<'a>(findings: impl IntoIterator<Item = &'a [Finding]>) -> Result<()> {
+    let count: usize = findings.into_iter().map(errors).sum();
+    match count {
+        0 => Ok(()),
+        1 => Err(CliError::ErrorsFound("the checks found an error: results will be wrong".into())),
+        _ => Err(CliError::ErrorsFound(format!(
+            "the checks found {count} errors: results will be wrong"
+        ))),
+    }
+}
+
+impl Job {
+    pub(super) fn findings(&self) -> Vec<Finding> {
+        merge(&self.warnings, self.assessment.as_ref())
+    }
+
+    /// None unless the job has succeeded.
+    pub(super) fn verdict(&self) -> Option<String> {
+        let verdict = || verdict(self.assessment.as_ref(), &self.findings());
+        (self.state == JobState::Succeeded).then(verdict)
+    }
+
+    /// Identifier, state and verdict, and an indented line for each finding.
+    pub(super) fn summary(&self) -> String {
+        let verdict = self.verdict().map(|verdict| format!(": {verdict}")).unwrap_or_default();
+        let findings = lines(&self.findings());
+        let findings = findings.iter().map(|line| format!("\n    {line}")).collect::<String>();
+        format!("{} {}{verdict}{findings}", self.id, self.state)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{lines, refuse_errors, verdict};
+    use engine::job::{Assessment, Finding, Grade, Severity};
+
+    fn finding(code: &str, severity: Severity, snapshot: Option<u32>) -> Finding {
+        let (code, detail, remedy) = (code.to_owned(), "light is missing".into(), "add it.".into());
+        Finding { code, severity, detail, remedy, frames: Vec::new(), snapshot }
+    }
+
+    #[test]
+    fn each_finding_has_one_line_with_its_remedy() {
+        let mut findings = vec![finding("bad_calibration", Severity::Error, None)];
+        findings.extend((0..3).map(|k| finding("no_dark", Severity::Warning, Some(k))));
+        assert_eq!(
+            lines(&findings),
+            [
+                "error bad_calibration: light is missing. Remedy: add it.",
+                "warning no_dark: snapshots 0, 1, 2: light is missing. Remedy: add it.",
+            ]
+        );
+        let many: Vec<_> = (0..12).map(|k| finding("level", Severity::Error, Some(k))).collect();
+        assert!(lines(&many)[0].contains("snapshots 0, 1, 2, 3, 4, 5, 6, 7, 8 and 3 more:"));
+    }
+
+    #[test]
+    fn errors_end_a_command_with_three() {
+        let (warning, error) = (
+            [finding("a", Severity::Warning, None)],
+            [finding("b", Severity::Error, None), finding("c", Severity::Error, None)],
+        );
+        assert!(refuse_errors([&warning[..]]).is_ok());
+        let refused = refuse_errors([&warning[..], &error]).unwrap_err();
+        assert!(refused.to_string().contains("2 errors"), "{refused}");
+        assert_eq!(
+            format!("{:?}", refused.exit_code()),
+            format!("{:?}", std::process::ExitCode::from(3))
+        );
+    }
+
+    #[test]
+    fn a_verdict_has_the_grade_and_the_expected_psnr() {
+        let assessment = Assessment {
+            grade: Grade::Usable,
+            psnr_db: 31.24,
+            psnr_low_db: 29.8,
+            psnr_high_db: 32.9,
+            reasons: Vec::new(),
+        };
+        let text = verdict(Some(&assessment), &[]);
+        assert_eq!(text, "usable, expected PSNR 31.2 dB (29.8 to 32.9)");
+        assert_eq!(verdict(None, &[]), "not assessed");
+        assert_eq!(verdict(None, &[finding("a", Severity::Error, None)]), "bad");
+    }
+}
