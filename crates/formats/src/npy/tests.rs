@@ -123,7 +123,7 @@ fn all_orders_of_axes_are_read() {
 fn unsupported_data_types_are_refused_by_name() {
     for (descr, name) in [
         ("'<c16'", "complex128"),
-        ("'|O'", "object (a pickle)"),
+        ("'|O'", "a pickle"),
         ("[('a', '<f4'), ('b', '<f4')]", "structured"),
         ("'<U7'", "'<U7'"),
     ] {

@@ -83,11 +83,11 @@ fn hidden_files_are_skipped_and_other_files_refused() {
             &["'a4.png' after 'a2.png'", "missing", "zipfile"][..],
         ),
         (&["a1.png", "a01.png"], &["same number"]),
-        (&["a1.png", "b2.png"], &["'b2.png' beside 'aN.png'"]),
+        (&["a1.png", "b2.png"], &["'b2.png' among 'aN.png'"]),
         (&["a1.png", "a2.PNG"], &["'a2.PNG'"]),
-        (&["a1.png", "read me.png"], &["'read me.png'", "without a number"]),
-        (&["a1/mask.png"], &["without a number"]),
-        (&["a99999999999999999999.png"], &["without a number"]),
+        (&["a1.png", "read me.png"], &["'read me.png'", "has no number"]),
+        (&["a1/mask.png"], &["has no number"]),
+        (&["a99999999999999999999.png"], &["has no number"]),
     ] {
         let message = refusal(&zipped(&several(names)));
         assert_names(&message, words);
