@@ -147,7 +147,7 @@ function accepted(item) {
   ];
 }
 
-const SEQUENCES = [["", "Decided by the camera’s times"], ["contiguous", "Consecutive, without gaps"], ["separate", "Independent"]];
+const SEQUENCES = [["", "From the camera’s times"], ["contiguous", "Consecutive, without gaps"], ["separate", "Independent"]];
 
 function measurementStep(form, changed, signal) {
   const verdict = h("div", { class: "verdict", "aria-live": "polite" });
@@ -204,7 +204,7 @@ function measurementStep(form, changed, signal) {
     setDarks([...darks, { sha256: blob.sha256, name: file.name }]);
   }, true);
   const inside = h("div", { hidden: true },
-    h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Several snapshots are", sequence)),
+    h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Sequence of snapshots", sequence)),
     h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))));
   const wake = () => {
     attempt += 1;
