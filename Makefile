@@ -19,8 +19,9 @@ test: runtime judges $(TRAINING)/.stamp ## all tests
 	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
-deploy-check: judges ## the samples under deploy/ and docker/ against the validators of those who read them
-	$(JUDGES)/bin/python tests/judges/deploy.py .
+deploy-check: judges runtime ## the samples under deploy/ and docker/ against the validators of those who read them
+	$(CARGO) build --quiet
+	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
 
 client-check: judges ## the client for Python: types, lint
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
@@ -54,6 +55,7 @@ ARCHIVE := sci-recon-$(PACKAGE)-x86_64-linux
 dist: release ## the same as an archive, dist/sci-recon-VERSION-x86_64-linux.tar.gz, which runs where it is unpacked
 	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
+	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
 	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
 

@@ -2,7 +2,7 @@
 //! can also be given as the environment variable that the help names.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bytesize::ByteSize;
@@ -143,6 +143,11 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_QUARANTINE_DAYS", value_name = "DAYS", default_value_t = 7)]
     pub quarantine_days: u32,
 
+    /// Days for which deleted files are kept in before-updates/kept/ after an update of the database, for a rollback to
+    /// the earlier version; 0 keeps none. A disk that is nearly full ends this early.
+    #[arg(long, env = "SCI_RECON_ROLLBACK_DAYS", value_name = "DAYS", default_value_t = 7)]
+    pub rollback_days: u32,
+
     /// Bytes in a second at which all stored files are compared with their hashes, in the background, at most
     /// once a day; 0: never.
     #[arg(long, env = "SCI_RECON_SCRUB_BYTES", value_name = "BYTES", value_parser = bytes,
@@ -248,7 +253,7 @@ impl RemoteArguments {
 /// with --nats or --nats-creds, tiles of a server elsewhere.
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArguments {
-    /// Folder with the database, uploads and results.
+    /// Folder with the database, uploads and results; without effect for a server elsewhere.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     #[cfg_attr(feature = "nats", arg(required_unless_present_any = ["nats", "nats_creds"]))]
     #[cfg_attr(not(feature = "nats"), arg(required = true))]
@@ -296,7 +301,8 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
 
-    /// How much workers stand back for others (0 to 19), so that the API answers at full load.
+    /// How much workers stand back for others (0 to 19), so that the API answers at full load. They never raise the
+    /// priority that they are started with.
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,
@@ -416,6 +422,17 @@ impl EngineArguments {
 }
 
 impl WorkerArguments {
+    /// The data folder that the worker opens; none where it works for a server elsewhere, whatever `data` says.
+    /// The environment of a container and a configuration file name one for all commands.
+    #[must_use]
+    pub fn data_folder(&self) -> Option<&Path> {
+        #[cfg(feature = "nats")]
+        if self.remote.nats.is_wanted() {
+            return None;
+        }
+        self.data.as_deref()
+    }
+
     /// The command line that makes these arguments again, for a worker process of this machine.
     #[must_use]
     pub fn command_line(&self) -> Vec<std::ffi::OsString> {
@@ -488,6 +505,19 @@ mod tests {
         for bad in ["", "GB", "-1", "10 XB", "lots"] {
             assert!(bytes(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    #[cfg(feature = "nats")]
+    fn a_worker_of_a_server_elsewhere_has_no_data_folder() {
+        let folder = |more: &[&str]| {
+            let line = [&["--data", "d"], more].concat();
+            let arguments = Worker::try_parse_from(line).unwrap().arguments;
+            arguments.data_folder().map(std::path::Path::to_owned)
+        };
+        assert_eq!(folder(&[]), Some("d".into()));
+        assert_eq!(folder(&["--nats", "nats://host:4222"]), None);
+        assert_eq!(folder(&["--nats-creds", "gpu.creds"]), None);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use super::CliError;
 use super::wait::wait;
 use crate::config::{NatsArguments, VERSION};
 use engine::job::{Pool, Timestamp};
-use workers::nats::{Authority, Check, ClusterError, Node, Program, configuration};
+use workers::nats::{Authority, Check, ClusterError, Node, Program, ServerVersion, configuration};
 
 /// Sets up the NATS server for workers on other machines, makes and revokes their credentials, and says
 /// what is missing.
@@ -43,6 +43,10 @@ struct Init {
     /// The most bytes in it.
     #[arg(long, value_name = "N", default_value_t = 20 << 30)]
     store_bytes: u64,
+
+    /// Version of the nodes' nats-server, such as 2.12 [default: that on this machine, or else a current one].
+    #[arg(long, value_name = "VERSION")]
+    nats_version: Option<ServerVersion>,
 
     /// Without encryption: for one machine, or a network of its own.
     #[arg(long)]
@@ -122,7 +126,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
 }
 
 fn make(init: &Init) -> Result<(), CliError> {
-    let Init { folder, nodes, store, store_bytes, no_tls } = init;
+    let Init { folder, nodes, store, store_bytes, nats_version, no_tls } = init;
     let tls = !no_tls;
     let store = store.clone().unwrap_or_else(|| folder.path.join("store"));
     let url = configuration::url(nodes, tls);
@@ -131,7 +135,8 @@ fn make(init: &Init) -> Result<(), CliError> {
         configuration::make_certificates(&folder.path, nodes)?;
     }
     authority.write_own_credentials()?;
-    let made = configuration::write(&authority, &folder.path, nodes, (&store, *store_bytes), tls)?;
+    let disk = (store.as_path(), *store_bytes);
+    let made = configuration::write(&authority, &folder.path, nodes, disk, tls, *nats_version)?;
     for file in made.files {
         println!("nats-server -c {}", file.display());
     }

@@ -1,23 +1,28 @@
-//! What workers may do, and the processes that run networks of users, where native code works on what a
-//! stranger has sent. They get no more memory than was planned, make no connections, and see the files that they
-//! need and no others; a network's process also starts no programs and sends no signals (Landlock, seccomp), as
-//! far as the kernel has it.
+//! Confinement of the processes that run native code on a stranger's data: workers, and networks of users.
+//!
+//! Each takes only the planned memory (`RLIMIT_DATA`). A worker opens no connections and reads only the data folder
+//! and the system's libraries. A network's process is limited to an allow-list of system calls: it computes with
+//! threads, opens files for reading, and starts no processes, maps no shared memory and signals nobody else.
+//! Landlock keeps the files, where the kernel has it; the system calls are filtered by seccomp in any case.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use landlock::{
-    ABI, Access, AccessFs, Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetError, RulesetStatus,
-    path_beneath_rules,
+    ABI, Access, AccessFs, AccessNet, Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetError,
+    RulesetStatus, Scope, path_beneath_rules,
 };
 use rustix::process::{Resource, Rlimit, setrlimit};
-use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
+use seccompiler::{
+    BackendError, BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition,
+    SeccompFilter, SeccompRule,
+};
 
 use crate::config::EngineArguments;
 use engine::pipeline::networks::find_library;
 
 /// The newest version of Landlock that was tried; older kernels do what they can.
-const LANDLOCK: ABI = ABI::V5;
+const LANDLOCK: ABI = ABI::V6;
 /// Where libraries lie, and what they look at: processors, devices.
 const SYSTEM: [&str; 11] = [
     "/usr",
@@ -33,17 +38,50 @@ const SYSTEM: [&str; 11] = [
     "/etc/localtime",
 ];
 
-/// What leads to other processes.
-const CONNECTIONS: [i64; 4] =
-    [libc::SYS_socket, libc::SYS_ptrace, libc::SYS_process_vm_readv, libc::SYS_process_vm_writev];
-/// What a network does not need, either.
-const OTHERS: [i64; 5] = [
-    libc::SYS_execve,
-    libc::SYS_execveat,
-    libc::SYS_kill,
-    libc::SYS_tkill,
-    libc::SYS_pidfd_send_signal,
+/// Devices that a confined process may open.
+const DEVICES: [&str; 5] = ["/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom"];
+
+/// System calls that a worker is refused: connections, and ways into other processes or out of its own limits.
+const REFUSED_TO_WORKERS: [i64; 10] = [
+    libc::SYS_socket,
+    libc::SYS_ptrace,
+    libc::SYS_process_vm_readv,
+    libc::SYS_process_vm_writev,
+    libc::SYS_io_uring_setup,
+    libc::SYS_io_uring_enter,
+    libc::SYS_io_uring_register,
+    libc::SYS_unshare,
+    libc::SYS_setns,
+    libc::SYS_pidfd_getfd,
 ];
+
+/// System calls that a network may make with any arguments: input and output on what is open, private memory, threads,
+/// time, and questions about itself and the machine.
+#[rustfmt::skip]
+const ALLOWED_TO_NETWORKS: &[i64] = &[
+    libc::SYS_read, libc::SYS_write, libc::SYS_readv, libc::SYS_writev, libc::SYS_pread64, libc::SYS_lseek,
+    libc::SYS_close, libc::SYS_fstat, libc::SYS_newfstatat, libc::SYS_statx, libc::SYS_fstatfs, libc::SYS_statfs,
+    libc::SYS_readlinkat, libc::SYS_faccessat, libc::SYS_faccessat2, libc::SYS_getdents64, libc::SYS_getcwd,
+    libc::SYS_ppoll, libc::SYS_brk, libc::SYS_mprotect, libc::SYS_munmap, libc::SYS_mremap, libc::SYS_madvise,
+    libc::SYS_futex, libc::SYS_sched_yield, libc::SYS_sched_getaffinity, libc::SYS_membarrier, libc::SYS_rseq,
+    libc::SYS_set_robust_list, libc::SYS_nanosleep, libc::SYS_clock_nanosleep, libc::SYS_clock_gettime,
+    libc::SYS_clock_getres, libc::SYS_gettimeofday, libc::SYS_getrandom, libc::SYS_getpid, libc::SYS_gettid,
+    libc::SYS_getuid, libc::SYS_geteuid, libc::SYS_getgid, libc::SYS_getegid, libc::SYS_getrusage, libc::SYS_uname,
+    libc::SYS_sysinfo, libc::SYS_rt_sigaction, libc::SYS_rt_sigprocmask, libc::SYS_rt_sigreturn,
+    libc::SYS_sigaltstack, libc::SYS_restart_syscall, libc::SYS_exit, libc::SYS_exit_group,
+    // Replaced by `clone` through [`without_clone3`].
+    libc::SYS_clone3,
+];
+
+/// Further ones of the first 64-bit Linux, which later architectures lack.
+#[cfg(target_arch = "x86_64")]
+#[rustfmt::skip]
+const ALLOWED_OF_OLD: &[i64] = &[
+    libc::SYS_stat, libc::SYS_lstat, libc::SYS_access, libc::SYS_readlink, libc::SYS_poll, libc::SYS_arch_prctl,
+    libc::SYS_time, libc::SYS_getdents, libc::SYS_getrlimit,
+];
+#[cfg(not(target_arch = "x86_64"))]
+const ALLOWED_OF_OLD: &[i64] = &[];
 
 /// Lets this process take so many bytes of memory.
 pub(super) fn limit_memory(bytes: u64) -> Result<(), String> {
@@ -52,16 +90,27 @@ pub(super) fn limit_memory(bytes: u64) -> Result<(), String> {
         .map_err(|error| format!("the memory can't be limited: {error}"))
 }
 
-/// Gives up what a worker does not need: connections, and all files but these and those of the system. Before
-/// it starts any thread. Says what could not be given up.
+/// Confines this process as a worker, which reads the given folders and those of the system, and writes only the
+/// writable ones. Must run before the process starts a thread.
+///
+/// # Errors
+/// Says which part of the confinement the kernel does not offer.
 pub(super) fn confine_worker(readable: &[&Path], writable: &[&Path]) -> Result<(), String> {
-    confine(readable, writable, &CONNECTIONS)
+    let rules = REFUSED_TO_WORKERS.iter().map(|&call| (call, Vec::new())).collect();
+    let filter = filter(rules, SeccompAction::Allow, refusal(libc::EPERM)).map_err(text)?;
+    confine(readable, writable, &[filter])
 }
 
-/// Gives up what a network of a user's does not need: also programs and signals, and all files but the system's
-/// and `readable`. Before it starts any thread. Says what could not be given up.
+/// Confines this process as the network of a user, which reads the system's libraries and `readable`. Must run before
+/// the process starts a thread.
+///
+/// # Errors
+/// Says which part of the confinement the kernel does not offer.
 pub(super) fn confine_network(readable: &[&Path]) -> Result<(), String> {
-    confine(readable, &[], &[&CONNECTIONS[..], &OTHERS].concat())
+    let rules = network_rules().map_err(text)?;
+    let allowed = filter(rules, refusal(libc::EPERM), SeccompAction::Allow).map_err(text)?;
+    // The allow-list comes last: it refuses to install another filter.
+    confine(readable, &[], &[without_clone3().map_err(text)?, allowed])
 }
 
 /// Whether files are kept from networks of users; if not, why.
@@ -83,10 +132,14 @@ fn files_can_be_kept() -> Result<(), String> {
     enforced(tried.join().unwrap_or_else(|_| Err("Landlock can't be tried".into()))?)
 }
 
-fn confine(readable: &[&Path], writable: &[&Path], denied: &[i64]) -> Result<(), String> {
-    let files = restrict_files(readable, writable).map_err(|error| error.to_string())?;
-    deny(denied).map_err(|error| error.to_string())?;
+fn confine(readable: &[&Path], writable: &[&Path], filters: &[BpfProgram]) -> Result<(), String> {
+    let files = restrict_files(readable, writable).map_err(text)?;
+    filters.iter().try_for_each(|filter| seccompiler::apply_filter(filter)).map_err(text)?;
     enforced(files)
+}
+
+fn text(error: impl std::fmt::Display) -> String {
+    error.to_string()
 }
 
 fn enforced(files: RulesetStatus) -> Result<(), String> {
@@ -107,10 +160,12 @@ fn restrict_files(readable: &[&Path], writable: &[&Path]) -> Result<RulesetStatu
     // Of what is not there no rule is made.
     let status = Ruleset::default()
         .handle_access(AccessFs::from_all(LANDLOCK))?
+        .handle_access(AccessNet::from_all(LANDLOCK))?
+        .scope(Scope::from_all(LANDLOCK))?
         .create()?
         .add_rules(path_beneath_rules(readable, AccessFs::from_read(LANDLOCK)))?
         .add_rules(path_beneath_rules(writable, AccessFs::from_all(LANDLOCK)))?
-        .add_rules(path_beneath_rules(["/dev"], AccessFs::from_all(LANDLOCK)))?
+        .add_rules(path_beneath_rules(DEVICES, AccessFs::from_file(LANDLOCK)))?
         .restrict_self()?;
     Ok(status.ruleset)
 }
@@ -122,13 +177,75 @@ pub(super) fn folders_of(named: Option<&Path>) -> Vec<PathBuf> {
     paths.into_iter().flatten().filter_map(|path| Some(path.parent()?.to_owned())).collect()
 }
 
-fn deny(calls: &[i64]) -> Result<(), Box<dyn std::error::Error>> {
-    let rules: BTreeMap<i64, _> = calls.iter().map(|&call| (call, Vec::new())).collect();
-    let refuse = SeccompAction::Errno(u32::try_from(libc::EPERM)?);
-    let here = std::env::consts::ARCH.try_into()?;
-    let filter: BpfProgram =
-        SeccompFilter::new(rules, SeccompAction::Allow, refuse, here)?.try_into()?;
-    Ok(seccompiler::apply_filter(&filter)?)
+type Rules = BTreeMap<i64, Vec<SeccompRule>>;
+
+/// The allow-list of a network's process.
+fn network_rules() -> Result<Rules, BackendError> {
+    let mut rules: Rules = [ALLOWED_TO_NETWORKS, ALLOWED_OF_OLD]
+        .concat()
+        .into_iter()
+        .map(|call| (call, Vec::new()))
+        .collect();
+    let bits = |argument, mask: libc::c_int, value: libc::c_int| {
+        let (mask, value) = (mask.unsigned_abs().into(), value.unsigned_abs().into());
+        SeccompCondition::new(
+            argument,
+            SeccompCmpArgLen::Dword,
+            SeccompCmpOp::MaskedEq(mask),
+            value,
+        )
+    };
+    let equals = |argument, value: u64| {
+        SeccompCondition::new(argument, SeccompCmpArgLen::Qword, SeccompCmpOp::Eq, value)
+    };
+    let mut allow = |call, conditions: Vec<SeccompCondition>| -> Result<(), BackendError> {
+        rules.entry(call).or_default().push(SeccompRule::new(conditions)?);
+        Ok(())
+    };
+    // Threads, and no processes.
+    allow(libc::SYS_clone, vec![bits(0, libc::CLONE_THREAD, libc::CLONE_THREAD)?])?;
+    // Shared mappings outlive a process and escape its limit of memory.
+    let kind = libc::MAP_SHARED | libc::MAP_PRIVATE;
+    allow(libc::SYS_mmap, vec![bits(3, kind, libc::MAP_PRIVATE)?])?;
+    // Files are opened for reading, also where no Landlock keeps them.
+    let writes = libc::O_ACCMODE | libc::O_CREAT | libc::O_TRUNC;
+    allow(libc::SYS_openat, vec![bits(2, writes, libc::O_RDONLY)?])?;
+    #[cfg(target_arch = "x86_64")]
+    allow(libc::SYS_open, vec![bits(1, writes, libc::O_RDONLY)?])?;
+    // Signals to this process alone, as `abort` sends them.
+    let own = rustix::process::getpid().as_raw_nonzero().get().unsigned_abs();
+    allow(libc::SYS_tgkill, vec![equals(0, own.into())?])?;
+    // Limits are read and not set.
+    allow(libc::SYS_prlimit64, vec![equals(0, 0)?, equals(2, 0)?])?;
+    let commands =
+        [libc::F_GETFD, libc::F_SETFD, libc::F_GETFL, libc::F_DUPFD, libc::F_DUPFD_CLOEXEC];
+    for command in commands {
+        allow(libc::SYS_fcntl, vec![equals(1, command.unsigned_abs().into())?])?;
+    }
+    allow(libc::SYS_ioctl, vec![equals(1, libc::TCGETS)?])?;
+    for option in [libc::PR_SET_NAME, libc::PR_GET_NAME] {
+        allow(libc::SYS_prctl, vec![equals(0, option.unsigned_abs().into())?])?;
+    }
+    Ok(rules)
+}
+
+/// Answers `clone3` as a kernel without it does, since its flags lie in memory, where no filter sees them: the C
+/// library then calls `clone`.
+fn without_clone3() -> Result<BpfProgram, BackendError> {
+    filter([(libc::SYS_clone3, vec![])].into(), SeccompAction::Allow, refusal(libc::ENOSYS))
+}
+
+fn refusal(error: libc::c_int) -> SeccompAction {
+    SeccompAction::Errno(error.unsigned_abs())
+}
+
+/// A filter that answers calls by `matched` where a rule holds, and all others by `otherwise`.
+fn filter(
+    rules: Rules,
+    otherwise: SeccompAction,
+    matched: SeccompAction,
+) -> Result<BpfProgram, BackendError> {
+    SeccompFilter::new(rules, otherwise, matched, std::env::consts::ARCH.try_into()?)?.try_into()
 }
 
 #[cfg(test)]

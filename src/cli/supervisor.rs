@@ -4,6 +4,7 @@
 //! because the server wants the worker to end or because the server was killed, the worker gives its
 //! task back and ends: no worker outlives its server.
 
+use std::ffi::OsStr;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
@@ -92,10 +93,14 @@ impl Slot {
     fn spawn(&self, id: WorkerId) -> std::io::Result<Child> {
         let arguments =
             WorkerArguments { id: Some(id), supervised: true, ..self.arguments.clone() };
-        Command::new(&self.program)
+        let mut command = Command::new(&self.program);
+        // The command line states every setting. A variable of the server, such as its NATS credential, would
+        // be taken for the worker's.
+        for (name, _) in std::env::vars_os().filter(|(name, _)| is_setting(name)) {
+            command.env_remove(name);
+        }
+        command
             .args(arguments.command_line())
-            // All that it needs has been told.
-            .env_remove("SCI_RECON_CONFIG")
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             // Away from the terminal: Ctrl-C is for the server, which then tells the workers.
@@ -149,6 +154,11 @@ impl Slot {
             tracing::error!(worker = %id, %error, "the task of a worker can't be freed");
         }
     }
+}
+
+/// True if an environment variable is a setting of this program.
+fn is_setting(name: &OsStr) -> bool {
+    name.as_encoded_bytes().starts_with(b"SCI_RECON_")
 }
 
 /// The memory of a worker, as far as it shows from outside.

@@ -32,7 +32,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     }
     // What the driver of a GPU opens is its own affair.
     let confined = !settings.engine.unconfined && settings.engine.device == "cpu";
-    if let Some(data) = settings.data.as_deref().filter(|_| confined) {
+    if let Some(data) = settings.data_folder().filter(|_| confined) {
         let library = folders_of(settings.engine.onnxruntime.as_deref());
         let readable: Vec<&Path> = library.iter().map(PathBuf::as_path).collect();
         if let Err(why) = confine_worker(&readable, &[data]) {
@@ -96,11 +96,13 @@ async fn work(
         let remote = remote_settings(settings);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
         let ended = Worker::new(remote.clone(), network, model, stall, stop).run().await;
+        if let Some(refusal) = remote.refusal() {
+            return Err(refusal.into());
+        }
         remote.leave().await;
         return Ok(ended?);
     }
-    let store =
-        Store::open(settings.data.as_deref().unwrap_or(Path::new("")), Purpose::Use).await?;
+    let store = Store::open(settings.data_folder().unwrap_or(Path::new("")), Purpose::Use).await?;
     let local = Local::new(store.clone(), id, !settings.without_tiles);
     let ended = Worker::new(local, network, model, stall, stop).run().await;
     store.close().await;
@@ -140,10 +142,15 @@ fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     ModelCommand { program, arguments, memory_bytes: *memory_bytes }
 }
 
-/// Lowers the priority of this process, and so of all its threads.
+/// Lowers the priority of this process, and so of all its threads. A lower one stays: only root may raise it.
 fn stand_back(nice: i32) -> Result<()> {
-    rustix::process::setpriority_process(None, nice)
-        .map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
+    let failed = |error: rustix::io::Errno| {
+        CliError::Failure(format!("the priority can't be lowered: {error}"))
+    };
+    if rustix::process::getpriority_process(None).map_err(failed)? >= nice {
+        return Ok(());
+    }
+    rustix::process::setpriority_process(None, nice).map_err(failed)
 }
 
 /// Waits for a reason to stop, and tells it on.

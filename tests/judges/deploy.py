@@ -1,21 +1,35 @@
 """Holds the samples under deploy/ and docker/ to the validators of those who read them.
 
-Usage: deploy.py ROOT. Says what was not checked because its program is not here; ends with 1 and the reasons
-if anything is wrong.
+Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Says what was not checked because its program is
+not here; ends with 1 and the reasons if anything is wrong.
 """
 
+import contextlib
 import json
 import os
 import pathlib
+import re
 import shutil
+import socket
+import ssl
 import subprocess
 import sys
 import tempfile
+import time
+import urllib.error
+import urllib.request
 
 import kubernetes_validate
 import yaml
+from docker.utils.build import exclude_paths
+
+from image import services
 
 VERSION = "1.31"
+# Tenths of the exposure that `systemd-analyze security` finds, at most.
+EXPOSURE = 30
+# An image name that no sample has: kustomize must put it everywhere.
+IMAGE = {"newName": "registry.example/sci-recon", "newTag": "1.2.3"}
 
 
 def run(*command, **options):
@@ -27,7 +41,7 @@ def kubernetes(root, wrong):
     folder = root / "deploy/kubernetes"
     documents = []
     for file in sorted(folder.glob("*.yaml")):
-        if file.name != "kustomization.yaml":
+        if file.name not in ("kustomization.yaml", "name-references.yaml"):
             documents += [(file.name, each) for each in yaml.safe_load_all(file.read_text())]
     listed = yaml.safe_load((folder / "kustomization.yaml").read_text())["resources"]
     if sorted(listed) != sorted({name for name, _ in documents}):
@@ -43,64 +57,362 @@ def kubernetes(root, wrong):
             wrong.append(f"{name}: {document['kind']}: {error.message}")
 
 
-def kustomize(root, wrong):
+def make_keys(program, folder, *nodes):
+    """What docs/CLUSTER.md has its readers write into `cluster` below a folder."""
+    options = [word for node in nodes for word in ("--node", node)]
+    for line in [
+        ["init", "--no-tls", *options, "--store", "/data", "--nats-version", "2.12"],
+        ["worker", "create", "--pool", "default", "--out", "cluster/default.creds"],
+    ]:
+        subprocess.run([program, "cluster", *line], cwd=folder, check=True, capture_output=True)
+
+
+def kustomize(root, wrong, program):
     if not shutil.which("kubectl"):
         return "kubectl"
     with tempfile.TemporaryDirectory() as copy:
         folder = pathlib.Path(copy) / "kubernetes"
-        shutil.copytree(root / "deploy/kubernetes", folder)
-        (folder / "cluster").mkdir(exist_ok=True)
-        for name in [*(f"nats-server-{n}.conf" for n in (1, 2, 3)), "hub.creds", "default.creds"]:
-            (folder / "cluster" / name).write_text("x")
-        status, told = run("kubectl", "kustomize", str(folder))
+        shutil.copytree(root / "deploy/kubernetes", folder, ignore=shutil.ignore_patterns("cluster"))
+        make_keys(program, folder, *(f"nats-{n}.nats" for n in range(3)))
+        file = folder / "kustomization.yaml"
+        text = yaml.safe_load(file.read_text())
+        text["images"] = [{**image, **IMAGE} for image in text["images"]]
+        file.write_text(yaml.safe_dump(text))
+        status, said = run("kubectl", "kustomize", str(folder))
     if status:
-        wrong.append(f"kubectl kustomize: {told}")
+        wrong.append(f"kubectl kustomize: {said}")
         return None
-    kinds = [each["kind"] for each in yaml.safe_load_all(told)]
+    documents = list(yaml.safe_load_all(said))
+    kinds = [each["kind"] for each in documents]
     if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
         wrong.append(f"kubectl kustomize makes {kinds}")
+    wrong += [f"kubectl kustomize: {reason}" for reason in unresolved(documents)]
+    for name, _, template in templates(documents):
+        wrong += [f"kubectl kustomize: {name}: {reason}" for reason in unrestricted(template["spec"])]
     return None
 
 
+# What the Pod Security Standard "restricted" allows (kubernetes.io/docs/concepts/security/pod-security-standards).
+VOLUMES = {"configMap", "csi", "downwardAPI", "emptyDir", "ephemeral", "persistentVolumeClaim", "projected", "secret"}
+
+
+def unrestricted(pod):
+    """Where a pod does not keep to "restricted", of which "baseline" is a part."""
+    for name in ("hostNetwork", "hostPID", "hostIPC"):
+        if pod.get(name):
+            yield name
+    for volume in pod.get("volumes", []):
+        kinds = set(volume) - {"name"}
+        if not kinds <= VOLUMES:
+            yield f"a volume of the kind {kinds - VOLUMES}"
+    whole = pod.get("securityContext", {})
+    if whole.get("sysctls") or whole.get("seLinuxOptions"):
+        yield "sysctls or seLinuxOptions"
+    for container in [*pod.get("initContainers", []), *pod["containers"]]:
+        own = container.get("securityContext", {})
+        both = {**whole, **own}
+        rules = {
+            "privileged": not own.get("privileged"),
+            "procMount": own.get("procMount", "Default") == "Default",
+            "hostPort": not any("hostPort" in port for port in container.get("ports", [])),
+            "allowPrivilegeEscalation": own.get("allowPrivilegeEscalation") is False,
+            "capabilities.drop": "ALL" in own.get("capabilities", {}).get("drop", []),
+            "capabilities.add": set(own.get("capabilities", {}).get("add", [])) <= {"NET_BIND_SERVICE"},
+            "runAsNonRoot": both.get("runAsNonRoot") is True,
+            "runAsUser": both.get("runAsUser") != 0,
+            "seccompProfile": both.get("seccompProfile", {}).get("type") in ("RuntimeDefault", "Localhost"),
+            "seLinuxOptions": not own.get("seLinuxOptions"),
+        }
+        yield from (f"{container['name']}: {name}" for name, kept in rules.items() if not kept)
+
+
+def templates(documents):
+    """Name and template of all pods that these objects make, with the object."""
+    for document in documents:
+        spec = document.get("spec", {})
+        template = spec.get("jobTargetRef", spec).get("template")
+        if template:
+            yield document["metadata"]["name"], document, template
+
+
+def unresolved(documents):
+    """References among these objects that lead nowhere."""
+    named = {}
+    for document in documents:
+        named.setdefault(document["kind"], {})[document["metadata"]["name"]] = document
+    services, secrets, [namespace] = named["Service"], named["Secret"], named["Namespace"]
+    labels = []
+    for name, document, template in templates(documents):
+        spec, pod = document["spec"], template["spec"]
+        containers = [*pod.get("initContainers", []), *pod["containers"]]
+        ports = [port for container in containers for port in container.get("ports", [])]
+        labels.append((template["metadata"]["labels"], ports))
+        if document["metadata"].get("namespace") != namespace:
+            yield f"{name} is in the namespace {document['metadata'].get('namespace')}"
+        if document["kind"] == "StatefulSet":
+            if spec["serviceName"] not in services:
+                yield f"{name} names the service {spec['serviceName']}"
+            if not spec["selector"]["matchLabels"].items() <= template["metadata"]["labels"].items():
+                yield f"{name} selects other pods than its own"
+        claims = {claim["metadata"]["name"]: {} for claim in spec.get("volumeClaimTemplates", [])}
+        volumes = {**claims, **{volume["name"]: volume for volume in pod.get("volumes", [])}}
+        for volume in volumes.values():
+            secret = volume.get("secret", {}).get("secretName")
+            if secret and secret not in secrets:
+                yield f"{name} names the secret {secret}; there are {sorted(secrets)}"
+        for container in containers:
+            yield from unresolved_in(container, name, spec, volumes, secrets)
+        probes = [container[kind]["httpGet"] for container in containers for kind in container if kind.endswith("Probe")]
+        for probe in probes:
+            if probe["port"] not in [port["name"] for port in ports]:
+                yield f"a probe of {name} asks the port {probe['port']}"
+    for name, service in services.items():
+        chosen = [ports for label, ports in labels if service["spec"]["selector"].items() <= label.items()]
+        if len(chosen) != 1:
+            yield f"the service {name} selects {len(chosen)} kinds of pods"
+        for port in service["spec"]["ports"] if chosen else []:
+            target = port.get("targetPort", port["port"])
+            if not any(target in (each["name"], each["containerPort"]) for each in chosen[0]):
+                yield f"the service {name} leads to the port {target}"
+    for name, job in named["ScaledJob"].items():
+        for trigger in job["spec"]["triggers"]:
+            host, port = trigger["metadata"]["natsServerMonitoringEndpoint"].split(":")
+            service = next((each for each in services if host == f"{each}.{namespace}.svc.cluster.local"), None)
+            if not service or int(port) not in [each["port"] for each in services[service]["spec"]["ports"]]:
+                yield f"a trigger of {name} asks {host}:{port}"
+
+
+def unresolved_in(container, name, spec, volumes, secrets):
+    image = container["image"]
+    if image != f"{IMAGE['newName']}:{IMAGE['newTag']}" and not image.startswith("nats:"):
+        yield f"{name} runs the image {image}"
+    mounts = {mount["mountPath"]: volumes.get(mount["name"]) for mount in container.get("volumeMounts", [])}
+    for place, volume in mounts.items():
+        if volume is None:
+            yield f"{name} mounts at {place} what it does not declare"
+    # The files that its command line names, with what a shell makes of them in each pod.
+    for line in command_lines(container, name, spec.get("replicas", 1)):
+        for word in line:
+            place, _, file = word.rpartition("/")
+            secret = (mounts.get(place) or {}).get("secret", {}).get("secretName")
+            if secret in secrets and file not in secrets[secret]["data"]:
+                yield f"{name} reads {word}; the secret has {sorted(secrets[secret]['data'])}"
+            if word.startswith("/etc/") and secret is None:
+                yield f"{name} reads {word}, which no secret brings"
+
+
+def command_lines(container, name, replicas):
+    """The words of a container's command; behind `sh -c` those of the program that the shell ends as."""
+    command = [*container.get("command", []), *container.get("args", [])]
+    if command[:2] != ["/bin/sh", "-c"]:
+        return [command]
+    lines = []
+    for n in range(replicas):
+        with tempfile.TemporaryDirectory() as folder:
+            stand_in = pathlib.Path(folder, "nats-server")
+            stand_in.write_text("#!/bin/sh\nprintf '%s\\n' \"$@\"\n")
+            stand_in.chmod(0o755)
+            environment = {"PATH": f"{folder}:/usr/bin:/bin", "HOSTNAME": f"{name}-{n}"}
+            lines.append(run(*command, env=environment)[1].splitlines())
+    return lines
+
+
+def context(root, wrong, program):
+    """What a build of the image sees: all files of the repository, and nothing that was made in the checkout."""
+    files = subprocess.run(["git", "-C", root, "ls-files", "-z"], capture_output=True, text=True, check=True).stdout
+    files = {name for name in files.split("\0") if (root / name).is_file()}
+    with tempfile.TemporaryDirectory() as copy:
+        for name in files:
+            place = pathlib.Path(copy, name)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, place)
+        for folder in [".", "docker", "deploy/kubernetes"]:
+            make_keys(program, pathlib.Path(copy, folder), "nats-0.nats", "nats-1.nats")
+            shutil.copy2(pathlib.Path(copy, folder, "cluster/default.creds"), pathlib.Path(copy, folder))
+        keys = pathlib.Path(copy, "elsewhere")
+        subprocess.run([program, "cluster", "init", "--keys", keys], check=True, capture_output=True)
+        for name in ["target/x", "runtime/x", "data/sci-recon.db", "tests/e2e/node_modules/x", ".git/x", "dist/x",
+                     ".venv/x", "clients/python/.venv/x", "tests/__pycache__/x.pyc"]:
+            pathlib.Path(copy, name).parent.mkdir(parents=True, exist_ok=True)
+            pathlib.Path(copy, name).write_text("x")
+        patterns = [line.strip() for line in (root / ".dockerignore").read_text().splitlines()]
+        patterns = [pattern for pattern in patterns if pattern and not pattern.startswith("#")]
+        seen = {name for name in exclude_paths(copy, patterns) if pathlib.Path(copy, name).is_file()}
+    if seen - files:
+        wrong.append(f".dockerignore leaves in the context: {sorted(seen - files)}")
+    if files - seen:
+        wrong.append(f".dockerignore takes out of the context: {sorted(files - seen)}")
+
+
 def compose(root, wrong):
+    listed = services(root)
+    built = [service.get("image") for service in listed.values() if "build" in service]
+    if len(built) != 1 or built[0] is None:
+        wrong.append(f"docker/cluster.yaml builds {built}: server and worker must run one image, built once")
+    for name, service in listed.items():
+        made_here = service.get("image") in built
+        if made_here != ("build" in service or service.get("pull_policy") == "never"):
+            wrong.append(f"docker/cluster.yaml: {name} has {service.get('image')}, which is {'' if made_here else 'not '}built")
+    if not {"sci-recon", "nats"} <= set(listed["worker"]["depends_on"]):
+        wrong.append("docker/cluster.yaml: another service makes the worker's image")
     if not shutil.which("docker-compose"):
         return "docker-compose"
     files = ["-f", str(root / "docker/compose.yaml"), "-f", str(root / "docker/cluster.yaml")]
-    status, told = run("docker-compose", *files, "config")
+    status, said = run("docker-compose", *files, "config")
     if status:
-        wrong.append(f"docker-compose config: {told}")
+        wrong.append(f"docker-compose config: {said}")
+    return None
+
+
+def image(root, wrong, program):
+    """The containers of the samples, started without Docker."""
+    nats_server = shutil.which("nats-server", path=os.environ["PATH"] + ":/usr/sbin")
+    namespaces = ["unshare", "--mount", "--net", "--pid", "--fork", "--kill-child", "--mount-proc"]
+    if not nats_server or run(*namespaces, "true")[0]:
+        return "containers (nats-server, and root with namespaces)"
+    script = root / "tests/judges/image.py"
+    status, said = run(*namespaces, sys.executable, script, root, program)
+    if status:
+        wrong.append(f"docker/Dockerfile: {said}")
     return None
 
 
 def systemd(root, wrong):
     if not shutil.which("systemd-analyze"):
         return "systemd-analyze"
-    for unit in (root / "deploy/systemd").glob("*.service"):
-        _, told = run("systemd-analyze", "verify", str(unit))
+    units = (root / "deploy/systemd").iterdir()
+    for unit in sorted(unit for unit in units if unit.suffix in (".service", ".timer")):
+        # With its drop-ins.
+        _, said = run("systemd-analyze", "verify", str(unit))
+        if unit.suffix == ".timer":
+            continue
+        status, exposure = run("systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}", str(unit))
+        if status:
+            wrong.append(f"{unit.name}: {exposure.splitlines()[-1]}")
         # The program is not installed where this runs.
-        told = [line for line in told.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
-        if told:
-            wrong.append(f"{unit.name}: {told}")
+        said = [line for line in said.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
+        if said:
+            wrong.append(f"{unit.name}: {said}")
+        texts = [file.read_text() for file in [unit, *unit.parent.glob(f"{unit.name}.d/*.conf")]]
+        wrong += [f"{unit.name}: {reason}" for reason in unreadable("\n".join(texts))]
     return None
 
 
-def nginx(root, wrong):
-    program = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin")
-    if not program or not shutil.which("openssl"):
-        return "nginx"
+def filtered(root, wrong, program):
+    """The server and a worker under the unit's system call filter: a job, with all confinement."""
+    if not shutil.which("systemd-analyze"):
+        return "a service under its system call filter (systemd-analyze)"
     with tempfile.TemporaryDirectory() as folder:
-        key, certificate = f"{folder}/key.pem", f"{folder}/cert.pem"
+        # Where a user without rights may read and run them.
+        pathlib.Path(folder).chmod(0o777)
+        copy = shutil.copy2(program, folder)
+        for library in (root / "runtime").glob("*.so"):
+            shutil.copy2(library, folder)
+        unit = root / "deploy/systemd/sci-recon.service"
+        before = [sys.executable, root / "tests/judges/filtered.py", unit]
+        with served(copy, folder, before, workers=1) as url:
+            state, confinement = sample_job(url), ask(f"{url}/readyz")["confinement"]
+        if (state, confinement) != ("succeeded", "ok"):
+            wrong.append(f"{unit.name}: under SystemCallFilter= a job is {state}, confinement says {confinement}")
+    return None
+
+
+def ask(url, body=None):
+    request = urllib.request.Request(url, body and json.dumps(body).encode(), {"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=60) as answer:
+        return json.load(answer)
+
+
+def sample_job(url):
+    """How a short job ends."""
+    job = ask(f"{url}/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
+    for _ in range(6):
+        state = ask(f"{url}/v1/jobs/{job}?wait=20")["state"]
+        if state not in ("queued", "running"):
+            break
+    return state
+
+
+def unreadable(text):
+    """Credentials that a unit's user can't read, since systemd does not hand them to it."""
+    lines = [line for line in text.splitlines() if "=" in line]
+    loaded = [line.removeprefix("LoadCredential=").split(":")[0] for line in lines if line.startswith("LoadCredential=")]
+    for name in re.findall(r"%d/([\w.-]+)", text):
+        if name not in loaded:
+            yield f"no LoadCredential= is named {name}"
+    for line in lines:
+        path = re.search(r"/\S*\.creds", line)
+        if path and not line.startswith("LoadCredential="):
+            yield f"DynamicUser= can't read {path.group()}: {line}"
+
+
+def nginx(root, wrong, program):
+    server = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin")
+    if not server or not shutil.which("openssl"):
+        return "nginx"
+    with tempfile.TemporaryDirectory() as folder, served(program, folder) as url:
+        key, certificate, port = f"{folder}/key.pem", f"{folder}/cert.pem", free_port()
         run("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate,
             "-days", "1", "-subj", "/CN=bench.example")
         site = (root / "deploy/nginx/sci-recon.conf").read_text()
-        site = site.replace("/etc/ssl/bench.example.pem", certificate)
-        site = site.replace("/etc/ssl/private/bench.example.key", key)
+        for place, ours in [("/etc/ssl/bench.example.pem", certificate), ("/etc/ssl/private/bench.example.key", key),
+                            ("listen 443 ", f"listen 127.0.0.1:{port} "), ("127.0.0.1:8080;", url.removeprefix("http://") + ";")]:
+            if place not in site:
+                wrong.append(f"deploy/nginx/sci-recon.conf does not name {place}")
+            site = site.replace(place, ours)
         whole = pathlib.Path(folder, "nginx.conf")
-        whole.write_text(f"pid {folder}/pid; error_log {folder}/log; events {{}} http {{ {site} }}")
-        status, told = run(program, "-t", "-q", "-c", str(whole))
+        whole.write_text(f"daemon off; pid {folder}/pid; error_log {folder}/log; events {{}} "
+                         f"http {{ access_log off; {site} }}")
+        status, said = run(server, "-t", "-q", "-c", str(whole))
         if status:
-            wrong.append(f"nginx -t: {told}")
+            wrong.append(f"nginx -t: {said}")
+            return None
+        proxy = subprocess.Popen([server, "-c", str(whole)])
+        try:
+            for path in ["/v1/jobs", "/sci/v1/jobs"]:
+                own = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", f"https://bench.example:{port}")
+                other = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", "https://other.example")
+                if own == "foreign_site" or other != "foreign_site":
+                    wrong.append(f"behind nginx at {path} a page of the service gets {own}, one of another {other}")
+        finally:
+            proxy.terminate()
+            proxy.wait()
     return None
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+@contextlib.contextmanager
+def served(program, folder, before=(), workers=0):
+    """A service without tokens that is reached as bench.example, started by a command before it; its address."""
+    line = [*before, program, "serve", "--data", f"{folder}/data", "--listen", "127.0.0.1:0", "--workers", str(workers),
+            "--host", "bench.example"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        try:
+            yield json.loads(server.stdout.readline())["url"]
+        finally:
+            server.terminate()
+
+
+def refusal(url, host, origin):
+    """The code of the problem with which a change is refused that a page of `origin` sends."""
+    request = urllib.request.Request(url, b"{}", {"Host": host, "Origin": origin, "Content-Type": "application/json"})
+    context = ssl._create_unverified_context()
+    start = time.monotonic()
+    while True:
+        try:
+            urllib.request.urlopen(request, timeout=20, context=context).close()
+            return None
+        except urllib.error.HTTPError as error:
+            return json.load(error)["code"]
+        except urllib.error.URLError:
+            # It is still starting.
+            if time.monotonic() - start > 10:
+                raise
+            time.sleep(0.1)
 
 
 def caddy(root, wrong):
@@ -127,6 +439,9 @@ def promtool(root, wrong):
     status, told = run("promtool", "check", "rules", str(root / "deploy/prometheus/alerts.yml"))
     if status:
         wrong.append(f"promtool check rules: {told}")
+    status, said = run("promtool", "check", "config", "--syntax-only", str(root / "deploy/prometheus/prometheus.yml"))
+    if status:
+        wrong.append(f"promtool check config: {said}")
     return None
 
 
@@ -146,10 +461,13 @@ def words(text):
 
 
 def main():
-    root, wrong = pathlib.Path(sys.argv[1]), []
+    root, program, wrong = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]).resolve(), []
     kubernetes(root, wrong)
     figures(root, wrong)
-    absent = [name for name in (check(root, wrong) for check in (kustomize, compose, systemd, nginx, caddy, promtool)) if name]
+    context(root, wrong, program)
+    absent = [check(root, wrong, program) for check in (kustomize, image, nginx, filtered)]
+    absent += [check(root, wrong) for check in (compose, systemd, caddy, promtool)]
+    absent = [name for name in absent if name]
     if absent:
         print(f"SKIPPED: what {', '.join(absent)} would say", file=sys.stderr)
     for reason in wrong:

@@ -1,9 +1,13 @@
 //! The commands that talk to a service: the real program, over connections that are cut.
 
+use std::io::{Read, Write};
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::Command;
 
 use crate::app::TestApp;
@@ -183,6 +187,71 @@ async fn refusals_say_what_is_wrong_and_where() {
     command.args(["--config", "lab.toml", "ls"]).current_dir(lab.folder.path());
     let output = command.env_remove("SCI_RECON_URL").output().await.unwrap();
     assert!(String::from_utf8_lossy(&output.stdout).contains(&job), "{output:?}");
+}
+
+/// A server with a self-signed certificate that answers everything with 404; its address, and the certificate as PEM.
+fn tls_server() -> (String, String) {
+    let names = vec!["localhost".to_owned(), "127.0.0.1".to_owned()];
+    let made = rcgen::generate_simple_self_signed(names).unwrap();
+    let key = rustls::pki_types::PrivateKeyDer::try_from(made.signing_key.serialize_der()).unwrap();
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let config = rustls::ServerConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .unwrap()
+        .with_no_client_auth()
+        .with_single_cert(vec![made.cert.der().clone()], key)
+        .unwrap();
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("https://{}", listener.local_addr().unwrap());
+    let config = Arc::new(config);
+    std::thread::spawn(move || {
+        for mut socket in listener.incoming().flatten() {
+            let mut session = rustls::ServerConnection::new(config.clone()).unwrap();
+            let mut stream = rustls::Stream::new(&mut session, &mut socket);
+            // A client that does not trust the certificate ends the connection.
+            if matches!(stream.read(&mut [0; 4096]), Ok(1..)) {
+                let answer =
+                    "HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
+                stream.write_all(answer.as_bytes()).unwrap();
+            }
+        }
+    });
+    (url, made.cert.pem())
+}
+
+#[tokio::test]
+async fn lasting_failures_end_a_command_at_once_and_others_are_announced() {
+    let (url, certificate) = tls_server();
+    let lab = Lab::new(url.clone(), "token");
+    lab.write("authority.pem", certificate.as_bytes());
+    let app = TestApp::start().await;
+    let start = Instant::now();
+    for (url, words) in [
+        (url.as_str(), "SSL_CERT_FILE"),
+        (&format!("https://{}", app.address()), "http:// instead of https://"),
+        // Too long for a host name: no resolver is asked.
+        (&format!("http://{}.lab", "b".repeat(70)), "correct the host name"),
+    ] {
+        let refused = lab.refused(2, &["ls", "--url", url]).await;
+        assert!(refused.contains(words) && refused.contains(url), "{refused}");
+    }
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    // With the certificate of its authority the service is spoken to.
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.args(["ls", "--url", &url]).env("SSL_CERT_FILE", lab.path("authority.pem"));
+    let output = command.output().await.unwrap();
+    assert!(String::from_utf8_lossy(&output.stderr).contains("404"), "{output:?}");
+    // A service that is down may come back.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.args(["ls", "--url", &format!("http://127.0.0.1:{port}")]);
+    let mut child =
+        command.stderr(std::process::Stdio::piped()).kill_on_drop(true).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let line = tokio::time::timeout(Duration::from_secs(10), lines.next_line()).await;
+    let line = line.expect("it says so at the first try").unwrap().unwrap();
+    assert!(line.contains("refused") && line.contains("trying again"), "{line}");
+    assert!(child.try_wait().unwrap().is_none(), "it tries again");
 }
 
 /// Arrays of other names, in files that other programs have written.

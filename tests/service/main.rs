@@ -17,6 +17,7 @@ mod cluster;
 mod colour;
 mod commands;
 mod conditions;
+mod confinement;
 mod contract;
 mod copies;
 mod crashes;

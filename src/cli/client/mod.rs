@@ -2,8 +2,11 @@
 
 mod download;
 mod job;
+mod unreachable;
 mod upload;
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::Args;
@@ -24,7 +27,8 @@ const LONGEST: f64 = 30.0;
 /// Which service.
 #[derive(Debug, Args)]
 pub struct ServiceArguments {
-    /// Address of the service.
+    /// Address of the service. For https, the certificate must be signed by an authority that this system trusts;
+    /// the variable SSL_CERT_FILE names a PEM file with another one.
     #[arg(
         long,
         env = "SCI_RECON_URL",
@@ -44,6 +48,9 @@ pub(super) enum ClientError {
     /// It can't be reached, or can't serve this now, for minutes.
     #[error("{0}")]
     Passing(String),
+    /// There is no service that can be spoken to under this address, and waiting will not change it.
+    #[error("{0}")]
+    Unreachable(String),
     /// It refuses this request, and will again.
     #[error("the service refuses it ({status} {code}): {detail}")]
     Refused { status: StatusCode, code: String, detail: String },
@@ -61,6 +68,7 @@ impl From<ClientError> for CliError {
             ClientError::Refused { status, .. } if status.is_client_error() => {
                 Self::Input(error.to_string())
             }
+            ClientError::Unreachable(reason) => Self::Input(reason),
             other => Self::Failure(other.to_string()),
         }
     }
@@ -72,6 +80,8 @@ pub(super) struct Client {
     url: String,
     token: Option<String>,
     http: reqwest::Client,
+    /// True once the service has answered: its address and certificate were right then.
+    has_answered: Arc<AtomicBool>,
 }
 
 impl Client {
@@ -96,7 +106,8 @@ impl Client {
             .read_timeout(Duration::from_secs(300))
             .build()
             .map_err(|error| CliError::Failure(told(&error)))?;
-        Ok(Self { url: url.trim_end_matches('/').to_owned(), token, http })
+        let url = url.trim_end_matches('/').to_owned();
+        Ok(Self { url, token, http, has_answered: Arc::default() })
     }
 
     fn request(&self, method: reqwest::Method, path: &str) -> RequestBuilder {
@@ -111,7 +122,9 @@ impl Client {
     async fn send(&self, request: impl Fn() -> RequestBuilder) -> Result<Response> {
         let mut attempt = 0;
         loop {
-            let error = match request().send().await {
+            let sent = request().send().await;
+            self.has_answered.fetch_or(sent.is_ok(), Ordering::Relaxed);
+            let error = match sent {
                 Ok(response) if response.status().is_success() => return Ok(response),
                 Ok(response) => refusal(response).await,
                 Err(error) => self.cut(&error),
@@ -121,7 +134,13 @@ impl Client {
     }
 
     fn cut(&self, error: &reqwest::Error) -> ClientError {
-        ClientError::Passing(format!("{} can't be reached: {}", self.url, told(error)))
+        let text = format!("{} can't be reached: {}", self.url, told(error));
+        // A service that has answered under this address is expected back.
+        let lasting = !self.has_answered.load(Ordering::Relaxed);
+        match unreachable::remedy(error).filter(|_| lasting) {
+            Some(remedy) => ClientError::Unreachable(format!("{text}: {remedy}")),
+            None => ClientError::Passing(text),
+        }
     }
 
     /// Reads a JSON document, again where it was cut.
@@ -150,11 +169,16 @@ impl Client {
     }
 }
 
-/// Waits before the next try; gives the error back where that would not help, or has not.
+/// Waits before the next try, and says so before the first pause; gives the error back where that would not help,
+/// or has not.
 async fn again(error: ClientError, attempt: &mut u32) -> Result<()> {
     *attempt += 1;
     match error {
-        ClientError::Passing(_) if *attempt < TRIES => {}
+        ClientError::Passing(reason) if *attempt < TRIES => {
+            if *attempt == 1 {
+                eprintln!("sci-recon: {reason}; trying again for about five minutes");
+            }
+        }
         error => return Err(error),
     }
     let seconds = (0.1 * f64::from(1 << (*attempt).min(10))).min(LONGEST);

@@ -169,13 +169,15 @@ impl Watch<'_> {
                 self.waiting(&reason).await;
                 return Ok(());
             }
-            // Whoever watches is not let in: that is no fault of the file.
+            // Neither is a wrong address or certificate a fault of the file, ...
+            Err(error @ ClientError::Unreachable(_)) => return Err(error.into()),
+            // ... nor that whoever watches is not let in.
             Err(ClientError::Refused { status, code, detail })
                 if [StatusCode::UNAUTHORIZED, StatusCode::FORBIDDEN].contains(&status) =>
             {
                 return Err(ClientError::Refused { status, code, detail }.into());
             }
-            // Nor that results can't be written here: they wait for the next start.
+            // Results that can't be written here wait for the next start.
             Err(ClientError::Here(error @ CliError::Failure(_)))
                 if matches!(entry.stage, Stage::Submitted { .. }) =>
             {

@@ -10,6 +10,7 @@ mod rounds;
 mod scale;
 
 use std::collections::BTreeMap;
+use std::os::unix::fs::PermissionsExt;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
@@ -118,6 +119,54 @@ async fn a_job_over_the_network_gives_the_same_bytes() {
     assert_eq!(figure(&app, "sci_recon_cluster_redelivered_total").await, 0.0);
     assert!(figure(&app, "sci_recon_cluster_blob_bytes_total{direction=\"in\"}").await > 0.0);
     nats.emptied().await;
+}
+
+#[tokio::test]
+async fn settings_of_one_process_are_not_taken_for_those_of_another() {
+    let Some(nats) = Nats::start(1) else { return };
+    // The server's address of NATS is in its environment, and its own workers do the tiles.
+    let environment = [("SCI_RECON_NATS", nats.url())];
+    let environment = environment.each_ref().map(|(name, url)| (*name, url.as_str()));
+    let app = TestApp::in_environment(&["--workers", "1", "--ack-wait", "5"], &environment).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&with_iterations(&measurement, 50)).await;
+    let done = app.ended(&id).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    drop(app);
+    // A configuration file names a data folder for all commands: a worker elsewhere has none.
+    let app = served(&nats, "5").await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("sci.toml");
+    std::fs::write(&file, "data = \"/var/lib/sci-recon\"\n").unwrap();
+    std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let _worker = worker(&nats, &["--config", file.to_str().unwrap()]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let id = app.submit(&with_iterations(&measurement, 50)).await;
+    let done = app.ended(&id).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+}
+
+#[tokio::test]
+async fn a_worker_keeps_a_lower_priority_than_its_own() {
+    let Some(nats) = Nats::start(1) else { return };
+    let app = served(&nats, "5").await;
+    let url = nats.url();
+    let line = ["--nats", url.as_str(), "--pool", "test"];
+    // Somebody other than root may not raise it. What `nice` adds, it adds to that of the test.
+    let own = rustix::process::getpriority_process(None).unwrap();
+    for added in [15, 5] {
+        let started = added.to_string();
+        let expected = (own + added).clamp(10, 19).to_string();
+        let mut worker = RemoteWorker::within(&["nice", "-n", &started], &line);
+        until("the worker comes in", || async { workers(&app).await.len() == 1 }).await;
+        let stat = format!("/proc/{}/stat", worker.inner().unwrap().as_raw_nonzero());
+        let stat = std::fs::read_to_string(stat).unwrap();
+        let (_, fields) = stat.rsplit_once(") ").unwrap();
+        assert_eq!(fields.split(' ').nth(16), Some(&*expected), "{stat}");
+        worker.process.signal(Signal::TERM);
+        assert_eq!(worker.process.ended(Duration::from_secs(5)), Some(0));
+        until("the worker is gone", || async { workers(&app).await.is_empty() }).await;
+    }
 }
 
 #[tokio::test]
@@ -262,7 +311,6 @@ async fn a_tile_that_kills_its_workers_is_given_up_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let library = crate::hangs::library(folder.path(), "abort();");
     // The worker runs as somebody else.
-    use std::os::unix::fs::PermissionsExt;
     std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
     // Far longer than the test: nobody waits for a silent worker.
     let app = served(&nats, "600").await;

@@ -378,7 +378,19 @@ pub fn program() -> &'static Path {
 /// Somebody without rights to anything.
 pub const NOBODY: u32 = 65_534;
 
-/// A worker in an empty folder, with a cleared environment, as another user where the test is root.
+/// The environment of every container: the ENV lines of the image.
+fn image_environment() -> Vec<(String, String)> {
+    let text = std::fs::read_to_string("docker/Dockerfile").unwrap();
+    let (_, stage) = text.rsplit_once("\nFROM ").unwrap();
+    let words =
+        stage.lines().filter_map(|line| line.strip_prefix("ENV ")).flat_map(str::split_whitespace);
+    let pairs = words.map(|word| word.split_once('=').unwrap());
+    let found: Vec<_> = pairs.map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
+    assert!(!found.is_empty(), "the image has no ENV");
+    found
+}
+
+/// A worker in an empty folder, with the environment of a container, as another user where the test is root.
 pub struct RemoteWorker {
     pub process: Process,
     pub folder: TempDir,
@@ -418,6 +430,7 @@ impl RemoteWorker {
             .args(arguments)
             .current_dir(folder.path())
             .env_clear()
+            .envs(image_environment())
             .env("RUST_LOG", "info")
             .stdin(Stdio::null())
             .stdout(Stdio::null())

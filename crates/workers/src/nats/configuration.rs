@@ -1,5 +1,6 @@
 //! Configurations of the message server: one for each node.
 
+use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -16,6 +17,37 @@ const CERTIFICATE: &str = "server.pem";
 const KEY: &str = "server.key";
 /// See `authority.rs`.
 const AUTHORITY: &str = "ca.pem";
+
+/// The first version that knows `sync_interval: always`.
+const SYNC_ALWAYS: ServerVersion = ServerVersion([2, 10, 0]);
+
+/// A version of nats-server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct ServerVersion([u32; 3]);
+
+impl FromStr for ServerVersion {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("{text:?} is no version of nats-server; one is 2.12 or 2.12.5");
+        let mut version = [0; 3];
+        let parts: Vec<&str> = text.trim_start_matches('v').split('.').collect();
+        if !(2..=3).contains(&parts.len()) {
+            return Err(wrong());
+        }
+        for (place, part) in version.iter_mut().zip(parts) {
+            *place = part.parse().map_err(|_| wrong())?;
+        }
+        Ok(Self(version))
+    }
+}
+
+impl fmt::Display for ServerVersion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [major, minor, patch] = self.0;
+        write!(f, "{major}.{minor}.{patch}")
+    }
+}
 
 /// A node of the message server: its host as others reach it, and its port.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -83,7 +115,8 @@ pub fn make_certificates(folder: &Path, nodes: &[Node]) -> Result<(), ClusterErr
 }
 
 /// Writes the configuration of each node into the folder of the keys. `store` is the folder for
-/// messages on the node's machine, `bytes` the most in it.
+/// messages on the node's machine, `bytes` the most in it. `version` is that of the nodes' nats-server; without it
+/// they are taken to have the one of this machine, or a current one.
 ///
 /// # Errors
 /// If they can't be written, or nats-server, where it is there, does not take them.
@@ -93,12 +126,15 @@ pub fn write(
     nodes: &[Node],
     (store, bytes): (&Path, u64),
     tls: bool,
+    version: Option<ServerVersion>,
 ) -> Result<Configured, ClusterError> {
     let folder = std::path::absolute(folder).map_err(at(folder))?;
     let store = &std::path::absolute(store).map_err(at(store))?;
     let secret = hex::encode(rand::random::<[u8; 16]>());
     let (mut files, mut warnings) = (Vec::new(), Vec::new());
-    let server = find_server();
+    let here = find_server().and_then(|path| Some((version_of(&path)?, path)));
+    let version = version.or(here.as_ref().map(|(version, _)| *version));
+    let sync = version.is_none_or(|version| version >= SYNC_ALWAYS);
     for (n, node) in nodes.iter().enumerate() {
         let name = if nodes.len() > 1 {
             format!("nats-server-{}.conf", n + 1)
@@ -106,42 +142,36 @@ pub fn write(
             "nats-server.conf".to_owned()
         };
         let path = folder.join(name);
-        let text = |sync: bool| -> Result<String, ClusterError> {
-            text(
-                authority,
-                &folder,
-                (n, node),
-                nodes,
-                (store, bytes),
-                tls.then_some(()),
-                &secret,
-                sync,
-            )
-        };
-        write_secret(&path, &text(true)?)?;
-        if let Some(server) = &server {
-            // An old server refuses the word; then without it.
-            if test(server, &path).is_err() {
-                write_secret(&path, &text(false)?)?;
-                test(server, &path).map_err(|reason| at(&path)(reason))?;
-                warnings.push(format!(
-                    "{} does not know `sync_interval: always`: after a power cut up to two minutes of \
-                     messages may be gone, which the server finds and mends. 2.12.5 or later is \
-                     recommended",
-                    server.display()
-                ));
-            }
+        let text = text(
+            authority,
+            &folder,
+            (n, node),
+            nodes,
+            (store, bytes),
+            tls.then_some(()),
+            &secret,
+            sync,
+        )?;
+        write_secret(&path, &text)?;
+        // An older server than the nodes' may refuse what they know.
+        if let Some((_, server)) = here.as_ref().filter(|(here, _)| !sync || *here >= SYNC_ALWAYS) {
+            test(server, &path).map_err(|reason| at(&path)(reason))?;
         }
         files.push(path);
     }
-    if server.is_none() {
-        warnings.push(
-            "there is no nats-server on this machine to try the configuration with: before 2.10 it \
-             refuses `sync_interval`, which is to be left out then"
+    match version {
+        Some(version) if !sync => warnings.push(format!(
+            "nats-server {version} does not know `sync_interval: always`: after a power cut up to two minutes of \
+             messages may be gone, which the server finds and mends. 2.12.5 or later is recommended; where the \
+             nodes have another version than this machine, name it with --nats-version"
+        )),
+        Some(_) => {}
+        None => warnings.push(
+            "there is no nats-server on this machine to try the configuration with; it is for 2.10 or later, \
+             unless --nats-version names an older one"
                 .into(),
-        );
+        ),
     }
-    warnings.dedup();
     Ok(Configured { files, warnings })
 }
 
@@ -157,7 +187,11 @@ fn text(
     sync: bool,
 ) -> Result<String, ClusterError> {
     let [(system, system_token), (account, account_token)] = authority.accounts()?;
-    let sync = if sync { "\n  sync_interval: always" } else { "" };
+    let sync = if sync {
+        "\n  sync_interval: always"
+    } else {
+        "\n  # With nats-server 2.10 or later: sync_interval: always"
+    };
     let store = if nodes.len() > 1 { store.join(format!("n{}", n + 1)) } else { store.into() };
     let certificates = format!(
         "tls {{\n  cert_file: {:?}\n  key_file: {:?}\n  ca_file: {:?}\n}}\n",
@@ -210,6 +244,14 @@ fn find_server() -> Option<PathBuf> {
     named.into_iter().chain(found).find(|path| path.is_file())
 }
 
+/// The version of a nats-server; none if it does not say one.
+fn version_of(server: &Path) -> Option<ServerVersion> {
+    let ran = Command::new(server).arg("--version").output().ok()?;
+    let said = String::from_utf8(ran.stdout).ok()?;
+    // A version before its release has more behind a dash.
+    said.rsplit(": ").next()?.trim().split('-').next()?.parse().ok()
+}
+
 /// Has nats-server read a configuration; the reason if it does not take it.
 fn test(server: &Path, path: &Path) -> Result<(), String> {
     let ran = Command::new(server).arg("-t").arg("-c").arg(path).output();
@@ -223,7 +265,17 @@ fn test(server: &Path, path: &Path) -> Result<(), String> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Node, url};
+    use super::{Node, SYNC_ALWAYS, ServerVersion, url};
+
+    #[test]
+    fn versions_have_two_or_three_numbers() {
+        let parse = |text: &str| text.parse::<ServerVersion>();
+        assert_eq!(parse("v2.12.5").unwrap().to_string(), "2.12.5");
+        assert!(parse("2.12").unwrap() > SYNC_ALWAYS && parse("2.9.10").unwrap() < SYNC_ALWAYS);
+        for bad in ["", "2", "2.x", "2.12.5.1"] {
+            assert!(parse(bad).is_err(), "{bad}");
+        }
+    }
 
     #[test]
     fn nodes_have_a_host_and_a_port() {

@@ -27,7 +27,7 @@ mod setup;
 
 pub use authority::{Authority, HUB as HUB_CREDENTIAL, Issued};
 pub use check::Check;
-pub use configuration::Node;
+pub use configuration::{Node, ServerVersion};
 pub use connection::{Access, ClusterError, Credential};
 pub use hub::{Hub, describe_metrics};
 pub use message::Program;
