@@ -27,7 +27,7 @@ const SOURCES: [&str; 7] = [
 /// Crates and modules that only these files and folders may name.
 const OWNERS: &[(&str, &[&str])] = &[
     ("ort", &["crates/reconstruction/src/prior/onnx.rs"]),
-    ("sqlx", &["crates/store/src/", "crates/engine/src/job/columns.rs"]),
+    ("sqlx", &["crates/store/src/"]),
     ("axum", &["src/http/", "src/cli/serve.rs"]),
     ("async_nats", &["crates/workers/src/nats/"]),
     ("crate::http", &["src/http/", "src/cli/serve.rs"]),

@@ -16,8 +16,8 @@ use sqlx::{ConnectOptions, Connection};
 use super::error::{Result, StoreError};
 use super::locked::LockedFile;
 use super::records::{self, Record};
-use super::rows::sql;
 use super::{DataDir, Store, dir, identity, on_files};
+use crate::columns::sql;
 use engine::job::{PartialId, Sha256};
 
 /// So often the database is written out, at most: what is made and deleted within the moment that one
@@ -58,7 +58,7 @@ impl Store {
         .await?;
         // 2. A database that knows of nothing else.
         let (mut database, missing) = self.settle(&frozen).await?;
-        let marker = identity::marker(&mut database, super::schema()).await?;
+        let marker = identity::marker(&mut database, super::migrations::newest()).await?;
         // 3. The bytes.
         let mut backup = Backup { missing, ..Backup::default() };
         self.copy_known(&mut database, &frozen, &draft.folder, &mut backup).await?;

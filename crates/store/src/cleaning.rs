@@ -8,11 +8,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use futures_util::TryStreamExt;
-
 use super::error::{Result, StoreError};
-use super::rows::{sql, sql_scalar};
 use super::{DataDir, Store, dir, on_files, upgrade};
+use crate::columns::{sql, sql_as};
 use engine::job::{JobId, PartialId, Sha256, Timestamp};
 
 /// An upload in pieces is a file first and a row a moment later.
@@ -105,27 +103,20 @@ impl Store {
     }
 
     async fn known_things(&self) -> Result<HashSet<Thing>> {
-        let mut known = HashSet::new();
-        let mut rows = sqlx::query_scalar("SELECT sha256 FROM blobs").fetch(&self.readers);
-        while let Some(sha256) = rows.try_next().await? {
-            known.insert(Thing::Blob(sha256));
-        }
-        let mut rows = sqlx::query_scalar("SELECT id FROM jobs").fetch(&self.readers);
-        while let Some(id) = rows.try_next().await? {
-            known.insert(Thing::Results(id));
-        }
+        let blobs = sql_as!("SELECT sha256 FROM blobs").fetch_all(&self.readers).await?;
+        let jobs = sql_as!("SELECT id FROM jobs").fetch_all(&self.readers).await?;
         let partials = "SELECT id FROM partials WHERE result IS NULL";
-        let mut rows = sqlx::query_scalar(partials).fetch(&self.readers);
-        while let Some(id) = rows.try_next().await? {
-            known.insert(Thing::Partial(id));
-        }
-        Ok(known)
+        let partials = sql_as!(partials).fetch_all(&self.readers).await?;
+        let blobs = blobs.into_iter().map(Thing::Blob);
+        let jobs = jobs.into_iter().map(Thing::Results);
+        let partials = partials.into_iter().map(Thing::Partial);
+        Ok(blobs.chain(jobs).chain(partials).collect())
     }
 
     /// Deletes jobs that ended before `before`, oldest first, until so many bytes of the disk are
     /// free. Says how many.
     pub async fn remove_jobs(&self, before: Timestamp, until_free: u64) -> Result<usize> {
-        let ended = sql_scalar!(
+        let ended = sql_as!(
             // A job that has not ended has no time at which it did.
             "SELECT id FROM jobs WHERE finished_at < ? ORDER BY finished_at, id",
             [before]

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::Store;
 use super::error::Result;
-use super::rows::{sql, sql_scalar};
+use crate::columns::{sql, sql_as};
 use engine::job::Timestamp;
 
 /// No age that anybody asks for is longer (a year, in milliseconds).
@@ -35,7 +35,7 @@ impl Store {
     /// which the service has run: no later than any time that was noted within this time of running.
     pub async fn ago(&self, age: Duration) -> Result<Timestamp> {
         let age = i64::try_from(age.as_millis()).unwrap_or(LONGEST);
-        let seen: Option<i64> = sql_scalar!(
+        let seen: Option<i64> = sql_as!(
             "SELECT min(wall) FROM clock WHERE run >= (SELECT max(run) FROM clock) - ?",
             [age]
         )

@@ -19,8 +19,8 @@ use uuid::Uuid;
 
 use super::dir::{self, DataDir, on_files};
 use super::error::{Result, StoreError};
-use super::rows::sql;
 use super::upgrade;
+use crate::columns::{sql, sql_as};
 
 /// Who opens a data folder, and so what may become of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -183,12 +183,12 @@ async fn look(path: &Path) -> Result<Database> {
 
 async fn ask(connection: &mut SqliteConnection) -> Result<Database> {
     let tables = "SELECT name FROM sqlite_master WHERE name IN ('_sqlx_migrations', 'folder')";
-    let tables: Vec<String> = sqlx::query_scalar(tables).fetch_all(&mut *connection).await?;
+    let tables: Vec<String> = sql_as!(tables).fetch_all(&mut *connection).await?;
     if !tables.iter().any(|name| name == "_sqlx_migrations") {
         return Ok(Database::Blank);
     }
     let schema = "SELECT max(version) FROM _sqlx_migrations";
-    let Some(schema) = sqlx::query_scalar(schema).fetch_one(&mut *connection).await? else {
+    let Some(schema) = sql_as!(schema).fetch_one(&mut *connection).await? else {
         return Ok(Database::Blank);
     };
     if tables.len() < 2 {
@@ -202,7 +202,7 @@ async fn ask(connection: &mut SqliteConnection) -> Result<Database> {
 
 async fn identity(connection: &mut SqliteConnection) -> Result<Option<(Uuid, i64)>> {
     let row: Option<(String, i64)> =
-        sqlx::query_as("SELECT id, generation FROM folder").fetch_optional(connection).await?;
+        sql_as!("SELECT id, generation FROM folder").fetch_optional(connection).await?;
     let read = |(id, generation): (String, _)| match id.parse() {
         Ok(id) => Ok((id, generation)),
         Err(_) => Err(StoreError::Corrupt { column: "id", value: id }),
@@ -223,7 +223,7 @@ pub(super) async fn settle(dir: &DataDir, connection: &mut SqliteConnection) -> 
         .execute(&mut *connection)
         .await?;
     // The identifier is then in the database itself, also if its write-ahead log is lost.
-    sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(connection).await?;
+    sql!("PRAGMA wal_checkpoint(TRUNCATE)").execute(connection).await?;
     Ok(())
 }
 

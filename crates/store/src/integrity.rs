@@ -14,8 +14,8 @@ use rustix::fs::{Advice, fadvise};
 use super::error::{Result, StoreError};
 use super::hashes::{Digests, Hashing, Identity, digest, open};
 use super::records::{self, Place, Record};
-use super::rows::{sql, sql_scalar};
 use super::{DataDir, Job, Store, on_files};
+use crate::columns::{sql, sql_as};
 use engine::job::{ResultFile, Sha256, Timestamp};
 
 /// Time from the begin of a slow look to that of the next.
@@ -139,14 +139,14 @@ impl Store {
     pub async fn damaged_files(&self) -> Result<u64> {
         let count = "SELECT (SELECT count(*) FROM blobs WHERE damaged_at IS NOT NULL)
                           + (SELECT count(*) FROM result_files WHERE damaged_at IS NOT NULL)";
-        Ok(sql_scalar!(count, []).fetch_one(&self.readers).await?)
+        Ok(sql_as!(count, []).fetch_one(&self.readers).await?)
     }
 
     /// Compares all records with the disk, and asks SQLite whether the database is sound. Changes nothing.
     pub async fn verify(&self) -> Result<Audit> {
         let mut audit = Audit::default();
         let verdicts: Vec<String> =
-            sql_scalar!("PRAGMA integrity_check(10)", []).fetch_all(&self.readers).await?;
+            sql_as!("PRAGMA integrity_check(10)", []).fetch_all(&self.readers).await?;
         audit.database = verdicts.join("; ");
         let mut after = None;
         loop {
@@ -215,8 +215,8 @@ impl Store {
         sql!("INSERT INTO scrub (one, started_at) VALUES (1, ?) ON CONFLICT DO NOTHING", [now])
             .execute(&self.writer)
             .await?;
-        let row: (Timestamp, Option<sqlx::types::Json<Place>>) =
-            sqlx::query_as("SELECT started_at, place FROM scrub").fetch_one(&self.readers).await?;
+        let row: (Timestamp, Option<crate::columns::Json<Place>>) =
+            sql_as!("SELECT started_at, place FROM scrub").fetch_one(&self.readers).await?;
         let (started_at, place) = (row.0, row.1.map(|json| json.0));
         let page = records::page(&mut *self.readers.acquire().await?, place.as_ref()).await?;
         let Some(last) = page.last() else {
@@ -234,7 +234,7 @@ impl Store {
         for record in &page {
             self.scrub_file(record, rate).await?;
         }
-        sql!("UPDATE scrub SET place = ?", [sqlx::types::Json(&last.place)])
+        sql!("UPDATE scrub SET place = ?", [crate::columns::Json(&last.place)])
             .execute(&self.writer)
             .await?;
         Ok(Duration::ZERO)

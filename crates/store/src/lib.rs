@@ -13,16 +13,19 @@
 //! fails if the disk does ([`StoreError`]). What a lab has nothing under is `NotFound`, and what others
 //! refer to is not deleted (`InUse`). Their descriptions name only what else can go wrong.
 
+use crate::columns::{sql, sql_as};
 use crate::error::Result;
 mod backup;
 mod cleaning;
 mod clock;
+mod columns;
 mod dir;
 mod error;
 mod hashes;
 mod identity;
 mod integrity;
 mod locked;
+mod migrations;
 mod queue;
 mod records;
 mod rows;
@@ -88,13 +91,6 @@ pub struct Store {
     _server: Option<Arc<LockedFile>>,
 }
 
-static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("../../migrations");
-
-/// The number of the newest migration.
-fn schema() -> i64 {
-    MIGRATIONS.iter().map(|migration| migration.version).max().unwrap_or_default()
-}
-
 /// A transaction that holds the writer's lock from its start, so that it can't fail half-way
 /// because another process began to write.
 pub(crate) type WriteTransaction = sqlx::Transaction<'static, Sqlite>;
@@ -107,9 +103,9 @@ impl Store {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
-        identity::check(&dir, purpose, schema()).await?;
+        identity::check(&dir, purpose, migrations::newest()).await?;
         dir.fill()?;
-        let copy = if serves { upgrade::save(&dir, schema()).await? } else { None };
+        let copy = if serves { upgrade::save(&dir, migrations::newest()).await? } else { None };
         let options = SqliteConnectOptions::new()
             .filename(dir.database())
             .create_if_missing(serves)
@@ -132,7 +128,7 @@ impl Store {
             .connect_with(options.clone());
         let writer = writer.await?;
         // Where the folder is only used, nothing is left to do: this refuses a newer database.
-        MIGRATIONS.run(&writer).await.map_err(|error| match copy {
+        migrations::migrator().run(&writer).await.map_err(|error| match copy {
             Some(copy) => StoreError::Upgrade { error, copy },
             None => error.into(),
         })?;
@@ -169,12 +165,13 @@ impl Store {
 
     /// Lets the database and the marker be newer than all copies of them; see `identity.rs`.
     pub async fn advance_generation(&self) -> Result<()> {
-        sqlx::query("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
+        sql!("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
         self.write_marker().await
     }
 
     async fn write_marker(&self) -> Result<()> {
-        let marker = identity::marker(&mut *self.writer.acquire().await?, schema()).await?;
+        let marker =
+            identity::marker(&mut *self.writer.acquire().await?, migrations::newest()).await?;
         let (root, draft) = (self.dir.root().to_owned(), self.temporary_path());
         on_files(move || identity::write(&root, &draft, &marker)).await
     }
@@ -191,14 +188,13 @@ impl Store {
 
     /// Asks the database for an answer.
     pub async fn ping(&self) -> Result<()> {
-        sqlx::query("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
+        sql!("SELECT count(*) FROM workers").fetch_one(&self.readers).await?;
         Ok(())
     }
 
     /// Has SQLite look for damage in the whole database, and remembers what it says.
     pub async fn look_at_database(&self) -> Result<()> {
-        let verdict: String =
-            sqlx::query_scalar("PRAGMA quick_check(1)").fetch_one(&self.readers).await?;
+        let verdict: String = sql_as!("PRAGMA quick_check(1)").fetch_one(&self.readers).await?;
         let damage = Some(verdict).filter(|verdict| verdict != "ok");
         if let Some(damage) = &damage {
             tracing::error!(damage, "the database is damaged");

@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use super::DataDir;
 use super::error::Result;
-use super::rows::{sql, sql_as, sql_scalar};
 use super::tables::results::WHOLE_JOB;
+use crate::columns::{from_row, sql, sql_as};
 use engine::job::{JobId, PartialId, Sha256};
 
 /// Records of a page.
@@ -33,13 +33,15 @@ pub(super) struct Record {
     pub(super) sha256: Sha256,
 }
 
-#[derive(Debug, FromRow)]
+#[derive(Debug)]
 struct ResultRow {
     job: JobId,
     snapshot: i64,
     name: String,
     sha256: Sha256,
 }
+
+from_row!(ResultRow, row => { job, snapshot, name, sha256 });
 
 impl Record {
     /// Where it lies below a data folder.
@@ -73,7 +75,7 @@ pub(super) async fn page(
             Some(Place::Blob(sha256)) => sha256.to_string(),
             _ => String::new(),
         };
-        let blobs: Vec<Sha256> = sql_scalar!(
+        let blobs: Vec<Sha256> = sql_as!(
             "SELECT sha256 FROM blobs WHERE sha256 > ? ORDER BY sha256 LIMIT ?",
             [last, PAGE]
         )
@@ -118,7 +120,7 @@ pub(super) async fn stands(connection: &mut SqliteConnection, record: &Record) -
 /// Uploads in pieces that are not stored yet, and the bytes that are known to have come.
 pub(super) async fn partials(connection: &mut SqliteConnection) -> Result<Vec<(PartialId, u64)>> {
     let partials = "SELECT id, received FROM partials WHERE result IS NULL";
-    Ok(sqlx::query_as(partials).fetch_all(connection).await?)
+    Ok(sql_as!(partials).fetch_all(connection).await?)
 }
 
 /// The snapshots of a job of which a file is known to be damaged, [`WHOLE_JOB`] among them.
@@ -128,5 +130,5 @@ pub(super) async fn damaged_snapshots(
 ) -> Result<Vec<i64>> {
     let snapshots = "SELECT DISTINCT snapshot FROM result_files
                      WHERE job = ? AND damaged_at IS NOT NULL";
-    Ok(sql_scalar!(snapshots, [job]).fetch_all(connection).await?)
+    Ok(sql_as!(snapshots, [job]).fetch_all(connection).await?)
 }

@@ -1,13 +1,9 @@
 //! Statements, pages, and what rows refer to.
 
-use std::str::FromStr;
-
-use serde::de::DeserializeOwned;
-use sqlx::sqlite::SqliteRow;
-use sqlx::types::Json;
-use sqlx::{Row, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use super::error::{Result, StoreError};
+use crate::columns::{sql, sql_as};
 use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256, Timestamp};
 
 /// One page of a list, and whether to go on after it.
@@ -52,33 +48,26 @@ impl<Id> Default for Filter<Id> {
     }
 }
 
-/// A statement with the values for its places, in order.
-macro_rules! sql {
-    ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query($text)$(.bind($value))* };
-}
-
-/// As `sql!`, for rows that are read as a type.
-macro_rules! sql_as {
-    ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query_as($text)$(.bind($value))* };
-}
-
-/// As `sql!`, for rows of one column.
-macro_rules! sql_scalar {
-    ($text:expr, [$($value:expr),* $(,)?]) => { sqlx::query_scalar($text)$(.bind($value))* };
+/// The text of `listed!`.
+macro_rules! listed_text {
+    ($place:expr) => {
+        concat!(
+            "SELECT * FROM ",
+            $place,
+            " lab = ?1 AND (?2 IS NULL OR id < ?2)
+               AND (?3 IS NULL OR calibration = ?3)
+               AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
+             ORDER BY id DESC LIMIT ?4"
+        )
+    };
 }
 
 /// A page of what belongs to calibrations and labs, newest first, with one more item than the page has, by `sql!`
-/// or `sql_as!`. The table is followed by WHERE and what else must hold.
+/// or `sql_as!`. The table is followed by WHERE and the conditions that it adds.
 macro_rules! listed {
     ($statement:ident, $place:expr, $lab:expr, $filter:expr, $limit:expr) => {
         $statement!(
-            sqlx::AssertSqlSafe(format!(
-                "SELECT * FROM {} lab = ?1 AND (?2 IS NULL OR id < ?2)
-                   AND (?3 IS NULL OR calibration = ?3)
-                   AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
-                 ORDER BY id DESC LIMIT ?4",
-                $place
-            )),
+            $crate::rows::listed_text!($place),
             [
                 $lab,
                 $filter.after,
@@ -91,44 +80,7 @@ macro_rules! listed {
     };
 }
 
-pub(super) use {listed, sql, sql_as, sql_scalar};
-
-/// The column as a length.
-pub(super) fn number(row: &SqliteRow, column: &'static str) -> Result<usize> {
-    let value: i64 = row.try_get(column)?;
-    value.try_into().map_err(|_| StoreError::Corrupt { column, value: value.to_string() })
-}
-
-/// The column as a length, where a row is read as a type.
-pub(super) fn length(row: &SqliteRow, column: &'static str) -> sqlx::Result<usize> {
-    let value: i64 = row.try_get(column)?;
-    let decode = |source| sqlx::Error::ColumnDecode { index: column.into(), source };
-    usize::try_from(value).map_err(|error| decode(error.into()))
-}
-
-/// The value whose text the column holds; none where it is NULL.
-pub(super) fn parsed<T>(row: &SqliteRow, column: &'static str) -> sqlx::Result<Option<T>>
-where
-    T: FromStr<Err: std::error::Error + Send + Sync + 'static>,
-{
-    let text: Option<String> = row.try_get(column)?;
-    let decode = |source| sqlx::Error::ColumnDecode { index: column.into(), source };
-    text.map(|text| text.parse().map_err(|error: T::Err| decode(Box::new(error)))).transpose()
-}
-
-/// The column as a list in JSON; an empty one where there is none.
-pub(super) fn list<T: DeserializeOwned>(
-    row: &SqliteRow,
-    column: &str,
-) -> Result<Vec<T>, sqlx::Error> {
-    Ok(row.try_get::<Option<Json<_>>, _>(column)?.map_or_else(Vec::new, |Json(list)| list))
-}
-
-/// A length or count as SQLite keeps it.
-pub(super) fn integer(value: impl TryInto<i64>) -> i64 {
-    // Every count here is bounded far below this by the limits on uploads.
-    value.try_into().unwrap_or(i64::MAX)
-}
+pub(super) use {listed, listed_text};
 
 /// What a new row refers to.
 #[derive(Debug, Clone, Copy)]
@@ -170,6 +122,6 @@ pub(super) async fn refuse_if_used(
     (what, id): (&'static str, String),
     (by, query): (&'static str, &'static str),
 ) -> Result<()> {
-    let users = sql_scalar!(query, [id]).fetch_one(connection).await?;
+    let users = sql_as!(query, [id]).fetch_one(connection).await?;
     if users > 0 { Err(StoreError::InUse { what, by, users }) } else { Ok(()) }
 }

@@ -5,7 +5,7 @@ use sqlx::SqliteConnection;
 use super::Store;
 use super::error::{Result, StoreError};
 use super::queue::graph;
-use super::rows::{Reference, require, sql_as};
+use super::rows::{Reference, require};
 use super::staging::StagedBlob;
 use super::tables::blobs::Origin;
 use super::tables::calibrations::{self, Asked, Calibration, NewCalibration};
@@ -13,6 +13,7 @@ use super::tables::checks::Source;
 use super::tables::keys::{self, Inserted, Made, RequestKey};
 use super::tables::measurements::{self, Measurement, NewMeasurement};
 use super::tables::{jobs, quota};
+use crate::columns::sql_as;
 use engine::job::{
     CalibrationId, Captures, JobId, JobSpec, Lab, Label, MeasurementId, Mosaic, Sha256, Timestamp,
     TokenId, planned_seconds,

@@ -7,6 +7,7 @@ mod migration;
 mod movies;
 mod remote;
 mod sequences;
+mod statements;
 mod turns;
 
 use std::io::Write;

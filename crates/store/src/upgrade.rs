@@ -11,7 +11,7 @@ use sqlx::{ConnectOptions, Connection};
 use super::DataDir;
 use super::dir::{self, on_files};
 use super::error::{Result, StoreError};
-use super::rows::sql;
+use crate::columns::{sql, sql_as};
 use engine::job::Timestamp;
 
 /// So many copies are kept.
@@ -28,12 +28,12 @@ pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> 
     let options = SqliteConnectOptions::new().filename(&database).read_only(true);
     let mut connection = options.connect().await?;
     let tables = "SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'";
-    let ours: i64 = sqlx::query_scalar(tables).fetch_one(&mut connection).await?;
+    let ours: i64 = sql_as!(tables).fetch_one(&mut connection).await?;
     let found: Option<i64> = if ours == 0 {
         None
     } else {
         let newest = "SELECT max(version) FROM _sqlx_migrations";
-        sqlx::query_scalar(newest).fetch_one(&mut connection).await?
+        sql_as!(newest).fetch_one(&mut connection).await?
     };
     let Some(found) = found.filter(|found| *found < schema) else {
         connection.close().await?;

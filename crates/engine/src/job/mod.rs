@@ -4,8 +4,6 @@ mod access;
 mod algorithm;
 mod assessment;
 mod captures;
-#[cfg(feature = "sqlite")]
-mod columns;
 mod ids;
 mod memory;
 mod model;

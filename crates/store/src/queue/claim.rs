@@ -4,14 +4,13 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use serde_json::Value;
+use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
-use sqlx::types::Json;
-use sqlx::{AssertSqlSafe, FromRow, Row, SqliteConnection};
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
 use crate::Store;
+use crate::columns::{Columns, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{sql, sql_as, sql_scalar};
 use crate::tables::calibrations::Calibration;
 use crate::tables::measurements::Measurement;
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
@@ -60,16 +59,22 @@ pub struct JobTask {
     pub records: Vec<TaskRecord>,
 }
 
-#[derive(Debug, Clone, FromRow)]
+#[derive(Debug, Clone)]
 pub struct CalibrationTask {
     pub calibration: CalibrationId,
     pub name: Option<Label>,
     /// Captures, of which masks are to be made; none where only a report on the masks is.
-    #[sqlx(json(nullable))]
     pub captures: Option<Captures>,
     /// The masks, a planar array, if they are there.
     pub masks: Option<Sha256>,
 }
+
+from_row!(CalibrationTask, row => {
+    calibration,
+    name,
+    captures = row.read_json("captures")?,
+    masks,
+});
 
 /// A movie that is to be made.
 #[derive(Debug, Clone)]
@@ -95,42 +100,48 @@ pub enum Claimant<'a> {
     Pool(&'a str),
 }
 
-impl Claimant<'_> {
-    /// The statement that tells whether there may be work: a task that is ready, or a lease that has run
-    /// out. Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
-    fn look(self) -> String {
-        let Choice { kinds, by_lab, .. } = self.choice();
-        format!(
-            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks {by_lab} WHERE state = 'ready' {kinds}
-                                        AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
+/// The statement that tells whether there may be work: a task that is ready, or a lease that has run out.
+/// Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
+macro_rules! look_text {
+    ($kinds:literal, $by_lab:literal) => {
+        concat!(
+            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks ",
+            $by_lab,
+            " WHERE state = 'ready' ",
+            $kinds,
+            " AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
                  OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
                                 AND lease_until NOT BETWEEN ?1 AND ?1 + ?3)"
         )
-    }
+    };
+}
 
-    /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of
-    /// the lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see
-    /// [`take`].
-    fn take(self) -> String {
-        let Choice { kinds, by_lab, by_job } = self.choice();
-        let ready = format!("state = 'ready' {kinds} AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6");
-        format!(
+/// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of the
+/// lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see [`take`].
+macro_rules! take_text {
+    ($kinds:literal, $by_lab:literal, $by_job:literal) => {
+        take_text!(@
+            concat!("state = 'ready' ", $kinds, " AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6"),
+            $by_lab, $by_job)
+    };
+    (@ $ready:expr, $by_lab:literal, $by_job:literal) => {
+        concat!(
             "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
                  stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
              WHERE id = (
                  SELECT tasks.id FROM (
                      -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
-                     SELECT finish, (SELECT id FROM tasks {by_lab}
-                                     WHERE {ready} AND tasks.lab = labs.lab
+                     SELECT finish, (SELECT id FROM tasks ", $by_lab, "
+                                     WHERE ", $ready, " AND tasks.lab = labs.lab
                                      ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
                      FROM labs
                      UNION ALL
-                     SELECT finish, (SELECT id FROM tasks {by_job}
-                                     WHERE {ready}
+                     SELECT finish, (SELECT id FROM tasks ", $by_job, "
+                                     WHERE ", $ready, "
                                        AND job = (SELECT id FROM jobs
                                                   WHERE jobs.state = 'running' AND jobs.lab = labs.lab
-                                                    AND EXISTS (SELECT 1 FROM tasks {by_job}
-                                                                WHERE job = jobs.id AND {ready})
+                                                    AND EXISTS (SELECT 1 FROM tasks ", $by_job, "
+                                                                WHERE job = jobs.id AND ", $ready, ")
                                                   ORDER BY priority DESC, id LIMIT 1)
                                      ORDER BY ordinal LIMIT 1)
                      FROM labs)
@@ -141,26 +152,30 @@ impl Claimant<'_> {
                  LIMIT 1)
              RETURNING id, job, calibration, movie, lab, kind, snapshot, snapshots, tile, attempt, cost"
         )
-    }
-
-    fn choice(self) -> Choice {
-        match self {
-            Self::Local => Choice { kinds: "", by_lab: "", by_job: "" },
-            Self::WithoutTiles => Choice {
-                kinds: "AND kind <> 'tile'",
-                by_lab: "INDEXED BY tasks_others",
-                by_job: "INDEXED BY tasks_others_of_job",
-            },
-            Self::Pool(_) => Choice { kinds: "AND kind = 'tile'", by_lab: "", by_job: "" },
-        }
-    }
+    };
 }
 
-/// Which tasks a claimant may have, and the indexes that lead past those that it may not.
-struct Choice {
-    kinds: &'static str,
-    by_lab: &'static str,
-    by_job: &'static str,
+/// The indexes lead past the tasks that a claimant may not have.
+impl Claimant<'_> {
+    fn look(self) -> &'static str {
+        match self {
+            Self::Local => look_text!("", ""),
+            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "INDEXED BY tasks_others"),
+            Self::Pool(_) => look_text!("AND kind = 'tile'", ""),
+        }
+    }
+
+    fn take(self) -> &'static str {
+        match self {
+            Self::Local => take_text!("", "", ""),
+            Self::WithoutTiles => take_text!(
+                "AND kind <> 'tile'",
+                "INDEXED BY tasks_others",
+                "INDEXED BY tasks_others_of_job"
+            ),
+            Self::Pool(_) => take_text!("AND kind = 'tile'", "", ""),
+        }
+    }
 }
 
 impl Store {
@@ -187,8 +202,7 @@ impl Store {
             transaction.commit().await?;
             return Ok(None);
         };
-        let lease =
-            Lease { task: row.try_get("id")?, attempt: row.try_get("attempt")?, worker, length };
+        let lease = Lease { task: row.read("id")?, attempt: row.read("attempt")?, worker, length };
         let (owner, kind) = (tasks::owner(&row)?, tasks::kind(&row)?);
         sql!(
             "INSERT INTO attempts (task, attempt, worker, started_at) VALUES (?, ?, ?, ?)",
@@ -207,7 +221,7 @@ impl Store {
         workers::seen(&mut transaction, worker).await?;
         transaction.commit().await?;
         match self.work(owner, kind).await {
-            Ok(work) => Ok(Some(ClaimedTask { lease, kind, cost: row.try_get("cost")?, work })),
+            Ok(work) => Ok(Some(ClaimedTask { lease, kind, cost: row.read("cost")?, work })),
             Err(error) => {
                 self.part(&lease, &Loss::Lost(error.to_string())).await?;
                 Err(error)
@@ -226,7 +240,7 @@ impl Store {
 
     /// Looks without the lock: most of the time there is nothing to do.
     async fn may_have_work(&self, claimant: Claimant<'_>, now: i64) -> Result<bool> {
-        let found = sql!(AssertSqlSafe(claimant.look()), [now, LONGEST_PAUSE, LONGEST_LEASE])
+        let found = sql!(claimant.look(), [now, LONGEST_PAUSE, LONGEST_LEASE])
             .fetch_optional(&self.readers)
             .await?;
         Ok(found.is_some())
@@ -268,7 +282,7 @@ impl Store {
         let job = self.job_of_any_lab(job).await?;
         let measurement = self.find_measurement(None, job.spec.measurement).await?;
         let prepared: Option<Json<Value>> =
-            sql_scalar!("SELECT record FROM tasks WHERE job = ? AND kind = 'prepare'", [job.id])
+            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'prepare'", [job.id])
                 .fetch_one(&self.readers)
                 .await?;
         let mut arrays = Vec::new();
@@ -305,7 +319,7 @@ async fn take(
     now: i64,
 ) -> Result<Option<SqliteRow>> {
     let row = sql!(
-        AssertSqlSafe(claimant.take()),
+        claimant.take(),
         [
             TaskState::Running,
             worker,
@@ -322,7 +336,7 @@ async fn take(
     sql!(
         "UPDATE labs SET start = max(finish, clock), finish = max(finish, clock) + ?2 / share
          FROM (SELECT max(start) AS clock FROM labs) WHERE lab = ?1",
-        [row.try_get::<String, _>("lab")?, row.try_get::<f64, _>("cost")?]
+        [row.read::<String>("lab")?, row.read::<f64>("cost")?]
     )
     .execute(connection)
     .await?;
@@ -370,7 +384,7 @@ mod tests {
         let claimant = Claimant::WithoutTiles;
         // The look for leases that have run out reads what runs.
         for (text, others) in [(claimant.look(), 1), (claimant.take(), 0)] {
-            let plan = plan(&store, &text).await;
+            let plan = plan(&store, text).await;
             let good = ["INDEX tasks_others", "PRIMARY KEY (id=?)"];
             let bad: Vec<_> =
                 plan.iter().filter(|line| !good.iter().any(|good| line.contains(good))).collect();

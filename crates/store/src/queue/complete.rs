@@ -3,12 +3,11 @@
 use serde::Deserialize;
 use serde_json::Value;
 use sqlx::SqliteConnection;
-use sqlx::types::Json;
 
 use super::lease::{self, Heartbeat, Lease, Outcome};
 use super::{graph, job};
+use crate::columns::{Json, sql};
 use crate::error::{Result, StoreError};
-use crate::rows::sql;
 use crate::staging::{StagedBlob, StagedDir};
 use crate::tables::blobs::Origin;
 use crate::tables::calibrations::{self, NewCalibration};
@@ -164,7 +163,7 @@ async fn finish(
             iterations,
             passes,
             fraction.clamp(0.0, 1.0),
-            record,
+            Json(record),
             result,
             Timestamp::now(),
             lease.task,

@@ -3,8 +3,8 @@
 use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 
+use crate::columns::sql;
 use crate::error::{Result, StoreError};
-use crate::rows::sql;
 use crate::tables::{labs, results, sums, tasks};
 use engine::job::{CalibrationId, JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState};
 

@@ -1,11 +1,10 @@
 //! What users do with a job in the queue: cancel it, take it up again, delete it; and how it ends.
 
 use sqlx::SqliteConnection;
-use sqlx::types::Json;
 
 use super::graph;
+use crate::columns::{Json, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{sql, sql_scalar};
 use crate::tables::jobs::{self, JobChanges};
 use crate::tables::sums;
 use crate::{Store, records};
@@ -127,7 +126,7 @@ impl Store {
     /// Removes the tiles and previews of a job.
     async fn drop_tiles(&self, transaction: &mut SqliteConnection, id: JobId) -> Result<()> {
         let results = "SELECT DISTINCT result FROM tasks WHERE job = ? AND result IS NOT NULL";
-        let results = sql_scalar!(results, [id]).fetch_all(&mut *transaction).await?;
+        let results = sql_as!(results, [id]).fetch_all(&mut *transaction).await?;
         sql!("UPDATE tasks SET result = NULL WHERE job = ?", [id])
             .execute(&mut *transaction)
             .await?;
@@ -163,5 +162,5 @@ pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Resu
 
 async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64> {
     let count = "SELECT count(*) FROM tasks WHERE job = ? AND state = ?";
-    Ok(sql_scalar!(count, [id, TaskState::Running]).fetch_one(connection).await?)
+    Ok(sql_as!(count, [id, TaskState::Running]).fetch_one(connection).await?)
 }

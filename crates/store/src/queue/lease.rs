@@ -8,13 +8,13 @@
 
 use std::time::Duration;
 
-use sqlx::{Row, SqliteConnection};
+use sqlx::SqliteConnection;
 use strum::Display;
 
 use super::job;
 use crate::Store;
+use crate::columns::{Columns, sql, sql_as};
 use crate::error::Result;
-use crate::rows::{sql, sql_scalar};
 use crate::tables::tasks::{self, Owner};
 use crate::tables::{sums, workers};
 use engine::job::{
@@ -133,7 +133,7 @@ impl Store {
         .await?;
         transaction.commit().await?;
         let Some(row) = row else { return Ok(Heartbeat::Lost) };
-        Ok(match row.try_get("job_state")? {
+        Ok(match row.read("job_state")? {
             None | Some(JobState::Queued | JobState::Running) => Heartbeat::Continue,
             Some(_) => Heartbeat::Cancelled,
         })
@@ -174,7 +174,7 @@ impl Store {
         let Some((Owner::Job(job), kind)) = held(&mut transaction, lease).await? else {
             return Ok(());
         };
-        let worst: u32 = sql_scalar!(
+        let worst: u32 = sql_as!(
             "SELECT coalesce(max(failures), 0) FROM tasks
              WHERE job = ?1 AND kind = 'tile' AND snapshot BETWEEN ?2 - ?3 + 1 AND ?2
                AND ?2 < snapshot + snapshots",
@@ -218,7 +218,7 @@ impl Store {
         };
         let mut transaction = self.write().await?;
         let tasks = "SELECT id FROM tasks WHERE worker = ? AND state = ?";
-        let tasks = sql_scalar!(tasks, [id, TaskState::Running]);
+        let tasks = sql_as!(tasks, [id, TaskState::Running]);
         for task in tasks.fetch_all(&mut *transaction).await? {
             lose(&mut transaction, task, &loss).await?;
         }
@@ -248,7 +248,7 @@ pub(super) async fn held(
 pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<()> {
     let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
     let tasks = "SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?";
-    let tasks = sql_scalar!(tasks, [TaskState::Running, now, now + LONGEST_LEASE]);
+    let tasks = sql_as!(tasks, [TaskState::Running, now, now + LONGEST_LEASE]);
     for task in tasks.fetch_all(&mut *connection).await? {
         lose(connection, task, &silent).await?;
     }
@@ -287,8 +287,8 @@ pub(super) async fn lose(
     .fetch_one(&mut *connection)
     .await?;
     let owner = tasks::owner(&row)?;
-    let (mut failures, mut losses): (u32, u32) = (row.try_get("failures")?, row.try_get("losses")?);
-    let mut starved: u32 = row.try_get("starved")?;
+    let (mut failures, mut losses): (u32, u32) = (row.read("failures")?, row.read("losses")?);
+    let mut starved: u32 = row.read("starved")?;
     let wanted = match owner {
         Owner::Job(job) => job::is_wanted(connection, job).await?,
         // Its task would have been deleted with it.

@@ -1,9 +1,9 @@
 //! Movies of results: asked for, made by a worker when nothing else is to be done, and kept with their job.
 
-use sqlx::{Row, SqliteConnection};
+use sqlx::SqliteConnection;
 
+use crate::columns::{Columns, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{sql, sql_scalar};
 use crate::tables::results::WHOLE_JOB;
 use crate::tables::{labs, quota};
 use crate::{Job, Store};
@@ -34,11 +34,11 @@ impl Store {
         let found = sql!(FIND, [job.id, place]).fetch_optional(&self.readers).await?;
         if let Some(row) = found
             && let state @ (TaskState::Ready | TaskState::Running | TaskState::Done) =
-                row.try_get("state")?
+                row.read("state")?
         {
             let (sha256, size): (Option<Sha256>, Option<u64>) =
-                (row.try_get("result")?, row.try_get("size")?);
-            let fraction: f64 = row.try_get("fraction")?;
+                (row.read("result")?, row.read("size")?);
+            let fraction: f64 = row.read("fraction")?;
             match (state, sha256.zip(size)) {
                 (TaskState::Done, None) => {}
                 (_, Some((sha256, size))) => return Ok(Movie::Ready { sha256, size }),
@@ -53,7 +53,7 @@ impl Store {
     async fn ask_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
         let place = place(snapshot);
         let mut transaction = self.write().await?;
-        let failed: Option<Option<String>> = sql_scalar!(
+        let failed: Option<Option<String>> = sql_as!(
             "SELECT (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt)
              FROM tasks WHERE movie = ? AND coalesce(snapshot, -1) = ? AND state = ?",
             [job.id, place, TaskState::Failed]
@@ -78,7 +78,7 @@ impl Store {
         job: JobId,
         place: Option<i64>,
     ) -> Result<()> {
-        let results: Vec<Option<Sha256>> = sql_scalar!(
+        let results: Vec<Option<Sha256>> = sql_as!(
             "DELETE FROM tasks WHERE movie = ?1 AND (?2 IS NULL OR coalesce(snapshot, -1) = ?2)
              RETURNING result",
             [job, place]

@@ -10,13 +10,12 @@ use std::time::Duration;
 
 use serde::Serialize;
 use serde_json::Value;
-use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::forecast::{Forecast, Left, Unfinished};
 use crate::Store;
+use crate::columns::{Columns, sql};
 use crate::error::{Result, StoreError};
-use crate::rows::sql;
 use crate::tables::jobs::Job;
 use engine::job::{JobId, JobState, Lab, TaskKind, TaskStage, TaskState};
 
@@ -120,7 +119,7 @@ impl Store {
         .fetch_all(&self.readers)
         .await?;
         let by_job: Result<HashMap<JobId, &SqliteRow>> =
-            rows.iter().map(|row| Ok((row.try_get("job")?, row))).collect();
+            rows.iter().map(|row| Ok((row.read("job")?, row))).collect();
         let by_job = by_job?;
         let forecast = if jobs.iter().any(|job| has_eta(job.state)) {
             Some(self.forecast().await?)
@@ -138,12 +137,12 @@ impl Store {
 
     /// The marks of all jobs, and whose they are. Reads indexes and the tasks that run.
     pub async fn job_marks(&self) -> Result<HashMap<(Lab, JobId), JobMark>> {
-        let rows = sqlx::query("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
+        let rows = sql!("SELECT id, lab, state FROM jobs").fetch_all(&self.readers).await?;
         let mut marks = HashMap::with_capacity(rows.len());
         for row in &rows {
-            let state = row.try_get("state")?;
+            let state = row.read("state")?;
             marks.insert(
-                (row.try_get("lab")?, row.try_get("id")?),
+                (row.read("lab")?, row.read("id")?),
                 JobMark { state, tasks: 0, iterations: 0, fraction: 0.0 },
             );
         }
@@ -158,13 +157,12 @@ impl Store {
         .fetch_all(&self.readers)
         .await?;
         for row in &rows {
-            if let Some(mark) = marks.get_mut(&(row.try_get("lab")?, row.try_get("job")?)) {
+            if let Some(mark) = marks.get_mut(&(row.read("lab")?, row.read("job")?)) {
                 // Which tasks run, and not only how many: one may have ended and another begun. One that
                 // waits elsewhere differs from one that is in hand.
-                mark.tasks =
-                    row.try_get::<i64, _>("tasks")? << 32 ^ row.try_get::<i64, _>("ordinals")?;
-                mark.iterations = row.try_get("iterations")?;
-                mark.fraction = row.try_get("fraction")?;
+                mark.tasks = row.read::<i64>("tasks")? << 32 ^ row.read::<i64>("ordinals")?;
+                mark.iterations = row.read("iterations")?;
+                mark.fraction = row.read("fraction")?;
             }
         }
         Ok(marks)
@@ -200,7 +198,7 @@ impl Store {
     }
 
     async fn new_forecast(&self) -> Result<Forecast> {
-        let rows = sqlx::query(
+        let rows = sql!(
             "SELECT id, lab, priority, state, tiles_left + others_left AS left
              FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
              WHERE finished_at IS NULL ORDER BY id",
@@ -209,20 +207,20 @@ impl Store {
         .await?;
         let (mut names, mut unfinished) = (HashMap::new(), Vec::with_capacity(rows.len()));
         for row in &rows {
-            let lab: String = row.try_get("lab")?;
+            let lab: String = row.read("lab")?;
             let next = names.len();
             unfinished.push(Unfinished {
-                id: row.try_get("id")?,
+                id: row.read("id")?,
                 lab: *names.entry(lab).or_insert(next),
-                priority: row.try_get("priority")?,
-                waits: row.try_get::<JobState, _>("state")? == JobState::Queued,
-                left: row.try_get("left")?,
+                priority: row.read("priority")?,
+                waits: row.read::<JobState>("state")? == JobState::Queued,
+                left: row.read("left")?,
             });
         }
         let mut shares = vec![1.0; names.len()];
-        for row in sqlx::query("SELECT lab, share FROM labs").fetch_all(&self.readers).await? {
-            if let Some(lab) = names.get(&row.try_get::<String, _>("lab")?) {
-                shares[*lab] = row.try_get("share")?;
+        for row in sql!("SELECT lab, share FROM labs").fetch_all(&self.readers).await? {
+            if let Some(lab) = names.get(&row.read::<String>("lab")?) {
+                shares[*lab] = row.read("share")?;
             }
         }
         let workers = self.live_workers(WORKER_AGE).await?.len();
@@ -233,7 +231,7 @@ impl Store {
     /// the last tasks of a kind, by what they really did and not by what was planned; 1 before there are
     /// any.
     async fn rates(&self) -> Result<(f64, f64)> {
-        let row = sqlx::query(
+        let row = sql!(
             "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
                     / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
                  sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
@@ -243,7 +241,7 @@ impl Store {
         .fetch_one(&self.readers)
         .await?;
         let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
-        Ok((rate(row.try_get("tiles")?), rate(row.try_get("others")?)))
+        Ok((rate(row.read("tiles")?), rate(row.read("others")?)))
     }
 }
 
@@ -252,7 +250,7 @@ fn has_eta(state: JobState) -> bool {
 }
 
 fn progress(job: &Job, row: &SqliteRow, forecast: Option<&Forecast>) -> Result<JobProgress> {
-    let figure = |column| row.try_get::<f64, _>(column);
+    let figure = |column| row.read::<f64>(column);
     let (cost, spent, tiles_spent) = (figure("cost")?, figure("spent")?, figure("tiles_spent")?);
     let (tiles, others) = (figure("tiles_left")?, figure("others_left")?);
     let done = cost - tiles - others + spent;
@@ -277,18 +275,18 @@ fn progress(job: &Job, row: &SqliteRow, forecast: Option<&Forecast>) -> Result<J
         percent: if job.state == JobState::Succeeded { 100.0 } else { round(share * 100.0, 2) },
         eta_seconds: eta.map(|seconds| round(seconds, 1)),
         queue_position: waits.map(|forecast| forecast.position(job.id)),
-        tiles_done: row.try_get("tiles_done")?,
-        tiles_total: row.try_get("tiles_total")?,
-        tiles_running: row.try_get("tiles_running")?,
-        snapshots_done: row.try_get("snapshots_done")?,
-        previews_done: row.try_get("previews_done")?,
-        iterations_done: row.try_get("all_iterations")?,
-        passes_done: row.try_get("all_passes")?,
+        tiles_done: row.read("tiles_done")?,
+        tiles_total: row.read("tiles_total")?,
+        tiles_running: row.read("tiles_running")?,
+        snapshots_done: row.read("snapshots_done")?,
+        previews_done: row.read("previews_done")?,
+        iterations_done: row.read("all_iterations")?,
+        passes_done: row.read("all_passes")?,
     })
 }
 
 fn stage(state: JobState, row: &SqliteRow) -> Result<ProgressStage> {
-    let count = |column| row.try_get::<u64, _>(column);
+    let count = |column| row.read::<u64>(column);
     Ok(match state {
         JobState::Queued => ProgressStage::Waiting,
         JobState::Succeeded | JobState::Failed | JobState::Cancelled => ProgressStage::Ended,

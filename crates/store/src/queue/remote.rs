@@ -8,14 +8,14 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use serde_json::{Value, json};
+use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{AssertSqlSafe, FromRow, Row, SqliteConnection};
 
 use super::claim::ClaimedTask;
 use super::lease::{self, Heartbeat, Lease, Loss};
 use crate::Store;
+use crate::columns::{Columns, FromRow, sql, sql_as};
 use crate::error::StoreError;
-use crate::rows::{sql, sql_as, sql_scalar};
 use crate::tables::{tasks, workers};
 use engine::job::{
     JobId, JobState, TaskId, TaskProgress, TaskStage, TaskState, Timestamp, WorkerId,
@@ -85,29 +85,32 @@ pub struct RemoteBeat {
     pub history: Option<String>,
 }
 
-const ROWS: &str =
-    "SELECT task, pool, r.attempt AS message, stream, seq, delivery, t.job, t.attempt,
-    t.worker, j.state AS job_state,
-    (SELECT started_at FROM attempts a WHERE a.task = r.task AND a.attempt = t.attempt) AS started_at
-    FROM remote_tasks r JOIN tasks t ON t.id = task JOIN jobs j ON j.id = t.job";
+/// The tiles that are out. CROSS JOIN has SQLite begin at `remote_tasks`, which holds few rows.
+macro_rules! rows {
+    () => {
+        "SELECT task, pool, r.attempt AS message, stream, seq, delivery, t.job, t.attempt,
+             t.worker, j.state AS job_state
+         FROM remote_tasks r CROSS JOIN tasks t ON t.id = task JOIN jobs j ON j.id = t.job"
+    };
+}
 
-impl FromRow<'_, SqliteRow> for RemoteTask {
-    fn from_row(row: &SqliteRow) -> Result<Self, sqlx::Error> {
-        let place = (row.try_get("stream")?, row.try_get("seq")?);
+impl FromRow for RemoteTask {
+    fn from_row(row: &SqliteRow) -> Result<Self, StoreError> {
+        let place = (row.read("stream")?, row.read("seq")?);
         Ok(Self {
-            task: row.try_get("task")?,
-            job: row.try_get("job")?,
-            pool: row.try_get("pool")?,
-            attempt: row.try_get("attempt")?,
-            message: row.try_get("message")?,
+            task: row.read("task")?,
+            job: row.read("job")?,
+            pool: row.read("pool")?,
+            attempt: row.read("attempt")?,
+            message: row.read("message")?,
             place: match place {
                 (Some(stream), Some(seq)) => Some(MessagePlace { stream, seq }),
                 _ => None,
             },
-            delivery: row.try_get("delivery")?,
-            worker: row.try_get("worker")?,
-            started_at: row.try_get("started_at")?,
-            wanted: is_wanted(row.try_get("job_state")?),
+            delivery: row.read("delivery")?,
+            worker: row.read("worker")?,
+            started_at: row.read("started_at")?,
+            wanted: is_wanted(row.read("job_state")?),
         })
     }
 }
@@ -115,12 +118,12 @@ impl FromRow<'_, SqliteRow> for RemoteTask {
 impl Store {
     /// The tiles that are out.
     pub async fn remote_tasks(&self) -> Result<Vec<RemoteTask>, StoreError> {
-        Ok(sql_as!(ROWS, []).fetch_all(&self.readers).await?)
+        Ok(sql_as!(rows!()).fetch_all(&self.readers).await?)
     }
 
     /// A tile that is out; none if it is not.
     pub async fn remote_task(&self, task: TaskId) -> Result<Option<RemoteTask>, StoreError> {
-        let found = sql_as!(AssertSqlSafe(format!("{ROWS} WHERE task = ?")), [task]);
+        let found = sql_as!(concat!(rows!(), " WHERE task = ?"), [task]);
         Ok(found.fetch_optional(&self.readers).await?)
     }
 
@@ -129,7 +132,7 @@ impl Store {
         if jobs.is_empty() {
             return Ok(Vec::new());
         }
-        let found = sql_scalar!(
+        let found = sql_as!(
             "SELECT value FROM json_each(?) WHERE NOT EXISTS
                  (SELECT 1 FROM jobs WHERE id = value AND state IN (?, ?))",
             [list(jobs), JobState::Queued, JobState::Running]
@@ -156,7 +159,7 @@ impl Store {
         .await?;
         let kind = tasks::kind(&row)?;
         let work = self.work(tasks::owner(&row)?, kind).await?;
-        Ok(ClaimedTask { lease: remote.lease(), kind, cost: row.try_get("cost")?, work })
+        Ok(ClaimedTask { lease: remote.lease(), kind, cost: row.read("cost")?, work })
     }
 
     /// Notes where the message of a tile is.
@@ -185,7 +188,7 @@ impl Store {
         worker: WorkerId,
     ) -> Result<Begun, StoreError> {
         let mut transaction = self.write().await?;
-        let found = sql_as!(AssertSqlSafe(format!("{ROWS} WHERE task = ?")), [task]);
+        let found = sql_as!(concat!(rows!(), " WHERE task = ?"), [task]);
         let found: Option<RemoteTask> = found.fetch_optional(&mut *transaction).await?;
         // A server that was killed may have published twice what it has noted once.
         let is_this = |found: &RemoteTask| {
@@ -273,7 +276,7 @@ impl Store {
             .await?;
             answers.push(match row {
                 None => Heartbeat::Lost,
-                Some(row) if is_wanted(row.try_get("job_state")?) => Heartbeat::Continue,
+                Some(row) if is_wanted(row.read("job_state")?) => Heartbeat::Continue,
                 Some(_) => Heartbeat::Cancelled,
             });
         }
@@ -319,7 +322,7 @@ async fn take_again(
     found: &RemoteTask,
     worker: WorkerId,
 ) -> Result<Option<u32>, StoreError> {
-    let attempt: Option<u32> = sql_scalar!(
+    let attempt: Option<u32> = sql_as!(
         "UPDATE tasks SET state = ?, worker = ?, attempt = attempt + 1, stage = ?, history = NULL
          WHERE id = ? AND state = ? RETURNING attempt",
         [TaskState::Running, worker, TaskStage::Reading, found.task, TaskState::Ready]

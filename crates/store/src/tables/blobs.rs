@@ -1,17 +1,18 @@
 //! Table `blobs`: files by the hash of their bytes.
 
 use serde::Serialize;
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 use strum::Display;
 
+use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Page, integer, sql, sql_as, sql_scalar};
+use crate::rows::Page;
 use crate::staging::StagedBlob;
 use crate::tables::quota;
 use crate::{Store, on_files};
 use engine::job::{Lab, Sha256, Timestamp, TokenId};
 
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Blob {
     /// The hash of its bytes, which is its address.
     pub sha256: Sha256,
@@ -20,15 +21,18 @@ pub struct Blob {
     pub created_at: Timestamp,
 }
 
+from_row!(Blob, row => { sha256, size, created_at });
+
 /// An upload in a list.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct BlobRow {
     #[serde(flatten)]
-    #[sqlx(flatten)]
     pub blob: Blob,
     /// True while something of the lab refers to it: it is not deleted then.
     pub in_use: bool,
 }
+
+from_row!(BlobRow, row => { blob = Blob::from_row(row)?, in_use });
 
 /// The condition under which something of a lab refers to an upload of its, named as columns of `h`.
 macro_rules! in_use {
@@ -132,7 +136,7 @@ impl Store {
     /// has them.
     pub async fn delete_upload(&self, lab: &Lab, sha256: Sha256) -> Result<()> {
         let mut transaction = self.write().await?;
-        let used: Option<bool> = sql_scalar!(
+        let used: Option<bool> = sql_as!(
             concat!("SELECT ", in_use!(), " FROM holdings AS h WHERE lab = ? AND sha256 = ?"),
             [lab, sha256]
         )
@@ -169,7 +173,7 @@ impl Store {
              ON CONFLICT (sha256) DO UPDATE SET
                  touched_at = excluded.touched_at, damaged_at = NULL,
                  origin = CASE excluded.origin WHEN 'upload' THEN 'upload' ELSE origin END",
-            [sha256, integer(size), origin.to_string(), now, now]
+            [sha256, size, origin.to_string(), now, now]
         )
         .execute(transaction)
         .await?;
@@ -182,7 +186,7 @@ impl Store {
         transaction: &mut SqliteConnection,
         sha256: Sha256,
     ) -> Result<()> {
-        let removed: Option<Timestamp> = sql_scalar!(
+        let removed: Option<Timestamp> = sql_as!(
             "DELETE FROM blobs WHERE sha256 = ?1
                  AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
@@ -238,7 +242,7 @@ impl Store {
     /// Number and bytes of all stored files.
     pub async fn blob_totals(&self) -> Result<(u64, u64)> {
         let totals = "SELECT count(*), coalesce(sum(size), 0) FROM blobs";
-        Ok(sqlx::query_as(totals).fetch_one(&self.readers).await?)
+        Ok(sql_as!(totals).fetch_one(&self.readers).await?)
     }
 }
 

@@ -6,16 +6,13 @@
 use std::collections::HashMap;
 
 use serde::Serialize;
+use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
-use sqlx::types::Json;
-use sqlx::{FromRow, Row, SqliteConnection};
 
 use crate::Store;
+use crate::columns::{Columns, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{
-    Filter, Page, Reference, integer, length, parsed, refuse_if_used, require, sql, sql_as,
-    sql_scalar,
-};
+use crate::rows::{Filter, Page, Reference, refuse_if_used, require};
 use crate::tables::checks;
 use engine::job::{
     CalibrationId, Captures, Lab, Label, Mosaic, Sha256, TaskState, Timestamp, TokenId,
@@ -44,27 +41,23 @@ pub struct NewCalibration {
     pub mosaic: Option<Mosaic>,
 }
 
-impl FromRow<'_, SqliteRow> for NewCalibration {
-    fn from_row(row: &SqliteRow) -> sqlx::Result<Self> {
-        Ok(Self {
-            name: row.try_get("name")?,
-            masks: row.try_get("masks")?,
-            format: row.try_get("format")?,
-            sample: row.try_get("sample")?,
-            axes: row.try_get("axes")?,
-            frames: length(row, "frames")?,
-            height: length(row, "height")?,
-            width: length(row, "width")?,
-            full_scale: row.try_get("full_scale")?,
-            mask_mean: row.try_get("mask_mean")?,
-            dead_pixels: row.try_get("dead_pixels")?,
-            clipped_negatives: row.try_get("clipped_negatives")?,
-            mosaic: parsed(row, "mosaic")?,
-        })
-    }
-}
+from_row!(NewCalibration, row => {
+    name,
+    masks,
+    format,
+    sample,
+    axes,
+    frames,
+    height,
+    width,
+    full_scale,
+    mask_mean,
+    dead_pixels,
+    clipped_negatives,
+    mosaic,
+});
 
-#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Calibration {
     pub id: CalibrationId,
     /// Hash of the prepared masks: a planar file of f32 [B, H, W] on [0, 1].
@@ -72,9 +65,15 @@ pub struct Calibration {
     pub prepared: Sha256,
     pub created_at: Timestamp,
     #[serde(flatten)]
-    #[sqlx(flatten)]
     pub facts: NewCalibration,
 }
+
+from_row!(Calibration, row => {
+    id,
+    prepared,
+    created_at,
+    facts = NewCalibration::from_row(row)?,
+});
 
 #[derive(Debug, Clone)]
 pub struct Unready {
@@ -270,8 +269,7 @@ impl Store {
         ] {
             refuse_if_used(&mut transaction, ("calibration", id.to_string()), users).await?;
         }
-        let prepared =
-            sql_scalar!("DELETE FROM calibrations WHERE id = ? RETURNING prepared", [id]);
+        let prepared = sql_as!("DELETE FROM calibrations WHERE id = ? RETURNING prepared", [id]);
         if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
             self.release(&mut transaction, prepared).await?;
         }
@@ -289,9 +287,9 @@ pub async fn insert_made(
 ) -> Result<()> {
     let request = "SELECT lab, token, name, mosaic, created_at FROM calibration_requests WHERE calibration = ?";
     let row = sql!(request, [id]).fetch_one(&mut *connection).await?;
-    let lab: Lab = row.try_get("lab")?;
-    let (token, created_at) = (row.try_get("token")?, row.try_get("created_at")?);
-    let (name, mosaic) = (row.try_get("name")?, parsed(&row, "mosaic")?);
+    let lab: Lab = row.read("lab")?;
+    let (token, created_at) = (row.read("token")?, row.read("created_at")?);
+    let (name, mosaic) = (row.read("name")?, row.read("mosaic")?);
     // It may have been renamed since the worker began, which knows nothing of colours.
     let facts = NewCalibration { name, mosaic, ..facts };
     insert(connection, (&lab, token), &Calibration { id, prepared, created_at, facts }).await?;
@@ -331,7 +329,7 @@ pub async fn insert_request(
             token,
             name,
             captures.map(Json),
-            integer(bytes),
+            bytes,
             Timestamp::now(),
             mosaic.map(|mosaic| mosaic.to_string())
         ]
@@ -372,13 +370,13 @@ pub async fn insert(
             &facts.format,
             &facts.sample,
             &facts.axes,
-            integer(facts.frames),
-            integer(facts.height),
-            integer(facts.width),
+            facts.frames,
+            facts.height,
+            facts.width,
             facts.full_scale,
             facts.mask_mean,
-            integer(facts.dead_pixels),
-            integer(facts.clipped_negatives),
+            facts.dead_pixels,
+            facts.clipped_negatives,
             calibration.created_at,
             facts.mosaic.map(|mosaic| mosaic.to_string())
         ]
@@ -389,17 +387,17 @@ pub async fn insert(
 }
 
 fn unready(row: &SqliteRow) -> Result<Unready> {
-    let captures: Option<Json<Captures>> = row.try_get("captures")?;
-    let failed = row.try_get::<TaskState, _>("state")? == TaskState::Failed;
+    let captures: Option<Json<Captures>> = row.read("captures")?;
+    let failed = row.read::<TaskState>("state")? == TaskState::Failed;
     Ok(Unready {
-        id: row.try_get("calibration")?,
-        name: row.try_get("name")?,
+        id: row.read("calibration")?,
+        name: row.read("name")?,
         frames: captures.map(|Json(captures)| captures.masks.len()),
-        mosaic: parsed(row, "mosaic")?,
-        fraction: row.try_get("fraction")?,
+        mosaic: row.read("mosaic")?,
+        fraction: row.read("fraction")?,
         // The reason of the last attempt; one that is tried again is none for a user.
-        error: if failed { row.try_get("reason")? } else { None },
-        problem: row.try_get("problem")?,
-        created_at: row.try_get("created_at")?,
+        error: if failed { row.read("reason")? } else { None },
+        problem: row.read("problem")?,
+        created_at: row.read("created_at")?,
     })
 }

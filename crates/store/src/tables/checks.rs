@@ -3,11 +3,12 @@
 use std::fmt::Display;
 use std::str::FromStr;
 
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use crate::Store;
+use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Filter, Page, Reference, listed, require, sql, sql_as, sql_scalar};
+use crate::rows::{Filter, Page, Reference, listed, require};
 use crate::tables::keys::{self, Inserted, Made, RequestKey};
 use engine::job::{
     CalibrationId, InvalidId, Lab, Label, MeasurementId, Sha256, Timestamp, TokenId,
@@ -26,7 +27,7 @@ pub struct NewCheck {
 }
 
 /// A check that goes on, or did not pass.
-#[derive(Debug, Clone, FromRow)]
+#[derive(Debug, Clone)]
 pub struct Check {
     /// Of what is to be made.
     pub id: String,
@@ -39,6 +40,8 @@ pub struct Check {
     pub problem: Option<String>,
     pub created_at: Timestamp,
 }
+
+from_row!(Check, row => { id, lab, token, name, request, problem, created_at });
 
 /// What of a check changes.
 #[derive(Debug, Clone, PartialEq)]
@@ -178,7 +181,7 @@ impl Store {
     /// Counts that a check is begun once more; says how often it was.
     pub async fn begin_check(&self, id: &str) -> Result<u32> {
         let count = "UPDATE checks SET begun = begun + 1 WHERE id = ? RETURNING begun";
-        Ok(sql_scalar!(count, [id]).fetch_one(&self.writer).await?)
+        Ok(sql_as!(count, [id]).fetch_one(&self.writer).await?)
     }
 
     /// The check of the lab's measurement with this identifier; none if it has passed, or there is none.
@@ -194,8 +197,9 @@ impl Store {
         filter: Filter<MeasurementId>,
         limit: u32,
     ) -> Result<Page<Check>> {
-        let place = "checks WHERE what = 'measurement' AND";
-        let items = listed!(sql_as, place, lab, filter, limit).fetch_all(&self.readers).await?;
+        let items = listed!(sql_as, "checks WHERE what = 'measurement' AND", lab, filter, limit)
+            .fetch_all(&self.readers)
+            .await?;
         Ok(Page::cut(items, limit))
     }
 
@@ -203,7 +207,7 @@ impl Store {
     pub async fn check_marks(
         &self,
     ) -> Result<std::collections::HashMap<(Lab, MeasurementId), CheckMark>> {
-        let rows: Vec<(Lab, MeasurementId, bool, Option<Label>)> = sqlx::query_as(
+        let rows: Vec<(Lab, MeasurementId, bool, Option<Label>)> = sql_as!(
             "SELECT lab, id, problem IS NOT NULL, name FROM checks WHERE what = 'measurement'",
         )
         .fetch_all(&self.readers)

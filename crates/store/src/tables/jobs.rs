@@ -1,21 +1,20 @@
 //! Table `jobs`. What becomes of a job is the queue's business.
 
-use sqlx::types::Json;
-use sqlx::{AssertSqlSafe, FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use crate::Store;
+use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Page, Span, integer, sql, sql_as, sql_scalar};
+use crate::rows::{Page, Span};
 use engine::job::{
     Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
     Timestamp,
 };
 
-#[derive(Debug, Clone, PartialEq, FromRow)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     pub id: JobId,
     pub lab: Lab,
-    #[sqlx(json)]
     pub spec: JobSpec,
     pub state: JobState,
     pub error: Option<String>,
@@ -24,9 +23,20 @@ pub struct Job {
     pub started_at: Option<Timestamp>,
     pub finished_at: Option<Timestamp>,
     /// How good its frames are expected to be; none until they are there, and where nothing can be told.
-    #[sqlx(json(nullable))]
     pub assessment: Option<Assessment>,
 }
+
+from_row!(Job, row => {
+    id,
+    lab,
+    spec = row.read::<Json<_>>("spec")?.0,
+    state,
+    error,
+    created_at,
+    started_at,
+    finished_at,
+    assessment = row.read_json("assessment")?,
+});
 
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
@@ -50,6 +60,23 @@ pub struct JobChanges {
     pub priority: Option<i32>,
 }
 
+/// The list of jobs that meet the condition `$whose`.
+macro_rules! list_text {
+    ($whose:literal) => {
+        concat!(
+            "SELECT * FROM jobs
+             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
+               AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
+               AND (?5 IS NULL OR label = ?5)
+               AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
+               AND (?9 IS NULL OR created_at >= ?9) AND (?10 IS NULL OR created_at < ?10)
+               AND ",
+            $whose,
+            " ORDER BY id DESC LIMIT ?7"
+        )
+    };
+}
+
 impl Store {
     pub async fn job(&self, lab: &Lab, id: JobId) -> Result<Job> {
         let job = sql_as!("SELECT * FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
@@ -69,20 +96,10 @@ impl Store {
         filter: &JobFilter,
         limit: u32,
     ) -> Result<Page<Job>> {
-        // Not one text for both: the index by lab would not be used.
-        let of = if lab.is_some() { "lab = ?8" } else { "?8 IS NULL" };
-        let text = format!(
-            "SELECT * FROM jobs
-             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
-               AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
-               AND (?5 IS NULL OR label = ?5)
-               AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
-               AND (?9 IS NULL OR created_at >= ?9) AND (?10 IS NULL OR created_at < ?10)
-             AND {of}
-             ORDER BY id DESC LIMIT ?7"
-        );
+        // One text for both would not use the index by lab.
+        let text = if lab.is_some() { list_text!("lab = ?8") } else { list_text!("?8 IS NULL") };
         let items = sql_as!(
-            AssertSqlSafe(text),
+            text,
             [
                 filter.after,
                 filter.states.as_ref().map(Json),
@@ -103,13 +120,13 @@ impl Store {
 
     /// The state of the lab's job.
     pub async fn job_state(&self, lab: &Lab, id: JobId) -> Result<JobState> {
-        let state = sql_scalar!("SELECT state FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
+        let state = sql_as!("SELECT state FROM jobs WHERE id = ? AND lab = ?", [id, lab]);
         state.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
         let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
-        Ok(sqlx::query_as(counts).fetch_all(&self.readers).await?)
+        Ok(sql_as!(counts).fetch_all(&self.readers).await?)
     }
 }
 
@@ -137,7 +154,7 @@ pub async fn insert(
             request,
             Timestamp::now(),
             lab,
-            integer(spec.disk_bytes()),
+            spec.disk_bytes(),
             spec.model.as_ref().map(|model| model.id)
         ]
     )
@@ -147,7 +164,7 @@ pub async fn insert(
 }
 
 pub async fn state(connection: &mut SqliteConnection, id: JobId) -> Result<JobState> {
-    let state = sql_scalar!("SELECT state FROM jobs WHERE id = ?", [id]);
+    let state = sql_as!("SELECT state FROM jobs WHERE id = ?", [id]);
     state.fetch_optional(connection).await?.ok_or_else(|| StoreError::missing("job", id))
 }
 

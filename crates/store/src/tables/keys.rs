@@ -7,8 +7,8 @@ use sqlx::SqliteConnection;
 use strum::IntoStaticStr;
 
 use crate::Store;
+use crate::columns::{sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{sql, sql_as};
 use engine::job::{InvalidId, JobId, Lab, Sha256};
 
 /// What a key makes; by these names in the column `what`.

@@ -3,15 +3,15 @@
 use std::collections::HashMap;
 
 use serde::Serialize;
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 use strum::VariantArray;
 
 use crate::Store;
+use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{integer, sql, sql_as};
 use engine::job::{JobState, Lab, Timestamp};
 
-#[derive(Debug, Clone, PartialEq, FromRow)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct LabRow {
     pub lab: Lab,
     /// Its share of the machine, beside the shares of the others that want it.
@@ -26,8 +26,10 @@ pub struct LabRow {
     pub cost_left: f64,
 }
 
+from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs, cost_left });
+
 /// What a lab has here.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LabUse {
     /// Uploads, and their bytes.
     pub uploads: u64,
@@ -37,6 +39,8 @@ pub struct LabUse {
     /// Jobs that wait and run.
     pub jobs: u64,
 }
+
+from_row!(LabUse, row => { uploads, upload_bytes, result_bytes, jobs });
 
 /// Figures of a lab for what watches the service.
 #[derive(Debug, Clone, PartialEq)]
@@ -108,7 +112,7 @@ impl Store {
 
     /// Figures of all labs, by name.
     pub async fn lab_figures(&self) -> Result<Vec<LabFigures>> {
-        let rows: Vec<(Lab, u64, f64, f64, u64, Option<Timestamp>)> = sqlx::query_as(
+        let rows: Vec<(Lab, u64, f64, f64, u64, Option<Timestamp>)> = sql_as!(
             "SELECT labs.lab, coalesce(jobs_begun, 0), coalesce(wait_seconds, 0.0),
                  coalesce(cpu_seconds, 0.0),
                  (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE jobs.lab = labs.lab)
@@ -121,7 +125,7 @@ impl Store {
         .fetch_all(&self.readers)
         .await?;
         let counted: Vec<(Lab, JobState, u64)> =
-            sqlx::query_as("SELECT lab, state, count(*) FROM jobs GROUP BY lab, state")
+            sql_as!("SELECT lab, state, count(*) FROM jobs GROUP BY lab, state")
                 .fetch_all(&self.readers)
                 .await?;
         let now = Timestamp::now();
@@ -172,9 +176,9 @@ impl Store {
                 lab,
                 share,
                 max_bytes.is_some(),
-                max_bytes.flatten().map(integer),
+                max_bytes.flatten(),
                 max_jobs.is_some(),
-                max_jobs.flatten().map(integer)
+                max_jobs.flatten()
             ]
         )
         .execute(&mut *transaction)
@@ -187,8 +191,7 @@ impl Store {
     pub async fn remove_lab(&self, lab: &Lab) -> Result<()> {
         let mut transaction = self.write().await?;
         for (by, query) in BELONGINGS {
-            let users: u64 =
-                sqlx::query_scalar(query).bind(lab).fetch_one(&mut *transaction).await?;
+            let users: u64 = sql_as!(query, [lab]).fetch_one(&mut *transaction).await?;
             if users > 0 {
                 return Err(StoreError::InUse { what: "lab", by, users });
             }

@@ -1,13 +1,13 @@
 //! Table `measurements`.
 
 use serde::Serialize;
+use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
-use sqlx::types::Json;
-use sqlx::{Row, SqliteConnection};
 
 use crate::Store;
+use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Filter, Page, integer, list, listed, number, refuse_if_used, sql, sql_scalar};
+use crate::rows::{Filter, Page, listed, refuse_if_used};
 use crate::tables::checks;
 use engine::job::{
     CalibrationId, Finding, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp, TokenId,
@@ -124,8 +124,7 @@ impl Store {
         own.ok_or_else(|| StoreError::missing("measurement", id))?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE measurement = ?";
         refuse_if_used(&mut transaction, ("measurement", id.to_string()), ("jobs", jobs)).await?;
-        let prepared =
-            sql_scalar!("DELETE FROM measurements WHERE id = ? RETURNING prepared", [id]);
+        let prepared = sql_as!("DELETE FROM measurements WHERE id = ? RETURNING prepared", [id]);
         let prepared = prepared.fetch_optional(&mut *transaction).await?;
         let prepared = prepared.ok_or_else(|| StoreError::missing("measurement", id))?;
         self.release(&mut transaction, prepared).await?;
@@ -157,8 +156,8 @@ pub async fn insert(
             &facts.sample,
             &facts.axes,
             facts.snapshots,
-            integer(facts.height),
-            integer(facts.width),
+            facts.height,
+            facts.width,
             facts.full_scale,
             facts.camera_fps,
             facts.exposure_s,
@@ -175,25 +174,25 @@ pub async fn insert(
 
 fn measurement(row: &SqliteRow) -> Result<Measurement> {
     Ok(Measurement {
-        id: row.try_get("id")?,
-        prepared: row.try_get("prepared")?,
-        created_at: row.try_get("created_at")?,
+        id: row.read("id")?,
+        prepared: row.read("prepared")?,
+        created_at: row.read("created_at")?,
         facts: NewMeasurement {
-            name: row.try_get("name")?,
-            calibration: row.try_get("calibration")?,
-            data: row.try_get("data")?,
-            format: row.try_get("format")?,
-            sample: row.try_get("sample")?,
-            axes: row.try_get("axes")?,
-            snapshots: row.try_get("snapshots")?,
-            height: number(row, "height")?,
-            width: number(row, "width")?,
-            full_scale: row.try_get("full_scale")?,
-            camera_fps: row.try_get("camera_fps")?,
-            exposure_s: row.try_get("exposure_s")?,
-            sequence: row.try_get("sequence")?,
-            dark: list(row, "dark")?,
-            warnings: list(row, "warnings")?,
+            name: row.read("name")?,
+            calibration: row.read("calibration")?,
+            data: row.read("data")?,
+            format: row.read("format")?,
+            sample: row.read("sample")?,
+            axes: row.read("axes")?,
+            snapshots: row.read("snapshots")?,
+            height: row.read("height")?,
+            width: row.read("width")?,
+            full_scale: row.read("full_scale")?,
+            camera_fps: row.read("camera_fps")?,
+            exposure_s: row.read("exposure_s")?,
+            sequence: row.read("sequence")?,
+            dark: row.read_json("dark")?.unwrap_or_default(),
+            warnings: row.read_json("warnings")?.unwrap_or_default(),
         },
     })
 }

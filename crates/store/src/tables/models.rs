@@ -1,34 +1,40 @@
 //! Table `models`.
 
 use serde::Serialize;
-use sqlx::FromRow;
-use sqlx::types::Json;
 
 use crate::Store;
+use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Filter, Page, Reference, listed, refuse_if_used, require, sql, sql_as};
+use crate::rows::{Filter, Page, Reference, listed, refuse_if_used, require};
 use crate::tables::keys::{self, Inserted, Made, RequestKey};
 use engine::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 
 /// What is known of an end-to-end network when it has been checked.
-#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NewModel {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
     pub file: Sha256,
     #[serde(flatten)]
-    #[sqlx(json)]
     pub facts: ModelFacts,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
+from_row!(NewModel, row => {
+    name,
+    calibration,
+    file,
+    facts = row.read::<Json<_>>("facts")?.0,
+});
+
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Model {
     pub id: ModelId,
     pub created_at: Timestamp,
     #[serde(flatten)]
-    #[sqlx(flatten)]
     pub content: NewModel,
 }
+
+from_row!(Model, row => { id, created_at, content = NewModel::from_row(row)? });
 
 impl From<Model> for JobModel {
     fn from(model: Model) -> Self {

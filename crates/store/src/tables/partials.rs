@@ -6,17 +6,16 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use sqlx::FromRow;
-
+use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::locked::LockedFile;
-use crate::rows::{Page, integer, sql, sql_as, sql_scalar};
+use crate::rows::Page;
 use crate::tables::keys::{self, Inserted, Made, RequestKey};
 use crate::tables::quota;
 use crate::{Store, dir, on_files};
 use engine::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
 
-#[derive(Debug, Clone, FromRow)]
+#[derive(Debug, Clone)]
 pub struct NewPartial {
     pub lab: Lab,
     /// Whose limit it counts against.
@@ -29,11 +28,12 @@ pub struct NewPartial {
     pub expected: Option<Sha256>,
 }
 
-#[derive(Debug, Clone, FromRow)]
+from_row!(NewPartial, row => { lab, token, length, metadata, expected });
+
+#[derive(Debug, Clone)]
 pub struct Partial {
     pub id: PartialId,
     /// What was said when it was begun.
-    #[sqlx(flatten)]
     pub facts: NewPartial,
     /// Bytes that are on the disk.
     pub received: u64,
@@ -42,6 +42,14 @@ pub struct Partial {
     /// When it is given up if nothing more comes.
     pub expires_at: Timestamp,
 }
+
+from_row!(Partial, row => {
+    id,
+    facts = NewPartial::from_row(row)?,
+    received,
+    result,
+    expires_at,
+});
 
 /// Bytes that are reserved for an upload of which little has come. More are as it grows, so that nobody takes
 /// the disk by an announcement.
@@ -178,7 +186,7 @@ impl Store {
                 id,
                 &facts.lab,
                 facts.token,
-                integer(facts.length),
+                facts.length,
                 &facts.metadata,
                 facts.expected,
                 expires_at
@@ -263,7 +271,7 @@ impl Store {
         let (received, expires_at) = (upload.received + bytes, after(age));
         let changed = sql!(
             "UPDATE partials SET received = ?, expires_at = ? WHERE id = ? AND received = ?",
-            [integer(received), expires_at, upload.id, integer(upload.received)]
+            [received, expires_at, upload.id, upload.received]
         )
         .execute(&self.writer)
         .await?;
@@ -328,7 +336,7 @@ impl Store {
         let empty = age.min(EMPTY);
         // What ends now began its age so long ago.
         let (last_empty, last) = (self.ago(empty).await?, self.ago(age).await?);
-        let due = sql_scalar!(
+        let due = sql_as!(
             "SELECT id FROM partials WHERE expires_at <= iif(received = 0, ?, ?)",
             [later(last_empty, empty), later(last, age)]
         );
@@ -355,7 +363,7 @@ impl Store {
     /// Bytes of the disk that were promised and are not written: the next ones of uploads in pieces, masks
     /// that are made of captures (twice, as they are scaled at the end), and of jobs what is not assembled.
     pub async fn promised_bytes(&self) -> Result<u64> {
-        let bytes: f64 = sql_scalar!(
+        let bytes: f64 = sql_as!(
             "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
                      FROM partials WHERE result IS NULL)
                   + (SELECT coalesce(sum(2 * prepared_bytes), 0)
@@ -365,7 +373,7 @@ impl Store {
                          SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
                          FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
                      FROM jobs WHERE finished_at IS NULL)",
-            [TaskState::Done, integer(FIRST_RESERVE)]
+            [TaskState::Done, FIRST_RESERVE]
         )
         .fetch_one(&self.readers)
         .await?;

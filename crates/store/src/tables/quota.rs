@@ -1,11 +1,11 @@
 //! What labs and tokens keep here, and how much they may. Asked again in the transaction in which something is
 //! added, so that of many requests at once no two get the last room.
 
-use sqlx::{AssertSqlSafe, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use crate::Store;
+use crate::columns::sql_as;
 use crate::error::{Result, StoreError};
-use crate::rows::{sql_as, sql_scalar};
 use engine::job::{Lab, TokenId};
 
 /// Uploads in pieces of a lab that may be unfinished at a time.
@@ -37,13 +37,13 @@ pub async fn check(
     needed: u64,
 ) -> Result<()> {
     let limit = "SELECT max_bytes FROM labs WHERE lab = ? AND max_bytes IS NOT NULL";
-    if let Some(limit) = sql_scalar!(limit, [lab]).fetch_optional(&mut *connection).await? {
+    if let Some(limit) = sql_as!(limit, [lab]).fetch_optional(&mut *connection).await? {
         let kept = lab_bytes(connection, lab).await?;
         within("lab", kept, needed, limit)?;
     }
     let Some(token) = token else { return Ok(()) };
     let limit = "SELECT max_bytes FROM tokens WHERE id = ? AND max_bytes IS NOT NULL";
-    if let Some(limit) = sql_scalar!(limit, [token]).fetch_optional(&mut *connection).await? {
+    if let Some(limit) = sql_as!(limit, [token]).fetch_optional(&mut *connection).await? {
         let kept = token_bytes(connection, token).await?;
         within("token", kept, needed, limit)?;
     }
@@ -57,37 +57,48 @@ fn within(whose: &'static str, kept: u64, needed: u64, limit: u64) -> Result<()>
     Err(StoreError::Quota { whose, kept, needed, limit })
 }
 
-/// The sum of what an owner, ?1, keeps here of uploads, whole and begun, and of arrays that were prepared.
-/// `owner` is the column that names it: `lab` or `token`.
-fn files_of(owner: &str) -> String {
-    format!(
-        "(SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-          WHERE {owner} = ?1)
-         + (SELECT coalesce(sum(length), 0) FROM partials WHERE {owner} = ?1 AND result IS NULL)
-         + (SELECT coalesce(sum(size), 0) FROM blobs
-            WHERE sha256 IN (SELECT prepared FROM calibrations WHERE {owner} = ?1
-                             UNION SELECT prepared FROM measurements WHERE {owner} = ?1))
-         + (SELECT coalesce(sum(prepared_bytes), 0) FROM calibration_requests AS asked
-            WHERE {owner} = ?1
-              AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = asked.calibration))"
-    )
+/// Bytes that an owner, ?1, keeps here of uploads, whole and begun, and of prepared arrays. `$owner` is the
+/// column that names the owner: `lab` or `token`.
+macro_rules! files_of {
+    ($owner:literal) => {
+        concat!(
+            "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
+                     WHERE ",
+            $owner,
+            " = ?1)
+                  + (SELECT coalesce(sum(length), 0) FROM partials
+                     WHERE ",
+            $owner,
+            " = ?1 AND result IS NULL)
+                  + (SELECT coalesce(sum(size), 0) FROM blobs
+                     WHERE sha256 IN (SELECT prepared FROM calibrations WHERE ",
+            $owner,
+            " = ?1
+                                      UNION SELECT prepared FROM measurements WHERE ",
+            $owner,
+            " = ?1))
+                  + (SELECT coalesce(sum(prepared_bytes), 0) FROM calibration_requests AS asked
+                     WHERE ",
+            $owner,
+            " = ?1
+                       AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = asked.calibration))"
+        )
+    };
 }
 
 async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Result<u64> {
-    let text = format!("SELECT {}", files_of("token"));
-    Ok(sql_scalar!(AssertSqlSafe(text), [token]).fetch_one(connection).await?)
+    sql_as!(files_of!("token"), [token]).fetch_one(connection).await
 }
 
 async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> {
-    let text = format!(
-        "SELECT {}
-              + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                 WHERE lab = ?1 AND movie IS NOT NULL)
-              + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes, result_bytes)), 0)
-                 FROM jobs WHERE lab = ?1)",
-        files_of("lab")
+    let text = concat!(
+        files_of!("lab"),
+        " + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
+             WHERE lab = ?1 AND movie IS NOT NULL)
+          + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes, result_bytes)), 0)
+             FROM jobs WHERE lab = ?1)"
     );
-    Ok(sql_scalar!(AssertSqlSafe(text), [lab]).fetch_one(connection).await?)
+    sql_as!(text, [lab]).fetch_one(connection).await
 }
 
 /// Refuses a job if enough wait and run. A lab has its own limit, if one was set. When all places are taken,
@@ -109,7 +120,7 @@ pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64)
         return Ok(());
     }
     let labs = "SELECT count(DISTINCT lab) FROM jobs WHERE finished_at IS NULL AND lab <> ?";
-    let others: u64 = sql_scalar!(labs, [lab]).fetch_one(connection).await?;
+    let others: u64 = sql_as!(labs, [lab]).fetch_one(connection).await?;
     if own < most / (others + 1) {
         return Ok(());
     }
@@ -120,6 +131,6 @@ pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64)
 /// Errors: [`StoreError::ManyPartials`].
 pub async fn check_partials(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
     let open = "SELECT count(*) FROM partials WHERE lab = ? AND result IS NULL";
-    let open: u64 = sql_scalar!(open, [lab]).fetch_one(connection).await?;
+    let open: u64 = sql_as!(open, [lab]).fetch_one(connection).await?;
     if open < MOST_PARTIALS { Ok(()) } else { Err(StoreError::ManyPartials(open)) }
 }

@@ -1,25 +1,23 @@
 //! Tables `calibration_reports` and `calibration_maps`: what is told of masks, and its pictures.
 
 use sqlx::SqliteConnection;
-use sqlx::types::Json;
 
 use crate::Store;
+use crate::columns::{Json, sql, sql_as};
 use crate::error::Result;
-use crate::rows::{sql, sql_scalar};
 use engine::job::{CalibrationId, CalibrationReport};
 
 impl Store {
     /// The report of a calibration; none if it is not made yet.
     pub async fn report(&self, id: CalibrationId) -> Result<Option<CalibrationReport>> {
-        let report =
-            sql_scalar!("SELECT report FROM calibration_reports WHERE calibration = ?", [id]);
+        let report = sql_as!("SELECT report FROM calibration_reports WHERE calibration = ?", [id]);
         Ok(report.fetch_optional(&self.readers).await?.map(|Json(report)| report))
     }
 
     /// A picture of a report, as PNG; none if there is none of this name.
     pub async fn map(&self, id: CalibrationId, name: &str) -> Result<Option<Vec<u8>>> {
         let png = "SELECT png FROM calibration_maps WHERE calibration = ? AND name = ?";
-        Ok(sql_scalar!(png, [id, name]).fetch_optional(&self.readers).await?)
+        Ok(sql_as!(png, [id, name]).fetch_optional(&self.readers).await?)
     }
 }
 

@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
+use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
 
+use crate::columns::{Columns, sql};
 use crate::error::{Result, StoreError};
-use crate::rows::{integer, sql};
 use crate::{Job, Store};
 use engine::job::{JobId, ResultFile};
 
@@ -64,7 +64,7 @@ pub async fn record(
     for file in files {
         sql!(
             "INSERT INTO result_files (job, snapshot, name, size, sha256) VALUES (?, ?, ?, ?, ?)",
-            [job, snapshot, &file.name, integer(file.size), file.sha256]
+            [job, snapshot, &file.name, file.size, file.sha256]
         )
         .execute(&mut *connection)
         .await?;
@@ -73,9 +73,5 @@ pub async fn record(
 }
 
 fn result_file(row: &SqliteRow) -> Result<ResultFile> {
-    Ok(ResultFile {
-        name: row.try_get("name")?,
-        size: row.try_get("size")?,
-        sha256: row.try_get("sha256")?,
-    })
+    Ok(ResultFile { name: row.read("name")?, size: row.read("size")?, sha256: row.read("sha256")? })
 }

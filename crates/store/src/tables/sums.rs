@@ -2,8 +2,8 @@
 
 use sqlx::SqliteConnection;
 
+use crate::columns::sql;
 use crate::error::Result;
-use crate::rows::sql;
 use engine::job::{JobId, TaskState};
 
 pub async fn recount(connection: &mut SqliteConnection, job: JobId) -> Result<()> {

@@ -6,13 +6,11 @@ use std::path::PathBuf;
 use serde::Serialize;
 use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
-use sqlx::types::Json;
-use sqlx::{FromRow, Row};
 use strum::{VariantArray, VariantNames};
 
 use crate::Store;
+use crate::columns::{Columns, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{sql, sql_as, sql_scalar};
 use engine::job::{CalibrationId, JobId, RunSpec, Sha256, TaskKind, TaskState};
 
 /// What a task belongs to, and goes with.
@@ -24,18 +22,22 @@ pub enum Owner {
     Movie(JobId),
 }
 
-#[derive(Debug, Clone, FromRow)]
+#[derive(Debug, Clone)]
 pub struct TileResult {
     /// The first snapshot of its run.
-    #[sqlx(rename = "snapshot")]
     pub run: u32,
     pub tile: u32,
     /// The hash that its file should have.
-    #[sqlx(rename = "result")]
     pub sha256: Sha256,
-    #[sqlx(json)]
     pub record: Value,
 }
+
+from_row!(TileResult, row => {
+    run = row.read("snapshot")?,
+    tile,
+    sha256 = row.read("result")?,
+    record = row.read::<Json<_>>("record")?.0,
+});
 
 /// What is known of a task that is done.
 #[derive(Debug, Clone)]
@@ -48,11 +50,10 @@ pub struct TaskRecord {
     pub attempt: u32,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TileState {
     /// The first snapshot of its run.
     #[serde(skip)]
-    #[sqlx(rename = "snapshot")]
     pub run: u32,
     /// The number of snapshots in its run.
     #[serde(skip)]
@@ -66,24 +67,37 @@ pub struct TileState {
     pub passes: u32,
     /// The share of the planned cost that is behind it.
     pub fraction: f64,
-    #[sqlx(rename = "attempt")]
     pub attempts: u32,
     /// `||y - H v|| / ||y||` of a tile that is done.
     pub residual: Option<f64>,
 }
 
+from_row!(TileState, row => {
+    run = row.read("snapshot")?,
+    snapshots,
+    tile,
+    state,
+    stage,
+    iterations,
+    passes,
+    fraction,
+    attempts = row.read("attempt")?,
+    residual,
+});
+
 /// How the solver went on a tile.
-#[derive(Debug, Clone, PartialEq, Serialize, FromRow)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TileHistory {
     pub tile: u32,
     pub state: TaskState,
     /// \[iteration, residual, change, sigma or null\], by iteration; many iterations are thinned out.
-    #[sqlx(json, rename = "history")]
     pub points: Vec<Value>,
 }
 
+from_row!(TileHistory, row => { tile, state, points = row.read::<Json<_>>("history")?.0 });
+
 /// What has been done in all by tasks of a kind, those of deleted jobs with them.
-#[derive(Debug, Clone, PartialEq, FromRow)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TaskTotals {
     pub kind: String,
     pub tasks: u64,
@@ -93,13 +107,15 @@ pub struct TaskTotals {
     pub passes: u64,
 }
 
+from_row!(TaskTotals, row => { kind, tasks, seconds, iterations, passes });
+
 /// Numbers of tasks by kind and state.
 pub type TaskCounts = BTreeMap<(String, TaskState), u64>;
 
 impl Store {
     /// The stored preview of a snapshot, while there is one: a prepared array of coarse frames.
     pub async fn preview(&self, job: JobId, snapshot: u32) -> Result<Option<(Sha256, PathBuf)>> {
-        let sha256: Option<Sha256> = sql_scalar!(
+        let sha256: Option<Sha256> = sql_as!(
             "SELECT result FROM tasks
              WHERE job = ? AND kind = 'preview' AND snapshot = ? AND result IS NOT NULL",
             [job, snapshot]
@@ -135,9 +151,9 @@ impl Store {
         let read = |row: &SqliteRow| {
             Ok(TaskRecord {
                 kind: kind(row)?,
-                record: row.try_get::<Json<_>, _>("record")?.0,
-                seconds: row.try_get::<Option<f64>, _>("seconds")?.unwrap_or(0.0),
-                attempt: row.try_get("attempt")?,
+                record: row.read::<Json<_>>("record")?.0,
+                seconds: row.read::<Option<f64>>("seconds")?.unwrap_or(0.0),
+                attempt: row.read("attempt")?,
             })
         };
         rows.iter().map(read).collect()
@@ -179,7 +195,7 @@ impl Store {
 
     /// Version of ONNX Runtime that the last worker told that finished a tile with it; none before.
     pub async fn last_onnxruntime(&self) -> Result<Option<String>> {
-        let version = sql_scalar!(
+        let version = sql_as!(
             "SELECT record ->> 'onnxruntime' FROM tasks
              WHERE state = ? AND kind = 'tile' AND record ->> 'onnxruntime' IS NOT NULL
              ORDER BY job DESC LIMIT 1",
@@ -192,13 +208,13 @@ impl Store {
 
     /// What has been done in all, by kind of task.
     pub async fn totals(&self) -> Result<Vec<TaskTotals>> {
-        Ok(sqlx::query_as("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await?)
+        Ok(sql_as!("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await?)
     }
 
     /// The number of tasks by kind and state, with zeros for what there is none of.
     pub async fn task_counts(&self) -> Result<TaskCounts> {
         let found: Vec<(String, TaskState, u64)> =
-            sqlx::query_as("SELECT kind, state, count(*) FROM tasks GROUP BY kind, state")
+            sql_as!("SELECT kind, state, count(*) FROM tasks GROUP BY kind, state")
                 .fetch_all(&self.readers)
                 .await?;
         let mut counts = TaskCounts::new();
@@ -212,17 +228,17 @@ impl Store {
 }
 
 pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
-    let name: String = row.try_get("kind")?;
-    let snapshots = (row.try_get("snapshot")?, row.try_get("snapshots")?);
-    TaskKind::from_parts(&name, snapshots, row.try_get("tile")?)
+    let name: String = row.read("kind")?;
+    let snapshots = (row.read("snapshot")?, row.read("snapshots")?);
+    TaskKind::from_parts(&name, snapshots, row.read("tile")?)
         .ok_or(StoreError::Corrupt { column: "kind", value: name })
 }
 
 /// What the task in this row belongs to.
 pub fn owner(row: &SqliteRow) -> Result<Owner> {
-    Ok(match (row.try_get("job")?, row.try_get("movie")?) {
+    Ok(match (row.read("job")?, row.read("movie")?) {
         (Some(job), _) => Owner::Job(job),
         (None, Some(job)) => Owner::Movie(job),
-        (None, None) => Owner::Calibration(row.try_get("calibration")?),
+        (None, None) => Owner::Calibration(row.read("calibration")?),
     })
 }

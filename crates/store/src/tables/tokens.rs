@@ -1,22 +1,18 @@
 //! Tables `tokens` and `sessions`: who may come in.
 
-use std::time::Duration;
-
-use sqlx::FromRow;
-
 use super::labs;
 use crate::Store;
+use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{integer, sql, sql_as};
 use engine::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 
-/// The last use of a token is known to within this time, so that few requests write.
-const USE_NOTED: Duration = Duration::from_secs(300);
+/// Milliseconds to which the last use of a token is known, so that few requests write.
+const USE_NOTED: i64 = 300_000;
 /// Sessions of a token at the same time; the oldest give way.
 const SESSIONS: u32 = 64;
 
 /// A token on record, without the secret.
-#[derive(Debug, Clone, PartialEq, Eq, FromRow)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Token {
     /// Its identifier, which is no secret.
     pub id: TokenId,
@@ -36,6 +32,19 @@ pub struct Token {
     pub revoked_at: Option<Timestamp>,
 }
 
+from_row!(Token, row => {
+    id,
+    lab,
+    role,
+    all_labs,
+    note,
+    max_bytes,
+    created_at,
+    expires_at,
+    used_at,
+    revoked_at,
+});
+
 impl Token {
     /// True if its last use was noted so long ago that this one is to be noted.
     pub fn is_use_due(&self) -> bool {
@@ -44,7 +53,7 @@ impl Token {
 }
 
 fn noted_before() -> Timestamp {
-    Timestamp(Timestamp::now().0 - integer(USE_NOTED.as_millis()))
+    Timestamp(Timestamp::now().0 - USE_NOTED)
 }
 
 impl Store {
@@ -62,7 +71,7 @@ impl Store {
                 token.role,
                 token.all_labs,
                 &token.note,
-                token.max_bytes.map(integer),
+                token.max_bytes,
                 token.created_at,
                 token.expires_at
             ]
@@ -146,7 +155,7 @@ impl Store {
     /// All tokens, oldest first, each with the bytes that it keeps here.
     pub async fn tokens(&self) -> Result<Vec<(Token, u64)>> {
         let tokens: Vec<Token> =
-            sqlx::query_as("SELECT * FROM tokens ORDER BY id").fetch_all(&self.readers).await?;
+            sql_as!("SELECT * FROM tokens ORDER BY id").fetch_all(&self.readers).await?;
         let mut listed = Vec::with_capacity(tokens.len());
         for token in tokens {
             let bytes = self.token_bytes(token.id).await?;
@@ -172,7 +181,7 @@ impl Store {
     /// True if no token was ever made: everyone may do everything then. Revoking the last one does
     /// not open the service again.
     pub async fn is_open(&self) -> Result<bool> {
-        let row = sqlx::query("SELECT 1 FROM tokens LIMIT 1").fetch_optional(&self.readers).await?;
+        let row = sql!("SELECT 1 FROM tokens LIMIT 1").fetch_optional(&self.readers).await?;
         Ok(row.is_none())
     }
 }

@@ -3,12 +3,12 @@
 use std::time::Duration;
 
 use serde::Serialize;
+use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{FromRow, Row, SqliteConnection};
 
 use crate::Store;
+use crate::columns::{Columns, FromRow, from_row, sql, sql_as};
 use crate::error::Result;
-use crate::rows::{sql, sql_scalar};
 use engine::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
 
 #[derive(Debug, Clone, Serialize)]
@@ -24,7 +24,7 @@ pub struct WorkerRow {
 }
 
 /// Where a worker is that came over the network; empty for one of this machine.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, FromRow)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct WorkerPlace {
     pub host: Option<String>,
     pub pool: Option<String>,
@@ -32,7 +32,9 @@ pub struct WorkerPlace {
     pub device: Option<String>,
 }
 
-#[derive(Debug, Clone, Serialize, FromRow)]
+from_row!(WorkerPlace, row => { host, pool, device });
+
+#[derive(Debug, Clone, Serialize)]
 pub struct WorkerTask {
     /// The job, or that of which it makes a movie; none for a calibration's.
     pub job: Option<JobId>,
@@ -43,6 +45,8 @@ pub struct WorkerTask {
     pub tile: Option<u32>,
     pub stage: Option<String>,
 }
+
+from_row!(WorkerTask, row => { job, calibration, kind, snapshot, tile, stage });
 
 impl Store {
     /// Records that a worker has started; it has the version of this program.
@@ -85,7 +89,7 @@ impl Store {
 
     /// The last sign of life of a worker; none if it is not on record.
     pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>> {
-        let seen = sql_scalar!("SELECT seen_at FROM workers WHERE id = ?", [id]);
+        let seen = sql_as!("SELECT seen_at FROM workers WHERE id = ?", [id]);
         Ok(seen.fetch_optional(&self.readers).await?)
     }
 
@@ -113,14 +117,14 @@ fn since(age: Duration) -> i64 {
 }
 
 fn worker(row: &SqliteRow) -> Result<WorkerRow> {
-    let has_task = row.try_get::<Option<String>, _>("kind")?.is_some();
+    let has_task = row.read::<Option<String>>("kind")?.is_some();
     Ok(WorkerRow {
-        id: row.try_get("id")?,
-        pid: row.try_get("pid")?,
-        version: row.try_get("version")?,
+        id: row.read("id")?,
+        pid: row.read("pid")?,
+        version: row.read("version")?,
         place: WorkerPlace::from_row(row)?,
-        started_at: row.try_get("started_at")?,
-        seen_at: row.try_get("seen_at")?,
+        started_at: row.read("started_at")?,
+        seen_at: row.read("seen_at")?,
         task: has_task.then(|| WorkerTask::from_row(row)).transpose()?,
     })
 }

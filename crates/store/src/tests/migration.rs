@@ -57,7 +57,7 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
         .create_if_missing(true)
         .foreign_keys(true);
     let mut connection = options.connect().await.unwrap();
-    sqlx::migrate!("../../migrations").run_to(BEFORE, &mut connection).await.unwrap();
+    crate::migrations::migrator().run_to(BEFORE, &mut connection).await.unwrap();
     let upload = format!("{:064}", 1);
     let captures =
         format!(r#"{{"masks": [["{upload}"]], "white": ["{upload}"], "black": ["{upload}"]}}"#);
@@ -156,7 +156,7 @@ async fn old_folder() -> (tempfile::TempDir, sqlx::SqliteConnection) {
         .create_if_missing(true)
         .foreign_keys(true);
     let mut connection = options.connect().await.unwrap();
-    sqlx::migrate!("../../migrations").run_to(BEFORE, &mut connection).await.unwrap();
+    crate::migrations::migrator().run_to(BEFORE, &mut connection).await.unwrap();
     (folder, connection)
 }
 
