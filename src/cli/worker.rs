@@ -101,7 +101,7 @@ async fn work(
     }
     let store =
         Store::open(settings.data.as_deref().unwrap_or(Path::new("")), Purpose::Use).await?;
-    let local = Local::new(store.clone(), id, !settings.without_tiles);
+    let local = Local::new(store.clone(), id, settings.takes.into());
     let ended = Worker::new(local, network, model, stall, stop).run().await;
     store.close().await;
     Ok(ended?)
@@ -127,23 +127,30 @@ fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
 /// How the worker starts the process of a user's network: with its own limits.
 fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     let WorkerArguments { memory_bytes, engine, .. } = settings;
-    let mut arguments = vec!["run-model".into(), "--device".into(), engine.device.clone().into()];
+    let mut options = vec!["--device".into(), engine.device.clone().into()];
     if let Some(library) = &engine.onnxruntime {
-        arguments.extend(["--onnxruntime".into(), library.into()]);
+        options.extend(["--onnxruntime".into(), library.into()]);
     }
     if let Some(bytes) = memory_bytes {
-        arguments.extend(["--memory-bytes".into(), bytes.to_string().into()]);
+        options.extend(["--memory-bytes".into(), bytes.to_string().into()]);
     }
     if engine.unconfined {
-        arguments.push("--unconfined".into());
+        options.push("--unconfined".into());
     }
-    ModelCommand { program, arguments, memory_bytes: *memory_bytes }
+    let line = |command: &str| [&[command.into()], &options[..]].concat();
+    let (run, check) = (line("run-model"), line("check-model"));
+    ModelCommand { program, run, check, memory_bytes: *memory_bytes }
 }
 
-/// Lowers the priority of this process, and so of all its threads.
+/// Lowers the priority of this process, and so of all its threads, unless it is that low already.
 fn stand_back(nice: i32) -> Result<()> {
-    rustix::process::setpriority_process(None, nice)
-        .map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
+    use rustix::process::{getpriority_process, setpriority_process};
+    let lowered = getpriority_process(None).and_then(|now| match nice > now {
+        true => setpriority_process(None, nice),
+        // Only an administrator may raise it.
+        false => Ok(()),
+    });
+    lowered.map_err(|error| CliError::Failure(format!("the priority can't be lowered: {error}")))
 }
 
 /// Waits for a reason to stop, and tells it on.

@@ -8,7 +8,7 @@ use sqlx::types::Json;
 use sqlx::{Row, SqliteConnection};
 
 use super::error::{Result, StoreError};
-use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256, Timestamp};
+use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256, ThingId, Timestamp};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -49,6 +49,14 @@ pub struct Filter<Id> {
 impl<Id> Default for Filter<Id> {
     fn default() -> Self {
         Self { calibration: None, created: Span::default(), after: None }
+    }
+}
+
+impl<Id: Into<ThingId>> Filter<Id> {
+    /// Drops the kind of the things from the filter.
+    pub(super) fn untyped(self) -> Filter<ThingId> {
+        let Self { calibration, created, after } = self;
+        Filter { calibration, created, after: after.map(Into::into) }
     }
 }
 

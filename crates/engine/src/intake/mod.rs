@@ -8,6 +8,7 @@ mod check;
 mod error;
 mod open;
 mod read;
+mod refusal;
 mod report_page;
 mod sample;
 
@@ -16,5 +17,6 @@ pub use check::{Exposure, Passed, judge, masks, measurement};
 pub use error::IntakeError;
 pub use open::{Opened, Source};
 pub use read::{Scaled, read_clip, read_colours, read_masks, read_snapshots, read_truth};
+pub use refusal::{Refusal, RefusalCode};
 pub use report_page::report_page;
 pub use sample::{Sample, sample};

@@ -8,7 +8,7 @@ use sqlx::{Decode, Encode, Type};
 
 use super::{
     CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, PartialId, Role, Sequence,
-    Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
+    Sha256, TaskId, TaskStage, TaskState, ThingId, Timestamp, TokenId, WorkerId,
 };
 
 /// How a type lies in a column: as another one, and how it becomes that one and is read of it.
@@ -50,6 +50,7 @@ column!(
     MeasurementId,
     ModelId,
     JobId,
+    ThingId,
     TaskId,
     PartialId,
     TokenId,

@@ -16,6 +16,8 @@ const PREVIEW_BLOCKS_S: f64 = 10e-9;
 const PREVIEW_WHOLE_S: f64 = 120e-9;
 /// The same for each sample of a movie (measured; of noise it is twice as much).
 const MOVIE_S: f64 = 700e-9;
+/// The most planned CPU-seconds of a task of the light worker, unless it is a check: an upload may wait for so long.
+const LIGHT_S: f64 = 1.0;
 /// No side of a movie is longer, or shorter: AV1's encoder takes no smaller ones.
 pub const MOVIE_SIDE: usize = 1920;
 pub const LEAST_MOVIE_SIDE: usize = 16;
@@ -50,6 +52,8 @@ pub enum TaskKind {
         snapshot: u32,
     },
     Manifest,
+    /// Check the uploads of a calibration, measurement or model, and prepare what is made of them.
+    Check,
     /// Make the masks of a calibration from its captures, and the report on them.
     Calibration,
     /// Make a movie of the frames of a snapshot, or of all of a job, which somebody has asked for.
@@ -66,7 +70,7 @@ impl TaskKind {
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
             Self::Movie { snapshot } => snapshot,
-            Self::Prepare | Self::Pilot | Self::Manifest | Self::Calibration => None,
+            Self::Prepare | Self::Pilot | Self::Manifest | Self::Check | Self::Calibration => None,
         }
     }
 
@@ -86,6 +90,20 @@ impl TaskKind {
         }
     }
 
+    /// True if the light worker of a server may take a task of this kind with these planned CPU-seconds. It takes
+    /// every check, as an upload must not wait behind tiles, and nothing else that is long.
+    pub fn is_light(self, cost: f64) -> bool {
+        match self {
+            Self::Check => true,
+            Self::Prepare
+            | Self::Preview { .. }
+            | Self::Assemble { .. }
+            | Self::Manifest
+            | Self::Movie { .. } => cost <= LIGHT_S,
+            Self::Pilot | Self::Tile { .. } | Self::Calibration => false,
+        }
+    }
+
     /// The kind with this name and these indices: the inverse of the functions above and `into_str`.
     pub fn from_parts(
         name: &str,
@@ -99,6 +117,7 @@ impl TaskKind {
             ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, snapshots, tile }),
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),
+            ("check", None, None) => Some(Self::Check),
             ("calibration", None, None) => Some(Self::Calibration),
             ("movie", snapshot, None) => Some(Self::Movie { snapshot }),
             _ => None,

@@ -144,7 +144,7 @@ impl Store {
     /// All that a tile that is out needs, once more.
     pub async fn remote_work(&self, remote: &RemoteTask) -> Result<ClaimedTask, StoreError> {
         let row = sql!(
-            "SELECT job, calibration, movie, kind, snapshot, snapshots, tile, cost FROM tasks WHERE id = ?",
+            "SELECT job, thing, kind, snapshot, snapshots, tile, cost FROM tasks WHERE id = ?",
             [remote.task]
         )
         .fetch_one(&self.readers)

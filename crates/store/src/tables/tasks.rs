@@ -13,15 +13,15 @@ use strum::{VariantArray, VariantNames};
 use crate::Store;
 use crate::error::{Result, StoreError};
 use crate::rows::{sql, sql_as, sql_scalar};
-use engine::job::{CalibrationId, JobId, RunSpec, Sha256, TaskKind, TaskState};
+use engine::job::{JobId, RunSpec, Sha256, TaskKind, TaskState, ThingId};
 
 /// What a task belongs to, and goes with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Owner {
+    /// The job that it belongs to.
     Job(JobId),
-    Calibration(CalibrationId),
-    /// The movie of a job, whose state does not follow it.
-    Movie(JobId),
+    /// The calibration, measurement, model or job for which it makes something. A job's state does not follow it.
+    Thing(ThingId),
 }
 
 #[derive(Debug, Clone, FromRow)]
@@ -220,9 +220,8 @@ pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
 
 /// What the task in this row belongs to.
 pub fn owner(row: &SqliteRow) -> Result<Owner> {
-    Ok(match (row.try_get("job")?, row.try_get("movie")?) {
-        (Some(job), _) => Owner::Job(job),
-        (None, Some(job)) => Owner::Movie(job),
-        (None, None) => Owner::Calibration(row.try_get("calibration")?),
+    Ok(match row.try_get("job")? {
+        Some(job) => Owner::Job(job),
+        None => Owner::Thing(row.try_get("thing")?),
     })
 }
