@@ -6,12 +6,14 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
+use strum::IntoStaticStr;
 
 #[cfg(feature = "nats")]
 use engine::job::Pool;
 use engine::job::WorkerId;
 use engine::pipeline::networks::{NetworkError, find_library};
 use reconstruction::prior::onnx::Device;
+use store::Claimant;
 
 /// The version of the program, with its commit if `make` built it.
 pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {
@@ -45,8 +47,9 @@ pub struct ServeArguments {
     #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
     pub hosts: Vec<String>,
 
-    /// Worker processes to run. 0 runs none, for workers that are started by hand; with --nats it runs one
-    /// that leaves the tiles to other machines [default: one per core].
+    /// Worker processes to run besides the light worker, which checks uploads and does other short tasks. 0 runs none,
+    /// for workers that are started by hand; with --nats it runs one that leaves the tiles to other machines [default:
+    /// one per core].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
 
@@ -270,9 +273,9 @@ pub struct WorkerArguments {
     #[command(flatten)]
     pub remote: RemoteArguments,
 
-    /// Leave the tiles to workers on other machines.
-    #[arg(long, hide = true)]
-    pub without_tiles: bool,
+    /// Which tasks it takes.
+    #[arg(long, value_enum, default_value_t, hide = true)]
+    pub takes: Takes,
 
     /// Memory limit; a task that needs more fails [default: no limit].
     #[arg(long, env = "SCI_RECON_WORKER_LIMIT_BYTES", value_name = "BYTES")]
@@ -293,6 +296,28 @@ pub struct WorkerArguments {
     /// End with standard input, which the server that started it holds open.
     #[arg(long, hide = true)]
     pub supervised: bool,
+}
+
+/// Which tasks a worker of this machine takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case", const_into_str)]
+pub enum Takes {
+    #[default]
+    All,
+    /// All except tiles, which are left to other machines.
+    WithoutTiles,
+    /// Short tasks, which must not wait for tiles.
+    Light,
+}
+
+impl From<Takes> for Claimant<'static> {
+    fn from(takes: Takes) -> Self {
+        match takes {
+            Takes::All => Self::Local,
+            Takes::WithoutTiles => Self::WithoutTiles,
+            Takes::Light => Self::Light,
+        }
+    }
 }
 
 /// Where and how workers compute.
@@ -458,6 +483,7 @@ impl WorkerArguments {
         if let Some(library) = &self.engine.onnxruntime {
             option("--onnxruntime", library.clone().into());
         }
+        option("--takes", self.takes.into_str().into());
         if let Some(id) = self.id {
             option("--id", id.to_string().into());
         }
@@ -466,9 +492,6 @@ impl WorkerArguments {
         }
         if self.engine.unconfined {
             line.push("--unconfined".into());
-        }
-        if self.without_tiles {
-            line.push("--without-tiles".into());
         }
         if self.supervised {
             line.push("--supervised".into());
@@ -543,7 +566,8 @@ mod tests {
             "--unconfined",
             "--memory-bytes",
             "1000",
-            "--without-tiles",
+            "--takes",
+            "light",
             "--log-format",
             "json",
         ];

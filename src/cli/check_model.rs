@@ -49,6 +49,9 @@ pub struct Arguments {
     /// Leaves the check all files and connections that its user may have.
     #[arg(long, hide = true)]
     unconfined: bool,
+    /// Ends when its standard input does: the worker that started it is gone then.
+    #[arg(long, hide = true)]
+    supervised: bool,
     #[command(flatten)]
     engine: NetworkArguments,
 }
@@ -57,7 +60,13 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
-    let Arguments { file, memory_bytes, unconfined, engine, .. } = arguments;
+    let Arguments { file, memory_bytes, unconfined, engine, supervised, .. } = arguments;
+    if *supervised {
+        std::thread::spawn(|| {
+            let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
+            std::process::exit(1);
+        });
+    }
     engine.confine(*memory_bytes, *unconfined, Some(file))?;
     let network = arguments.engine.network()?;
     // Without a library nothing can be said of the network.

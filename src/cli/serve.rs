@@ -16,7 +16,7 @@ use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 #[cfg(feature = "nats")]
 use crate::config::{ClusterArguments, RemoteArguments, VERSION};
-use crate::config::{ConfigError, ServeArguments, WorkerArguments};
+use crate::config::{ConfigError, EngineArguments, ServeArguments, Takes, WorkerArguments};
 use crate::http::{App, Metrics, listen, router};
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
@@ -97,7 +97,11 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let trouble = hub.as_ref().map(Hub::trouble);
     #[cfg(not(feature = "nats"))]
     let trouble = None;
-    let supervisor = Supervisor::start(&store, &program, &workers, settings.worker_count(), &stop);
+    let mut lines = vec![workers.clone(); settings.worker_count()];
+    // Clients wait for the check of their uploads, which must not wait for tiles.
+    let engine = EngineArguments { nice: 0, ..workers.engine.clone() };
+    lines.push(WorkerArguments { takes: Takes::Light, engine, ..workers });
+    let supervisor = Supervisor::start(&store, &program, lines, &stop);
     let closing = CancellationToken::new();
     let figures = metrics.clone();
     let maintenance = maintain(store.clone(), move || figures.upkeep(), settings.clone());
@@ -116,7 +120,6 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     });
     // 5. The API.
     let app = App::new(store.clone(), settings, metrics, (trouble, confinement), closing);
-    app.resume_checks().await?;
     let service = router(app);
     tokio::select! {
         () = listen(listener, service, settings, stopped(stop.clone())) => {}
@@ -159,7 +162,7 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
         data: Some(root.to_owned()),
         #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
-        without_tiles: settings.without_tiles(),
+        takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
         // A GPU's driver maps far more than it uses.
         memory_bytes: (settings.engine.device == "cpu")
             .then(|| allowance(settings.worker_memory_bytes)),

@@ -38,20 +38,19 @@ pub(super) struct Supervisor {
 }
 
 impl Supervisor {
-    /// Starts `count` workers, to end when `stop` becomes true.
+    /// Starts a worker with each of these arguments, to end when `stop` becomes true.
     pub(super) fn start(
         store: &Store,
         program: &Path,
-        arguments: &WorkerArguments,
-        count: usize,
+        workers: Vec<WorkerArguments>,
         stop: &watch::Receiver<bool>,
     ) -> Self {
         let mut slots = JoinSet::new();
-        for _ in 0..count {
+        for arguments in workers {
             let slot = Slot {
                 store: store.clone(),
                 program: program.to_owned(),
-                arguments: arguments.clone(),
+                arguments,
                 stop: stop.clone(),
             };
             slots.spawn(slot.keep_running());

@@ -103,7 +103,7 @@ async fn work(
         return Ok(ended?);
     }
     let store = Store::open(settings.data_folder().unwrap_or(Path::new("")), Purpose::Use).await?;
-    let local = Local::new(store.clone(), id, !settings.without_tiles);
+    let local = Local::new(store.clone(), id, settings.takes.into());
     let ended = Worker::new(local, network, model, stall, stop).run().await;
     store.close().await;
     Ok(ended?)
@@ -129,17 +129,19 @@ fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
 /// How the worker starts the process of a user's network: with its own limits.
 fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     let WorkerArguments { memory_bytes, engine, .. } = settings;
-    let mut arguments = vec!["run-model".into(), "--device".into(), engine.device.clone().into()];
+    let mut options = vec!["--device".into(), engine.device.clone().into()];
     if let Some(library) = &engine.onnxruntime {
-        arguments.extend(["--onnxruntime".into(), library.into()]);
+        options.extend(["--onnxruntime".into(), library.into()]);
     }
     if let Some(bytes) = memory_bytes {
-        arguments.extend(["--memory-bytes".into(), bytes.to_string().into()]);
+        options.extend(["--memory-bytes".into(), bytes.to_string().into()]);
     }
     if engine.unconfined {
-        arguments.push("--unconfined".into());
+        options.push("--unconfined".into());
     }
-    ModelCommand { program, arguments, memory_bytes: *memory_bytes }
+    let line = |command: &str| [&[command.into()], &options[..]].concat();
+    let (run, check) = (line("run-model"), line("check-model"));
+    ModelCommand { program, run, check, memory_bytes: *memory_bytes }
 }
 
 /// Lowers the priority of this process, and so of all its threads. A lower one stays: only root may raise it.

@@ -76,13 +76,6 @@ pub(super) struct Access {
     pub(super) session: Option<Secret>,
 }
 
-/// Whose something is, and against whose limit it counts.
-#[derive(Debug, Clone)]
-pub(super) struct Owner {
-    pub(super) lab: Lab,
-    pub(super) token: Option<TokenId>,
-}
-
 impl Access {
     /// On a service without tokens.
     fn open() -> Self {
@@ -97,12 +90,6 @@ impl Access {
             session: None,
         }
     }
-
-    /// Whose what is made by the request will be.
-    pub(super) fn owner(&self) -> Owner {
-        Owner { lab: self.lab.clone(), token: self.token }
-    }
-
     fn of(token: Token, session: Option<Secret>) -> Self {
         let Token { id, lab, role, all_labs, max_bytes, expires_at, .. } = token;
         let token = Some(id);

@@ -91,27 +91,17 @@ impl Admission {
 
     /// Refuses `what` if the disk has no room for its `needed` bytes beside what is reserved for
     /// others. They are part of what is reserved unless `extra` says that they come on top.
-    async fn check_disk(&self, extra: u64, what: &str, needed: u64) -> Result<()> {
-        let (free, _) = self.store.dir().disk()?;
+    async fn check_disk(&self, extra: u64, what: &'static str, needed: u64) -> Result<()> {
         let reserved = self.store.promised_bytes().await? + self.reserved.load(Ordering::Acquire);
-        let wanted = reserved.saturating_add(extra).saturating_add(self.min_free_bytes);
-        if free >= wanted {
-            return Ok(());
-        }
         let others = reserved.saturating_sub(needed - extra);
-        let detail = format!(
-            "{what} needs {needed} bytes; {free} are free, of which {others} are promised to others \
-             and {} are kept in reserve",
-            self.min_free_bytes
-        );
-        Err(ApiError::new(Code::InsufficientStorage, detail))
+        Ok(self.store.dir().check_room(what, needed, others, self.min_free_bytes)?)
     }
 
     /// Has `accept` put on record what the disk has room for, and by that reserve it: a job, an upload in
-    /// pieces, masks that are to be made.
+    /// pieces.
     pub(super) async fn with_room<T>(
         &self,
-        what: &str,
+        what: &'static str,
         needed: u64,
         accept: impl Future<Output = Result<T, StoreError>>,
     ) -> Result<T> {

@@ -10,20 +10,18 @@ use tokio_util::sync::CancellationToken;
 use super::admission::Admission;
 use super::events::Events;
 use super::metrics::Metrics;
-use super::model_check::Checker;
 use super::rendering::Pictures;
 use super::revocation::Revocations;
-use super::running::Checks;
 use super::shares::Turns;
 use crate::config::ServeArguments;
 use engine::job::{Timestamp, without_paths};
 use formats::Limits;
 use store::Store;
 
-/// Labs of which a file is checked at the same time, so that a slow one keeps no other lab waiting.
-const CHECKS_AT_ONCE: usize = 4;
-/// Files of a lab that may wait to be checked.
-const CHECKS: usize = 32;
+/// Labs for which a file is read at the same time, so that a slow one keeps no other lab waiting.
+const READS_AT_ONCE: usize = 4;
+/// Requests of a lab that may wait for a file to be read.
+const READS: usize = 32;
 
 /// What all handlers share; cheap to clone.
 #[derive(Debug, Clone)]
@@ -37,14 +35,12 @@ pub struct Services {
     pub(super) started_at: Timestamp,
     pub(super) limits: Limits,
     pub(super) admission: Admission,
-    /// Each check takes a core and a frame of memory; of a lab there is one at a time.
+    /// Each read takes a core and a frame of memory; a lab has one at a time.
     pub(super) intake: Turns,
-    pub(super) checks: Checks,
     /// Ends what has no end of its own.
     pub(super) closing: CancellationToken,
     /// When it was last tried whether files can be written, and what came of it.
     pub(super) disk_tried: Mutex<Option<(Instant, std::result::Result<(), String>)>>,
-    pub(super) checker: Checker,
     pub(super) metrics: Metrics,
     pub(super) events: Events,
     pub(super) revocations: Revocations,
@@ -76,11 +72,9 @@ impl App {
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
-            intake: Turns::new(CHECKS_AT_ONCE, CHECKS),
-            checks: Checks::default(),
+            intake: Turns::new(READS_AT_ONCE, READS),
             closing,
             disk_tried: Mutex::default(),
-            checker: Checker::new(settings),
             metrics,
             cluster,
             confinement,

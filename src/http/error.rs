@@ -1,6 +1,5 @@
 //! Errors as the user sees them: problem+json (RFC 9457).
 
-use std::io::ErrorKind;
 use std::sync::LazyLock;
 
 use axum::Json;
@@ -10,7 +9,7 @@ use serde::Serialize;
 use serde_json::Value;
 use strum::{EnumString, IntoStaticStr, VariantArray};
 
-use engine::intake::IntakeError;
+use engine::intake::{IntakeError, Refusal, RefusalCode};
 use engine::job::InvalidField;
 use formats::FormatError;
 use store::StoreError;
@@ -98,7 +97,7 @@ pub struct ApiError {
     has_hope: bool,
     detail: String,
     errors: Vec<InvalidField>,
-    reason: Option<&'static str>,
+    reason: Option<String>,
     headers: Vec<(HeaderName, HeaderValue)>,
 }
 
@@ -159,10 +158,6 @@ impl ApiError {
         self
     }
 
-    pub(super) fn code(&self) -> Code {
-        self.code
-    }
-
     /// The body of the answer.
     pub(super) fn problem(&self) -> Value {
         let (status, title, retryable) = self.code.row();
@@ -175,7 +170,7 @@ impl ApiError {
             code,
             retryable: retryable && self.has_hope,
             instance: REQUEST_ID.try_with(|id| format!("urn:sci-recon:request:{id}")).ok(),
-            reason: self.reason,
+            reason: self.reason.as_deref(),
             pointer: self.errors.first().map(|error| error.pointer.as_str()),
             errors: &self.errors,
         };
@@ -224,6 +219,8 @@ impl From<StoreError> for ApiError {
             StoreError::QueueFull { .. } => Code::QueueFull,
             StoreError::Quota { .. } => Code::QuotaExceeded,
             StoreError::ManyPartials(_) => Code::TooManyUploads,
+            StoreError::ManyChecks(_) => Code::TooManyChecks,
+            StoreError::NoRoom { .. } => Code::InsufficientStorage,
             StoreError::Short { .. } => {
                 tracing::error!(%error, "bytes of an upload are lost");
                 Code::UploadDamaged
@@ -256,51 +253,40 @@ impl From<StoreError> for ApiError {
     }
 }
 
-/// A check of a file that has taken longer than it may.
-pub(super) fn too_slow() -> ApiError {
-    tracing::warn!("the check of a file took too long");
-    let detail = "the check of the file took longer than --check-seconds allows: try again when less is going \
-                  on, or send it in a format that is quicker to read, such as npy";
-    ApiError::new(Code::TimedOut, detail)
+impl From<Refusal> for ApiError {
+    fn from(Refusal { code, detail, pointer, reason }: Refusal) -> Self {
+        let code = match code {
+            RefusalCode::InvalidRequest => Code::InvalidRequest,
+            RefusalCode::InvalidContent => Code::InvalidContent,
+            RefusalCode::SizeMismatch => Code::SizeMismatch,
+            RefusalCode::UploadDamaged => Code::UploadDamaged,
+            RefusalCode::QuotaExceeded => Code::QuotaExceeded,
+            RefusalCode::InsufficientStorage => Code::InsufficientStorage,
+            RefusalCode::TimedOut => Code::TimedOut,
+            RefusalCode::Unavailable => Code::Unavailable,
+            RefusalCode::Internal => Code::Internal,
+        };
+        let refused = Self { reason, ..Self::new(code, detail) };
+        match pointer {
+            Some(pointer) => refused.at(&pointer),
+            None => refused,
+        }
+    }
 }
 
 impl From<FormatError> for ApiError {
     fn from(error: FormatError) -> Self {
-        if error.is_disk_full() {
-            return disk_full(&error);
-        }
-        if let FormatError::Io { source, .. } = &error {
-            match source.kind() {
-                ErrorKind::TimedOut => return too_slow(),
-                ErrorKind::Interrupted => return StoreError::Interrupted.into(),
-                _ => {}
-            }
-        }
-        if !error.is_callers_fault() {
-            return Self::internal(&error);
-        }
-        let refused = Self::new(Code::InvalidContent, error.to_string());
-        let refused = Self { reason: Some(error.code()), ..refused };
-        match error {
-            FormatError::FullScale(_) => refused.at("/full_scale"),
-            FormatError::AxesAmbiguous { .. } | FormatError::NoAxes(_) => refused.at("/axes"),
-            FormatError::NoNames | FormatError::MissingArray { .. } => refused.at("/array"),
-            _ => refused,
-        }
+        IntakeError::from(error).into()
     }
 }
 
 impl From<IntakeError> for ApiError {
     fn from(error: IntakeError) -> Self {
-        let (place, error) = match error {
-            IntakeError::Format { place, source } => (place, source.into()),
-            IntakeError::Size { place, detail } => (place, Self::new(Code::SizeMismatch, detail)),
-            IntakeError::Content { place, detail } => {
-                (place, Self::new(Code::InvalidContent, detail))
-            }
-            IntakeError::Stopped => return StoreError::Interrupted.into(),
-        };
-        if place.is_empty() { error } else { error.at(&place) }
+        match Refusal::try_from(error) {
+            Ok(refusal) => refusal.into(),
+            Err(IntakeError::Stopped) => StoreError::Interrupted.into(),
+            Err(error) => Self::internal(&error),
+        }
     }
 }
 

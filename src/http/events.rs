@@ -1,5 +1,4 @@
-//! `/v1/events`: says which jobs, calibrations and checks of measurements have changed, for those who would
-//! poll otherwise.
+//! `/v1/events`: says which jobs, calibrations and measurements have changed, for those who would poll otherwise.
 //!
 //! Workers are other processes, so the server looks at the database once a second, as long as
 //! somebody listens, and compares what it sees with what it saw before.
@@ -22,8 +21,8 @@ use tokio_util::sync::CancellationToken;
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use engine::job::{CalibrationId, JobId, Lab, MeasurementId};
-use store::{CalibrationMark, CheckMark, JobMark, Store, StoreError};
+use engine::job::{CalibrationId, JobId, Lab, MeasurementId, ModelId, ThingId};
+use store::{JobMark, Made, RequestMark, Store, StoreError};
 
 /// The longest time between two looks at all jobs.
 const LOOK: Duration = Duration::from_secs(1);
@@ -57,10 +56,20 @@ struct Told {
     jobs: HashMap<Lab, String>,
     calibrations: HashMap<Lab, String>,
     measurements: HashMap<Lab, String>,
+    /// For requests that wait for the check of a model.
+    models: HashMap<Lab, String>,
 }
 
 /// Which of what labs are told.
 type Kind = fn(&Told) -> &HashMap<Lab, String>;
+
+fn kind(what: Made) -> Kind {
+    match what {
+        Made::Calibration => |told| &told.calibrations,
+        Made::Measurement => |told| &told.measurements,
+        Made::Model | Made::Upload => |told| &told.models,
+    }
+}
 
 type Changes = Arc<Told>;
 
@@ -97,31 +106,28 @@ impl Events {
         self.until(lab, time, (|told| &told.jobs, job.to_string()), ended).await
     }
 
-    /// Waits until the masks of a calibration are there, or there will be none.
-    pub(super) async fn calibrated(
+    /// Waits until a calibration, measurement or model is there, or was refused.
+    pub(super) async fn settled(
         &self,
         store: &Store,
         lab: &Lab,
-        id: CalibrationId,
+        (what, id): (Made, ThingId),
         time: Duration,
     ) -> Result<()> {
-        let settled =
-            || async { Ok(store.unready(lab, id).await?.is_none_or(|it| it.error.is_some())) };
-        self.until(lab, time, (|told| &told.calibrations, id.to_string()), settled).await
+        let settled = || async { Ok(store.is_settled(lab, id).await?) };
+        self.until(lab, time, (kind(what), id.to_string()), settled).await
     }
 
-    /// Waits until a measurement has passed its check, or has not.
-    pub(super) async fn measured(
+    /// Waits until the uploads for a calibration, measurement or model are checked.
+    pub(super) async fn checked(
         &self,
         store: &Store,
         lab: &Lab,
-        id: MeasurementId,
+        (what, id): (Made, ThingId),
         time: Duration,
     ) -> Result<()> {
-        let settled = || async {
-            Ok(store.measurement_check(lab, id).await?.is_none_or(|it| it.problem.is_some()))
-        };
-        self.until(lab, time, (|told| &told.measurements, id.to_string()), settled).await
+        let checked = || async { Ok(store.is_checked(id).await?) };
+        self.until(lab, time, (kind(what), id.to_string()), checked).await
     }
 
     /// Waits until something of this kind and name is `settled`, at most for `time` and until the service stops. No
@@ -198,16 +204,17 @@ impl Drop for Waiter {
 /// What was last seen.
 struct Marks {
     jobs: Versions<JobId, JobMark>,
-    calibrations: Versions<CalibrationId, CalibrationMark>,
-    /// Of those that have not passed their check; it does not change what has.
-    measurements: Versions<MeasurementId, CheckMark>,
+    calibrations: Versions<CalibrationId, RequestMark>,
+    measurements: Versions<MeasurementId, RequestMark>,
+    models: Versions<ModelId, RequestMark>,
 }
 
 async fn marks(store: &Store) -> Result<Marks, StoreError> {
     Ok(Marks {
         jobs: store.job_marks().await?,
-        calibrations: store.calibration_marks().await?,
-        measurements: store.check_marks().await?,
+        calibrations: store.request_marks(Made::Calibration).await?,
+        measurements: store.request_marks(Made::Measurement).await?,
+        models: store.request_marks(Made::Model).await?,
     })
 }
 
@@ -236,17 +243,21 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             Some(before) => Told {
                 jobs: changes(&before.jobs, &now.jobs),
                 calibrations: changes(&before.calibrations, &now.calibrations),
-                measurements: moved(&before.measurements, &now.measurements),
+                measurements: changes(&before.measurements, &now.measurements),
+                models: changes(&before.models, &now.models),
             },
             // What changed between the greeting and this first look is not known.
             None => Told {
                 jobs: everything(&now.jobs),
                 calibrations: everything(&now.calibrations),
-                // Of every lab that can have any.
-                measurements: everything(&now.calibrations),
+                measurements: everything(&now.measurements),
+                models: everything(&now.models),
             },
         };
-        if !told.jobs.is_empty() || !told.calibrations.is_empty() || !told.measurements.is_empty() {
+        if [&told.jobs, &told.calibrations, &told.measurements, &told.models]
+            .iter()
+            .any(|told| !told.is_empty())
+        {
             // Fails only if the last listener has just gone.
             let _ = sender.send(told.into());
         }
@@ -268,19 +279,6 @@ fn changes<Id: Copy + Ord + Hash + Serialize, Mark: PartialEq>(
         changes.entry(lab).or_default().deleted.push(*id);
     }
     told(changes.into_iter().map(|(lab, change)| (lab, change.cut())))
-}
-
-/// As [`changes`], of things that leave `now` when they have come to their end: those have changed, too.
-fn moved<Id: Copy + Ord + Hash + Serialize, Mark: PartialEq>(
-    before: &Versions<Id, Mark>,
-    now: &Versions<Id, Mark>,
-) -> HashMap<Lab, String> {
-    let mut moved: HashMap<&Lab, Change<Id>> = HashMap::new();
-    let new = now.iter().filter(|(id, mark)| before.get(id) != Some(mark)).map(|(id, _)| id);
-    for (lab, id) in new.chain(before.keys().filter(|id| !now.contains_key(id))) {
-        moved.entry(lab).or_default().changed.push(*id);
-    }
-    told(moved.into_iter().map(|(lab, change)| (lab, change.cut())))
 }
 
 /// Has every lab that has such things read its list again.

@@ -1,7 +1,5 @@
 //! Extractors whose refusals are problems.
 
-use std::str::FromStr;
-
 use axum::body::Bytes;
 use axum::extract::rejection::{BytesRejection, PathRejection, QueryRejection};
 use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
@@ -15,8 +13,8 @@ use serde::de::DeserializeOwned;
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
-use engine::job::{InvalidField, InvalidId, Lab, Sha256};
-use store::{Inserted, Made, RequestKey};
+use engine::job::{InvalidField, Sha256};
+use store::{Inserted, RequestKey};
 
 /// The service, and for whom a request to it is.
 pub(super) struct Caller(pub(super) App, pub(super) Access);
@@ -197,22 +195,6 @@ pub(super) fn request_key<T: Serialize>(
     let Some(key) = idempotency_key(headers)? else { return Ok(None) };
     let text = serde_json::to_vec(request).map_err(|error| ApiError::internal(&error))?;
     Ok(Some(RequestKey { key, request: Sha256::of(&text) }))
-}
-
-/// Makes a thing, or finds the one of this kind that the lab made with the same key.
-pub(super) async fn once<Id>(
-    app: &App,
-    lab: &Lab,
-    (what, key): (Made, Option<&RequestKey>),
-    make: impl Future<Output = Result<Inserted<Id>>>,
-) -> Result<Inserted<Id>>
-where
-    Id: FromStr<Err = InvalidId>,
-{
-    match app.store.made_with(lab, what, key).await? {
-        Some(id) => Ok(Inserted::Before(id)),
-        None => make.await,
-    }
 }
 
 /// The status of an answer to a request that makes a thing, and the thing.

@@ -1,77 +1,21 @@
 //! `/v1/measurements`: coded snapshots.
 
-use std::time::Duration;
-
 use axum::Json;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::Value;
-use tokio_util::sync::CancellationToken;
 
-use super::access::{Access, Owner};
-use super::admission::Reservation;
 use super::app::App;
-use super::checks::{self, Checked, Stage, patience};
-use super::error::{ApiError, Code, Result};
+use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::intake::{self, Desk, Prepared, Upload};
 use super::page::{ListQuery, PageBody, Renaming, ShowQuery};
-use engine::intake::Exposure;
+use super::submissions::{Stage, make, patience, pending};
 use engine::job::{
-    CalibrationId, Finding, InvalidField, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp,
+    CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Sequence, Sha256,
+    Submission, Timestamp,
 };
-use formats::{Axes, StackInfo};
-use store::{
-    Check, Inserted, Made, Measurement, NewCheck, NewMeasurement, Page, RequestKey, Source,
-    StagedBlob,
-};
-
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct MeasurementRequest {
-    name: Option<Label>,
-    calibration: CalibrationId,
-    data: Sha256,
-    /// What the snapshots are called in a file of several arrays.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    array: Option<Label>,
-    /// The order of the array's axes; none for the only one that fits.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    axes: Option<Axes>,
-    /// Captures of the dark, the LCoS all black, at the measurement's exposure: their average is
-    /// subtracted.
-    #[serde(default)]
-    dark: Vec<Sha256>,
-    /// The stored number from which on a pixel is full.
-    saturation: Option<u32>,
-    full_scale: Option<f32>,
-    /// Snapshots in a second.
-    camera_fps: Option<f64>,
-    /// Seconds of one snapshot.
-    exposure_s: Option<f64>,
-    /// Whether the snapshots follow one another; what the times say where it is left out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    sequence: Option<Sequence>,
-}
-
-impl MeasurementRequest {
-    pub(super) fn of_data(name: Option<Label>, calibration: CalibrationId, data: Sha256) -> Self {
-        Self {
-            name,
-            calibration,
-            data,
-            array: None,
-            axes: None,
-            dark: Vec::new(),
-            saturation: None,
-            full_scale: None,
-            camera_fps: None,
-            exposure_s: None,
-            sequence: None,
-        }
-    }
-}
+use store::{Asked, Made, Measurement, Page, Request, StoreError};
 
 /// A measurement as it is shown. What is known of its data is null until they are checked.
 #[derive(Debug, Serialize)]
@@ -126,20 +70,23 @@ impl From<Measurement> for MeasurementBody {
     }
 }
 
-impl TryFrom<Check> for MeasurementBody {
+impl TryFrom<Request> for MeasurementBody {
     type Error = ApiError;
 
-    fn try_from(check: Check) -> Result<Self> {
-        let unreadable = |error: serde_json::Error| ApiError::internal(&error);
-        let asked: MeasurementRequest = serde_json::from_str(&check.request).map_err(unreadable)?;
-        let error = check.error()?;
+    fn try_from(request: Request) -> Result<Self> {
+        let (state, error, problem) = pending(&request);
+        let Submission::Measurement(asked) = request.submission else {
+            return Err(
+                StoreError::NotFound { what: "measurement", id: request.id.to_string() }.into()
+            );
+        };
         Ok(Self {
-            id: check.id.parse().map_err(|error| ApiError::internal(&error))?,
-            state: Stage::unready(error.as_ref()),
+            id: request.id.into(),
+            state,
             error,
-            problem: checks::problem(check.problem)?,
-            created_at: check.created_at,
-            name: check.name,
+            problem,
+            created_at: request.created_at,
+            name: request.name,
             calibration: asked.calibration,
             data: asked.data,
             format: None,
@@ -158,12 +105,24 @@ impl TryFrom<Check> for MeasurementBody {
     }
 }
 
+impl TryFrom<Asked<Measurement>> for MeasurementBody {
+    type Error = ApiError;
+
+    fn try_from(asked: Asked<Measurement>) -> Result<Self> {
+        match asked {
+            Asked::Ready(measurement) => Ok(measurement.into()),
+            Asked::Pending(request) => (*request).try_into(),
+        }
+    }
+}
+
 pub(super) async fn create(
     Caller(app, access): Caller,
     headers: HeaderMap,
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
+    let request = Submission::Measurement(request);
     let made = make(&app, &access, request, key.as_ref(), patience(&headers)).await?;
     let (status, id) = created(made);
     let body = body(&app, &access.lab, id).await?;
@@ -172,136 +131,8 @@ pub(super) async fn create(
     Ok((status, location, Json(body)).into_response())
 }
 
-/// Makes one, or finds the one that was made with the same key. Waits so long for its check.
-pub(super) async fn make(
-    app: &App,
-    access: &Access,
-    request: MeasurementRequest,
-    key: Option<&RequestKey>,
-    patience: Duration,
-) -> Result<Inserted<MeasurementId>> {
-    checks::made(app, access, request, key, patience).await
-}
-
-impl Checked for MeasurementRequest {
-    const WHAT: Made = Made::Measurement;
-    type Id = MeasurementId;
-    type Passed = (NewMeasurement, StagedBlob, Reservation);
-
-    fn new_id() -> MeasurementId {
-        MeasurementId::new()
-    }
-
-    fn draft(&self) -> NewCheck {
-        let mut files = self.dark.clone();
-        files.push(self.data);
-        let (name, calibration) = (self.name.clone(), Some(self.calibration));
-        NewCheck { name, calibration, request: String::new(), files }
-    }
-
-    async fn vet(&self, app: &App, owner: &Owner) -> Result<()> {
-        check_times(self)?;
-        let lab = &owner.lab;
-        let calibration = app.store.calibration(lab, self.calibration).await;
-        calibration.map_err(|error| ApiError::reference("/calibration", error))?;
-        let there = app.store.upload(lab, self.data).await;
-        there.map_err(|error| ApiError::reference("/data", error))?;
-        for (index, upload) in self.dark.iter().enumerate() {
-            let there = app.store.upload(lab, *upload).await;
-            there.map_err(|error| ApiError::reference(&format!("/dark/{index}"), error))?;
-        }
-        Ok(())
-    }
-
-    async fn check(
-        self,
-        app: &App,
-        owner: &Owner,
-        stop: &CancellationToken,
-    ) -> Result<Self::Passed> {
-        let calibration = app.store.calibration(&owner.lab, self.calibration).await;
-        let calibration =
-            calibration.map_err(|error| ApiError::reference("/calibration", error))?;
-        let file = intake::upload(app, self.data).await.map_err(|error| error.at("/data"))?;
-        let mut dark = Vec::with_capacity(self.dark.len());
-        for (index, upload) in self.dark.iter().enumerate() {
-            let place = |error: ApiError| error.at(&format!("/dark/{index}"));
-            dark.push(intake::upload(app, *upload).await.map_err(place)?);
-        }
-        let frames = calibration.facts.frames;
-        let exposure = Exposure { dark, saturation: self.saturation };
-        let Self { axes, full_scale, .. } = self;
-        let of = Upload { array: self.array.clone(), axes, full_scale };
-        let look = move |desk: &Desk| intake::measurement(desk, &file, of, &exposure, &calibration);
-        let Prepared { info, full_scale, found, file, room } =
-            intake::run(app, owner, stop, look).await?;
-        Ok((facts(self, &info, full_scale, frames, found), file, room))
-    }
-
-    async fn keep(
-        app: &App,
-        owner: &Owner,
-        (facts, file, room): Self::Passed,
-        source: Source<'_, MeasurementId>,
-    ) -> Result<Inserted<MeasurementId>> {
-        let made =
-            app.store.add_measurement((&owner.lab, owner.token), facts, file, source).await?;
-        drop(room);
-        Ok(made)
-    }
-}
-
-/// Refuses times that can't be: they become the times of frames.
-fn check_times(request: &MeasurementRequest) -> Result<()> {
-    let checks = [
-        ("/camera_fps", request.camera_fps, 1e9, "snapshots in a second"),
-        ("/exposure_s", request.exposure_s, 1e5, "seconds"),
-    ];
-    let mut errors = Vec::new();
-    for (pointer, value, most, unit) in checks {
-        if let Some(value) = value
-            && !(value > 0.0 && value <= most)
-        {
-            let detail = format!("{value} {unit} can't be; it must be above 0 and at most {most}");
-            errors.push(InvalidField::new(pointer, detail));
-        }
-    }
-    if errors.is_empty() { Ok(()) } else { Err(ApiError::fields(Code::InvalidRequest, errors)) }
-}
-
-fn facts(
-    request: MeasurementRequest,
-    info: &StackInfo,
-    full_scale: f32,
-    frames: usize,
-    warnings: Vec<Finding>,
-) -> NewMeasurement {
-    let told = Sequence::from_camera(request.camera_fps, request.exposure_s, frames);
-    NewMeasurement {
-        name: request.name,
-        calibration: request.calibration,
-        data: request.data,
-        format: info.format.to_string(),
-        sample: info.sample.to_string(),
-        axes: info.axes.map(|axes| axes.to_string()),
-        // The limits on uploads keep the count far below this.
-        snapshots: u32::try_from(info.frames).unwrap_or(u32::MAX),
-        height: info.height,
-        width: info.width,
-        full_scale,
-        camera_fps: request.camera_fps,
-        exposure_s: request.exposure_s,
-        sequence: request.sequence.unwrap_or(told),
-        dark: request.dark,
-        warnings,
-    }
-}
-
 async fn body(app: &App, lab: &Lab, id: MeasurementId) -> Result<MeasurementBody> {
-    match app.store.measurement_check(lab, id).await? {
-        Some(check) => check.try_into(),
-        None => Ok(app.store.measurement(lab, id).await?.into()),
-    }
+    app.store.asked_measurement(lab, id).await?.try_into()
 }
 
 pub(super) async fn list(
@@ -309,18 +140,9 @@ pub(super) async fn list(
     QueryOf(query): QueryOf<ListQuery<MeasurementId>>,
 ) -> Result<Json<PageBody<MeasurementBody>>> {
     let (limit, filter) = (query.limit.get(), query.filter());
-    // In this order: what passes its check between the two looks is named, and once.
-    let unready = app.store.measurement_checks(&access.lab, filter, limit).await?;
-    let ready = app.store.measurements(&access.lab, filter, limit).await?;
-    let mut items: Vec<MeasurementBody> = ready.items.into_iter().map(Into::into).collect();
-    for check in unready.items {
-        items.push(check.try_into()?);
-    }
-    items.sort_by_key(|item| std::cmp::Reverse(item.id));
-    items.dedup_by_key(|item| item.id);
-    let most = usize::try_from(limit).unwrap_or(usize::MAX);
-    let more = ready.more || unready.more || items.len() > most;
-    items.truncate(most);
+    let Page { items, more } = app.store.measurements(&access.lab, filter, limit).await?;
+    let items = items.into_iter().map(TryInto::try_into);
+    let items: Vec<MeasurementBody> = items.collect::<Result<_>>()?;
     Ok(Json(PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item)))
 }
 
@@ -330,7 +152,8 @@ pub(super) async fn show(
     QueryOf(query): QueryOf<ShowQuery>,
 ) -> Result<Json<MeasurementBody>> {
     if let Some(time) = query.wait(&app) {
-        app.events.measured(&app.store, &access.lab, id, time).await?;
+        let what = (Made::Measurement, id.into());
+        app.events.settled(&app.store, &access.lab, what, time).await?;
     }
     Ok(Json(body(&app, &access.lab, id).await?))
 }
@@ -349,6 +172,5 @@ pub(super) async fn delete(
     Params(id): Params<MeasurementId>,
 ) -> Result<StatusCode> {
     app.store.delete_measurement(&access.lab, id).await?;
-    app.checks.stop(id);
     Ok(StatusCode::NO_CONTENT)
 }

@@ -1,26 +1,20 @@
 //! `/v1/models`: end-to-end networks, each for one calibration.
 
+use std::time::Duration;
+
 use axum::Json;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
 
-use super::access::Access;
-use super::app::App;
-use super::error::{ApiError, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, once, request_key};
-use super::intake;
+use super::error::{ApiError, Code, Result};
+use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{ListQuery, PageBody, Renaming};
-use engine::job::{CalibrationId, Label, ModelId, Sha256};
-use store::{Inserted, Made, Model, NewModel, RequestKey};
+use super::submissions::make;
+use engine::job::{ModelId, ModelRequest, Submission};
+use store::{Model, StoreError};
 
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ModelRequest {
-    name: Option<Label>,
-    calibration: CalibrationId,
-    file: Sha256,
-}
+/// How long a request waits for the check of a network, which may wait for others. It has no state to be asked for.
+const PATIENCE: Duration = Duration::from_secs(900);
 
 pub(super) async fn create(
     Caller(app, access): Caller,
@@ -28,39 +22,18 @@ pub(super) async fn create(
     Body(request): Body<ModelRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
-    let (status, id) = created(make(&app, &access, request, key.as_ref()).await?);
+    let made = make(&app, &access, Submission::Model(request), key.as_ref(), PATIENCE).await?;
+    let (status, id) = created::<ModelId>(made);
     let location = [(header::LOCATION, format!("/v1/models/{id}"))];
-    let model = app.store.model(&access.lab, id).await?;
+    let model = app.store.model(&access.lab, id).await.map_err(|error| match error {
+        StoreError::NotFound { .. } => {
+            let detail =
+                "the check of the network goes on: send the request again, with an Idempotency-Key";
+            ApiError::new(Code::TimedOut, detail)
+        }
+        error => error.into(),
+    })?;
     Ok((status, location, Json(model)).into_response())
-}
-
-/// Makes one, or finds the one that was made with the same key.
-async fn make(
-    app: &App,
-    access: &Access,
-    request: ModelRequest,
-    key: Option<&RequestKey>,
-) -> Result<Inserted<ModelId>> {
-    let insert = insert(app, access, request, key);
-    once(app, &access.lab, (Made::Model, key), insert).await
-}
-
-/// Checks a network and registers it.
-async fn insert(
-    app: &App,
-    access: &Access,
-    request: ModelRequest,
-    key: Option<&RequestKey>,
-) -> Result<Inserted<ModelId>> {
-    let ModelRequest { name, calibration, file } = request;
-    let lab = &access.lab;
-    let found = app.store.calibration(lab, calibration).await;
-    let masks = found.map_err(|error| ApiError::reference("/calibration", error))?.facts;
-    app.store.upload(lab, file).await.map_err(|error| ApiError::reference("/file", error))?;
-    let path = intake::upload(app, file).await.map_err(|error| error.at("/file"))?;
-    let facts = app.checker.check(lab, &path, &masks).await?;
-    let new = NewModel { name, calibration, file, facts };
-    Ok(app.store.add_model(lab, new, key).await?)
 }
 
 pub(super) async fn list(

@@ -46,9 +46,9 @@ pub(super) async fn show(
     let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
     let (shape, truth) = (job.spec.shape, query.truth);
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
-    let owner = access.owner();
-    let frames = intake::run(&app, &owner, &app.closing, move |desk| {
-        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, *desk.limits());
+    let limits = app.limits;
+    let frames = intake::run(&app, &access.lab, move || {
+        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, limits);
         // Behind a mosaic true frames may have colours, or be as the sensor sees them.
         let colours = if shape.mosaic.is_some() { truth.open_colours()? } else { None };
         if let Some(colours) = colours {

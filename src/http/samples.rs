@@ -9,14 +9,16 @@ use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
-use super::calibrations::{self, CalibrationRequest};
 use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, idempotency_key};
 use super::intake;
 use super::jobs::{self, JobBody};
-use super::measurements::{self, MeasurementRequest};
+use super::submissions::make;
 use engine::intake::sample;
-use engine::job::{Algorithm, JobRequest, Label, Sha256, SnapshotSelection};
+use engine::job::{
+    Algorithm, CalibrationRequest, JobRequest, Label, MeasurementRequest, Sha256,
+    SnapshotSelection, Submission,
+};
 use store::{RequestKey, StagedBlob, Store};
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -47,8 +49,8 @@ pub(super) async fn create(
 ) -> Result<Response> {
     // Apart from the keys with which the lab makes such things itself.
     let key = idempotency_key(&headers)?.map(|key| format!("/v1/samples {key}"));
-    let staged =
-        intake::run(&app, &access.owner(), &app.closing, |desk| simulate(desk.store())).await?;
+    let store = app.store.clone();
+    let staged = intake::run(&app, &access.lab, move || simulate(&store)).await?;
     app.admission.check_length(&access, staged.iter().map(StagedBlob::size).sum()).await?;
     let mut files = Vec::new();
     for file in staged {
@@ -58,10 +60,13 @@ pub(super) async fn create(
     let request_key = |file: Sha256| key.clone().map(|key| RequestKey { key, request: file });
     // The next step needs what this one makes.
     let time = 2 * app.settings.check_time();
-    let named = CalibrationRequest::of_masks(name(), masks);
-    let made = calibrations::make(&app, &access, named, request_key(masks).as_ref(), time).await?;
-    let named = MeasurementRequest::of_data(name(), made.id(), data);
-    let made = measurements::make(&app, &access, named, request_key(data).as_ref(), time).await?;
+    let named =
+        CalibrationRequest { name: name(), masks: Some(masks), ..CalibrationRequest::default() };
+    let (named, key_of_masks) = (Submission::Calibration(named), request_key(masks));
+    let made = make(&app, &access, named, key_of_masks.as_ref(), time).await?;
+    let named = MeasurementRequest::new(name(), made.id(), data);
+    let (named, key_of_data) = (Submission::Measurement(named), request_key(data));
+    let made = make(&app, &access, named, key_of_data.as_ref(), time).await?;
     let job = JobRequest {
         measurement: made.id(),
         calibration: None,

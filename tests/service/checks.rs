@@ -172,25 +172,87 @@ async fn a_check_survives_a_killed_server_but_not_its_deletion() {
 }
 
 #[tokio::test]
-async fn a_check_that_crashes_the_service_is_abandoned() {
-    let mut app = TestApp::start().await;
+async fn a_check_whose_workers_die_is_abandoned() {
+    let app = TestApp::start().await;
     let masks = app.upload(large_masks()).await;
     let calibration = id(&app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await.expect(202));
     let place = format!("{CALIBRATIONS}/{calibration}");
-    for _ in 0..20 {
-        app.restart();
-        // Until it has begun again.
-        tokio::time::sleep(Duration::from_millis(100)).await;
+    let mut killed = Vec::new();
+    for _ in 0..10_000 {
         let shown = app.get(&place).await.expect(200).json();
         match shown["state"].as_str().unwrap() {
             "preparing" => {}
             "failed" => {
                 assert_eq!(shown["problem"]["code"], "internal");
                 assert!(shown["error"].as_str().unwrap().contains("ended 5 times"), "{shown}");
+                assert!(killed.len() >= 5, "{killed:?}");
+                app.get("/livez").await.expect(200);
                 return;
             }
             state => panic!("{state}: the check is too short for this test"),
         }
+        // Once it is at the check: it has the file open.
+        if let Some(worker) = app.light_worker()
+            && reads(worker, &masks)
+        {
+            let _ = rustix::process::kill_process(worker, rustix::process::Signal::KILL);
+            killed.push(worker);
+        }
+        tokio::time::sleep(Duration::from_millis(2)).await;
     }
     panic!("the check is never abandoned");
+}
+
+/// True if a process has this upload open.
+fn reads(process: rustix::process::Pid, upload: &str) -> bool {
+    let files = std::fs::read_dir(format!("/proc/{process}/fd"));
+    let mut links = files.into_iter().flatten().flatten();
+    links.any(|file| std::fs::read_link(file.path()).is_ok_and(|path| path.ends_with(&upload[2..])))
+}
+
+#[tokio::test]
+async fn an_upload_is_checked_while_all_workers_are_busy_with_tiles() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let scene = Scene { frames: 8, height: 256, width: 256, snapshots: 1 };
+    let (calibration, measurement) = app.scene(&scene).await;
+    let long = json!({
+        "measurement": measurement,
+        "algorithm": "gap-tv",
+        "tile": {"size": 256, "overlap": 0},
+        "schedule": {"stages": [{"prior": "tv", "iterations": 2000, "tv_weight": 0.1}]},
+    });
+    let job = app.submit(&long).await;
+    app.when(&job, |job| job["progress"]["tiles_running"] == 1).await;
+    let before = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
+    // 1 MB.
+    let body = json!({"masks": app.upload(constant(&[4, 256, 256], 1.0)).await});
+    let start = std::time::Instant::now();
+    app.post(CALIBRATIONS, &body).await.expect(201);
+    let data = app.upload(constant(&[4, 256, 256], 8.0)).await;
+    let body = json!({"calibration": calibration, "data": data});
+    app.post(MEASUREMENTS, &body).await.expect(201);
+    eprintln!("two checks took {:?}", start.elapsed());
+    let after = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
+    assert_eq!((&after["state"], &after["progress"]["tiles_done"]), (&json!("running"), &json!(0)));
+    assert_eq!(after["progress"]["tiles_running"], 1, "{before:#} {after:#}");
+    let cancelled = app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await;
+    assert!(cancelled.status.is_success(), "{}", cancelled.status);
+}
+
+#[tokio::test]
+async fn an_answer_is_all_that_is_left_of_a_refusal_in_time() {
+    let app = TestApp::start().await;
+    let masks = app.upload(constant(&[4, 48, 64], 3.0)).await;
+    let request = || {
+        let request = app.request(Method::POST, CALIBRATIONS).json(&json!({"masks": masks}));
+        app.send(request.header("Idempotency-Key", "k"))
+    };
+    // Also of two with one key at a time.
+    let answers = futures_util::future::join_all([request(), request()]).await;
+    for answer in answers {
+        answer.problem(422, "invalid_content");
+    }
+    let listed = app.get(CALIBRATIONS).await.expect(200).json();
+    assert_eq!(listed["items"], json!([]));
+    app.delete(&format!("/v1/blobs/{masks}")).await.expect(204);
 }

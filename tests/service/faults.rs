@@ -46,7 +46,12 @@ pub async fn results_of(app: &TestApp, job: &str, snapshots: usize) -> BTreeMap<
 impl TestApp {
     /// Process identifiers of the workers, from the kernel.
     pub fn workers(&self) -> Vec<rustix::process::Pid> {
-        children(self.pid())
+        children(self.pid()).into_iter().filter(|pid| !is_light(*pid)).collect()
+    }
+
+    /// The worker that takes short tasks alone, once it runs.
+    pub fn light_worker(&self) -> Option<rustix::process::Pid> {
+        children(self.pid()).into_iter().find(|pid| is_light(*pid))
     }
 
     /// Sends SIGKILL to one worker.
@@ -57,6 +62,11 @@ impl TestApp {
             let _ = rustix::process::kill_process(*pid, rustix::process::Signal::KILL);
         }
     }
+}
+
+fn is_light(pid: rustix::process::Pid) -> bool {
+    let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+    line.split(|byte| *byte == 0).any(|word| word == b"light")
 }
 
 /// Child processes of a process, from the kernel.

@@ -65,6 +65,26 @@ async fn a_task_that_kills_its_workers_is_abandoned() {
 }
 
 #[tokio::test]
+async fn a_network_that_hangs_delays_no_other_check_of_its_lab_and_is_given_up() {
+    let (_folder, app) = with_library("for (;;) pause();").await;
+    let (calibration, _) = app.scene(&Scene::SMALL).await;
+    let file = app.upload(b"a network".to_vec()).await;
+    let body = json!({"calibration": calibration, "file": file});
+    let hanging = app.post("/v1/models", &body);
+    let others = async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        let masks = app.upload(Scene::SMALL.masks()).await;
+        app.post("/v1/calibrations", &json!({"masks": masks})).await.expect(201);
+        Instant::now()
+    };
+    let ((refused, end), checked) = tokio::join!(async { (hanging.await, Instant::now()) }, others);
+    assert!(checked < end, "it waited for the network");
+    let detail = refused.problem(500, "internal");
+    assert!(detail.contains("no progress"), "{detail}");
+    assert_eq!(app.get("/v1/models").await.json()["items"], json!([]));
+}
+
+#[tokio::test]
 async fn a_stop_does_not_wait_for_a_hanging_task() {
     let folder = tempfile::tempdir().unwrap();
     let library = library(folder.path(), "for (;;) pause();");

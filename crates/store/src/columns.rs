@@ -8,7 +8,7 @@ use std::marker::PhantomData;
 
 use engine::job::{
     CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, Mosaic, PartialId, Role,
-    Sequence, Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
+    Sequence, Sha256, TaskId, TaskStage, TaskState, ThingId, Timestamp, TokenId, WorkerId,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -190,6 +190,7 @@ texts!(
     CalibrationId,
     MeasurementId,
     ModelId,
+    ThingId,
     JobId,
     TaskId,
     PartialId,

@@ -146,6 +146,23 @@ impl DataDir {
         })?;
         Ok((stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize))
     }
+
+    /// Refuses `what` if the disk has no room for its `needed` bytes beside those that are `promised` to others and
+    /// those that stay free.
+    /// Errors: [`StoreError::NoRoom`].
+    pub fn check_room(
+        &self,
+        what: &'static str,
+        needed: u64,
+        promised: u64,
+        reserve: u64,
+    ) -> Result<()> {
+        let free = self.disk()?.0;
+        if free >= promised.saturating_add(needed).saturating_add(reserve) {
+            return Ok(());
+        }
+        Err(StoreError::NoRoom { what, needed, free, promised, reserve })
+    }
 }
 
 fn is_young(file: &File, age: Duration) -> bool {

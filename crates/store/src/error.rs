@@ -98,6 +98,14 @@ pub enum StoreError {
     Quota { whose: &'static str, kept: u64, needed: u64, limit: u64 },
     #[error("{0} uploads of this lab are not complete; end some before another is begun")]
     ManyPartials(u64),
+    #[error("{0} files of this lab wait to be checked; try again when some are done")]
+    ManyChecks(u64),
+    /// The disk has no room for something that is about to be written.
+    #[error(
+        "{what} needs {needed} bytes; {free} are free, of which {promised} are promised to others and {reserve} \
+         are kept in reserve"
+    )]
+    NoRoom { what: &'static str, needed: u64, free: u64, promised: u64, reserve: u64 },
     #[error("the Idempotency-Key {key:?} was used for another request, which made {what} {id}")]
     KeyReused { key: String, what: &'static str, id: String },
     /// A task that blocks was broken off, as at shutdown.

@@ -55,20 +55,20 @@ pub use identity::Purpose;
 pub use integrity::Audit;
 pub use locked::LockedFile;
 pub use queue::{
-    Begun, CalibrationDone, CalibrationTask, Claimant, ClaimedTask, Completion, Estimate,
-    Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
-    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
-    WorkerEnd,
+    Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, Claimant, ClaimedTask, Completion,
+    Estimate, Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES,
+    MAX_STARVED, MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask,
+    Work, WorkerEnd,
 };
 pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
-pub use submit::{NewCaptures, NewJob};
+pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Blob, BlobRow, Calibration, CalibrationMark, Check, CheckMark, Entitlement, FIRST_RESERVE,
-    FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made,
-    Measurement, Model, NewCalibration, NewCheck, NewMeasurement, NewModel, NewPartial, Origin,
-    Partial, PartialFile, RequestKey, Source, TaskCounts, TaskRecord, TaskTotals, TileHistory,
-    TileResult, TileState, Token, Unready, WorkerPlace, WorkerRow, WorkerTask, share_error,
+    Asked, Blob, BlobRow, Calibration, Entitlement, FIRST_RESERVE, FoundPartial, Inserted, Job,
+    JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration,
+    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request, RequestKey,
+    RequestMark, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
+    WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

@@ -35,6 +35,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (170, "movies", include_str!("../../../migrations/0170_movies.sql")),
     (180, "checks", include_str!("../../../migrations/0180_checks.sql")),
     (181, "result bytes", include_str!("../../../migrations/0181_result_bytes.sql")),
+    (190, "requests", include_str!("../../../migrations/0190_requests.sql")),
 ];
 
 /// The number of the newest migration.

@@ -4,7 +4,7 @@ use sqlx::SqliteConnection;
 
 use super::error::{Result, StoreError};
 use crate::columns::{sql, sql_as};
-use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256, Timestamp};
+use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256, ThingId, Timestamp};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -60,6 +60,14 @@ macro_rules! listed_text {
              ORDER BY id DESC LIMIT ?4"
         )
     };
+}
+
+impl<Id: Into<ThingId>> Filter<Id> {
+    /// Drops the kind of the things from the filter.
+    pub(super) fn untyped(self) -> Filter<ThingId> {
+        let Self { calibration, created, after } = self;
+        Filter { calibration, created, after: after.map(Into::into) }
+    }
 }
 
 /// A page of what belongs to calibrations and labs, newest first, with one more item than the page has, by `sql!`

@@ -1,6 +1,7 @@
 //! The queue as workers see it: the whole life of a job, and every way in which it can be disturbed.
 
 mod calibrations;
+mod checks;
 mod failures;
 mod keeping;
 mod migration;
@@ -11,18 +12,21 @@ mod statements;
 mod turns;
 
 use std::io::Write;
+use std::str::FromStr;
 use std::time::Duration;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::{
-    ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
-    Product, Purpose, Source, StagedDir, Store, StoreError, Work, WorkerEnd, WorkerPlace,
+    Checked, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob,
+    NewMeasurement, NewRequest, Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd,
+    WorkerPlace,
 };
 use engine::job::{
-    Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sequence, Sha256,
-    SnapshotSelection, TaskKind, TaskProgress, TileSpec, WorkerId,
+    Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
+    MeasurementId, MeasurementRequest, ResultFile, Sequence, Sha256, SnapshotSelection, Submission,
+    TaskKind, TaskProgress, ThingId, TileSpec, WorkerId,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -77,10 +81,12 @@ impl Lab {
             clipped_negatives: 0,
             mosaic: None,
         };
-        let masks = upload(b"prepared masks");
-        let whose = (&local, None);
-        let calibration =
-            store.add_calibration(whose, facts, masks, Source::Request(None)).await.unwrap().id();
+        let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
+        let worker = WorkerId::new();
+        store.worker_started(worker, 1, &WorkerPlace::default(), false).await.unwrap();
+        let asked = Submission::Calibration(asked);
+        let passed = Checked::Masks(facts, upload(b"prepared masks"));
+        let calibration = make(&store, worker, asked, passed).await;
         let facts = NewMeasurement {
             name: None,
             calibration,
@@ -98,14 +104,20 @@ impl Lab {
             dark: Vec::new(),
             warnings: Vec::new(),
         };
-        let data = upload(b"prepared data");
-        let measurement =
-            store.add_measurement(whose, facts, data, Source::Request(None)).await.unwrap().id();
-        let worker = WorkerId::new();
-        store.worker_started(worker, 1, &WorkerPlace::default()).await.unwrap();
+        let asked = MeasurementRequest::new(None, calibration, data.sha256);
+        let passed = Checked::Measurement(facts, upload(b"prepared data"));
+        let measurement = make(&store, worker, Submission::Measurement(asked), passed).await;
         let lab = Self { store, measurement, worker, _folder: folder };
         assert_eq!(lab.work_off().await, [TaskKind::Calibration], "its report");
         lab
+    }
+
+    /// Makes something of uploads, whose check ends like this.
+    async fn make<Id>(&self, asked: Submission, passed: Checked) -> Id
+    where
+        Id: From<ThingId> + FromStr<Err = InvalidId>,
+    {
+        make(&self.store, self.worker, asked, passed).await
     }
 
     /// A job with two tiles in each of two snapshots.
@@ -203,6 +215,7 @@ impl Lab {
                 Product::Files(folder, vec![frame, array])
             }
             TaskKind::Movie { snapshot } => self.blob(&format!("movie {snapshot:?}")),
+            TaskKind::Check => panic!("what passes depends on the request"),
             TaskKind::Calibration => Product::Calibration(Box::new(calibrations::report())),
             TaskKind::Manifest => {
                 let folder = self.store.staged_dir().unwrap();
@@ -254,6 +267,32 @@ impl Lab {
     async fn state(&self, job: JobId) -> JobState {
         self.store.job(&engine::job::Lab::local(), job).await.unwrap().state
     }
+}
+
+/// A request without the service around it.
+fn new_request(submission: Submission) -> NewRequest {
+    let limits = CheckLimits { max_file_bytes: 1 << 30, min_free_bytes: 0, seconds: 10.0 };
+    NewRequest { submission, limits, origin: None }
+}
+
+/// Requests something, and does its check with this outcome.
+async fn make<Id>(store: &Store, worker: WorkerId, asked: Submission, passed: Checked) -> Id
+where
+    Id: From<ThingId> + FromStr<Err = InvalidId>,
+{
+    let local = engine::job::Lab::local();
+    let made = store.request((&local, None), &new_request(asked), None).await.unwrap();
+    let task = store.claim(worker, LEASE).await.unwrap().unwrap();
+    assert_eq!(task.kind, TaskKind::Check);
+    assert_eq!(checked(store, &task, passed).await, Heartbeat::Continue);
+    made.id()
+}
+
+/// Ends a check with this outcome.
+async fn checked(store: &Store, task: &ClaimedTask, outcome: Checked) -> Heartbeat {
+    let product = Product::Checked(Box::new(outcome));
+    let completion = Completion { progress: TaskProgress::START, record: json!(null), product };
+    store.complete(&task.lease, completion).await.unwrap()
 }
 
 fn id(inserted: Inserted) -> JobId {

@@ -7,10 +7,11 @@ use std::time::Duration;
 use ndarray::ArrayView3;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
+use tokio::runtime::Handle;
 use tokio::sync::Mutex;
 
 use super::transport::{
-    Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
+    Check, Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
 };
 use engine::job::{Sha256, TaskKind, TaskProgress, WorkerId};
 use engine::pipeline::PipelineError;
@@ -39,9 +40,8 @@ pub struct Local {
 }
 
 impl Local {
-    /// For a worker of this name, which does all there is, or leaves the tiles to other machines.
-    pub fn new(store: Store, worker: WorkerId, tiles: bool) -> Self {
-        let claimant = if tiles { Claimant::Local } else { Claimant::WithoutTiles };
+    /// For a worker of this name, which takes the tasks that this claimant may have.
+    pub fn new(store: Store, worker: WorkerId, claimant: Claimant<'static>) -> Self {
         Self { store, worker, claimant, watcher: Arc::default() }
     }
 
@@ -49,13 +49,18 @@ impl Local {
         Arrays { masks: (self.path(masks), masks), snapshots: (self.path(snapshots), snapshots) }
     }
 
-    /// All that a task needs, at the attempt of this number.
-    fn input(&self, work: &Work, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
+    /// All that a task needs.
+    fn input(&self, work: Work, kind: TaskKind, lease: Lease) -> Result<TaskInput, TaskError> {
         match work {
-            Work::Job(task) => self.step(task, kind, attempt),
+            Work::Job(task) => self.step(&task, kind, lease.attempt),
+            Work::Check(task) => Ok(TaskInput::Check(Box::new(Check {
+                task: *task,
+                store: self.store.clone(),
+                lease,
+                runtime: Handle::current(),
+            }))),
             Work::Calibration(task) => match &task.captures {
                 Some(captures) => Ok(TaskInput::Captures {
-                    name: task.name.clone(),
                     files: captures.map(|upload| self.path(*upload)),
                     scratch: self.store.staged_path().map_err(failed)?,
                     masks: Box::new(self.store.blob_writer().map_err(failed)?),
@@ -67,7 +72,7 @@ impl Local {
             },
             Work::Movie(work) => {
                 let file = self.store.staged_path().map_err(failed)?;
-                Ok(TaskInput::Movie(Box::new(movie_task(work)?), file))
+                Ok(TaskInput::Movie(Box::new(movie_task(&work)?), file))
             }
         }
     }
@@ -113,7 +118,7 @@ impl Local {
                 tasks: tasks(&task.records, attempt)?,
                 folder: folder()?,
             },
-            TaskKind::Calibration | TaskKind::Movie { .. } => {
+            TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
                 return Err(not_possible(kind).into());
             }
         })
@@ -127,6 +132,7 @@ impl Local {
             Output::Stack(frames) => Product::File(self.staged(frames.view())?),
             Output::File(file) => Product::File(file.finish()?),
             Output::Files(folder, files) => Product::Files(folder, files),
+            Output::Checked(checked) => Product::Checked(checked),
             Output::Calibration(done) => Product::Calibration(done),
         })
     }
@@ -152,10 +158,8 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        Ok(self
-            .store
-            .worker_started(self.worker, std::process::id(), &WorkerPlace::default())
-            .await?)
+        let (place, light) = (WorkerPlace::default(), self.claimant == Claimant::Light);
+        Ok(self.store.worker_started(self.worker, std::process::id(), &place, light).await?)
     }
 
     async fn seen(&self) -> Result<(), TransportError> {
@@ -187,6 +191,9 @@ impl Transport for Local {
             Work::Job(task) => {
                 tracing::info_span!("task", job = %task.job, kind = name, task = %id)
             }
+            Work::Check(task) => {
+                tracing::info_span!("task", request = %task.request.id, kind = name, task = %id)
+            }
             Work::Calibration(task) => {
                 tracing::info_span!("task", calibration = %task.calibration, kind = name, task = %id)
             }
@@ -195,7 +202,7 @@ impl Transport for Local {
             }
         };
         let here = self.clone();
-        let input = move || here.input(&work, kind, lease.attempt);
+        let input = move || here.input(work, kind, lease);
         let input = tokio::task::spawn_blocking(input).await?;
         Ok(Some(Claim { lease, span, cost, input }))
     }

@@ -41,8 +41,10 @@ enum Answer {
 pub struct ModelCommand {
     /// This program.
     pub program: PathBuf,
-    /// Its arguments.
-    pub arguments: Vec<OsString>,
+    /// The arguments that run a network.
+    pub run: Vec<OsString>,
+    /// The arguments that check one, without its file and the size of the masks.
+    pub check: Vec<OsString>,
     /// The most memory that it may take, in bytes.
     pub memory_bytes: Option<u64>,
 }
@@ -56,6 +58,11 @@ pub(super) struct ModelProcesses {
 impl ModelProcesses {
     pub(super) fn new(command: ModelCommand) -> Self {
         Self { command, running: None }
+    }
+
+    /// How such a process is started.
+    pub(super) fn command(&self) -> &ModelCommand {
+        &self.command
     }
 
     /// A process with this network, which is kept until another one is asked for, or none: memory is
@@ -101,7 +108,7 @@ impl ModelProcess {
             ReconError::Runtime(format!("the process of a network can't be started: {error}"))
         };
         let mut child = Command::new(&command.program)
-            .args(&command.arguments)
+            .args(&command.run)
             // All that it needs has been told.
             .env_remove("SCI_RECON_CONFIG")
             .stdin(Stdio::piped())
@@ -339,9 +346,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("network.onnx");
         std::fs::write(&path, "8 bytes.").unwrap();
-        let arguments = ["-c".into(), format!("head -c 16 >/dev/null; {script}").into()].into();
-        let memory_bytes = Some(512 << 20);
-        let command = ModelCommand { program: "sh".into(), arguments, memory_bytes };
+        let run = ["-c".into(), format!("head -c 16 >/dev/null; {script}").into()].into();
+        let (check, memory_bytes) = (Vec::new(), Some(512 << 20));
+        let command = ModelCommand { program: "sh".into(), run, check, memory_bytes };
         let mut processes = ModelProcesses::new(command);
         let file = ModelFile::open(&path).unwrap();
         let process = processes.only(Some(&file), monitor)?.unwrap();

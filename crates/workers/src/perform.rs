@@ -4,10 +4,11 @@ use ndarray::Array3;
 use serde::Serialize;
 use serde_json::Value;
 
+use super::check::check;
 use super::model_process::ModelProcesses;
 use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, TransportError};
 use engine::intake::{self, Calibrated, IntakeError, Report, calibrate};
-use engine::job::{Assessment, Label, Sha256, SnapshotRange, TaskProgress, TaskStage};
+use engine::job::{Assessment, Sha256, SnapshotRange, TaskProgress, TaskStage};
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::assessment::TileAssessment;
@@ -108,7 +109,11 @@ pub(super) fn perform(
             monitor.reach(TaskStage::Writing, 1.0);
             (json(&of_all)?, Output::Files(folder, vec![file]))
         }
-        TaskInput::Captures { name, files, scratch, masks } => {
+        TaskInput::Check(task) => {
+            let checked = check(&task, engines.models.command(), monitor)?;
+            (Value::Null, Output::Checked(Box::new(checked)))
+        }
+        TaskInput::Captures { files, scratch, masks } => {
             let open =
                 |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
             let limits = Limits::default();
@@ -116,7 +121,7 @@ pub(super) fn perform(
                 tell(share, monitor)
             })?;
             let masks = masks.finish().map_err(TransportError::from)?;
-            let facts = facts(name, &made, masks.sha256());
+            let facts = facts(&made, masks.sha256());
             (Value::Null, calibration(Some((facts, masks)), made.report, monitor))
         }
         TaskInput::Movie(task, file) => {
@@ -147,10 +152,11 @@ fn calibration(
     Output::Calibration(Box::new(CalibrationDone { masks, report, maps }))
 }
 
-fn facts(name: Option<Label>, made: &Calibrated, masks: Sha256) -> NewCalibration {
+fn facts(made: &Calibrated, masks: Sha256) -> NewCalibration {
     let report = &made.report.report;
     NewCalibration {
-        name,
+        // The request has its name and colours.
+        name: None,
         masks,
         format: "captures".into(),
         sample: made.sample.to_string(),
@@ -162,7 +168,6 @@ fn facts(name: Option<Label>, made: &Calibrated, masks: Sha256) -> NewCalibratio
         mask_mean: report.masks.mean,
         dead_pixels: report.masks.dead_pixels,
         clipped_negatives: made.clipped_negatives,
-        // The request has it.
         mosaic: None,
     }
 }

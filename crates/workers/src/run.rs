@@ -34,6 +34,8 @@ const TROUBLE: Duration = Duration::from_secs(2);
 /// How long a task may take to come to the end of an iteration when the worker is to end. A deep
 /// pass may take longer: it is given up then, and its task given back.
 const GRACE: Duration = Duration::from_secs(5);
+/// How long a task that hangs may take to end the processes that it started.
+const LAST_CHANCE: Duration = Duration::from_secs(1);
 /// A task may be silent for so many times its planned processor time: a machine that does much else
 /// is slow, but not for ever.
 const SLOWNESS: f64 = 4.0;
@@ -240,6 +242,9 @@ impl<T: Transport> Worker<T> {
         loop {
             let silence = monitor.silence();
             if silence > patience {
+                // The task may wait for the process of a network, which must not outlive it.
+                monitor.stop();
+                let _ = tokio::time::timeout(LAST_CHANCE, &mut computing).await;
                 return Err(WorkerError::Stalled(silence));
             }
             tokio::select! {

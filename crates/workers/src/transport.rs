@@ -9,11 +9,11 @@ use std::time::Duration;
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use tokio::runtime::Handle;
 
 use engine::intake::{CaptureFiles, IntakeError};
 use engine::job::{
-    JobId, JobSpec, Label, Mosaic, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange,
-    TaskProgress,
+    JobId, JobSpec, Mosaic, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange, TaskProgress,
 };
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
@@ -26,7 +26,10 @@ use formats::FormatError;
 use reconstruction::assessment::Evidence;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
-use store::{BlobWriter, CalibrationDone, Heartbeat, Lease, StagedDir, StagedPath, StoreError};
+use store::{
+    BlobWriter, CalibrationDone, CheckTask, Checked, Heartbeat, Lease, StagedDir, StagedPath,
+    Store, StoreError,
+};
 
 /// The queue or the files can't be reached.
 pub type TransportError = Box<dyn Error + Send + Sync>;
@@ -140,9 +143,10 @@ pub enum TaskInput {
         tasks: JobTasks,
         folder: StagedDir,
     },
+    /// Check the uploads of a request.
+    Check(Box<Check>),
     /// Make masks of captures, and a report on them; they lie in `scratch` until their scale is known.
     Captures {
-        name: Option<Label>,
         files: CaptureFiles,
         scratch: StagedPath,
         masks: Box<BlobWriter>,
@@ -151,6 +155,15 @@ pub enum TaskInput {
     Report(PathBuf),
     /// Make a movie, which is written to the file.
     Movie(Box<MovieTask>, StagedPath),
+}
+
+/// A check that a worker of this machine has claimed.
+#[derive(Debug)]
+pub struct Check {
+    pub task: CheckTask,
+    pub store: Store,
+    pub lease: Lease,
+    pub runtime: Handle,
 }
 
 /// A tile to be reconstructed. Arrays and models are named by their hashes, so that this can go to
@@ -193,6 +206,7 @@ pub enum Output {
     File(StagedPath),
     /// Files of a result, which are on the disk, and their folder.
     Files(StagedDir, Vec<ResultFile>),
+    Checked(Box<Checked>),
     /// The report on a calibration, and its masks if they were made of captures.
     Calibration(Box<CalibrationDone>),
 }

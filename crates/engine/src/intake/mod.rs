@@ -8,6 +8,7 @@ mod check;
 mod error;
 mod open;
 mod read;
+mod refusal;
 mod report_page;
 mod sample;
 
@@ -18,5 +19,6 @@ pub use open::{Opened, Source};
 pub use read::{
     Scaled, Snapshots, read_clip, read_colours, read_masks, read_snapshots, read_truth,
 };
+pub use refusal::{Refusal, RefusalCode};
 pub use report_page::report_page;
 pub use sample::{Sample, sample};

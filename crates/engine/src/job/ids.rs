@@ -44,7 +44,28 @@ macro_rules! identifiers {
     )*};
 }
 
+/// Converts the identifiers of things to and from [`ThingId`].
+macro_rules! things {
+    ($($name:ident),*) => {$(
+        impl From<$name> for ThingId {
+            fn from(id: $name) -> Self {
+                Self(id.0)
+            }
+        }
+
+        impl From<ThingId> for $name {
+            fn from(id: ThingId) -> Self {
+                Self(id.0)
+            }
+        }
+    )*};
+}
+
+things!(CalibrationId, MeasurementId, ModelId, JobId);
+
 identifiers! {
+    /// A calibration, measurement, model or job that a task makes, or makes something of.
+    ThingId,
     /// A calibration: the masks of one optical setting.
     CalibrationId,
     /// A measurement: one or more snapshots taken with one calibration.

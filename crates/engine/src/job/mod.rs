@@ -12,6 +12,7 @@ mod report;
 mod request;
 mod shape;
 mod state;
+mod submission;
 mod task;
 mod text;
 
@@ -20,7 +21,8 @@ pub use algorithm::Algorithm;
 pub use assessment::Assessment;
 pub use captures::{Captures, MAX_CALIBRATION_SECONDS, MAX_MASKS, planned_seconds};
 pub use ids::{
-    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, TokenId, WorkerId,
+    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,
+    WorkerId,
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{MARGIN, Mosaic};
@@ -33,6 +35,9 @@ pub use report::{
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
 pub use shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 pub use state::{IllegalTransition, JobState};
+pub use submission::{
+    CalibrationRequest, CheckLimits, MeasurementRequest, ModelRequest, Submission,
+};
 pub use task::{
     MIN_MOVIE_SIDE, MOVIE_SIDE, ResultFile, TaskKind, TaskProgress, TaskStage, TaskState,
     movie_step,

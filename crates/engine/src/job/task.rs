@@ -18,6 +18,8 @@ const PREVIEW_BLOCKS_S: f64 = 10e-9;
 const PREVIEW_WHOLE_S: f64 = 120e-9;
 /// CPU seconds per sample of a movie (measured; noise takes twice as long).
 const MOVIE_S: f64 = 700e-9;
+/// Largest planned CPU seconds of a task that the light worker takes, checks excepted: an upload may wait that long.
+const LIGHT_S: f64 = 1.0;
 /// Longest side of a movie in pixels.
 pub const MOVIE_SIDE: usize = 1920;
 /// Shortest side of a movie in pixels; the AV1 encoder accepts no smaller ones.
@@ -49,6 +51,8 @@ pub enum TaskKind {
     Assemble { snapshot: u32 },
     /// Writes the manifest of the job.
     Manifest,
+    /// Checks the uploads of a calibration, measurement or model, and prepares them.
+    Check,
     /// Computes the masks of a calibration from its captures, and the report.
     Calibration,
     /// Encodes a requested movie of one snapshot, or of all snapshots of a job.
@@ -63,7 +67,7 @@ impl TaskKind {
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
             Self::Movie { snapshot } => snapshot,
-            Self::Prepare | Self::Pilot | Self::Manifest | Self::Calibration => None,
+            Self::Prepare | Self::Pilot | Self::Manifest | Self::Check | Self::Calibration => None,
         }
     }
 
@@ -83,6 +87,20 @@ impl TaskKind {
         }
     }
 
+    /// True if the light worker of a server takes a task of this kind with these planned CPU seconds. It takes every
+    /// check, since an upload must not wait behind tiles, and no other long task.
+    pub fn is_light(self, cost: f64) -> bool {
+        match self {
+            Self::Check => true,
+            Self::Prepare
+            | Self::Preview { .. }
+            | Self::Assemble { .. }
+            | Self::Manifest
+            | Self::Movie { .. } => cost <= LIGHT_S,
+            Self::Pilot | Self::Tile { .. } | Self::Calibration => false,
+        }
+    }
+
     /// The kind with this name and these indices. It is the inverse of the accessors and of `into_str`.
     pub fn from_parts(
         name: &str,
@@ -96,6 +114,7 @@ impl TaskKind {
             ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, snapshots, tile }),
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),
+            ("check", None, None) => Some(Self::Check),
             ("calibration", None, None) => Some(Self::Calibration),
             ("movie", snapshot, None) => Some(Self::Movie { snapshot }),
             _ => None,

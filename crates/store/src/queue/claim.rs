@@ -9,15 +9,16 @@ use sqlx::sqlite::SqliteRow;
 
 use super::lease::{self, LONGEST_LEASE, Lease, Loss};
 use crate::Store;
-use crate::columns::{Columns, Json, from_row, sql, sql_as};
+use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::calibrations::Calibration;
 use crate::tables::measurements::Measurement;
+use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
 use crate::tables::{jobs, workers};
 use engine::job::{
-    CalibrationId, Captures, JobId, JobSpec, JobState, Label, Sha256, TaskKind, TaskStage,
-    TaskState, Timestamp, WorkerId,
+    CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Sha256, Submission, TaskKind,
+    TaskStage, TaskState, ThingId, Timestamp, WorkerId,
 };
 
 /// The longest pause of a task after a failure, in milliseconds: one that ends later was noted before
@@ -38,6 +39,7 @@ pub struct ClaimedTask {
 #[derive(Debug, Clone)]
 pub enum Work {
     Job(Box<JobTask>),
+    Check(Box<CheckTask>),
     /// A calibration's masks, or the report on them.
     Calibration(Box<CalibrationTask>),
     Movie(Box<MovieWork>),
@@ -59,22 +61,23 @@ pub struct JobTask {
     pub records: Vec<TaskRecord>,
 }
 
+/// The check of a request's uploads.
+#[derive(Debug, Clone)]
+pub struct CheckTask {
+    pub request: Request,
+    pub limits: CheckLimits,
+    /// The calibration that the request names.
+    pub calibration: Option<Calibration>,
+}
+
 #[derive(Debug, Clone)]
 pub struct CalibrationTask {
     pub calibration: CalibrationId,
-    pub name: Option<Label>,
     /// Captures, of which masks are to be made; none where only a report on the masks is.
     pub captures: Option<Captures>,
     /// The masks, a planar array, if they are there.
     pub masks: Option<Sha256>,
 }
-
-from_row!(CalibrationTask, row => {
-    calibration,
-    name,
-    captures = row.read_json("captures")?,
-    masks,
-});
 
 /// A movie that is to be made.
 #[derive(Debug, Clone)]
@@ -95,6 +98,9 @@ pub enum Claimant<'a> {
     Local,
     /// One that leaves the tiles to other machines.
     WithoutTiles,
+    /// One that takes short tasks alone, so that they wait for no tile. It begins no job: a job would be shown as
+    /// running though nobody computes it.
+    Light,
     /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
     /// run out.
     Pool(&'a str),
@@ -103,7 +109,7 @@ pub enum Claimant<'a> {
 /// The statement that tells whether there may be work: a task that is ready, or a lease that has run out.
 /// Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
 macro_rules! look_text {
-    ($kinds:literal, $by_lab:literal) => {
+    ($kinds:expr, $by_lab:literal) => {
         concat!(
             "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks ",
             $by_lab,
@@ -119,7 +125,7 @@ macro_rules! look_text {
 /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of the
 /// lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see [`take`].
 macro_rules! take_text {
-    ($kinds:literal, $by_lab:literal, $by_job:literal) => {
+    ($kinds:expr, $by_lab:literal, $by_job:literal) => {
         take_text!(@
             concat!("state = 'ready' ", $kinds, " AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6"),
             $by_lab, $by_job)
@@ -150,8 +156,16 @@ macro_rules! take_text {
                  ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
                      jobs.state = 'running' DESC, job, ordinal, tasks.id
                  LIMIT 1)
-             RETURNING id, job, calibration, movie, lab, kind, snapshot, snapshots, tile, attempt, cost"
+             RETURNING id, job, thing, lab, kind, snapshot, snapshots, tile, attempt, cost"
         )
+    };
+}
+
+/// The condition for tasks of the light worker: short ones, of jobs that have begun.
+macro_rules! light {
+    () => {
+        "AND light = 1 AND (job IS NULL OR EXISTS
+             (SELECT 1 FROM jobs WHERE id = tasks.job AND state = 'running'))"
     };
 }
 
@@ -161,6 +175,7 @@ impl Claimant<'_> {
         match self {
             Self::Local => look_text!("", ""),
             Self::WithoutTiles => look_text!("AND kind <> 'tile'", "INDEXED BY tasks_others"),
+            Self::Light => look_text!(light!(), "INDEXED BY tasks_light"),
             Self::Pool(_) => look_text!("AND kind = 'tile'", ""),
         }
     }
@@ -173,6 +188,9 @@ impl Claimant<'_> {
                 "INDEXED BY tasks_others",
                 "INDEXED BY tasks_others_of_job"
             ),
+            Self::Light => {
+                take_text!(light!(), "INDEXED BY tasks_light", "INDEXED BY tasks_light_of_job")
+            }
             Self::Pool(_) => take_text!("AND kind = 'tile'", "", ""),
         }
     }
@@ -233,8 +251,11 @@ impl Store {
     pub(super) async fn work(&self, owner: Owner, kind: TaskKind) -> Result<Work, StoreError> {
         match owner {
             Owner::Job(job) => self.job_task(job, kind).await,
-            Owner::Calibration(id) => self.calibration_task(id).await,
-            Owner::Movie(job) => self.movie_work(job, kind.snapshot()).await,
+            Owner::Thing(id) => match kind {
+                TaskKind::Check => self.check_task(id).await,
+                TaskKind::Movie { snapshot } => self.movie_work(id.into(), snapshot).await,
+                _ => self.calibration_task(id.into()).await,
+            },
         }
     }
 
@@ -297,16 +318,28 @@ impl Store {
         Ok(Work::Movie(Box::new(work)))
     }
 
+    async fn check_task(&self, id: ThingId) -> Result<Work> {
+        let mut connection = self.readers.acquire().await?;
+        let request = requests::find(&mut connection, id).await?;
+        let limits = requests::limits(&mut connection, id).await?;
+        drop(connection);
+        let calibration = match request.submission.calibration() {
+            Some(id) => Some(self.find_calibration(None, id).await?),
+            None => None,
+        };
+        Ok(Work::Check(Box::new(CheckTask { request, limits, calibration })))
+    }
+
     async fn calibration_task(&self, id: CalibrationId) -> Result<Work> {
-        let task = sql_as!(
-            "SELECT calibration, name, captures,
-                 (SELECT prepared FROM calibrations WHERE id = calibration) AS masks
-             FROM calibration_requests WHERE calibration = ?",
-            [id]
-        );
-        let task = task.fetch_optional(&self.readers).await?;
-        let task = task.ok_or_else(|| StoreError::missing("calibration", id))?;
-        Ok(Work::Calibration(Box::new(task)))
+        let mut connection = self.readers.acquire().await?;
+        let request = requests::find(&mut connection, id.into()).await?;
+        let masks = sql_as!("SELECT prepared FROM calibrations WHERE id = ?", [id]);
+        let masks = masks.fetch_optional(&mut *connection).await?;
+        let captures = match request.submission {
+            Submission::Calibration(request) => request.captures,
+            Submission::Measurement(_) | Submission::Model(_) => None,
+        };
+        Ok(Work::Calibration(Box::new(CalibrationTask { calibration: id, captures, masks })))
     }
 }
 
@@ -377,15 +410,20 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_takes_no_tiles_reads_none() {
+    async fn workers_that_take_some_tasks_read_no_others() {
         let folder = tempfile::tempdir().unwrap();
         let purpose = Purpose::Serve { accept_database: false };
         let store = Store::open(folder.path(), purpose).await.unwrap();
-        let claimant = Claimant::WithoutTiles;
         // The look for leases that have run out reads what runs.
-        for (text, others) in [(claimant.look(), 1), (claimant.take(), 0)] {
+        let (no_tiles, light) = (Claimant::WithoutTiles, Claimant::Light);
+        for (text, index, others) in [
+            (no_tiles.look(), "INDEX tasks_others", 1),
+            (no_tiles.take(), "INDEX tasks_others", 0),
+            (light.look(), "INDEX tasks_light", 1),
+            (light.take(), "INDEX tasks_light", 0),
+        ] {
             let plan = plan(&store, text).await;
-            let good = ["INDEX tasks_others", "PRIMARY KEY (id=?)"];
+            let good = [index, "PRIMARY KEY (id=?)"];
             let bad: Vec<_> =
                 plan.iter().filter(|line| !good.iter().any(|good| line.contains(good))).collect();
             assert!(plan.iter().any(|line| line.contains(good[0])), "{plan:#?}");

@@ -11,13 +11,14 @@ use crate::error::{Result, StoreError};
 use crate::staging::{StagedBlob, StagedDir};
 use crate::tables::blobs::Origin;
 use crate::tables::calibrations::{self, NewCalibration};
-use crate::tables::reports;
+use crate::tables::measurements::{self, NewMeasurement};
 use crate::tables::tasks::Owner;
-use crate::tables::{results, sums};
+use crate::tables::{models, partials, quota, reports, requests, results, sums};
 use crate::{Store, dir, on_files};
+use engine::intake::Refusal;
 use engine::job::{
-    Assessment, CalibrationId, CalibrationReport, JobId, ResultFile, Sha256, TaskKind,
-    TaskProgress, TaskState, Timestamp,
+    Assessment, CalibrationId, CalibrationReport, JobId, ModelFacts, ResultFile, Sha256, TaskKind,
+    TaskProgress, TaskState, ThingId, Timestamp, planned_seconds,
 };
 
 #[derive(Debug)]
@@ -39,7 +40,20 @@ pub enum Product {
     File(StagedBlob),
     /// The files of a snapshot (assemble) or of the job (manifest), which are on the disk.
     Files(StagedDir, Vec<ResultFile>),
+    Checked(Box<Checked>),
     Calibration(Box<CalibrationDone>),
+}
+
+/// The outcome of a check.
+#[derive(Debug)]
+pub enum Checked {
+    /// Masks on \[0,1\].
+    Masks(NewCalibration, StagedBlob),
+    /// Masks can be made from the captures; the planned CPU-seconds.
+    Captures(f64),
+    Measurement(NewMeasurement, StagedBlob),
+    Model(ModelFacts),
+    Refused(Refusal),
 }
 
 #[derive(Debug)]
@@ -66,7 +80,11 @@ impl Store {
             (Owner::Job(job), Product::TileCost(share)) => {
                 graph::scale_tiles(&mut transaction, job, share).await?;
             }
-            (Owner::Job(_) | Owner::Movie(_), Product::File(staged)) => {
+            (Owner::Job(_), Product::File(staged)) => {
+                result = Some(staged.sha256());
+                self.publish(&mut transaction, staged, Origin::Tile).await?;
+            }
+            (Owner::Thing(_), Product::File(staged)) if matches!(kind, TaskKind::Movie { .. }) => {
                 result = Some(staged.sha256());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }
@@ -74,11 +92,14 @@ impl Store {
                 results::record(&mut transaction, job, kind.snapshot(), &files).await?;
                 self.put_files(job, kind, staged, files).await?;
             }
-            (Owner::Calibration(id), Product::Calibration(done)) => {
-                self.calibrated(&mut transaction, id, *done).await?;
+            (Owner::Thing(id), Product::Calibration(done)) if kind == TaskKind::Calibration => {
+                self.calibrated(&mut transaction, id.into(), *done).await?;
             }
-            (Owner::Job(_), Product::Calibration(_))
-            | (Owner::Calibration(_) | Owner::Movie(_), _) => {
+            (Owner::Thing(id), Product::Checked(checked)) if kind == TaskKind::Check => {
+                self.checked(&mut transaction, id, *checked).await?;
+            }
+            (Owner::Job(_), Product::Calibration(_) | Product::Checked(_))
+            | (Owner::Thing(_), _) => {
                 let value = kind.into_str().to_owned();
                 return Err(StoreError::Corrupt { column: "kind", value });
             }
@@ -118,6 +139,59 @@ impl Store {
             }
         })
         .await
+    }
+
+    /// Records the outcome of a check, and has the report of a calibration made.
+    async fn checked(
+        &self,
+        transaction: &mut SqliteConnection,
+        id: ThingId,
+        checked: Checked,
+    ) -> Result<()> {
+        let seconds = match checked {
+            Checked::Masks(facts, staged) => {
+                let prepared = staged.sha256();
+                let seconds = planned_seconds(0, facts.frames, facts.height * facts.width);
+                self.publish(transaction, staged, Origin::Prepared).await?;
+                calibrations::insert_made(transaction, id.into(), prepared, facts).await?;
+                seconds
+            }
+            Checked::Captures(seconds) => seconds,
+            Checked::Measurement(facts, staged) => {
+                let prepared = staged.sha256();
+                self.publish(transaction, staged, Origin::Prepared).await?;
+                return measurements::insert_made(transaction, id.into(), prepared, facts).await;
+            }
+            Checked::Model(facts) => {
+                return models::insert_made(transaction, id.into(), &facts).await;
+            }
+            Checked::Refused(refusal) => return requests::refuse(transaction, id, &refusal).await,
+        };
+        let lab = requests::find(transaction, id).await?.lab;
+        graph::insert_for(transaction, (&lab, id), TaskKind::Calibration, seconds).await
+    }
+
+    /// Reserves `bytes` for the result of a check. The disk must have room for `copies` of them above `min_free`.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NoRoom`]; [`StoreError::Interrupted`] if the task is not the
+    /// worker's any more.
+    pub async fn promise(
+        &self,
+        lease: &Lease,
+        bytes: u64,
+        (copies, min_free): (u64, u64),
+    ) -> Result<()> {
+        let mut transaction = self.write().await?;
+        let Some((Owner::Thing(id), _)) = lease::held(&mut transaction, lease).await? else {
+            return Err(StoreError::Interrupted);
+        };
+        // An earlier attempt may have reserved its own.
+        requests::promise(&mut transaction, id, 0).await?;
+        let request = requests::find(&mut transaction, id).await?;
+        quota::check(&mut transaction, &request.lab, request.token, bytes).await?;
+        let promised = partials::promised(&mut transaction).await?;
+        self.dir().check_room("the upload", copies * bytes, promised, min_free)?;
+        requests::promise(&mut transaction, id, bytes).await?;
+        Ok(transaction.commit().await?)
     }
 
     /// Writes what was made for a calibration; its captures are needed no more.

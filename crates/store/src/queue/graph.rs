@@ -6,10 +6,14 @@ use sqlx::SqliteConnection;
 use crate::columns::sql;
 use crate::error::{Result, StoreError};
 use crate::tables::{labs, results, sums, tasks};
-use engine::job::{CalibrationId, JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState};
+use engine::job::{JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState, ThingId};
 
+/// Above all others: a client waits for the check of its upload.
+const CHECK_PRIORITY: i32 = 2000;
 /// Above that of every job: people wait for calibrations before they measure.
 const CALIBRATION_PRIORITY: i32 = 1000;
+/// Below that of every job: nobody waits for a reconstruction because somebody wants to look at another.
+const MOVIE_PRIORITY: i32 = -1000;
 
 pub async fn insert(
     connection: &mut SqliteConnection,
@@ -35,15 +39,16 @@ pub async fn insert(
                 kind.tile(),
                 state,
                 cost,
-                kind.snapshots()
+                kind.snapshots(),
+                u8::from(kind.is_light(cost))
             ])
         })
         .collect();
     sql!(
         "INSERT INTO tasks (id, job, lab, ordinal, kind, snapshot, tile, state, priority, cost,
-             snapshots)
+             snapshots, light)
          SELECT value ->> 0, ?1, ?4, value ->> 1, value ->> 2, value ->> 3, value ->> 4, value ->> 5,
-             ?2, value ->> 6, value ->> 7
+             ?2, value ->> 6, value ->> 7, value ->> 8
          FROM json_each(?3)",
         [job, spec.priority, Value::from(rows).to_string(), lab]
     )
@@ -53,23 +58,32 @@ pub async fn insert(
     sums::recount(connection, job).await
 }
 
-/// Writes the task of a calibration, with its planned processor seconds.
-pub async fn insert_calibration(
+/// Writes a task that makes a thing, or something of it, with its planned CPU-seconds.
+pub async fn insert_for(
     connection: &mut SqliteConnection,
-    lab: &Lab,
-    calibration: CalibrationId,
+    (lab, thing): (&Lab, ThingId),
+    kind: TaskKind,
     cost: f64,
 ) -> Result<()> {
+    // The ordinal is the order of the tasks of one thing.
+    let (priority, ordinal) = match kind {
+        TaskKind::Check => (CHECK_PRIORITY, 0),
+        TaskKind::Movie { .. } => (MOVIE_PRIORITY, 1),
+        _ => (CALIBRATION_PRIORITY, 1),
+    };
     sql!(
-        "INSERT INTO tasks (id, calibration, lab, ordinal, kind, state, priority, cost)
-         VALUES (?, ?, ?, 0, ?, ?, ?, ?)",
+        "INSERT INTO tasks (id, thing, lab, ordinal, kind, light, snapshot, state, priority, cost)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             TaskId::new(),
-            calibration,
+            thing,
             lab,
-            TaskKind::Calibration.into_str(),
-            first_state(TaskKind::Calibration),
-            CALIBRATION_PRIORITY,
+            ordinal,
+            kind.into_str(),
+            kind.is_light(cost),
+            kind.snapshot(),
+            first_state(kind),
+            priority,
             cost
         ]
     )
@@ -81,7 +95,9 @@ pub async fn insert_calibration(
 /// The state of a task that waits for its turn alone, or for others.
 fn first_state(kind: TaskKind) -> TaskState {
     match kind {
-        TaskKind::Prepare | TaskKind::Calibration | TaskKind::Movie { .. } => TaskState::Ready,
+        TaskKind::Prepare | TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
+            TaskState::Ready
+        }
         TaskKind::Preview { .. }
         | TaskKind::Pilot
         | TaskKind::Tile { .. }
@@ -135,7 +151,9 @@ pub(super) async fn unblock(
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1
                                    AND kind IN ('preview', 'assemble') AND state <> ?5)"
         }
-        TaskKind::Manifest | TaskKind::Calibration | TaskKind::Movie { .. } => return Ok(()),
+        TaskKind::Manifest | TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
+            return Ok(());
+        }
     };
     sql!(
         query,

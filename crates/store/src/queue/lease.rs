@@ -16,7 +16,8 @@ use crate::Store;
 use crate::columns::{Columns, sql, sql_as};
 use crate::error::Result;
 use crate::tables::tasks::{self, Owner};
-use crate::tables::{sums, workers};
+use crate::tables::{requests, sums, workers};
+use engine::intake::{Refusal, RefusalCode};
 use engine::job::{
     JobState, RunSpec, TaskId, TaskKind, TaskProgress, TaskState, Timestamp, WorkerId,
 };
@@ -27,6 +28,8 @@ pub const MAX_FAILURES: u32 = 3;
 pub const MAX_STARVED: u32 = 5;
 /// So many losses of a task, and it is given up in the same way.
 pub const MAX_LOSSES: u32 = 25;
+/// Number of workers that may end during one check, for any reason, before it is given up.
+const MAX_CHECK_DEATHS: u32 = 5;
 /// The pause of a task that waits for room on the disk, in milliseconds.
 const POSTPONED: i64 = 10_000;
 /// No lease lasts longer (in milliseconds): one that ends later was given before the clock was set back.
@@ -235,7 +238,7 @@ pub(super) async fn held(
     lease: &Lease,
 ) -> Result<Option<(Owner, TaskKind)>> {
     let row = sql!(
-        "SELECT job, calibration, movie, kind, snapshot, snapshots, tile FROM tasks
+        "SELECT job, thing, kind, snapshot, snapshots, tile FROM tasks
          WHERE id = ? AND attempt = ? AND state = ?",
         [lease.task, lease.attempt, TaskState::Running]
     )
@@ -280,7 +283,7 @@ pub(super) async fn lose(
     loss: &Loss,
 ) -> Result<()> {
     let row = sql!(
-        "SELECT job, calibration, movie, kind, snapshot, snapshots, tile, failures, losses, starved
+        "SELECT job, thing, kind, snapshot, snapshots, tile, failures, losses, starved
          FROM tasks WHERE id = ?",
         [task]
     )
@@ -292,7 +295,7 @@ pub(super) async fn lose(
     let wanted = match owner {
         Owner::Job(job) => job::is_wanted(connection, job).await?,
         // Its task would have been deleted with it.
-        Owner::Calibration(_) | Owner::Movie(_) => true,
+        Owner::Thing(_) => true,
     };
     let (outcome, reason, mut hopeless) = match loss {
         Loss::Released if wanted => (Outcome::Released, None, false),
@@ -308,7 +311,11 @@ pub(super) async fn lose(
         Loss::Starved(_) => starved += 1,
         Loss::Crashed(_) | Loss::Failed(..) => failures += 1,
     }
+    let kind = tasks::kind(&row)?;
     hopeless |= failures >= MAX_FAILURES || losses >= MAX_LOSSES || starved >= MAX_STARVED;
+    // A check reads what a stranger has sent, and is soon done: its workers die of it rather than by chance.
+    let fatal = kind == TaskKind::Check && failures + losses + starved >= MAX_CHECK_DEATHS;
+    hopeless |= fatal;
     end_attempt(connection, task, outcome, reason).await?;
     let state = match (wanted, hopeless) {
         (false, _) => TaskState::Cancelled,
@@ -331,10 +338,23 @@ pub(super) async fn lose(
     )
     .execute(&mut *connection)
     .await?;
-    // A calibration or a movie has failed when its only task has; the reason is that of the task's last attempt.
-    let Owner::Job(job) = owner else { return Ok(()) };
+    let job = match owner {
+        Owner::Job(job) => job,
+        Owner::Thing(id) if state == TaskState::Failed => {
+            let refusal = match loss {
+                Loss::Failed(reason, false) => Refusal::new(RefusalCode::InvalidContent, reason),
+                _ if fatal => Refusal::new(
+                    RefusalCode::Internal,
+                    format!("the worker ended {MAX_CHECK_DEATHS} times while the file was checked"),
+                ),
+                _ => Refusal::new(RefusalCode::Internal, reason.unwrap_or("no reason is known")),
+            };
+            // A movie has no request; the reason is that of its last attempt.
+            return requests::refuse(connection, id, &refusal).await;
+        }
+        Owner::Thing(_) => return Ok(()),
+    };
     if state == TaskState::Failed {
-        let kind = tasks::kind(&row)?;
         let error =
             failure_text(kind, failures + losses + starved, reason.unwrap_or("no reason is known"));
         job::fail(connection, job, &error).await?;
@@ -356,6 +376,7 @@ fn failure_text(kind: TaskKind, attempts: u32, reason: &str) -> String {
         TaskKind::Preview { snapshot } => format!("the preview of snapshot {snapshot}"),
         TaskKind::Pilot => "the pilot".into(),
         TaskKind::Manifest => "writing the manifest".into(),
+        TaskKind::Check => "the check".into(),
         TaskKind::Calibration => "the calibration".into(),
         TaskKind::Movie { .. } => "the movie".into(),
     };

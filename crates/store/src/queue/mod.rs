@@ -15,8 +15,8 @@ mod movie;
 mod progress;
 mod remote;
 
-pub use claim::{CalibrationTask, Claimant, ClaimedTask, JobTask, MovieWork, Work};
-pub use complete::{CalibrationDone, Completion, Product};
+pub use claim::{CalibrationTask, CheckTask, Claimant, ClaimedTask, JobTask, MovieWork, Work};
+pub use complete::{CalibrationDone, Checked, Completion, Product};
 pub(super) use forecast::Forecast;
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, WorkerEnd};
 pub use movie::Movie;

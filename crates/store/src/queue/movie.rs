@@ -2,15 +2,13 @@
 
 use sqlx::SqliteConnection;
 
+use super::graph;
 use crate::columns::{Columns, sql, sql_as};
 use crate::error::{Result, StoreError};
+use crate::tables::quota;
 use crate::tables::results::WHOLE_JOB;
-use crate::tables::{labs, quota};
 use crate::{Job, Store};
-use engine::job::{JobId, Sha256, TaskId, TaskKind, TaskState};
-
-/// Below that of every job: nobody waits for a reconstruction because somebody wants to look at another.
-const MOVIE_PRIORITY: i32 = -1000;
+use engine::job::{JobId, Sha256, TaskKind, TaskState};
 
 /// Where the movie of a snapshot, or of all of a job, stands.
 #[derive(Debug, Clone, PartialEq)]
@@ -55,7 +53,7 @@ impl Store {
         let mut transaction = self.write().await?;
         let failed: Option<Option<String>> = sql_as!(
             "SELECT (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt)
-             FROM tasks WHERE movie = ? AND coalesce(snapshot, -1) = ? AND state = ?",
+             FROM tasks WHERE thing = ? AND coalesce(snapshot, -1) = ? AND state = ?",
             [job.id, place, TaskState::Failed]
         )
         .fetch_optional(&mut *transaction)
@@ -66,7 +64,11 @@ impl Store {
             return Ok(Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into())));
         }
         quota::check(&mut transaction, &job.lab, None, job.spec.movie_bytes(snapshot)).await?;
-        insert(&mut transaction, job, snapshot).await?;
+        let known = sql!("SELECT 1 FROM jobs WHERE id = ?", [job.id]);
+        let known = known.fetch_optional(&mut *transaction).await?;
+        known.ok_or_else(|| StoreError::missing("job", job.id))?;
+        let (kind, cost) = (TaskKind::Movie { snapshot }, job.spec.movie_cost(snapshot));
+        graph::insert_for(&mut transaction, (&job.lab, job.id.into()), kind, cost).await?;
         transaction.commit().await?;
         Ok(Movie::Asked(None))
     }
@@ -79,7 +81,7 @@ impl Store {
         place: Option<i64>,
     ) -> Result<()> {
         let results: Vec<Option<Sha256>> = sql_as!(
-            "DELETE FROM tasks WHERE movie = ?1 AND (?2 IS NULL OR coalesce(snapshot, -1) = ?2)
+            "DELETE FROM tasks WHERE thing = ?1 AND (?2 IS NULL OR coalesce(snapshot, -1) = ?2)
              RETURNING result",
             [job, place]
         )
@@ -95,32 +97,9 @@ impl Store {
 /// A damaged one is as good as none.
 const FIND: &str = "SELECT state, fraction, result, size FROM tasks
     LEFT JOIN blobs ON sha256 = result AND damaged_at IS NULL
-    WHERE movie = ? AND coalesce(snapshot, -1) = ?";
+    WHERE thing = ? AND coalesce(snapshot, -1) = ?";
 
 /// The snapshot of a movie as it is looked for.
 fn place(snapshot: Option<u32>) -> i64 {
     snapshot.map_or(WHOLE_JOB, i64::from)
-}
-
-async fn insert(connection: &mut SqliteConnection, job: &Job, snapshot: Option<u32>) -> Result<()> {
-    let kind = TaskKind::Movie { snapshot };
-    let inserted = sql!(
-        "INSERT INTO tasks (id, movie, lab, ordinal, kind, snapshot, state, priority, cost)
-         SELECT ?, id, lab, 0, ?, ?, ?, ?, ? FROM jobs WHERE id = ?",
-        [
-            TaskId::new(),
-            kind.into_str(),
-            snapshot,
-            TaskState::Ready,
-            MOVIE_PRIORITY,
-            job.spec.movie_cost(snapshot),
-            job.id
-        ]
-    )
-    .execute(&mut *connection)
-    .await?;
-    if inserted.rows_affected() == 0 {
-        return Err(StoreError::missing("job", job.id));
-    }
-    labs::know(connection, &job.lab).await
 }

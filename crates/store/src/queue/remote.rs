@@ -89,7 +89,9 @@ pub struct RemoteBeat {
 macro_rules! rows {
     () => {
         "SELECT task, pool, r.attempt AS message, stream, seq, delivery, t.job, t.attempt,
-             t.worker, j.state AS job_state
+             t.worker, j.state AS job_state,
+             (SELECT started_at FROM attempts a WHERE a.task = r.task AND a.attempt = t.attempt)
+                 AS started_at
          FROM remote_tasks r CROSS JOIN tasks t ON t.id = task JOIN jobs j ON j.id = t.job"
     };
 }
@@ -152,7 +154,7 @@ impl Store {
     /// All that a tile that is out needs, once more.
     pub async fn remote_work(&self, remote: &RemoteTask) -> Result<ClaimedTask, StoreError> {
         let row = sql!(
-            "SELECT job, calibration, movie, kind, snapshot, snapshots, tile, cost FROM tasks WHERE id = ?",
+            "SELECT job, thing, kind, snapshot, snapshots, tile, cost FROM tasks WHERE id = ?",
             [remote.task]
         )
         .fetch_one(&self.readers)

@@ -39,11 +39,8 @@ macro_rules! in_use {
     () => {
         "(EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = h.sha256)
           OR EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = h.sha256)
-          OR EXISTS (SELECT 1 FROM calibration_captures AS c
-                     JOIN calibration_requests AS r USING (calibration)
-                     WHERE r.lab = h.lab AND c.sha256 = h.sha256)
-          OR EXISTS (SELECT 1 FROM check_files AS f JOIN checks USING (id)
-                     WHERE checks.lab = h.lab AND f.sha256 = h.sha256)
+          OR EXISTS (SELECT 1 FROM request_files AS f JOIN requests USING (id)
+                     WHERE requests.lab = h.lab AND f.sha256 = h.sha256)
           OR EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = h.sha256))"
     };
 }
@@ -191,8 +188,7 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM calibration_captures WHERE sha256 = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM check_files WHERE sha256 = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM request_files WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM models WHERE file = ?1)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)
              RETURNING created_at",
@@ -205,11 +201,11 @@ impl Store {
         self.discard(self.dir().blob(&sha256), Some(created_at)).await
     }
 
-    /// Removes the uploads that nothing refers to and nobody has sent since `before`, and checks from before that
-    /// were not passed. Says how many uploads.
+    /// Removes the uploads that nothing refers to and nobody has sent since `before`, and requests from before that
+    /// were refused. Returns the number of uploads.
     pub async fn collect(&self, before: Timestamp) -> Result<usize> {
         let mut transaction = self.write().await?;
-        sql!("DELETE FROM checks WHERE problem IS NOT NULL AND created_at < ?", [before])
+        sql!("DELETE FROM requests WHERE refusal IS NOT NULL AND created_at < ?", [before])
             .execute(&mut *transaction)
             .await?;
         sql!(
@@ -223,9 +219,7 @@ impl Store {
                AND NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
                AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
                AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
-               AND NOT EXISTS (SELECT 1 FROM calibration_captures AS c
-                               WHERE c.sha256 = blobs.sha256)
-               AND NOT EXISTS (SELECT 1 FROM check_files AS f WHERE f.sha256 = blobs.sha256)
+               AND NOT EXISTS (SELECT 1 FROM request_files AS f WHERE f.sha256 = blobs.sha256)
                AND NOT EXISTS (SELECT 1 FROM models WHERE file = sha256)
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
              RETURNING sha256, created_at",

@@ -77,7 +77,7 @@ impl Store {
                   WHERE lab = ?1) AS upload_bytes,
                  (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE lab = ?1)
                  + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                    WHERE lab = ?1 AND movie IS NOT NULL) AS result_bytes,
+                    WHERE lab = ?1 AND thing IS NOT NULL AND result IS NOT NULL) AS result_bytes,
                  (SELECT count(*) FROM jobs WHERE lab = ?1 AND finished_at IS NULL) AS jobs",
             [lab]
         );
@@ -117,7 +117,7 @@ impl Store {
                  coalesce(cpu_seconds, 0.0),
                  (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE jobs.lab = labs.lab)
                  + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                    WHERE tasks.lab = labs.lab AND movie IS NOT NULL),
+                    WHERE tasks.lab = labs.lab AND thing IS NOT NULL AND result IS NOT NULL),
                  (SELECT min(created_at) FROM jobs
                   WHERE jobs.lab = labs.lab AND finished_at IS NULL AND started_at IS NULL)
              FROM labs LEFT JOIN lab_totals USING (lab) ORDER BY labs.lab",
@@ -213,7 +213,7 @@ const BELONGINGS: [(&str, &str); 8] = [
     ("measurements", "SELECT count(*) FROM measurements WHERE lab = ?"),
     ("calibrations", "SELECT count(*) FROM calibrations WHERE lab = ?"),
     ("networks", "SELECT count(*) FROM models WHERE lab = ?"),
-    ("checks of files", "SELECT count(*) FROM checks WHERE lab = ?"),
+    ("requests", "SELECT count(*) FROM requests WHERE lab = ?"),
     ("uploads", "SELECT count(*) FROM holdings WHERE lab = ?"),
     (
         "uploads that are not complete",

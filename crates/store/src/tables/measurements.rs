@@ -7,8 +7,9 @@ use sqlx::sqlite::SqliteRow;
 use crate::Store;
 use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Filter, Page, listed, refuse_if_used};
-use crate::tables::checks;
+use crate::rows::{Filter, Page, refuse_if_used};
+use crate::tables::keys::Made;
+use crate::tables::requests::{self, Asked};
 use engine::job::{
     CalibrationId, Finding, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp, TokenId,
 };
@@ -55,15 +56,29 @@ impl Store {
     /// The lab's measurement with this identifier.
     /// Errors: [`StoreError::Unchecked`] if it has not passed its check.
     pub async fn measurement(&self, lab: &Lab, id: MeasurementId) -> Result<Measurement> {
-        match self.find_measurement(Some(lab), id).await {
-            Err(missing @ StoreError::NotFound { .. }) => {
-                match self.measurement_check(lab, id).await? {
-                    Some(check) => Err(StoreError::Unchecked { id, error: check.error()? }),
-                    // It may have passed between the two looks.
-                    None => self.find_measurement(Some(lab), id).await.map_err(|_| missing),
-                }
+        match self.asked_measurement(lab, id).await? {
+            Asked::Ready(measurement) => Ok(measurement),
+            Asked::Pending(request) => {
+                let error = request.refusal.map(|refusal| refusal.detail);
+                Err(StoreError::Unchecked { id, error })
             }
-            found => found,
+        }
+    }
+
+    /// The lab's measurement with this identifier, ready or pending.
+    pub async fn asked_measurement(
+        &self,
+        lab: &Lab,
+        id: MeasurementId,
+    ) -> Result<Asked<Measurement>> {
+        // In this order: it may become ready between the two looks.
+        let request = self.find_request(lab, id).await?;
+        match self.find_measurement(Some(lab), id).await {
+            Err(missing @ StoreError::NotFound { .. }) => match request {
+                Some(request) => Ok(Asked::Pending(Box::new(request))),
+                None => Err(missing),
+            },
+            found => Ok(Asked::Ready(found?)),
         }
     }
 
@@ -82,15 +97,19 @@ impl Store {
         measurement(&row.ok_or_else(|| StoreError::missing("measurement", id))?)
     }
 
+    /// A page of the lab's measurements, newest first.
     pub async fn measurements(
         &self,
         lab: &Lab,
         filter: Filter<MeasurementId>,
         limit: u32,
-    ) -> Result<Page<Measurement>> {
-        let rows =
-            listed!(sql, "measurements WHERE", lab, filter, limit).fetch_all(&self.readers).await?;
-        Ok(Page::cut(rows.iter().map(measurement).collect::<Result<_, _>>()?, limit))
+    ) -> Result<Page<Asked<Measurement>>> {
+        let facts = "SELECT * FROM measurements WHERE id IN (SELECT value FROM json_each(?))";
+        let read = |row: &SqliteRow| {
+            let measurement = measurement(row)?;
+            Ok((measurement.id.into(), measurement))
+        };
+        self.asked((lab, Made::Measurement), filter.untyped(), limit, facts, read).await
     }
 
     /// Gives a measurement another name, or none.
@@ -101,39 +120,44 @@ impl Store {
         name: Option<&Label>,
     ) -> Result<()> {
         let mut transaction = self.write().await?;
-        let renamed =
-            sql!("UPDATE measurements SET name = ? WHERE id = ? AND lab = ?", [name, id, lab])
-                .execute(&mut *transaction)
-                .await?;
-        if renamed.rows_affected() == 0
-            && !checks::rename(&mut transaction, (lab, id), name).await?
-        {
-            return Err(StoreError::missing("measurement", id));
-        }
+        requests::rename(&mut transaction, (lab, Made::Measurement, id.into()), name).await?;
+        sql!("UPDATE measurements SET name = ? WHERE id = ?", [name, id])
+            .execute(&mut *transaction)
+            .await?;
         Ok(transaction.commit().await?)
     }
 
     /// Deletes a measurement that no job refers to.
     pub async fn delete_measurement(&self, lab: &Lab, id: MeasurementId) -> Result<()> {
         let mut transaction = self.write().await?;
-        if checks::delete_of(&mut transaction, lab, id).await? {
-            return Ok(transaction.commit().await?);
-        }
-        let own = "SELECT 1 FROM measurements WHERE id = ? AND lab = ?";
-        let own = sql!(own, [id, lab]).fetch_optional(&mut *transaction).await?;
-        own.ok_or_else(|| StoreError::missing("measurement", id))?;
+        requests::delete(&mut transaction, (lab, Made::Measurement, id.into())).await?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE measurement = ?";
         refuse_if_used(&mut transaction, ("measurement", id.to_string()), ("jobs", jobs)).await?;
         let prepared = sql_as!("DELETE FROM measurements WHERE id = ? RETURNING prepared", [id]);
-        let prepared = prepared.fetch_optional(&mut *transaction).await?;
-        let prepared = prepared.ok_or_else(|| StoreError::missing("measurement", id))?;
-        self.release(&mut transaction, prepared).await?;
-        transaction.commit().await?;
-        Ok(())
+        if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
+            self.release(&mut transaction, prepared).await?;
+        }
+        Ok(transaction.commit().await?)
     }
 }
 
-pub async fn insert(
+/// Writes the row of a measurement that has passed its check.
+pub async fn insert_made(
+    connection: &mut SqliteConnection,
+    id: MeasurementId,
+    prepared: Sha256,
+    facts: NewMeasurement,
+) -> Result<()> {
+    let request = "SELECT lab, token, name, created_at FROM requests WHERE id = ?";
+    let (lab, token, name, created_at): (Lab, Option<TokenId>, Option<Label>, Timestamp) =
+        sql_as!(request, [id]).fetch_one(&mut *connection).await?;
+    // It may have been renamed since the worker began.
+    let facts = NewMeasurement { name, ..facts };
+    insert(connection, (&lab, token), &Measurement { id, prepared, created_at, facts }).await?;
+    requests::fulfil(connection, id.into()).await
+}
+
+async fn insert(
     connection: &mut SqliteConnection,
     (lab, token): (&Lab, Option<TokenId>),
     measurement: &Measurement,

@@ -2,15 +2,15 @@
 
 pub(super) mod blobs;
 pub(super) mod calibrations;
-pub(super) mod checks;
 pub(super) mod jobs;
 pub(super) mod keys;
 pub(super) mod labs;
 pub(super) mod measurements;
-mod models;
-mod partials;
+pub(super) mod models;
+pub(super) mod partials;
 pub(super) mod quota;
 pub(super) mod reports;
+pub(super) mod requests;
 pub(super) mod results;
 pub(super) mod sums;
 pub(super) mod tasks;
@@ -18,14 +18,14 @@ mod tokens;
 pub(super) mod workers;
 
 pub use blobs::{Blob, BlobRow, Origin};
-pub use calibrations::{Calibration, CalibrationMark, NewCalibration, Unready};
-pub use checks::{Check, CheckMark, NewCheck, Source};
+pub use calibrations::{Calibration, NewCalibration};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
 pub use labs::{Entitlement, LabFigures, LabRow, LabUse, share_error};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
+pub use requests::{Asked, Request, RequestMark};
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
 pub use workers::{WorkerPlace, WorkerRow, WorkerTask};

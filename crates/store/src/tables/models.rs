@@ -2,11 +2,14 @@
 
 use serde::Serialize;
 
+use sqlx::SqliteConnection;
+
 use crate::Store;
 use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Filter, Page, Reference, listed, refuse_if_used, require};
-use crate::tables::keys::{self, Inserted, Made, RequestKey};
+use crate::rows::{Filter, Page, listed, refuse_if_used};
+use crate::tables::keys::Made;
+use crate::tables::requests;
 use engine::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 
 /// What is known of an end-to-end network when it has been checked.
@@ -45,33 +48,6 @@ impl From<Model> for JobModel {
 }
 
 impl Store {
-    /// Errors: [`StoreError::KeyReused`].
-    pub async fn add_model(
-        &self,
-        lab: &Lab,
-        content: NewModel,
-        key: Option<&RequestKey>,
-    ) -> Result<Inserted<ModelId>> {
-        let model = Model { id: ModelId::new(), created_at: Timestamp::now(), content };
-        let NewModel { name, calibration, file, facts } = &model.content;
-        let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, lab, Made::Model, key).await? {
-            return Ok(Inserted::Before(before));
-        }
-        let references = [Reference::Calibration(*calibration), Reference::Blob(*file)];
-        require(&mut transaction, &references).await?;
-        sql!(
-            "INSERT INTO models (id, lab, name, calibration, file, facts, created_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?)",
-            [model.id, lab, &name, calibration, file, Json(facts), model.created_at]
-        )
-        .execute(&mut *transaction)
-        .await?;
-        keys::insert(&mut transaction, lab, Made::Model, key, model.id).await?;
-        transaction.commit().await?;
-        Ok(Inserted::New(model.id))
-    }
-
     pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model> {
         let model = sql_as!("SELECT * FROM models WHERE id = ? AND lab = ?", [id, lab]);
         model.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("model", id))
@@ -90,13 +66,13 @@ impl Store {
 
     /// Gives a model another name, or none.
     pub async fn rename_model(&self, lab: &Lab, id: ModelId, name: Option<&Label>) -> Result<()> {
-        let renamed = sql!("UPDATE models SET name = ? WHERE id = ? AND lab = ?", [name, id, lab])
-            .execute(&self.writer)
+        self.model(lab, id).await?;
+        let mut transaction = self.write().await?;
+        requests::rename(&mut transaction, (lab, Made::Model, id.into()), name).await?;
+        sql!("UPDATE models SET name = ? WHERE id = ?", [name, id])
+            .execute(&mut *transaction)
             .await?;
-        match renamed.rows_affected() {
-            0 => Err(StoreError::missing("model", id)),
-            _ => Ok(()),
-        }
+        Ok(transaction.commit().await?)
     }
 
     /// Deletes a model that no job refers to. Its file is left to [`Self::collect`].
@@ -105,12 +81,26 @@ impl Store {
         let mut transaction = self.write().await?;
         let jobs = "SELECT count(*) AS users FROM jobs WHERE model = ?";
         refuse_if_used(&mut transaction, ("model", id.to_string()), ("jobs", jobs)).await?;
-        let deleted =
-            sql!("DELETE FROM models WHERE id = ?", [id]).execute(&mut *transaction).await?;
-        if deleted.rows_affected() == 0 {
-            return Err(StoreError::missing("model", id));
-        }
+        requests::delete(&mut transaction, (lab, Made::Model, id.into())).await?;
+        sql!("DELETE FROM models WHERE id = ?", [id]).execute(&mut *transaction).await?;
         transaction.commit().await?;
         Ok(())
     }
+}
+
+/// Writes the row of a model that has passed its check.
+pub async fn insert_made(
+    connection: &mut SqliteConnection,
+    id: ModelId,
+    facts: &ModelFacts,
+) -> Result<()> {
+    sql!(
+        "INSERT INTO models (id, lab, name, calibration, file, facts, created_at)
+         SELECT id, lab, name, calibration, request ->> '$.file', ?, created_at
+         FROM requests WHERE id = ?",
+        [Json(facts), id]
+    )
+    .execute(&mut *connection)
+    .await?;
+    requests::fulfil(connection, id.into()).await
 }

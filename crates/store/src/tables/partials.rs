@@ -6,6 +6,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use sqlx::SqliteConnection;
+
 use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::locked::LockedFile;
@@ -360,26 +362,30 @@ impl Store {
         Ok(ended)
     }
 
-    /// Bytes of the disk that were promised and are not written: the next ones of uploads in pieces, masks
-    /// that are made of captures (twice, as they are scaled at the end), and of jobs what is not assembled.
+    /// As [`promised`].
     pub async fn promised_bytes(&self) -> Result<u64> {
-        let bytes: f64 = sql_as!(
-            "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
-                     FROM partials WHERE result IS NULL)
-                  + (SELECT coalesce(sum(2 * prepared_bytes), 0)
-                     FROM calibration_requests JOIN tasks USING (calibration)
-                     WHERE tasks.state NOT IN (?1, 'failed'))
-                  + (SELECT coalesce(sum(disk_bytes * (
-                         SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
-                         FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
-                     FROM jobs WHERE finished_at IS NULL)",
-            [TaskState::Done, FIRST_RESERVE]
-        )
-        .fetch_one(&self.readers)
-        .await?;
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a sum of bytes
-        Ok(bytes as u64)
+        promised(&mut *self.readers.acquire().await?).await
     }
+}
+
+/// Bytes of the disk that are reserved and not written yet: the next ones of uploads in pieces, prepared arrays, and
+/// snapshots of jobs. Masks from captures count twice, as they are scaled at the end.
+pub async fn promised(connection: &mut SqliteConnection) -> Result<u64> {
+    let bytes: f64 = sql_as!(
+        "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
+                 FROM partials WHERE result IS NULL)
+              + (SELECT coalesce(sum(prepared_bytes * iif(request ->> '$.captures' IS NULL, 1, 2)), 0)
+                 FROM requests WHERE prepared_bytes > 0)
+              + (SELECT coalesce(sum(disk_bytes * (
+                     SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
+                     FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
+                 FROM jobs WHERE finished_at IS NULL)",
+        [TaskState::Done, FIRST_RESERVE]
+    )
+    .fetch_one(connection)
+    .await?;
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a sum of bytes
+    Ok(bytes as u64)
 }
 
 fn after(age: Duration) -> Timestamp {

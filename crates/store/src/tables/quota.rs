@@ -8,6 +8,8 @@ use crate::columns::sql_as;
 use crate::error::{Result, StoreError};
 use engine::job::{Lab, TokenId};
 
+/// Checks of a lab that may wait and run at a time.
+const MOST_CHECKS: u64 = 32;
 /// Uploads in pieces of a lab that may be unfinished at a time.
 pub(crate) const MOST_PARTIALS: u64 = 64;
 
@@ -77,11 +79,10 @@ macro_rules! files_of {
                                       UNION SELECT prepared FROM measurements WHERE ",
             $owner,
             " = ?1))
-                  + (SELECT coalesce(sum(prepared_bytes), 0) FROM calibration_requests AS asked
+                  + (SELECT coalesce(sum(prepared_bytes), 0) FROM requests
                      WHERE ",
             $owner,
-            " = ?1
-                       AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = asked.calibration))"
+            " = ?1)"
         )
     };
 }
@@ -94,7 +95,7 @@ async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> 
     let text = concat!(
         files_of!("lab"),
         " + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-             WHERE lab = ?1 AND movie IS NOT NULL)
+             WHERE lab = ?1 AND thing IS NOT NULL AND result IS NOT NULL)
           + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes, result_bytes)), 0)
              FROM jobs WHERE lab = ?1)"
     );
@@ -133,4 +134,13 @@ pub async fn check_partials(connection: &mut SqliteConnection, lab: &Lab) -> Res
     let open = "SELECT count(*) FROM partials WHERE lab = ? AND result IS NULL";
     let open: u64 = sql_as!(open, [lab]).fetch_one(connection).await?;
     if open < MOST_PARTIALS { Ok(()) } else { Err(StoreError::ManyPartials(open)) }
+}
+
+/// Refuses another check if enough of the lab wait and run.
+/// Errors: [`StoreError::ManyChecks`].
+pub async fn check_checks(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
+    let open = "SELECT count(*) FROM tasks
+                WHERE lab = ? AND kind = 'check' AND state IN ('ready', 'running')";
+    let open: u64 = sql_as!(open, [lab]).fetch_one(connection).await?;
+    if open < MOST_CHECKS { Ok(()) } else { Err(StoreError::ManyChecks(open)) }
 }

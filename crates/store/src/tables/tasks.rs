@@ -11,15 +11,15 @@ use strum::{VariantArray, VariantNames};
 use crate::Store;
 use crate::columns::{Columns, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use engine::job::{CalibrationId, JobId, RunSpec, Sha256, TaskKind, TaskState};
+use engine::job::{JobId, RunSpec, Sha256, TaskKind, TaskState, ThingId};
 
 /// What a task belongs to, and goes with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Owner {
+    /// The job that it belongs to.
     Job(JobId),
-    Calibration(CalibrationId),
-    /// The movie of a job, whose state does not follow it.
-    Movie(JobId),
+    /// The calibration, measurement, model or job for which it makes something. A job's state does not follow it.
+    Thing(ThingId),
 }
 
 #[derive(Debug, Clone)]
@@ -236,9 +236,8 @@ pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
 
 /// What the task in this row belongs to.
 pub fn owner(row: &SqliteRow) -> Result<Owner> {
-    Ok(match (row.read("job")?, row.read("movie")?) {
-        (Some(job), _) => Owner::Job(job),
-        (None, Some(job)) => Owner::Movie(job),
-        (None, None) => Owner::Calibration(row.read("calibration")?),
+    Ok(match row.read("job")? {
+        Some(job) => Owner::Job(job),
+        None => Owner::Thing(row.read("thing")?),
     })
 }

@@ -36,9 +36,9 @@ from_row!(WorkerPlace, row => { host, pool, device });
 
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerTask {
-    /// The job, or that of which it makes a movie; none for a calibration's.
+    /// The job that it is a part of, or makes something of.
     pub job: Option<JobId>,
-    /// The calibration; none for a job's.
+    /// The calibration that it makes, or reports on.
     pub calibration: Option<CalibrationId>,
     pub kind: String,
     pub snapshot: Option<u32>,
@@ -49,19 +49,20 @@ pub struct WorkerTask {
 from_row!(WorkerTask, row => { job, calibration, kind, snapshot, tile, stage });
 
 impl Store {
-    /// Records that a worker has started; it has the version of this program.
+    /// Records that a worker has started; it has the version of this program. A `light` one computes no tiles.
     pub async fn worker_started(
         &self,
         id: WorkerId,
         pid: u32,
         WorkerPlace { host, pool, device }: &WorkerPlace,
+        light: bool,
     ) -> Result<()> {
         let now = Timestamp::now();
         sql!(
-            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?)
+            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at, light)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
              ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
-            [id, pid, env!("CARGO_PKG_VERSION"), host, pool, device, now, now]
+            [id, pid, env!("CARGO_PKG_VERSION"), host, pool, device, now, now, light]
         )
         .execute(&self.writer)
         .await?;
@@ -73,13 +74,15 @@ impl Store {
         seen(&mut *self.writer.acquire().await?, id).await
     }
 
-    /// The workers that gave a sign of life within `age`.
+    /// The workers that gave a sign of life within `age`, except the light one: it adds nothing to the speed of jobs.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>> {
         let rows = sql!(
             "SELECT workers.id, pid, version, host, pool, device, started_at, seen_at,
-                 coalesce(job, movie) AS job, calibration, kind, snapshot, tile, stage
+                 coalesce(job, (SELECT id FROM jobs WHERE id = thing)) AS job,
+                 (SELECT id FROM requests WHERE id = thing AND what = 'calibration') AS calibration,
+                 kind, snapshot, tile, stage
              FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
-             WHERE seen_at >= ? ORDER BY workers.id",
+             WHERE seen_at >= ? AND workers.light = 0 ORDER BY workers.id",
             [TaskState::Running, since(age)]
         )
         .fetch_all(&self.readers)

@@ -4,12 +4,15 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::{LEASE, Lab};
+use super::{LEASE, Lab, new_request};
 use crate::{
-    CalibrationDone, ClaimedTask, Completion, Heartbeat, MAX_FAILURES, NewCalibration, NewCaptures,
-    Product, StoreError, Unready, Work, WorkerEnd,
+    Asked, CalibrationDone, Checked, ClaimedTask, Completion, Heartbeat, MAX_FAILURES,
+    NewCalibration, Product, Request, StoreError, Work, WorkerEnd,
 };
-use engine::job::{CalibrationId, Captures, Mosaic, TaskKind, TaskProgress, TaskState};
+use engine::job::{
+    CalibrationId, CalibrationRequest, Captures, Mosaic, Submission, TaskKind, TaskProgress,
+    TaskState,
+};
 
 /// What a worker makes of masks that are there.
 pub(super) fn report() -> CalibrationDone {
@@ -44,16 +47,25 @@ impl Lab {
             patterns: None,
             saturation: None,
         };
-        let lab = engine::job::Lab::local();
-        let name = "optics of May".parse().unwrap();
-        let mosaic = Some(Mosaic::Gbrg);
-        let name = Some(&name);
-        let asked = NewCaptures { name, captures: &captures, bytes: 1, cost: 2.5, mosaic };
-        self.store.add_captures((&lab, None), asked, None).await.unwrap().id()
+        let asked = CalibrationRequest {
+            name: Some("optics of May".parse().unwrap()),
+            captures: Some(captures),
+            mosaic: Some(Mosaic::Gbrg),
+            ..CalibrationRequest::default()
+        };
+        self.make(Submission::Calibration(asked), Checked::Captures(2.5)).await
     }
 
-    async fn unready(&self, id: CalibrationId) -> Option<Unready> {
-        self.store.unready(&engine::job::Lab::local(), id).await.unwrap()
+    async fn unready(&self, id: CalibrationId) -> Option<Request> {
+        match self.store.asked_calibration(&engine::job::Lab::local(), id).await.unwrap() {
+            Asked::Ready(_) => None,
+            Asked::Pending(request) => Some(*request),
+        }
+    }
+
+    /// Why there will be no masks.
+    async fn error(&self, id: CalibrationId) -> Option<String> {
+        self.unready(id).await.unwrap().refusal.map(|refusal| refusal.detail)
     }
 
     /// Completes a calibration of captures as a worker would.
@@ -102,8 +114,7 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     let half = TaskProgress { fraction: 0.5, ..TaskProgress::START };
     assert_eq!(lab.store.heartbeat(&task.lease, half, None).await.unwrap(), Heartbeat::Continue);
     let shown = lab.unready(first).await.unwrap();
-    assert_eq!((shown.frames, shown.fraction, shown.error), (Some(2), 0.5, None));
-    assert_eq!(shown.mosaic, Some(Mosaic::Gbrg));
+    assert_eq!((shown.fraction, shown.refusal), (0.5, None));
     let refused = lab.store.calibration(&local, first).await;
     assert!(matches!(refused, Err(StoreError::Unready { error: None, .. })));
     // Jobs are forecast and watched as if there were no calibrations.
@@ -153,10 +164,10 @@ async fn a_calibration_that_fails_is_tried_again_and_then_given_up_for_its_last_
         lab.skip_pauses().await;
         let task = lab.claim().await.unwrap();
         assert_eq!(task.lease.attempt, attempt);
-        assert_eq!(lab.unready(id).await.unwrap().error, None);
+        assert_eq!(lab.error(id).await, None);
         lab.store.fail(&task.lease, &format!("no disk, {attempt}"), true).await.unwrap();
     }
-    assert_eq!(lab.unready(id).await.unwrap().error.unwrap(), "no disk, 3");
+    assert_eq!(lab.error(id).await.unwrap(), "no disk, 3");
     let attempts: Vec<(String, String)> = sqlx::query_as(
         "SELECT outcome, reason FROM attempts WHERE outcome = 'failed' ORDER BY attempt",
     )
@@ -168,7 +179,7 @@ async fn a_calibration_that_fails_is_tried_again_and_then_given_up_for_its_last_
     let other = lab.calibrate().await;
     let task = lab.claim().await.unwrap();
     lab.store.fail(&task.lease, "no light", false).await.unwrap();
-    assert_eq!(lab.unready(other).await.unwrap().error.unwrap(), "no light");
+    assert_eq!(lab.error(other).await.unwrap(), "no light");
 }
 
 #[tokio::test]
@@ -181,10 +192,10 @@ async fn a_calibration_outlives_its_workers() {
     assert_eq!((again.lease.task, again.lease.attempt), (late.lease.task, 2));
     assert_eq!(lab.made(&late).await, Heartbeat::Lost);
     lab.store.worker_ended(lab.worker, &WorkerEnd::Crashed("signal 11".into())).await.unwrap();
-    assert_eq!(lab.unready(id).await.unwrap().error, None);
+    assert_eq!(lab.error(id).await, None);
     assert!(lab.claim().await.is_none(), "after a crash it waits");
     // A pause that ends far in the future was noted before the clock was set back; so was a lease.
-    let forward = "UPDATE tasks SET ready_at = ready_at + 86400000 WHERE calibration IS NOT NULL";
+    let forward = "UPDATE tasks SET ready_at = ready_at + 86400000 WHERE thing IS NOT NULL";
     sqlx::query(forward).execute(&lab.store.writer).await.unwrap();
     assert_eq!(lab.claim().await.unwrap().lease.attempt, 3);
     let forward = "UPDATE tasks SET lease_until = lease_until + 86400000 WHERE state = 'running'";
@@ -207,8 +218,9 @@ async fn captures_that_are_gone_are_named() {
         saturation: None,
     };
     let whose = (&engine::job::Lab::local(), None);
-    let asked = NewCaptures { name: None, captures: &captures, bytes: 1, cost: 1.0, mosaic: None };
-    let refused = lab.store.add_captures(whose, asked, None).await;
+    let asked = CalibrationRequest { captures: Some(captures), ..CalibrationRequest::default() };
+    let asked = new_request(Submission::Calibration(asked));
+    let refused = lab.store.request::<CalibrationId>(whose, &asked, None).await;
     assert!(matches!(refused, Err(StoreError::NotFound { what: "blob", id })
         if id == gone.to_string()));
     assert!(lab.claim().await.is_none());

@@ -3,8 +3,8 @@
 use std::io::Write;
 
 use super::Lab;
-use crate::{Inserted, JobFilter, NewModel, StoreError};
-use engine::job::{ModelFacts, ModelTrial, Timestamp};
+use crate::{Checked, Inserted, JobFilter, StoreError};
+use engine::job::{ModelFacts, ModelId, ModelRequest, ModelTrial, Submission, Timestamp};
 
 #[tokio::test]
 async fn a_key_makes_one_job() {
@@ -84,8 +84,8 @@ async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
         lab.store.measurement(&local, lab.measurement).await.unwrap().facts.calibration;
     let trial = ModelTrial { height: 64, width: 96, cpu_seconds: 1.0, peak_rss_bytes: 1 << 20 };
     let facts = ModelFacts { inputs: Vec::new(), outputs: Vec::new(), fixed_size: true, trial };
-    let new = NewModel { name: None, calibration, file: file.sha256, facts };
-    let id = lab.store.add_model(&local, new, None).await.unwrap().id();
+    let asked = ModelRequest { name: None, calibration, file: file.sha256 };
+    let id: ModelId = lab.make(Submission::Model(asked), Checked::Model(facts)).await;
     let model = lab.store.model(&local, id).await.unwrap();
     lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
     let soon = Timestamp(Timestamp::now().0 + 1000);

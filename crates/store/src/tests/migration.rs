@@ -4,7 +4,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
 use strum::VariantArray;
 
-use crate::{Filter, Purpose, Store, Work};
+use crate::{Asked, Filter, Purpose, Store, Work};
 use engine::job::{Lab, TaskState, WorkerId};
 
 /// The last migration before calibrations became tasks.
@@ -70,8 +70,8 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
     let broken = sqlx::query("PRAGMA foreign_key_check").fetch_all(&store.readers).await.unwrap();
     assert!(broken.is_empty());
     let states: Vec<(String, String, u32, u32, u32)> = sqlx::query_as(
-        "SELECT calibration, state, attempt, failures, losses FROM tasks WHERE kind = 'calibration'
-         ORDER BY calibration",
+        "SELECT thing, state, attempt, failures, losses FROM tasks WHERE kind = 'calibration'
+         ORDER BY thing",
     )
     .fetch_all(&store.readers)
     .await
@@ -87,18 +87,22 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
 
     // As users see them.
     let (local, other) = (Lab::local(), "other".parse::<Lab>().unwrap());
-    let all = store.all_unready(&local, Filter::default(), 10).await.unwrap().items;
-    let seen: Vec<_> = all
-        .iter()
-        .map(|unready| {
-            let name = unready.name.as_ref().unwrap().as_str();
-            (unready.id.to_string(), name, unready.created_at.0, unready.error.as_deref())
+    let all = store.calibrations(&local, Filter::default(), 10).await.unwrap().items;
+    assert!(matches!(&all[0], Asked::Ready(calibration) if calibration.id.to_string() == id(4)));
+    let pending = all.iter().filter_map(|asked| match asked {
+        Asked::Ready(_) => None,
+        Asked::Pending(request) => Some(request),
+    });
+    let seen: Vec<_> = pending
+        .map(|request| {
+            let name = request.name.as_ref().unwrap().as_str();
+            let error = request.refusal.as_ref().map(|refusal| refusal.detail.as_str());
+            (request.id.to_string(), name, request.created_at.0, error, request.fraction)
         })
         .collect();
-    let three = (id(3), "three", 30, Some("no light"));
-    assert_eq!(seen, [three, (id(2), "two", 20, None), (id(1), "one", 10, None)]);
-    assert_eq!((all[1].fraction, all[1].frames), (0.5, Some(1)));
-    assert_eq!(store.all_unready(&other, Filter::default(), 10).await.unwrap().items.len(), 1);
+    let three = (id(3), "three", 30, Some("no light"), 0.0);
+    assert_eq!(seen, [three, (id(2), "two", 20, None, 0.5), (id(1), "one", 10, None, 0.0)]);
+    assert_eq!(store.calibrations(&other, Filter::default(), 10).await.unwrap().items.len(), 1);
     assert!(store.calibration(&local, id(4).parse().unwrap()).await.is_ok());
 
     // As workers see them: what a silent one holds comes back, too.
@@ -126,7 +130,7 @@ async fn calibrations_become_tasks_and_nothing_else_changes() {
     .unwrap();
     assert_eq!(attempts, [(1, 81, "lost".into()), (2, 83, "cancelled".into())]);
     store.delete_calibration(&local, id(1).parse().unwrap()).await.unwrap();
-    let left: i64 = sqlx::query_scalar("SELECT count(*) FROM calibration_captures")
+    let left: i64 = sqlx::query_scalar("SELECT count(*) FROM request_files")
         .fetch_one(&store.readers)
         .await
         .unwrap();
@@ -162,7 +166,8 @@ async fn old_folder() -> (tempfile::TempDir, sqlx::SqliteConnection) {
 
 fn saved(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
     let entries = std::fs::read_dir(folder.join("before-updates"));
-    entries.into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
+    let paths = entries.into_iter().flatten().map(|entry| entry.unwrap().path());
+    paths.filter(|path| path.extension().is_some_and(|extension| extension == "db")).collect()
 }
 
 const SERVE: Purpose = Purpose::Serve { accept_database: false };

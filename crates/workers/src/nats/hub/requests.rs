@@ -165,7 +165,7 @@ impl Core {
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        if let Err(error) = self.store.worker_started(worker, pid, &place).await {
+        if let Err(error) = self.store.worker_started(worker, pid, &place, false).await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
         }

@@ -1,0 +1,203 @@
+//! Requests to make a calibration, measurement or model of uploads.
+
+use serde::{Deserialize, Serialize};
+
+use super::{CalibrationId, Captures, InvalidField, Label, Mosaic, Sequence, Sha256};
+use formats::Axes;
+
+/// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
+const CHECK_S: f64 = 20e-9;
+const SHORTEST_CHECK_S: f64 = 0.05;
+/// CPU-seconds of loading a small network and running it once.
+const MODEL_S: f64 = 1.0;
+
+/// The body of `POST /v1/calibrations`: masks, or the captures from which they are made.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CalibrationRequest {
+    pub name: Option<Label>,
+    pub masks: Option<Sha256>,
+    /// Name of the array in a file of several.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub array: Option<Label>,
+    /// Order of the array's axes; without it, the only one that fits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub axes: Option<Axes>,
+    pub full_scale: Option<f32>,
+    pub captures: Option<Captures>,
+    /// Colours of the sensor's pixels; a grey sensor has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mosaic: Option<Mosaic>,
+}
+
+/// The body of `POST /v1/measurements`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MeasurementRequest {
+    pub name: Option<Label>,
+    pub calibration: CalibrationId,
+    pub data: Sha256,
+    /// Name of the array in a file of several.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub array: Option<Label>,
+    /// Order of the array's axes; without it, the only one that fits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub axes: Option<Axes>,
+    /// Captures with the LCoS all black, at the measurement's exposure. Their average is subtracted.
+    #[serde(default)]
+    pub dark: Vec<Sha256>,
+    /// Smallest stored number of a saturated pixel.
+    pub saturation: Option<u32>,
+    pub full_scale: Option<f32>,
+    /// Snapshots per second.
+    pub camera_fps: Option<f64>,
+    /// Exposure of one snapshot in seconds.
+    pub exposure_s: Option<f64>,
+    /// States whether the snapshots follow one another; without it, the times decide.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sequence: Option<Sequence>,
+}
+
+/// The body of `POST /v1/models`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelRequest {
+    pub name: Option<Label>,
+    pub calibration: CalibrationId,
+    pub file: Sha256,
+}
+
+/// A request that is fulfilled once its uploads have passed a check.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Submission {
+    Calibration(CalibrationRequest),
+    Measurement(MeasurementRequest),
+    Model(ModelRequest),
+}
+
+/// Limits of a check, as the server sets them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CheckLimits {
+    pub max_file_bytes: u64,
+    /// Bytes of the disk that stay free.
+    pub min_free_bytes: u64,
+    /// Seconds that a check may take.
+    pub seconds: f64,
+}
+
+impl Submission {
+    pub fn name(&self) -> Option<&Label> {
+        match self {
+            Self::Calibration(request) => request.name.as_ref(),
+            Self::Measurement(request) => request.name.as_ref(),
+            Self::Model(request) => request.name.as_ref(),
+        }
+    }
+
+    /// The calibration that it needs.
+    pub fn calibration(&self) -> Option<CalibrationId> {
+        match self {
+            Self::Calibration(_) => None,
+            Self::Measurement(request) => Some(request.calibration),
+            Self::Model(request) => Some(request.calibration),
+        }
+    }
+
+    /// Each upload with its place in the request.
+    pub fn uploads(&self) -> Vec<(String, Sha256)> {
+        match self {
+            Self::Calibration(CalibrationRequest { masks, captures, .. }) => {
+                let masks = masks.map(|masks| ("/masks".to_owned(), masks));
+                masks.into_iter().chain(captures.iter().flat_map(Captures::uploads)).collect()
+            }
+            Self::Measurement(MeasurementRequest { data, dark, .. }) => {
+                let dark = dark.iter().enumerate();
+                let dark = dark.map(|(index, upload)| (format!("/dark/{index}"), *upload));
+                std::iter::once(("/data".to_owned(), *data)).chain(dark).collect()
+            }
+            Self::Model(ModelRequest { file, .. }) => vec![("/file".to_owned(), *file)],
+        }
+    }
+
+    /// Planned CPU-seconds of a check that reads `bytes`.
+    #[allow(clippy::cast_precision_loss)] // a plan
+    pub fn check_cost(&self, bytes: u64) -> f64 {
+        let read = (bytes as f64 * CHECK_S).max(SHORTEST_CHECK_S);
+        match self {
+            // Only headers are read.
+            Self::Calibration(CalibrationRequest { captures: Some(_), .. }) => SHORTEST_CHECK_S,
+            Self::Calibration(_) | Self::Measurement(_) => read,
+            Self::Model(_) => read + MODEL_S,
+        }
+    }
+
+    /// Refuses fields that contradict each other.
+    /// Errors: all that is wrong, each with its place.
+    pub fn check(&self) -> Result<(), Vec<InvalidField>> {
+        match self {
+            Self::Calibration(request) => request.check(),
+            Self::Measurement(request) => request.check_times(),
+            Self::Model(_) => Ok(()),
+        }
+    }
+}
+
+impl CalibrationRequest {
+    fn check(&self) -> Result<(), Vec<InvalidField>> {
+        let wrong = |pointer: &str, detail: &str| Err(vec![InvalidField::new(pointer, detail)]);
+        match (&self.masks, &self.captures) {
+            (Some(_), None) => Ok(()),
+            (None, Some(_)) if self.array.is_some() => {
+                wrong("/array", "captures are pictures, not named arrays")
+            }
+            (None, Some(_)) if self.axes.is_some() => {
+                wrong("/axes", "captures are [frame, row, column]: leave axes out")
+            }
+            (None, Some(_)) if self.full_scale.is_some() => wrong(
+                "/full_scale",
+                "captures have no full scale: white and black give their masks' scale",
+            ),
+            (None, Some(captures)) => captures.check(),
+            _ => wrong("", "name either masks or captures, not both or none"),
+        }
+    }
+}
+
+impl MeasurementRequest {
+    /// A request that states nothing but its data and their calibration.
+    pub fn new(name: Option<Label>, calibration: CalibrationId, data: Sha256) -> Self {
+        Self {
+            name,
+            calibration,
+            data,
+            array: None,
+            axes: None,
+            dark: Vec::new(),
+            saturation: None,
+            full_scale: None,
+            camera_fps: None,
+            exposure_s: None,
+            sequence: None,
+        }
+    }
+
+    /// Refuses times that are out of range: they become the times of frames.
+    fn check_times(&self) -> Result<(), Vec<InvalidField>> {
+        let checks = [
+            ("/camera_fps", self.camera_fps, 1e9, "snapshots in a second"),
+            ("/exposure_s", self.exposure_s, 1e5, "seconds"),
+        ];
+        let mut errors = Vec::new();
+        for (pointer, value, most, unit) in checks {
+            if let Some(value) = value
+                && !(value > 0.0 && value <= most)
+            {
+                let detail =
+                    format!("{value} {unit} can't be; it must be above 0 and at most {most}");
+                errors.push(InvalidField::new(pointer, detail));
+            }
+        }
+        if errors.is_empty() { Ok(()) } else { Err(errors) }
+    }
+}

@@ -1,0 +1,325 @@
+//! Table `requests`: calibrations, measurements and models as labs asked for them.
+//!
+//! A request stands here for as long as the thing that it asked for, ready or not. Tasks of the queue fulfil it: a
+//! check of its uploads, and, for a calibration, one that makes masks or a report. The thing's facts get a row in
+//! the table of its kind once they are known.
+
+use std::collections::HashMap;
+
+use sqlx::SqliteConnection;
+use sqlx::sqlite::SqliteRow;
+
+use crate::Store;
+use crate::columns::{Columns, FromRow, Json, sql, sql_as};
+use crate::error::{Result, StoreError};
+use crate::rows::{Filter, Page, Reference, listed_text, require};
+use crate::tables::keys::Made;
+use engine::intake::Refusal;
+use engine::job::{CheckLimits, Lab, Label, Submission, TaskState, ThingId, Timestamp, TokenId};
+
+/// A request on record.
+#[derive(Debug, Clone)]
+pub struct Request {
+    /// Identifier of the calibration, measurement or model.
+    pub id: ThingId,
+    pub lab: Lab,
+    pub token: Option<TokenId>,
+    pub name: Option<Label>,
+    pub submission: Submission,
+    /// Identifier of the HTTP request.
+    pub origin: Option<String>,
+    /// Why nothing is made; none while there is hope.
+    pub refusal: Option<Refusal>,
+    pub created_at: Timestamp,
+    /// Share of the work of its latest task that is done, on \[0,1\].
+    pub fraction: f64,
+}
+
+/// A thing that a lab asked for.
+#[derive(Debug, Clone)]
+pub enum Asked<T> {
+    Ready(T),
+    /// It is being checked or made, or was refused.
+    Pending(Box<Request>),
+}
+
+/// Changes when a calibration, measurement or model does.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RequestMark {
+    /// Ordinal, state and progress of the latest task.
+    task: Option<(i64, TaskState, f64)>,
+    name: Option<Label>,
+}
+
+impl Made {
+    /// The kind of thing that a submission makes.
+    pub fn of(submission: &Submission) -> Self {
+        match submission {
+            Submission::Calibration(_) => Self::Calibration,
+            Submission::Measurement(_) => Self::Measurement,
+            Submission::Model(_) => Self::Model,
+        }
+    }
+}
+
+impl FromRow for Request {
+    fn from_row(row: &SqliteRow) -> Result<Self> {
+        let text: String = row.read("request")?;
+        // The column `what` holds the variant, because lists are filtered by it.
+        let submission = match row.read::<String>("what")?.as_str() {
+            "calibration" => serde_json::from_str(&text).map(Submission::Calibration),
+            "measurement" => serde_json::from_str(&text).map(Submission::Measurement),
+            _ => serde_json::from_str(&text).map(Submission::Model),
+        };
+        let decode = |error: serde_json::Error| StoreError::Corrupt {
+            column: "request",
+            value: format!("{text} ({error})"),
+        };
+        Ok(Self {
+            id: row.read("id")?,
+            lab: row.read("lab")?,
+            token: row.read("token")?,
+            name: row.read("name")?,
+            submission: submission.map_err(decode)?,
+            origin: row.read("origin")?,
+            refusal: row.read_json("refusal")?,
+            created_at: row.read("created_at")?,
+            fraction: row.read::<Option<f64>>("fraction")?.unwrap_or_default(),
+        })
+    }
+}
+
+/// Requests with the progress of their latest tasks, to be followed by a condition.
+macro_rules! requests {
+    () => {
+        "(SELECT *, (SELECT fraction FROM tasks WHERE thing = requests.id
+                     ORDER BY ordinal DESC LIMIT 1) AS fraction FROM requests)"
+    };
+}
+
+impl Store {
+    /// The lab's request for this thing; none if there is none.
+    pub async fn find_request(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<Option<Request>> {
+        let request = concat!("SELECT * FROM ", requests!(), " WHERE id = ? AND lab = ?");
+        let request = sql_as!(request, [id.into(), lab]);
+        Ok(request.fetch_optional(&self.readers).await?)
+    }
+
+    /// True if the uploads of a request are checked, or nobody wants that any more.
+    pub async fn is_checked(&self, id: impl Into<ThingId>) -> Result<bool> {
+        let check = "SELECT 1 FROM tasks WHERE thing = ? AND kind = 'check' AND state IN (?, ?)";
+        let check = sql!(check, [id.into(), TaskState::Ready, TaskState::Running]);
+        Ok(check.fetch_optional(&self.readers).await?.is_none())
+    }
+
+    /// True if what was asked for is there, or was refused, or deleted.
+    pub async fn is_settled(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<bool> {
+        let pending = "SELECT 1 FROM requests
+                       WHERE id = ?1 AND lab = ?2 AND refusal IS NULL
+                         AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = ?1)
+                         AND NOT EXISTS (SELECT 1 FROM measurements WHERE id = ?1)
+                         AND NOT EXISTS (SELECT 1 FROM models WHERE id = ?1)";
+        let pending = sql!(pending, [id.into(), lab]);
+        Ok(pending.fetch_optional(&self.readers).await?.is_none())
+    }
+
+    /// A page of the lab's requests of one kind, newest first. `facts` selects the rows of ready things by their
+    /// identifiers, a JSON array.
+    pub(super) async fn asked<T>(
+        &self,
+        (lab, what): (&Lab, Made),
+        filter: Filter<ThingId>,
+        limit: u32,
+        facts: &'static str,
+        read: impl Fn(&SqliteRow) -> Result<(ThingId, T)>,
+    ) -> Result<Page<Asked<T>>> {
+        // Both statements see the same state of the database.
+        let mut snapshot = self.readers.begin().await?;
+        let items: Vec<Request> = sql_as!(
+            listed_text!(concat!(requests!(), " WHERE what = ?7 AND")),
+            [
+                lab,
+                filter.after,
+                filter.calibration,
+                i64::from(limit) + 1,
+                filter.created.from,
+                filter.created.before,
+                what.into_str()
+            ]
+        )
+        .fetch_all(&mut *snapshot)
+        .await?;
+        let page = Page::cut(items, limit);
+        let ids = serde_json::Value::from_iter(page.items.iter().map(|item| item.id.to_string()));
+        let rows = sql!(facts, [ids.to_string()]).fetch_all(&mut *snapshot).await?;
+        let mut ready: HashMap<ThingId, T> = rows.iter().map(read).collect::<Result<_>>()?;
+        let asked = |request: Request| match ready.remove(&request.id) {
+            Some(facts) => Asked::Ready(facts),
+            None => Asked::Pending(Box::new(request)),
+        };
+        Ok(Page { items: page.items.into_iter().map(asked).collect(), more: page.more })
+    }
+
+    /// A mark of each calibration, measurement or model, by its lab and identifier.
+    pub async fn request_marks<Id>(&self, what: Made) -> Result<HashMap<(Lab, Id), RequestMark>>
+    where
+        Id: From<ThingId> + Eq + std::hash::Hash,
+    {
+        type Found = (Lab, ThingId, Option<Label>, Option<i64>, Option<TaskState>, Option<f64>);
+        // The columns are those of the row with the largest ordinal.
+        let rows: Vec<Found> = sql_as!(
+            "SELECT requests.lab, requests.id, name, max(ordinal), state, fraction
+             FROM requests LEFT JOIN tasks ON thing = requests.id WHERE what = ?
+             GROUP BY requests.id",
+            [what.into_str()]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        let mark = |(lab, id, name, ordinal, state, fraction): Found| {
+            let task = ordinal.zip(state).zip(fraction);
+            let task = task.map(|((ordinal, state), fraction)| (ordinal, state, fraction));
+            ((lab, id.into()), RequestMark { task, name })
+        };
+        Ok(rows.into_iter().map(mark).collect())
+    }
+
+    /// Removes a request that was refused, as its client knows why.
+    pub async fn drop_refused(&self, id: impl Into<ThingId>) -> Result<()> {
+        sql!("DELETE FROM requests WHERE id = ? AND refusal IS NOT NULL", [id.into()])
+            .execute(&self.writer)
+            .await?;
+        Ok(())
+    }
+}
+
+/// Records a request, with the uploads that it needs. Returns their size in bytes.
+/// Errors: [`StoreError::NotFound`] if an upload or the calibration is gone.
+pub async fn insert(
+    connection: &mut SqliteConnection,
+    (lab, token): (&Lab, Option<TokenId>),
+    id: ThingId,
+    (submission, limits, origin): (&Submission, &CheckLimits, Option<&str>),
+) -> Result<u64> {
+    let calibration = submission.calibration();
+    require(connection, calibration.map(Reference::Calibration).as_slice()).await?;
+    let text = match submission {
+        Submission::Calibration(request) => serde_json::to_string(request),
+        Submission::Measurement(request) => serde_json::to_string(request),
+        Submission::Model(request) => serde_json::to_string(request),
+    };
+    let text =
+        text.map_err(|error| StoreError::Corrupt { column: "request", value: error.to_string() })?;
+    sql!(
+        "INSERT INTO requests (id, what, lab, token, name, calibration, request, limits, origin, created_at)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            id,
+            Made::of(submission).into_str(),
+            lab,
+            token,
+            submission.name(),
+            calibration,
+            text,
+            Json(limits),
+            origin,
+            Timestamp::now()
+        ]
+    )
+    .execute(&mut *connection)
+    .await?;
+    for (_, file) in submission.uploads() {
+        require(connection, &[Reference::Blob(file)]).await?;
+        let files = "INSERT INTO request_files (id, sha256) VALUES (?, ?) ON CONFLICT DO NOTHING";
+        sql!(files, [id, file]).execute(&mut *connection).await?;
+    }
+    let size =
+        "SELECT coalesce(sum(size), 0) FROM request_files JOIN blobs USING (sha256) WHERE id = ?";
+    Ok(sql_as!(size, [id]).fetch_one(connection).await?)
+}
+
+/// The request for this thing, whoever made it.
+pub async fn find(connection: &mut SqliteConnection, id: ThingId) -> Result<Request> {
+    let request = sql_as!(concat!("SELECT * FROM ", requests!(), " WHERE id = ?"), [id]);
+    let request = request.fetch_optional(connection).await?;
+    request.ok_or_else(|| StoreError::missing("request", id))
+}
+
+/// The limits of a request's check.
+pub async fn limits(connection: &mut SqliteConnection, id: ThingId) -> Result<CheckLimits> {
+    let limits = sql_as!("SELECT limits FROM requests WHERE id = ?", [id]);
+    let Json(limits) = limits.fetch_one(connection).await?;
+    Ok(limits)
+}
+
+/// Promises disk space for what is being made; the promise ends when that is on record, or refused.
+pub async fn promise(connection: &mut SqliteConnection, id: ThingId, bytes: u64) -> Result<()> {
+    sql!("UPDATE requests SET prepared_bytes = ? WHERE id = ?", [bytes, id])
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+/// Ends what a request held for being fulfilled: its uploads and its promise.
+pub async fn fulfil(connection: &mut SqliteConnection, id: ThingId) -> Result<()> {
+    promise(connection, id, 0).await?;
+    sql!("DELETE FROM request_files WHERE id = ?", [id]).execute(connection).await?;
+    Ok(())
+}
+
+/// Records why nothing is made of a request. Its key is free again, as after any refusal. A calibration that is
+/// there already, and lacks its report, is left alone.
+pub async fn refuse(
+    connection: &mut SqliteConnection,
+    id: ThingId,
+    refusal: &Refusal,
+) -> Result<()> {
+    let refused = sql!(
+        "UPDATE requests SET refusal = ?1
+         WHERE id = ?2 AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = ?2)",
+        [Json(refusal), id]
+    );
+    if refused.execute(&mut *connection).await?.rows_affected() > 0 {
+        sql!("DELETE FROM request_keys WHERE id = ?", [id]).execute(&mut *connection).await?;
+        fulfil(connection, id).await?;
+    }
+    Ok(())
+}
+
+/// Gives a thing another name, or none.
+pub async fn rename(
+    connection: &mut SqliteConnection,
+    (lab, what, id): (&Lab, Made, ThingId),
+    name: Option<&Label>,
+) -> Result<()> {
+    let renamed = "UPDATE requests SET name = ? WHERE id = ? AND lab = ? AND what = ?";
+    let renamed = sql!(renamed, [name, id, lab, what.into_str()]).execute(connection).await?;
+    found(renamed.rows_affected(), what, id)
+}
+
+/// Removes a request of a lab. Its tasks go with it: a worker that has one finds that nobody wants it any more.
+pub async fn delete(
+    connection: &mut SqliteConnection,
+    (lab, what, id): (&Lab, Made, ThingId),
+) -> Result<()> {
+    let deleted = "DELETE FROM requests WHERE id = ? AND lab = ? AND what = ?";
+    let deleted = sql!(deleted, [id, lab, what.into_str()]).execute(connection).await?;
+    found(deleted.rows_affected(), what, id)
+}
+
+fn found(rows: u64, what: Made, id: ThingId) -> Result<()> {
+    if rows > 0 { Ok(()) } else { Err(StoreError::missing(what.into_str(), id)) }
+}
+
+/// Number of measurements or models of a calibration that are there or being made.
+pub const USERS: [(&str, &str); 2] = [
+    (
+        "measurements",
+        "SELECT count(*) FROM requests
+         WHERE calibration = ? AND what = 'measurement' AND refusal IS NULL",
+    ),
+    (
+        "models",
+        "SELECT count(*) FROM requests
+         WHERE calibration = ? AND what = 'model' AND refusal IS NULL",
+    ),
+];

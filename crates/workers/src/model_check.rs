@@ -1,0 +1,119 @@
+//! The check of a network, in a separate process (`sci-recon check-model`): a stranger's file reaches native code,
+//! which may crash, hang, or take all memory.
+
+use std::io::Read;
+use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
+use std::process::{Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use super::model_process::ModelCommand;
+use super::transport::TaskError;
+use engine::intake::{IntakeError, Refusal, RefusalCode};
+use engine::job::{ModelFacts, ModelVerdict, without_paths};
+use engine::pipeline::progress::Monitor;
+use store::NewCalibration;
+
+/// Time between looks at the process.
+const LOOK: Duration = Duration::from_millis(20);
+/// Characters of a reason that are shown.
+const REASON: usize = 2000;
+
+/// How the process ended, and what it wrote.
+struct Ended {
+    status: ExitStatus,
+    stdout: Vec<u8>,
+    stderr: Vec<u8>,
+}
+
+/// Checks whether an upload is a network for these masks, and runs it once, until `deadline`.
+/// Errors: the process can't be started, or the check was stopped.
+pub(super) fn run(
+    command: &ModelCommand,
+    file: &Path,
+    masks: &NewCalibration,
+    deadline: Instant,
+    monitor: &Monitor,
+) -> Result<Result<ModelFacts, Refusal>, TaskError> {
+    let start = Instant::now();
+    let ended = watched(prepared(command, file, masks), deadline, monitor)
+        .map_err(|error| TaskError::Transport(error.into()))?;
+    // The names in a network are any text of any length.
+    let cut = |why: String| without_paths(&why).chars().take(REASON).collect::<String>();
+    let refused =
+        |why: String| Ok(Err(Refusal::new(RefusalCode::InvalidContent, cut(why)).at("/file")));
+    let Some(Ended { status, stdout, stderr }) = ended else {
+        if monitor.stopped() {
+            return Err(IntakeError::Stopped.into());
+        }
+        let seconds = start.elapsed().as_secs();
+        return refused(format!("one run of the network takes more than {seconds} s"));
+    };
+    if status.signal().is_some() {
+        let limit = match command.memory_bytes {
+            Some(bytes) => format!("; it may take {} MiB of memory", bytes >> 20),
+            None => String::new(),
+        };
+        return refused(format!("the network ended the process that tried it ({status}){limit}"));
+    }
+    match serde_json::from_slice(&stdout) {
+        Ok(ModelVerdict::Fits(facts)) => Ok(Ok(facts)),
+        Ok(ModelVerdict::Refused(why)) => refused(why),
+        Err(_) => {
+            let output = String::from_utf8_lossy(&stderr);
+            tracing::error!(%output, %status, "a network can't be checked");
+            let detail = "the service can't run networks now; its log says why";
+            Ok(Err(Refusal::new(RefusalCode::Unavailable, detail)))
+        }
+    }
+}
+
+fn prepared(model: &ModelCommand, file: &Path, masks: &NewCalibration) -> Command {
+    let mut command = Command::new(&model.program);
+    command.args(&model.check).arg(file);
+    // Each of the four sub-images of a mosaic goes through the network.
+    let step = if masks.mosaic.is_some() { 2 } else { 1 };
+    let (height, width) = (masks.height / step, masks.width / step);
+    for (name, value) in [("--frames", masks.frames), ("--height", height), ("--width", width)] {
+        command.arg(name).arg(value.to_string());
+    }
+    // Its standard input ends with this process.
+    command.arg("--supervised").env_remove("SCI_RECON_CONFIG");
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// Runs a process to its end; none if it was killed at the deadline, or as nobody wants it any more.
+fn watched(
+    mut command: Command,
+    deadline: Instant,
+    monitor: &Monitor,
+) -> std::io::Result<Option<Ended>> {
+    let mut child = command.spawn()?;
+    let (mut output, mut errors) = (child.stdout.take(), child.stderr.take());
+    std::thread::scope(|scope| {
+        let read = |pipe: Option<&mut dyn Read>| {
+            let mut bytes = Vec::new();
+            // What came before an error is good enough.
+            pipe.map(|pipe| pipe.read_to_end(&mut bytes));
+            bytes
+        };
+        let stdout = scope.spawn(move || read(output.as_mut().map(|pipe| pipe as _)));
+        let stderr = scope.spawn(move || read(errors.as_mut().map(|pipe| pipe as _)));
+        let status = loop {
+            match child.try_wait() {
+                Ok(None) if monitor.stopped() || Instant::now() >= deadline => break Ok(None),
+                Ok(None) => std::thread::sleep(LOOK),
+                ended => break ended,
+            }
+        };
+        if !matches!(status, Ok(Some(_))) {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+        let bytes =
+            |thread: std::thread::ScopedJoinHandle<'_, Vec<u8>>| thread.join().unwrap_or_default();
+        let (stdout, stderr) = (bytes(stdout), bytes(stderr));
+        Ok(status?.map(|status| Ended { status, stdout, stderr }))
+    })
+}

@@ -1,0 +1,182 @@
+//! Requests for what is made of uploads. The check of the uploads is a task of the queue; the answer waits for it for
+//! a while.
+
+use std::str::FromStr;
+use std::time::Duration;
+
+use axum::http::HeaderMap;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::access::Access;
+use super::app::App;
+use super::error::{ApiError, Code, REQUEST_ID, Result};
+use engine::job::{CheckLimits, InvalidId, Lab, Submission, ThingId};
+use store::{Inserted, Made, NewRequest, Request, RequestKey, StoreError};
+
+/// How long a request waits for a check by default.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// The longest that a request may wait, in seconds.
+const MOST_PATIENCE: f64 = 20.0;
+
+/// How far something is that is made of files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Stage {
+    /// Its files are checked, or masks are made of captures.
+    Preparing,
+    Ready,
+    /// There will be nothing; `error` says why.
+    Failed,
+}
+
+/// State of a pending request; if it failed, the reason in words and as a problem.
+pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Value>) {
+    let Some(refusal) = request.refusal.clone() else { return (Stage::Preparing, None, None) };
+    let detail = refusal.detail.clone();
+    let problem = || ApiError::from(refusal).problem();
+    // The answer to the original request would have had the same problem.
+    let problem = match request.origin.clone() {
+        Some(origin) => REQUEST_ID.sync_scope(origin, problem),
+        None => problem(),
+    };
+    (Stage::Failed, Some(detail), Some(problem))
+}
+
+/// How long the client wants to wait for a check (RFC 7240): `Prefer: respond-async` or `wait=SECONDS`.
+pub(super) fn patience(headers: &HeaderMap) -> Duration {
+    let values = headers.get_all("prefer").iter().filter_map(|value| value.to_str().ok());
+    let mut wait = None;
+    let mut is_async = false;
+    for preference in values.flat_map(|value| value.split([',', ';'])) {
+        let (name, value) = preference.split_once('=').unwrap_or((preference, ""));
+        match name.trim().to_ascii_lowercase().as_str() {
+            "respond-async" => is_async = true,
+            // The RFC has malformed preferences ignored.
+            "wait" => wait = value.trim().trim_matches('"').parse::<f64>().ok(),
+            _ => {}
+        }
+    }
+    match wait.filter(|seconds| *seconds >= 0.0) {
+        Some(seconds) => Duration::from_secs_f64(seconds.min(MOST_PATIENCE)),
+        None if is_async => Duration::ZERO,
+        None => PATIENCE,
+    }
+}
+
+/// Has something made, or finds what was made with the same key. Waits so long for the check of its uploads.
+/// Errors: why the request is refused, if that is known in time; nothing of it stays on record then.
+pub(super) async fn make<Id>(
+    app: &App,
+    access: &Access,
+    submission: Submission,
+    key: Option<&RequestKey>,
+    patience: Duration,
+) -> Result<Inserted<Id>>
+where
+    Id: Into<ThingId> + From<ThingId> + FromStr<Err = InvalidId> + Copy,
+{
+    let invalid = |errors| ApiError::fields(Code::InvalidRequest, errors);
+    submission.check().map_err(invalid)?;
+    let (lab, what) = (&access.lab, Made::of(&submission));
+    loop {
+        let made = match app.store.made_with(lab, what, key).await? {
+            Some(id) => Inserted::Before(id),
+            None => submit(app, access, &submission, key).await?,
+        };
+        if patience.is_zero() {
+            return Ok(made);
+        }
+        let waiting = settled(app.clone(), lab.clone(), (what, made.id().into()), patience);
+        // Runs to completion even if the client disconnects.
+        let waiting = match REQUEST_ID.try_with(Clone::clone) {
+            Ok(id) => tokio::spawn(REQUEST_ID.scope(id, waiting)),
+            Err(_) => tokio::spawn(waiting),
+        };
+        let there = waiting.await.unwrap_or_else(|_| Err(StoreError::Interrupted.into()))?;
+        // Another request with this key was refused meanwhile, which freed the key.
+        if there || matches!(made, Inserted::New(_)) {
+            return Ok(made);
+        }
+    }
+}
+
+/// Puts a request on record, and its check in the queue.
+async fn submit<Id>(
+    app: &App,
+    access: &Access,
+    submission: &Submission,
+    key: Option<&RequestKey>,
+) -> Result<Inserted<Id>>
+where
+    Id: From<ThingId> + FromStr<Err = InvalidId>,
+{
+    vet(app, &access.lab, submission).await?;
+    let settings = &app.settings;
+    let limits = CheckLimits {
+        max_file_bytes: settings.max_upload_bytes,
+        min_free_bytes: settings.min_free_bytes,
+        seconds: settings.check_time().as_secs_f64(),
+    };
+    let origin = REQUEST_ID.try_with(Clone::clone).ok();
+    let new = NewRequest { submission: submission.clone(), limits, origin };
+    Ok(app.store.request((&access.lab, access.token), &new, key).await?)
+}
+
+/// Waits for a check. False if its request was deleted.
+/// Errors: why the uploads are refused; the request is not kept then.
+async fn settled(
+    app: App,
+    lab: Lab,
+    (what, id): (Made, ThingId),
+    patience: Duration,
+) -> Result<bool> {
+    if let Err(error) = app.events.checked(&app.store, &lab, (what, id), patience).await {
+        // Enough requests of the lab wait: the answer is that the check goes on.
+        tracing::debug!(?error, "a check is not waited for");
+    }
+    let Some(request) = app.store.find_request(&lab, id).await? else { return Ok(false) };
+    let Some(refusal) = request.refusal else { return Ok(true) };
+    app.store.drop_refused(id).await?;
+    Err(refusal.into())
+}
+
+/// Refuses a request that names what is not there.
+async fn vet(app: &App, lab: &Lab, submission: &Submission) -> Result<()> {
+    if let Some(calibration) = submission.calibration() {
+        let found = app.store.calibration(lab, calibration).await;
+        found.map_err(|error| ApiError::reference("/calibration", error))?;
+    }
+    for (place, upload) in submission.uploads() {
+        let found = app.store.upload(lab, upload).await;
+        found.map_err(|error| ApiError::reference(&place, error))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use axum::http::{HeaderMap, HeaderValue};
+
+    use super::{PATIENCE, patience};
+
+    #[test]
+    fn clients_say_how_long_they_wait() {
+        let wait = |values: &[&'static str]| {
+            let mut headers = HeaderMap::new();
+            for value in values {
+                headers.append("prefer", HeaderValue::from_static(value));
+            }
+            patience(&headers)
+        };
+        assert_eq!(wait(&[]), PATIENCE);
+        assert_eq!(wait(&["respond-async"]), Duration::ZERO);
+        assert_eq!(wait(&["respond-async, wait=3"]), Duration::from_secs(3));
+        assert_eq!(wait(&["Respond-Async", "wait=\"2.5\"; x=1"]), Duration::from_secs_f64(2.5));
+        assert_eq!(wait(&["wait=100"]), Duration::from_secs(20));
+        assert_eq!(wait(&["wait=-1, handling=lenient"]), PATIENCE);
+        assert_eq!(wait(&["wait=NaN"]), PATIENCE);
+    }
+}
