@@ -94,7 +94,7 @@ where
             Err(_) => tokio::spawn(waiting),
         };
         let there = waiting.await.unwrap_or_else(|_| Err(StoreError::Interrupted.into()))?;
-        // Another request with this key was refused meanwhile, which freed the key.
+        // A request with this key was refused meanwhile: the key is free again.
         if there || matches!(made, Inserted::New(_)) {
             return Ok(made);
         }
@@ -137,8 +137,10 @@ async fn settled(
     }
     let Some(request) = app.store.find_request(&lab, id).await? else { return Ok(false) };
     let Some(refusal) = request.refusal else { return Ok(true) };
-    app.store.drop_refused(id).await?;
-    Err(refusal.into())
+    if app.store.drop_refused(id).await? {
+        return Err(refusal.into());
+    }
+    Ok(app.store.find_request(&lab, id).await?.is_some())
 }
 
 /// Refuses a request that names what is not there.

@@ -369,7 +369,7 @@ impl Store {
 }
 
 /// Bytes of the disk that are reserved and not written yet: the next ones of uploads in pieces, prepared arrays, and
-/// snapshots of jobs. Masks from captures count twice, as they are scaled at the end.
+/// snapshots of jobs. Masks from captures count twice: they are scaled at the end.
 pub async fn promised(connection: &mut SqliteConnection) -> Result<u64> {
     let bytes: f64 = sql_as!(
         "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)

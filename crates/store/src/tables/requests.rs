@@ -183,12 +183,13 @@ impl Store {
         Ok(rows.into_iter().map(mark).collect())
     }
 
-    /// Removes a request that was refused, as its client knows why.
-    pub async fn drop_refused(&self, id: impl Into<ThingId>) -> Result<()> {
-        sql!("DELETE FROM requests WHERE id = ? AND refusal IS NOT NULL", [id.into()])
-            .execute(&self.writer)
-            .await?;
-        Ok(())
+    /// Removes a request that its check refused. False if there is no such request, as of captures that passed the
+    /// check and could not be used.
+    pub async fn drop_refused(&self, id: impl Into<ThingId>) -> Result<bool> {
+        let dropped = "DELETE FROM requests WHERE id = ?1 AND refusal IS NOT NULL
+                       AND NOT EXISTS (SELECT 1 FROM tasks WHERE thing = ?1 AND kind = 'calibration')";
+        let dropped = sql!(dropped, [id.into()]).execute(&self.writer).await?;
+        Ok(dropped.rows_affected() > 0)
     }
 }
 
