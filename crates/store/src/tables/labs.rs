@@ -213,7 +213,7 @@ const BELONGINGS: [(&str, &str); 8] = [
     ("measurements", "SELECT count(*) FROM measurements WHERE lab = ?"),
     ("calibrations", "SELECT count(*) FROM calibrations WHERE lab = ?"),
     ("networks", "SELECT count(*) FROM models WHERE lab = ?"),
-    ("requests", "SELECT count(*) FROM requests WHERE lab = ?"),
+    ("checks of files", "SELECT count(*) FROM requests WHERE lab = ?"),
     ("uploads", "SELECT count(*) FROM holdings WHERE lab = ?"),
     (
         "uploads that are not complete",
