@@ -112,27 +112,18 @@ pub struct JobSpec {
     pub shape: SceneShape,
     pub snapshots: SnapshotRange,
     /// Whether the snapshots follow one another.
-    #[serde(default = "separate")]
     pub sequence: Sequence,
     /// How they are reconstructed together.
-    #[serde(default)]
     pub run: RunSpec,
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`]; none for all others.
-    #[serde(default)]
     pub model: Option<JobModel>,
     /// The schedule; without stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
     pub priority: i32,
     pub label: Option<Label>,
-    #[serde(default)]
     pub warnings: Vec<Finding>,
-}
-
-/// Jobs of before there were sequences.
-fn separate() -> Sequence {
-    Sequence::Separate
 }
 
 impl JobRequest {

@@ -108,13 +108,6 @@ impl RunSpec {
     }
 }
 
-/// Jobs of before there were runs.
-impl Default for RunSpec {
-    fn default() -> Self {
-        Self::ALONE
-    }
-}
-
 /// The most voxels of a run's tile: those of a snapshot of 30 frames at the usual size. So a sequence takes
 /// no more memory.
 const RUN_VOXELS: usize = 30 * 320 * 320;
@@ -176,7 +169,6 @@ pub struct SceneShape {
     pub width: usize,
     pub snapshots: u32,
     /// The colours of the sensor's pixels; none for a grey one.
-    #[serde(default)]
     pub mosaic: Option<Mosaic>,
 }
 

@@ -370,7 +370,7 @@ mod tests {
 
     /// What SQLite reads of `tasks` for a statement, line by line.
     async fn plan(store: &Store, text: &str) -> Vec<String> {
-        let explained = sql!(AssertSqlSafe(format!("EXPLAIN QUERY PLAN {text}")));
+        let explained = sqlx::query(AssertSqlSafe(format!("EXPLAIN QUERY PLAN {text}")));
         let rows = explained.fetch_all(&store.readers).await.unwrap();
         let lines = rows.iter().map(|row| row.get::<String, _>("detail"));
         lines.filter(|line| line.contains(" tasks")).collect()
