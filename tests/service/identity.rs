@@ -196,16 +196,13 @@ async fn many_orphans_are_rejected_and_few_are_quarantined() {
 }
 
 #[tokio::test]
-async fn a_folder_without_a_marker_is_adopted_and_its_copy_starts() {
+async fn a_first_start_that_was_interrupted_goes_on_and_a_copy_of_it_starts() {
     let mut app = TestApp::start().await;
     send(&app, 5, "a").await;
     app.stop();
-    // The state of an earlier version.
     std::fs::remove_file(app.data().join("sci-recon.json")).unwrap();
     let mut connection = app.database().await;
-    for sql in ["DROP TABLE folder", "DELETE FROM _sqlx_migrations WHERE description = 'folder'"] {
-        sqlx::query(sql).execute(&mut connection).await.unwrap();
-    }
+    sqlx::query("DELETE FROM folder").execute(&mut connection).await.unwrap();
     drop(connection);
     let output = run(&["token", "list"], app.data());
     let text = String::from_utf8_lossy(&output.stderr).into_owned();

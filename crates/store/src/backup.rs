@@ -58,7 +58,7 @@ impl Store {
         .await?;
         // 2. A database that knows of nothing else.
         let (mut database, missing) = self.settle(&frozen).await?;
-        let marker = identity::marker(&mut database, super::migrations::newest()).await?;
+        let marker = identity::marker(&mut database, self.schema).await?;
         // 3. The bytes.
         let mut backup = Backup { missing, ..Backup::default() };
         self.copy_known(&mut database, &frozen, &draft.folder, &mut backup).await?;

@@ -19,6 +19,7 @@ use uuid::Uuid;
 
 use super::dir::{self, DataDir, on_files};
 use super::error::{Result, StoreError};
+use super::migrations::BEFORE_BASELINE;
 use super::upgrade;
 use crate::columns::{sql, sql_as};
 
@@ -49,7 +50,9 @@ enum Database {
     Missing,
     /// Without tables of ours.
     Blank,
-    /// Of a version before there were identifiers.
+    /// Made before the baseline of the migrations.
+    Former,
+    /// Without an identifier, as a first start leaves it that was interrupted.
     Unnamed,
     Named {
         id: Uuid,
@@ -93,6 +96,8 @@ type Refusal = Option<(String, &'static str)>;
 
 const RESTORE: &str = "put the folder's own database back, with its -wal file, or serve a backup; for \
                        a new service name an empty folder";
+const FORMER: &str = "name an empty folder; to read this one, build the program from commit c69346f, the last that \
+                      reads it, and serve the folder with that";
 pub(super) const ACCEPT: &str = "put back what belongs together, or serve a backup; `serve --accept-database` goes \
                       on with this database, and moves files that it does not know to quarantine/";
 
@@ -124,6 +129,9 @@ fn judge(
             format!("the database sci-recon.db is empty, though there are {folder} here"),
             RESTORE,
         ),
+        (Database::Former, _) => {
+            refuse("the database was made before version 0.1.0".into(), FORMER)
+        }
         (Database::Unnamed, None) if purpose != Purpose::Use => Ok(()),
         (Database::Named { schema: found, .. }, _)
             if purpose == Purpose::Use && *found < schema =>
@@ -191,6 +199,11 @@ async fn ask(connection: &mut SqliteConnection) -> Result<Database> {
     let Some(schema) = sql_as!(schema).fetch_one(&mut *connection).await? else {
         return Ok(Database::Blank);
     };
+    let former = "SELECT count(*) FROM _sqlx_migrations WHERE version = 1 AND description = ?";
+    let former: i64 = sql_as!(former, [BEFORE_BASELINE]).fetch_one(&mut *connection).await?;
+    if former > 0 {
+        return Ok(Database::Former);
+    }
     if tables.len() < 2 {
         return Ok(Database::Unnamed);
     }
@@ -308,6 +321,8 @@ mod tests {
             (&marker, Database::Blank, true, [false; 3]),
             (&None, Database::Unnamed, true, [true, true, false]),
             (&marker, Database::Unnamed, true, [false, true, false]),
+            (&None, Database::Former, true, [false; 3]),
+            (&marker, Database::Former, true, [false; 3]),
             (&None, named(id, 0), false, [true; 3]),
             (&None, named(id, 5), true, [false, true, false]),
             (&torn, named(id, 5), true, [false, true, false]),

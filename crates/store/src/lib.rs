@@ -54,6 +54,7 @@ pub use error::StoreError;
 pub use identity::Purpose;
 pub use integrity::Audit;
 pub use locked::LockedFile;
+use migrations::Schema;
 pub use queue::{
     Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, Claimant, ClaimedTask, Completion,
     Estimate, Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES,
@@ -87,6 +88,8 @@ pub struct Store {
     going: Arc<AtomicUsize>,
     /// What was last found wrong with the database.
     damage: Arc<Mutex<Option<String>>>,
+    /// The number of the newest migration.
+    schema: i64,
     /// The lock of the server, if this is its store.
     _server: Option<Arc<LockedFile>>,
 }
@@ -100,12 +103,16 @@ impl Store {
     /// Errors: if the folder is none, is another server's, or does not belong to its database; if
     /// it can't be written; or if a newer version of this program has changed the database.
     pub async fn open(root: &Path, purpose: Purpose) -> Result<Self> {
+        Self::open_with(root, purpose, &Schema::current()).await
+    }
+
+    async fn open_with(root: &Path, purpose: Purpose, schema: &Schema) -> Result<Self> {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
-        identity::check(&dir, purpose, migrations::newest()).await?;
+        identity::check(&dir, purpose, schema.newest()).await?;
         dir.fill()?;
-        let copy = if serves { upgrade::save(&dir, migrations::newest()).await? } else { None };
+        let copy = if serves { upgrade::save(&dir, schema.newest()).await? } else { None };
         let options = SqliteConnectOptions::new()
             .filename(dir.database())
             .create_if_missing(serves)
@@ -127,8 +134,7 @@ impl Store {
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         let writer = writer.await?;
-        // Where the folder is only used, nothing is left to do: this refuses a newer database.
-        migrations::migrator().run(&writer).await.map_err(|error| match copy {
+        schema.apply(&writer).await.map_err(|error| match copy {
             Some(copy) => StoreError::Upgrade { error, copy },
             None => error.into(),
         })?;
@@ -147,6 +153,7 @@ impl Store {
             hashes,
             going: Arc::default(),
             damage: Arc::default(),
+            schema: schema.newest(),
             _server: server,
         };
         if serves {
@@ -170,8 +177,7 @@ impl Store {
     }
 
     async fn write_marker(&self) -> Result<()> {
-        let marker =
-            identity::marker(&mut *self.writer.acquire().await?, migrations::newest()).await?;
+        let marker = identity::marker(&mut *self.writer.acquire().await?, self.schema).await?;
         let (root, draft) = (self.dir.root().to_owned(), self.temporary_path());
         on_files(move || identity::write(&root, &draft, &marker)).await
     }

@@ -14,11 +14,9 @@ use super::error::{Result, StoreError};
 use crate::columns::{sql, sql_as};
 use engine::job::Timestamp;
 
-/// So many copies are kept.
-const KEPT: usize = 3;
-
 /// Copies a database that is older than this program, whose newest migration is `schema`, to
-/// `before-updates/`, and says where. Nothing is done if it is up to date, or if there is none.
+/// `before-updates/`, in place of an earlier copy, and says where. Nothing is done if it is up to date, or if there
+/// is none.
 /// Errors: the database; the disk, which may be full.
 pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> {
     let database = dir.database();
@@ -51,10 +49,8 @@ pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> 
         let file = File::open(&synced).map_err(StoreError::io("open", &synced))?;
         file.sync_all().map_err(StoreError::io("write to the disk", &synced))?;
         dir::sync_dir(&folder)?;
-        let mut copies = copies(&folder)?;
-        copies.sort();
-        let old = copies.len().saturating_sub(KEPT);
-        copies[..old].iter().try_for_each(|path| dir::remove(path))
+        let others = copies(&folder)?.into_iter().filter(|path| *path != synced);
+        others.into_iter().try_for_each(|path| dir::remove(&path))
     })
     .await?;
     tracing::info!(from = found, to = schema, copy = %copy.display(), "the database is brought up to date");

@@ -30,10 +30,8 @@ pub struct Key {
     pub program_version: String,
     pub clip: String,
     /// Number of snapshots of the clip.
-    #[serde(default = "one")]
     pub snapshots: usize,
     /// Mode of joint reconstruction.
-    #[serde(default)]
     pub run: RunSpec,
     pub algorithm: Algorithm,
     pub scale: usize,
@@ -68,13 +66,7 @@ pub struct Row {
     pub white: f32,
     pub stop_reason: String,
     /// True if the pilot joined snapshots.
-    #[serde(default)]
     pub joints: Vec<JointRecord>,
-}
-
-/// Default for rows from before sequences.
-fn one() -> usize {
-    1
 }
 
 /// A ring around the centre.

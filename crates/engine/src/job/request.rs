@@ -111,27 +111,18 @@ pub struct JobSpec {
     pub shape: SceneShape,
     pub snapshots: SnapshotRange,
     /// Temporal relation of the snapshots.
-    #[serde(default = "separate")]
     pub sequence: Sequence,
     /// How contiguous snapshots are reconstructed together.
-    #[serde(default)]
     pub run: RunSpec,
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`]; `None` for other algorithms.
-    #[serde(default)]
     pub model: Option<JobModel>,
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
     pub priority: i32,
     pub label: Option<Label>,
-    #[serde(default)]
     pub warnings: Vec<Finding>,
-}
-
-/// The default for stored jobs that do not have the field.
-fn separate() -> Sequence {
-    Sequence::Separate
 }
 
 impl JobRequest {

@@ -111,13 +111,6 @@ impl RunSpec {
     }
 }
 
-/// The default for stored jobs that do not have the field.
-impl Default for RunSpec {
-    fn default() -> Self {
-        Self::ALONE
-    }
-}
-
 /// Largest number of voxels in a tile of a run: that of a snapshot of 30 frames with the default size. Sequences
 /// therefore take no more memory than large snapshots.
 const RUN_VOXELS: usize = 30 * 320 * 320;
@@ -189,7 +182,6 @@ pub struct SceneShape {
     pub width: usize,
     pub snapshots: u32,
     /// The mosaic of a colour sensor; `None` for a grey sensor.
-    #[serde(default)]
     pub mosaic: Option<Mosaic>,
 }
 

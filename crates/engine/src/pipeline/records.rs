@@ -168,19 +168,13 @@ pub struct TileTaskRecord {
     #[serde(flatten)]
     pub tile: TileRecord,
     /// The snapshots that have frames here, by their place in the run; the others are left to another run.
-    #[serde(default = "the_only_one")]
     pub solved: Vec<usize>,
-    /// None where nothing can be told, and of before there were any.
+    /// None where nothing can be estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assessment: Option<TileAssessment>,
     /// From reading its window to its frames.
     #[serde(flatten)]
     pub cost: CostRecord,
-}
-
-/// Of before there were runs.
-fn the_only_one() -> Vec<usize> {
-    vec![0]
 }
 
 /// What computing took, and on what.

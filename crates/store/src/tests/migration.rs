@@ -1,148 +1,23 @@
-//! Data of the version before.
+//! A database is copied before a migration, and one of another version is refused.
+
+use std::path::{Path, PathBuf};
 
 use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{ConnectOptions, Connection};
+use sqlx::{ConnectOptions, Connection, SqliteConnection};
 use strum::VariantArray;
+use tempfile::TempDir;
 
-use crate::{Asked, Filter, Purpose, Store, Work};
-use engine::job::{Lab, TaskState, WorkerId};
+use crate::migrations::Schema;
+use crate::{Purpose, Store, StoreError};
+use engine::job::TaskState;
 
-/// The last migration before calibrations became tasks.
-const BEFORE: i64 = 70;
-
-/// One calibration in each state (the last digit tells which), and a job with one task of two attempts.
-const ROWS: &str = "
-    INSERT INTO blobs (sha256, size, origin, created_at, touched_at) VALUES
-        (printf('%064d', 1), 1, 'upload', 1, 1), (printf('%064d', 2), 1, 'prepared', 1, 1);
-    INSERT INTO calibrations (id, lab, name, masks, prepared, format, sample, frames, height, width,
-        full_scale, mask_mean, dead_pixels, clipped_negatives, created_at)
-    VALUES ('019a0000-0000-7000-8000-000000000004', 'local', NULL, printf('%064d', 1),
-        printf('%064d', 2), 'npy', 'uint8', 2, 4, 4, 1, 0.5, 0, 0, 50);
-    INSERT INTO calibration_tasks (calibration, lab, name, captures, state, attempt, worker,
-        lease_until, fraction, failures, losses, ready_at, error, created_at)
-    VALUES
-        ('019a0000-0000-7000-8000-000000000001', 'local', 'one', '{captures}', 'ready', 1, NULL, NULL, 0,
-            1, 0, 7, NULL, 10),
-        ('019a0000-0000-7000-8000-000000000002', 'local', 'two', '{captures}', 'running', 2, 'w', 1, 0.5,
-            0, 1, 0, NULL, 20),
-        ('019a0000-0000-7000-8000-000000000003', 'local', 'three', '{captures}', 'failed', 3, NULL, NULL,
-            0, 3, 0, 0, 'no light', 30),
-        ('019a0000-0000-7000-8000-000000000004', 'local', NULL, NULL, 'done', 1, NULL, NULL, 1, 0, 0, 0,
-            NULL, 40),
-        ('019a0000-0000-7000-8000-000000000005', 'other', NULL, '{captures}', 'ready', 0, NULL, NULL, 0,
-            0, 0, 0, NULL, 50);
-    INSERT INTO calibration_captures (calibration, sha256)
-        VALUES ('019a0000-0000-7000-8000-000000000001', printf('%064d', 1));
-    INSERT INTO measurements (id, calibration, data, prepared, format, sample, snapshots, height, width,
-        full_scale, created_at)
-    VALUES ('m', '019a0000-0000-7000-8000-000000000004', printf('%064d', 1), printf('%064d', 2), 'npy',
-        'uint8', 1, 4, 4, 1, 60);
-    INSERT INTO jobs (id, calibration, measurement, spec, state, priority, request, created_at)
-        VALUES ('j', '019a0000-0000-7000-8000-000000000004', 'm', '{}', 'cancelled', 0, 'r', 70);
-    INSERT INTO tasks (id, job, ordinal, kind, snapshot, tile, state, priority, cost, attempt, history)
-        VALUES ('t', 'j', 0, 'tile', 0, 0, 'cancelled', 5, 1.5, 2, '[[1,2,3,null]]');
-    INSERT INTO attempts (task, attempt, worker, started_at, ended_at, outcome, reason)
-        VALUES ('t', 1, 'w', 80, 81, 'lost', 'silence'), ('t', 2, 'w', 82, 83, 'cancelled', NULL);
-";
-
-fn id(digit: u32) -> String {
-    format!("019a0000-0000-7000-8000-00000000000{digit}")
-}
-
-#[tokio::test]
-async fn calibrations_become_tasks_and_nothing_else_changes() {
-    let folder = tempfile::tempdir().unwrap();
-    let options = SqliteConnectOptions::new()
-        .filename(folder.path().join("sci-recon.db"))
-        .create_if_missing(true)
-        .foreign_keys(true);
-    let mut connection = options.connect().await.unwrap();
-    crate::migrations::migrator().run_to(BEFORE, &mut connection).await.unwrap();
-    let upload = format!("{:064}", 1);
-    let captures =
-        format!(r#"{{"masks": [["{upload}"]], "white": ["{upload}"], "black": ["{upload}"]}}"#);
-    let rows = sqlx::AssertSqlSafe(ROWS.replace("{captures}", &captures));
-    sqlx::raw_sql(rows).execute(&mut connection).await.unwrap();
-    connection.close().await.unwrap();
-
-    let store =
-        Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
-    let broken = sqlx::query("PRAGMA foreign_key_check").fetch_all(&store.readers).await.unwrap();
-    assert!(broken.is_empty());
-    let states: Vec<(String, String, u32, u32, u32)> = sqlx::query_as(
-        "SELECT thing, state, attempt, failures, losses FROM tasks WHERE kind = 'calibration'
-         ORDER BY thing",
-    )
-    .fetch_all(&store.readers)
-    .await
-    .unwrap();
-    let expected = [
-        (id(1), "ready".to_owned(), 1, 1, 0),
-        (id(2), "running".into(), 2, 0, 1),
-        (id(3), "failed".into(), 3, 3, 0),
-        (id(4), "done".into(), 1, 0, 0),
-        (id(5), "ready".into(), 0, 0, 0),
-    ];
-    assert_eq!(states, expected);
-
-    // As users see them.
-    let (local, other) = (Lab::local(), "other".parse::<Lab>().unwrap());
-    let all = store.calibrations(&local, Filter::default(), 10).await.unwrap().items;
-    assert!(matches!(&all[0], Asked::Ready(calibration) if calibration.id.to_string() == id(4)));
-    let pending = all.iter().filter_map(|asked| match asked {
-        Asked::Ready(_) => None,
-        Asked::Pending(request) => Some(request),
-    });
-    let seen: Vec<_> = pending
-        .map(|request| {
-            let name = request.name.as_ref().unwrap().as_str();
-            let error = request.refusal.as_ref().map(|refusal| refusal.detail.as_str());
-            (request.id.to_string(), name, request.created_at.0, error, request.fraction)
-        })
-        .collect();
-    let three = (id(3), "three", 30, Some("no light"), 0.0);
-    assert_eq!(seen, [three, (id(2), "two", 20, None, 0.5), (id(1), "one", 10, None, 0.0)]);
-    assert_eq!(store.calibrations(&other, Filter::default(), 10).await.unwrap().items.len(), 1);
-    assert!(store.calibration(&local, id(4).parse().unwrap()).await.is_ok());
-
-    // As workers see them: what a silent one holds comes back, too.
-    let mut claimed = Vec::new();
-    let lease = std::time::Duration::from_secs(60);
-    while let Some(task) = store.claim(WorkerId::new(), lease).await.unwrap() {
-        let Work::Calibration(calibration) = task.work else { panic!() };
-        assert!(calibration.captures.is_some());
-        claimed.push((calibration.calibration.to_string(), task.lease.attempt));
-    }
-    assert_eq!(claimed, [(id(1), 2), (id(2), 3), (id(5), 1)]);
-
-    // The tasks of jobs, their attempts, and captures that are still needed are as they were.
-    let tile: (String, u32, i32, String) =
-        sqlx::query_as("SELECT state, attempt, priority, history FROM tasks WHERE id = 't'")
-            .fetch_one(&store.readers)
-            .await
-            .unwrap();
-    assert_eq!(tile, ("cancelled".into(), 2, 5, "[[1,2,3,null]]".into()));
-    let attempts: Vec<(u32, i64, String)> = sqlx::query_as(
-        "SELECT attempt, ended_at, outcome FROM attempts WHERE task = 't' ORDER BY attempt",
-    )
-    .fetch_all(&store.readers)
-    .await
-    .unwrap();
-    assert_eq!(attempts, [(1, 81, "lost".into()), (2, 83, "cancelled".into())]);
-    store.delete_calibration(&local, id(1).parse().unwrap()).await.unwrap();
-    let left: i64 = sqlx::query_scalar("SELECT count(*) FROM request_files")
-        .fetch_one(&store.readers)
-        .await
-        .unwrap();
-    assert_eq!(left, 0);
-}
+const SERVE: Purpose = Purpose::Serve { accept_database: false };
+const ACCEPT: Purpose = Purpose::Serve { accept_database: true };
 
 /// The checks of the tables know the states that the program knows.
 #[tokio::test]
 async fn the_states_of_tasks_are_those_of_the_table() {
-    let folder = tempfile::tempdir().unwrap();
-    let store =
-        Store::open(folder.path(), Purpose::Serve { accept_database: false }).await.unwrap();
+    let (_folder, store) = served().await;
     let names =
         TaskState::VARIANTS.iter().map(|state| format!("'{state}'")).collect::<Vec<_>>().join(", ");
     let table: String = sqlx::query_scalar("SELECT sql FROM sqlite_master WHERE name = 'tasks'")
@@ -152,81 +27,110 @@ async fn the_states_of_tasks_are_those_of_the_table() {
     assert!(table.contains(&names), "{table}");
 }
 
-/// A folder with the database of the version before, and a connection to it.
-async fn old_folder() -> (tempfile::TempDir, sqlx::SqliteConnection) {
+async fn served() -> (TempDir, Store) {
     let folder = tempfile::tempdir().unwrap();
-    let options = SqliteConnectOptions::new()
-        .filename(folder.path().join("sci-recon.db"))
-        .create_if_missing(true)
-        .foreign_keys(true);
-    let mut connection = options.connect().await.unwrap();
-    crate::migrations::migrator().run_to(BEFORE, &mut connection).await.unwrap();
-    (folder, connection)
+    let store = Store::open(folder.path(), SERVE).await.unwrap();
+    (folder, store)
 }
 
-fn saved(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
+/// A folder with a database of this version.
+async fn folder() -> TempDir {
+    let (folder, store) = served().await;
+    store.close().await;
+    folder
+}
+
+/// Opens a folder as the version with one more migration does.
+async fn open_next(folder: &Path, text: &'static str) -> Result<Store, StoreError> {
+    Store::open_with(folder, SERVE, &Schema::next(text)).await
+}
+
+async fn connect(database: &Path) -> SqliteConnection {
+    SqliteConnectOptions::new().filename(database).connect().await.unwrap()
+}
+
+fn saved(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder.join("before-updates"));
     let paths = entries.into_iter().flatten().map(|entry| entry.unwrap().path());
     paths.filter(|path| path.extension().is_some_and(|extension| extension == "db")).collect()
 }
 
-const SERVE: Purpose = Purpose::Serve { accept_database: false };
-
 #[tokio::test]
 async fn the_database_is_saved_before_it_is_brought_up_to_date() {
-    let (folder, connection) = old_folder().await;
-    connection.close().await.unwrap();
-    Store::open(folder.path(), SERVE).await.unwrap().close().await;
+    let folder = folder().await;
+    assert!(saved(folder.path()).is_empty(), "nothing is saved that is up to date");
+    let add = "ALTER TABLE jobs ADD COLUMN mood TEXT";
+    open_next(folder.path(), add).await.unwrap().close().await;
     let copies = saved(folder.path());
     assert_eq!(copies.len(), 1);
-    assert!(copies[0].to_str().unwrap().ends_with(&format!("-schema-{BEFORE:04}.db")));
-    // Nothing is saved that is up to date.
-    Store::open(folder.path(), SERVE).await.unwrap().close().await;
+    let newest = Schema::current().newest();
+    assert!(copies[0].to_str().unwrap().ends_with(&format!("-schema-{newest:04}.db")));
+    open_next(folder.path(), add).await.unwrap().close().await;
     assert_eq!(saved(folder.path()), copies);
-    // Back to it, for one start that takes the database for right.
-    let database = folder.path().join("sci-recon.db");
-    std::fs::copy(&copies[0], &database).unwrap();
+    // A rollback: one start that takes the database for right.
+    let refused = Store::open(folder.path(), SERVE).await.unwrap_err().to_string();
+    assert!(refused.contains(copies[0].to_str().unwrap()), "{refused}");
+    std::fs::copy(&copies[0], folder.path().join("sci-recon.db")).unwrap();
     assert!(Store::open(folder.path(), SERVE).await.is_err(), "it is older than its folder");
-    let accept = Purpose::Serve { accept_database: true };
-    Store::open(folder.path(), accept).await.unwrap().close().await;
+    Store::open(folder.path(), ACCEPT).await.unwrap().close().await;
+    // The next update replaces the copy.
+    open_next(folder.path(), add).await.unwrap().close().await;
+    assert_eq!(saved(folder.path()).len(), 1);
+    assert_ne!(saved(folder.path()), copies);
 }
 
 #[tokio::test]
-async fn an_update_that_fails_names_the_copy() {
-    let (folder, mut connection) = old_folder().await;
-    // In the way of a later migration.
-    sqlx::query("CREATE TABLE labs (lab TEXT)").execute(&mut connection).await.unwrap();
-    connection.close().await.unwrap();
-    let error = Store::open(folder.path(), SERVE).await.unwrap_err().to_string();
+async fn an_update_that_fails_names_the_copy_and_changes_nothing() {
+    let folder = folder().await;
+    let text = "DELETE FROM folder; CREATE TABLE labs (lab TEXT)";
+    let error = open_next(folder.path(), text).await.unwrap_err().to_string();
     let copy = saved(folder.path()).pop().unwrap();
     assert!(error.contains("can't be brought up to date"), "{error}");
     assert!(error.contains(copy.to_str().unwrap()), "{error}");
-    let options = SqliteConnectOptions::new().filename(&copy).read_only(true);
-    let mut connection = options.connect().await.unwrap();
-    let newest = "SELECT max(version) FROM _sqlx_migrations";
-    let newest: i64 = sqlx::query_scalar(newest).fetch_one(&mut connection).await.unwrap();
-    assert_eq!(newest, BEFORE);
+    for database in [copy, folder.path().join("sci-recon.db")] {
+        let newest = "SELECT max(version) FROM _sqlx_migrations, folder";
+        let mut connection = connect(&database).await;
+        let newest: i64 = sqlx::query_scalar(newest).fetch_one(&mut connection).await.unwrap();
+        assert_eq!(newest, Schema::current().newest());
+    }
+    Store::open(folder.path(), SERVE).await.unwrap();
 }
 
 #[tokio::test]
 async fn a_newer_database_is_refused_in_words() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = Store::open(folder.path(), SERVE).await.unwrap();
-    let newer =
-        "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-                 VALUES (9999, 'later', 1, x'00', 0)";
-    sqlx::query(newer).execute(&store.writer).await.unwrap();
-    store.close().await;
-    drop(store);
-    let kept = folder.path().join("before-updates");
-    std::fs::create_dir(&kept).unwrap();
-    for name in ["1-schema-0070.db", "2-schema-9998.db"] {
-        std::fs::write(kept.join(name), "").unwrap();
-    }
-    for purpose in [SERVE, Purpose::Serve { accept_database: true }, Purpose::Use] {
+    let folder = folder().await;
+    let add = "ALTER TABLE jobs ADD COLUMN mood TEXT";
+    open_next(folder.path(), add).await.unwrap().close().await;
+    let (newest, kept) = (Schema::current().newest(), saved(folder.path()).pop().unwrap());
+    std::fs::write(folder.path().join("before-updates/2-schema-9998.db"), "").unwrap();
+    for purpose in [SERVE, ACCEPT, Purpose::Use] {
         let error = Store::open(folder.path(), purpose).await.unwrap_err().to_string();
-        assert!(error.contains("schema 9999") && error.contains("Nothing was changed"), "{error}");
+        assert!(error.contains(&format!("schema {}", newest + 1)), "{error}");
+        assert!(error.contains("Nothing was changed"), "{error}");
         assert!(error.contains(env!("CARGO_PKG_VERSION")), "{error}");
-        assert!(error.contains("1-schema-0070.db") && !error.contains("9998"), "{error}");
+        assert!(error.contains(kept.to_str().unwrap()) && !error.contains("9998"), "{error}");
     }
+}
+
+#[tokio::test]
+async fn a_database_from_before_the_baseline_is_refused_unchanged() {
+    let folder = tempfile::tempdir().unwrap();
+    let database = folder.path().join("sci-recon.db");
+    let options = SqliteConnectOptions::new().filename(&database).create_if_missing(true);
+    let mut connection = options.connect().await.unwrap();
+    for text in [
+        "CREATE TABLE _sqlx_migrations (version BIGINT PRIMARY KEY, description TEXT NOT NULL)",
+        "INSERT INTO _sqlx_migrations VALUES (1, 'init'), (20, 'lists')",
+    ] {
+        sqlx::query(text).execute(&mut connection).await.unwrap();
+    }
+    connection.close().await.unwrap();
+    let before = std::fs::read(&database).unwrap();
+    for purpose in [SERVE, ACCEPT, Purpose::Use] {
+        let error = Store::open(folder.path(), purpose).await.unwrap_err().to_string();
+        assert!(error.contains("before version 0.1.0") && error.contains("c69346f"), "{error}");
+        assert!(error.contains("Nothing was changed"), "{error}");
+    }
+    assert_eq!(std::fs::read(&database).unwrap(), before);
+    assert!(saved(folder.path()).is_empty() && !folder.path().join("blobs").exists());
 }

@@ -1,0 +1,428 @@
+-- The schema of version 0.1.0.
+
+CREATE TABLE folder (
+    -- Ties the database to its folder; see crates/store/src/identity.rs.
+    one        INTEGER PRIMARY KEY CHECK (one = 1),
+    id         TEXT NOT NULL,
+    generation INTEGER NOT NULL -- only rises; 0 until the marker has been written
+) STRICT;
+
+CREATE TABLE clock (
+    -- Times that the service has seen. After the clock was wrong for a while, a young file must not look old.
+    run  INTEGER PRIMARY KEY, -- milliseconds for which the service has run
+    wall INTEGER NOT NULL     -- the time of day at that moment
+) STRICT;
+
+CREATE TABLE labs (
+    lab       TEXT PRIMARY KEY,
+    share     REAL NOT NULL DEFAULT 1 CHECK (share > 0), -- weight of the lab beside the weights of others
+    -- Tags of start-time fair queueing, in planned CPU-seconds divided by the share: of the task that was
+    -- handed out last, its start and its end.
+    start     REAL NOT NULL DEFAULT 0,
+    finish    REAL NOT NULL DEFAULT 0,
+    -- Limits; NULL for no limit.
+    max_bytes INTEGER CHECK (max_bytes >= 0),
+    max_jobs  INTEGER CHECK (max_jobs >= 0)
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE lab_totals (
+    -- Counters that only grow, although jobs are deleted.
+    lab          TEXT PRIMARY KEY,
+    jobs_begun   INTEGER NOT NULL DEFAULT 0,
+    wait_seconds REAL NOT NULL DEFAULT 0, -- of those jobs, from submission to the first task's start
+    cpu_seconds  REAL NOT NULL DEFAULT 0  -- of tasks that are done
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE tokens (
+    id         TEXT PRIMARY KEY,
+    hash       TEXT NOT NULL UNIQUE CHECK (length(hash) = 64), -- SHA-256; the secret is not stored
+    lab        TEXT NOT NULL,
+    role       TEXT NOT NULL CHECK (role IN ('read', 'submit', 'admin')),
+    all_labs   INTEGER NOT NULL DEFAULT 0 CHECK (all_labs IN (0, 1)), -- 1: valid for every lab
+    note       TEXT, -- the person or machine that has it
+    max_bytes  INTEGER CHECK (max_bytes >= 0), -- limit of its uploads and prepared arrays; NULL for none
+    created_at INTEGER NOT NULL,
+    expires_at INTEGER, -- NULL: never
+    used_at    INTEGER, -- last use, to within a few minutes; NULL: never
+    revoked_at INTEGER
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE sessions (
+    -- A browser presents a session instead of a token. It ends with its token.
+    hash       TEXT PRIMARY KEY CHECK (length(hash) = 64), -- SHA-256; the secret is not stored
+    token      TEXT NOT NULL REFERENCES tokens (id) ON DELETE CASCADE,
+    created_at INTEGER NOT NULL,
+    expires_at INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX sessions_token ON sessions (token, created_at);
+
+CREATE TABLE blobs (
+    sha256     TEXT PRIMARY KEY CHECK (length(sha256) = 64),
+    size       INTEGER NOT NULL CHECK (size > 0),
+    -- upload: sent by a user; prepared: derived from an upload; tile: the result of a task.
+    origin     TEXT NOT NULL CHECK (origin IN ('upload', 'prepared', 'tile')),
+    created_at INTEGER NOT NULL,
+    touched_at INTEGER NOT NULL, -- last upload or production; unused files are kept for a time after it
+    damaged_at INTEGER -- when the file was found missing or changed; NULL if it is believed sound
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX blobs_damaged ON blobs (sha256) WHERE damaged_at IS NOT NULL;
+
+CREATE TABLE holdings (
+    -- Uploads of each lab. Labs that send the same bytes share one file.
+    lab        TEXT NOT NULL,
+    sha256     TEXT NOT NULL REFERENCES blobs (sha256),
+    token      TEXT REFERENCES tokens (id), -- its limit applies
+    created_at INTEGER NOT NULL,
+    touched_at INTEGER NOT NULL, -- last upload
+    PRIMARY KEY (lab, sha256)
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX holdings_sha256 ON holdings (sha256);
+CREATE INDEX holdings_token ON holdings (token) WHERE token IS NOT NULL;
+
+CREATE TABLE partials (
+    -- Resumable uploads.
+    id         TEXT PRIMARY KEY,
+    lab        TEXT NOT NULL,
+    token      TEXT REFERENCES tokens (id),
+    length     INTEGER NOT NULL CHECK (length > 0), -- bytes of the whole file
+    received   INTEGER NOT NULL DEFAULT 0 CHECK (received BETWEEN 0 AND length),
+    metadata   TEXT NOT NULL, -- as the client sent it
+    expected   TEXT, -- SHA-256 that the client states for the whole file
+    result     TEXT, -- SHA-256 of the stored file, once it is complete
+    expires_at INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX partials_expiry ON partials (expires_at);
+
+CREATE TABLE scrub (
+    -- Position of the slow verification of all stored files.
+    one        INTEGER PRIMARY KEY CHECK (one = 1),
+    started_at INTEGER NOT NULL,
+    place      TEXT -- the file verified last, as JSON; NULL before the first and after the last
+) STRICT;
+
+CREATE TABLE request_keys (
+    -- Idempotency keys: a request that is repeated with its key creates nothing new.
+    lab     TEXT NOT NULL,
+    what    TEXT NOT NULL CHECK (what IN ('calibration', 'measurement', 'model', 'upload')),
+    key     TEXT NOT NULL,
+    request TEXT NOT NULL, -- hash of the request, which distinguishes a repetition from another request
+    id      TEXT NOT NULL, -- identifier of the created row
+    PRIMARY KEY (lab, what, key)
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX request_keys_id ON request_keys (id);
+
+CREATE TABLE calibrations (
+    -- Calibrations with masks.
+    id                TEXT PRIMARY KEY,
+    lab               TEXT NOT NULL,
+    token             TEXT REFERENCES tokens (id), -- its limit applies to the prepared array
+    name              TEXT,
+    masks             TEXT NOT NULL REFERENCES blobs (sha256),
+    prepared          TEXT NOT NULL REFERENCES blobs (sha256),
+    format            TEXT NOT NULL,
+    sample            TEXT NOT NULL,
+    axes              TEXT, -- order of the axes of an uploaded array; NULL for pictures
+    frames            INTEGER NOT NULL CHECK (frames > 0),
+    height            INTEGER NOT NULL CHECK (height > 0),
+    width             INTEGER NOT NULL CHECK (width > 0),
+    full_scale        REAL NOT NULL CHECK (full_scale > 0),
+    mask_mean         REAL NOT NULL,
+    dead_pixels       INTEGER NOT NULL,
+    clipped_negatives INTEGER NOT NULL,
+    -- The colours of a cell of 2x2 pixels, row by row; NULL for a grey sensor.
+    mosaic            TEXT CHECK (mosaic IN ('rggb', 'bggr', 'grbg', 'gbrg')),
+    created_at        INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX calibrations_lab ON calibrations (lab, id);
+CREATE INDEX calibrations_masks ON calibrations (masks);
+CREATE INDEX calibrations_prepared ON calibrations (prepared);
+
+CREATE TABLE calibration_reports (
+    calibration TEXT PRIMARY KEY REFERENCES calibrations (id) ON DELETE CASCADE,
+    report      TEXT NOT NULL -- as JSON
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE calibration_maps (
+    -- Pictures of a report. A table with row numbers, since its rows are large.
+    calibration TEXT NOT NULL REFERENCES calibrations (id) ON DELETE CASCADE,
+    name        TEXT NOT NULL,
+    png         BLOB NOT NULL,
+    PRIMARY KEY (calibration, name)
+) STRICT;
+
+CREATE TABLE measurements (
+    id          TEXT PRIMARY KEY,
+    lab         TEXT NOT NULL,
+    token       TEXT REFERENCES tokens (id), -- its limit applies to the prepared array
+    name        TEXT,
+    calibration TEXT NOT NULL REFERENCES calibrations (id),
+    data        TEXT NOT NULL REFERENCES blobs (sha256),
+    prepared    TEXT NOT NULL REFERENCES blobs (sha256),
+    format      TEXT NOT NULL,
+    sample      TEXT NOT NULL,
+    axes        TEXT, -- order of the axes of an uploaded array; NULL for pictures
+    snapshots   INTEGER NOT NULL CHECK (snapshots > 0),
+    height      INTEGER NOT NULL,
+    width       INTEGER NOT NULL,
+    full_scale  REAL NOT NULL CHECK (full_scale > 0),
+    camera_fps  REAL CHECK (camera_fps > 0),
+    exposure_s  REAL CHECK (exposure_s > 0),
+    -- contiguous: the snapshots follow one another without a gap.
+    sequence    TEXT NOT NULL CHECK (sequence IN ('contiguous', 'separate')),
+    dark        TEXT, -- uploads that were subtracted, as JSON
+    warnings    TEXT, -- findings of the check, as JSON
+    created_at  INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX measurements_lab ON measurements (lab, id);
+CREATE INDEX measurements_calibration ON measurements (calibration);
+CREATE INDEX measurements_data ON measurements (data);
+CREATE INDEX measurements_prepared ON measurements (prepared);
+
+CREATE TABLE models (
+    id          TEXT PRIMARY KEY,
+    lab         TEXT NOT NULL,
+    name        TEXT,
+    calibration TEXT NOT NULL REFERENCES calibrations (id),
+    file        TEXT NOT NULL REFERENCES blobs (sha256), -- the ONNX file
+    facts       TEXT NOT NULL, -- results of its check, as JSON
+    created_at  INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX models_lab ON models (lab, id);
+CREATE INDEX models_calibration ON models (calibration);
+CREATE INDEX models_file ON models (file);
+
+CREATE TABLE jobs (
+    id              TEXT PRIMARY KEY,
+    lab             TEXT NOT NULL,
+    calibration     TEXT NOT NULL REFERENCES calibrations (id),
+    measurement     TEXT NOT NULL REFERENCES measurements (id),
+    model           TEXT REFERENCES models (id),
+    label           TEXT,
+    spec            TEXT NOT NULL, -- JobSpec as JSON
+    state           TEXT NOT NULL CHECK (state IN
+                        ('queued', 'running', 'succeeded', 'failed', 'cancelling', 'cancelled')),
+    priority        INTEGER NOT NULL,
+    error           TEXT, -- the reason of a failure
+    idempotency_key TEXT UNIQUE,
+    request         TEXT NOT NULL, -- hash of the request, which distinguishes a repetition
+    disk_bytes      INTEGER NOT NULL, -- reserved for its results until it ends
+    result_bytes    INTEGER NOT NULL DEFAULT 0, -- sum over its result files
+    assessment      TEXT, -- expected quality, as JSON; NULL until it is known
+    created_at      INTEGER NOT NULL,
+    started_at      INTEGER, -- first claim of a task
+    finished_at     INTEGER
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX jobs_lab ON jobs (lab, id);
+CREATE INDEX jobs_state ON jobs (state);
+CREATE INDEX jobs_unfinished ON jobs (id) WHERE finished_at IS NULL;
+CREATE INDEX jobs_figures ON jobs (lab, state, result_bytes);
+CREATE INDEX jobs_calibration ON jobs (calibration);
+CREATE INDEX jobs_measurement ON jobs (measurement);
+CREATE INDEX jobs_model ON jobs (model);
+
+CREATE TABLE job_sums (
+    -- Sums over the tasks of a job, written whenever a task ends.
+    job            TEXT PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE,
+    -- Planned CPU-seconds: of all tasks, of the remaining ones, and of the longest remaining one.
+    cost           REAL NOT NULL,
+    tiles_left     REAL NOT NULL,
+    tiles_longest  REAL NOT NULL,
+    others_left    REAL NOT NULL,
+    others_longest REAL NOT NULL,
+    tiles_total    INTEGER NOT NULL,
+    tiles_done     INTEGER NOT NULL,
+    tile_seconds   REAL NOT NULL, -- duration of the tiles that are done
+    tile_cost      REAL NOT NULL, -- planned CPU-seconds of the tiles that are done
+    prepared       INTEGER NOT NULL,
+    previews_done  INTEGER NOT NULL,
+    snapshots_done INTEGER NOT NULL,
+    iterations     INTEGER NOT NULL, -- of tasks that are done
+    passes         INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE attempts (
+    task       TEXT NOT NULL REFERENCES tasks (id) ON DELETE CASCADE,
+    attempt    INTEGER NOT NULL,
+    worker     TEXT NOT NULL,
+    started_at INTEGER NOT NULL,
+    ended_at   INTEGER,
+    -- failed: the worker reported an error; crashed: the worker died of a fault; lost: the lease expired or
+    -- the worker was killed; released: the task was given back unharmed.
+    outcome    TEXT CHECK (outcome IN
+                   ('done', 'failed', 'crashed', 'lost', 'cancelled', 'released')),
+    reason     TEXT,
+    PRIMARY KEY (task, attempt)
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE remote_tasks (
+    -- Tiles that are out with workers on other machines. Their leases don't expire: the hub watches the
+    -- workers.
+    task     TEXT PRIMARY KEY REFERENCES tasks (id) ON DELETE CASCADE,
+    pool     TEXT NOT NULL, -- the workers that may have it
+    attempt  INTEGER NOT NULL, -- that of the message; `tasks` counts on when the message is redelivered
+    -- Where the message is; NULL until it is published.
+    stream   TEXT, -- the stream, by the time of its creation
+    seq      INTEGER, -- its number in the stream
+    delivery INTEGER NOT NULL DEFAULT 0 -- the last delivery that a worker has begun with; 0 for none
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX remote_tasks_pool ON remote_tasks (pool);
+
+CREATE TABLE result_files (
+    job        TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+    snapshot   INTEGER NOT NULL, -- -1 for files of the whole job
+    name       TEXT NOT NULL, -- path below the snapshot's folder, such as frames/frame_0001.exr
+    size       INTEGER NOT NULL,
+    sha256     TEXT NOT NULL,
+    damaged_at INTEGER, -- when the file was found missing or changed; NULL if it is believed sound
+    PRIMARY KEY (job, snapshot, name)
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX result_files_damaged ON result_files (job, snapshot) WHERE damaged_at IS NOT NULL;
+
+CREATE TABLE workers (
+    id         TEXT PRIMARY KEY,
+    pid        INTEGER NOT NULL,
+    version    TEXT NOT NULL,
+    -- Of workers on other machines:
+    host       TEXT,
+    pool       TEXT,
+    device     TEXT,
+    started_at INTEGER NOT NULL,
+    seen_at    INTEGER NOT NULL
+, light INTEGER NOT NULL DEFAULT 0) STRICT, WITHOUT ROWID;
+
+CREATE TABLE totals (
+    -- Counters by kind of task that only grow, although jobs are deleted.
+    kind           TEXT PRIMARY KEY,
+    tasks          INTEGER NOT NULL,
+    seconds        REAL NOT NULL,
+    iterations     INTEGER NOT NULL,
+    passes         INTEGER NOT NULL,
+    -- Fading sums over the last tasks: duration, and planned CPU-seconds that were really used.
+    recent_seconds REAL NOT NULL DEFAULT 0,
+    recent_cost    REAL NOT NULL DEFAULT 0
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE requests (
+    id             TEXT PRIMARY KEY, -- of the calibration, measurement or model
+    what           TEXT NOT NULL,    -- 'calibration', 'measurement' or 'model'
+    lab            TEXT NOT NULL,
+    token          TEXT REFERENCES tokens (id),
+    name           TEXT,
+    calibration    TEXT,             -- that of a measurement or a model
+    request        TEXT NOT NULL,    -- as JSON
+    limits         TEXT NOT NULL,    -- of its check, as JSON
+    prepared_bytes INTEGER NOT NULL DEFAULT 0, -- promised on the disk for what is being made
+    origin         TEXT,             -- identifier of the HTTP request
+    refusal        TEXT,             -- why nothing is made, as JSON
+    created_at     INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX requests_lab ON requests (lab, what, id);
+CREATE INDEX requests_calibration ON requests (calibration, what) WHERE calibration IS NOT NULL;
+
+CREATE TABLE request_files (
+    id     TEXT NOT NULL REFERENCES requests (id) ON DELETE CASCADE,
+    sha256 TEXT NOT NULL REFERENCES blobs (sha256),
+    PRIMARY KEY (id, sha256)
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX request_files_sha256 ON request_files (sha256);
+
+CREATE TABLE tasks (
+    id          TEXT PRIMARY KEY,
+    -- It is a part of this job, or makes something for this calibration, measurement, model or job:
+    job         TEXT REFERENCES jobs (id) ON DELETE CASCADE,
+    thing       TEXT,
+    lab         TEXT NOT NULL DEFAULT 'local',
+    ordinal     INTEGER NOT NULL, -- the order in which the tasks of a job, or of a thing, are handed out
+    kind        TEXT NOT NULL,
+    light       INTEGER NOT NULL DEFAULT 0, -- 1 if the light worker may take it
+    snapshot    INTEGER, -- NULL for the movie of all snapshots
+    snapshots   INTEGER NOT NULL DEFAULT 1 CHECK (snapshots > 0),
+    tile        INTEGER,
+    state       TEXT NOT NULL CHECK (state IN
+                    ('blocked', 'ready', 'running', 'done', 'failed', 'cancelled')),
+    priority    INTEGER NOT NULL,
+    cost        REAL NOT NULL CHECK (cost >= 0), -- planned CPU-seconds, as the weight of progress
+    -- The attempt that runs or ran last:
+    attempt     INTEGER NOT NULL DEFAULT 0, -- number from 1; the fence against older ones
+    worker      TEXT, -- of the attempt that runs
+    lease_until INTEGER,
+    stage       TEXT,
+    iterations  INTEGER NOT NULL DEFAULT 0,
+    passes      INTEGER NOT NULL DEFAULT 0,
+    fraction    REAL NOT NULL DEFAULT 0, -- of the planned cost
+    seconds     REAL, -- that the successful attempt took
+    ready_at    INTEGER NOT NULL DEFAULT 0, -- not handed out before: the pause after a failure
+    -- Counts over all attempts since the job was last (re)started:
+    failures    INTEGER NOT NULL DEFAULT 0, -- errors that a worker reported, and crashes
+    losses      INTEGER NOT NULL DEFAULT 0, -- leases that ran out
+    starved     INTEGER NOT NULL DEFAULT 0, -- deaths for want of memory
+    -- Set when the task is done:
+    result      TEXT REFERENCES blobs (sha256), -- of a tile or preview, until the job has succeeded; of a movie
+    record      TEXT, -- what the worker has to report about it, as JSON
+    history     TEXT, -- how the solver went: [iteration, residual, change, sigma] as JSON
+    UNIQUE (job, ordinal),
+    CHECK ((job IS NULL) <> (thing IS NULL))
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX tasks_order ON tasks (job, kind, snapshot, state);
+CREATE UNIQUE INDEX tasks_thing ON tasks (thing, kind, coalesce(snapshot, -1)) WHERE thing IS NOT NULL;
+CREATE INDEX tasks_kept_of_lab ON tasks (lab) WHERE thing IS NOT NULL AND result IS NOT NULL;
+CREATE INDEX tasks_checks ON tasks (lab) WHERE kind = 'check' AND state IN ('ready', 'running');
+CREATE INDEX tasks_worker ON tasks (worker) WHERE worker IS NOT NULL;
+CREATE INDEX tasks_result ON tasks (result) WHERE result IS NOT NULL;
+CREATE INDEX tasks_claim ON tasks (state, lab, priority DESC, job, ordinal);
+CREATE INDEX tasks_ready ON tasks (job, ordinal) WHERE state = 'ready';
+CREATE INDEX tasks_others ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND kind <> 'tile';
+CREATE INDEX tasks_others_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND kind <> 'tile';
+CREATE INDEX tasks_light ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND light = 1;
+CREATE INDEX tasks_light_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND light = 1;
+
+CREATE TRIGGER result_files_add AFTER INSERT ON result_files
+BEGIN
+    UPDATE jobs SET result_bytes = result_bytes + NEW.size WHERE id = NEW.job;
+END;
+
+CREATE TRIGGER result_files_change AFTER UPDATE OF size ON result_files
+BEGIN
+    UPDATE jobs SET result_bytes = result_bytes + NEW.size - OLD.size WHERE id = NEW.job;
+END;
+
+CREATE TRIGGER result_files_remove AFTER DELETE ON result_files
+BEGIN
+    UPDATE jobs SET result_bytes = result_bytes - OLD.size WHERE id = OLD.job;
+END;
+
+CREATE TRIGGER upload_keys_end AFTER DELETE ON partials
+BEGIN
+    DELETE FROM request_keys WHERE id = OLD.id;
+END;
+
+CREATE TRIGGER remote_tasks_end AFTER UPDATE OF state ON tasks
+    WHEN OLD.state = 'running' AND NEW.state <> 'running'
+BEGIN
+    DELETE FROM remote_tasks WHERE task = NEW.id;
+END;
+
+CREATE TRIGGER requests_end AFTER DELETE ON requests
+BEGIN
+    DELETE FROM tasks WHERE thing = OLD.id;
+    DELETE FROM request_keys WHERE id = OLD.id;
+END;
+
+CREATE TRIGGER jobs_end AFTER DELETE ON jobs
+BEGIN
+    DELETE FROM tasks WHERE thing = OLD.id;
+END;
