@@ -122,6 +122,11 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_QUARANTINE_DAYS", value_name = "DAYS", default_value_t = 7)]
     pub quarantine_days: u32,
 
+    /// Days for which deleted files are kept in before-updates/kept/ after an update of the database, for a rollback to
+    /// the earlier version; 0 keeps none. A disk that is nearly full ends this early.
+    #[arg(long, env = "SCI_RECON_ROLLBACK_DAYS", value_name = "DAYS", default_value_t = 7)]
+    pub rollback_days: u32,
+
     /// Bytes in a second at which all stored files are compared with their hashes, in the background, at most
     /// once a day; 0: never.
     #[arg(long, env = "SCI_RECON_SCRUB_BYTES", value_name = "BYTES", value_parser = bytes,

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::config::ServeArguments;
+use crate::job::Timestamp;
 use crate::store::{Store, StoreError};
 
 /// Time between two foldings of figures.
@@ -42,6 +43,14 @@ async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreErro
     store.dir().sweep_tmp()?;
     let orphans = store.quarantine_orphans(false).await?;
     store.empty_quarantine(store.ago(DAY * settings.quarantine_days).await?).await?;
+    let full = store.dir().disk()?.0 < settings.low_water_bytes.max(settings.min_free_bytes);
+    let updated = match settings.rollback_days {
+        days if days > 0 && !full => store.ago(DAY * days).await?,
+        _ => Timestamp::now(),
+    };
+    if store.release_kept(updated).await? {
+        tracing::info!("files from before the last update are no longer kept");
+    }
     // 2. What is older than it may get.
     let old = store.ago(settings.upload_age()).await?;
     let uploads = store.expire_partials(settings.upload_age()).await? + store.collect(old).await?;

@@ -195,7 +195,7 @@ impl Draft {
             if lock.try_lock().is_err() {
                 return refuse("another copy is being made here", "wait for it");
             }
-            dir::remove(&path)?;
+            remove_draft(&path, &marker)?;
         }
         fs::create_dir(&path).map_err(StoreError::io("make the folder", &path))?;
         let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
@@ -234,6 +234,15 @@ fn is_draft(folder: &Path, marker: &Path) -> Result<bool> {
     }
     let alone = dir::children(folder)?.iter().all(|path| path == marker);
     Ok(alone && identity::UNFINISHED.as_bytes().starts_with(&mark))
+}
+
+/// Removes a copy that was broken off, its mark last: if this is broken off, too, the rest is still known as such.
+fn remove_draft(folder: &Path, marker: &Path) -> Result<()> {
+    for path in dir::children(folder)?.iter().filter(|path| *path != marker) {
+        dir::remove(path)?;
+    }
+    dir::remove(marker)?;
+    dir::remove(folder)
 }
 
 /// Gives every file below a folder a second name below another one. What goes meanwhile is let go.

@@ -12,7 +12,7 @@ use futures_util::TryStreamExt;
 
 use super::error::{Result, StoreError};
 use super::rows::{sql, sql_scalar};
-use super::{DataDir, Store, dir, on_files};
+use super::{DataDir, Store, dir, on_files, upgrade};
 use crate::job::{JobId, PartialId, Sha256, Timestamp};
 
 /// An upload in pieces is a file first and a row a moment later.
@@ -74,6 +74,13 @@ impl Store {
             old.into_iter().try_for_each(|path| dir::remove(&path))
         })
         .await
+    }
+
+    /// Removes the files that are kept for a return to the version before, unless the last update was made after
+    /// `before`.
+    pub async fn release_kept(&self, before: Timestamp) -> Result<bool> {
+        let (root, draft) = (self.dir().clone(), self.temporary_path());
+        on_files(move || upgrade::release_kept(&root, before, &draft)).await
     }
 
     /// What lies in the folder and, at this moment, stands in no record.

@@ -20,6 +20,7 @@ use crate::job::{JobId, PartialId, Sha256};
 /// partial/ID            uploads that come in pieces
 /// quarantine/TIME/      what no record knows of, for some days
 /// before-updates/       copies of the database from before updates of the program
+/// before-updates/kept/  files that were deleted in the days after an update, for a return to such a copy
 /// tmp/                  files that are being written, locked by their writers
 /// ```
 #[derive(Debug, Clone)]
@@ -99,6 +100,11 @@ impl DataDir {
         self.root.join("before-updates")
     }
 
+    /// Files that the last copy in [`Self::before_updates`] knows of and that were deleted since.
+    pub(crate) fn kept(&self) -> PathBuf {
+        self.before_updates().join("kept")
+    }
+
     /// What no row knows of is kept here for some days.
     pub(crate) fn quarantine(&self) -> PathBuf {
         self.root.join("quarantine")
@@ -168,6 +174,8 @@ pub(crate) fn children(folder: &Path) -> Result<Vec<PathBuf>> {
 
 /// Writes a folder's entries to the disk: without it a rename may be forgotten in a power cut.
 pub(crate) fn sync_dir(path: &Path) -> Result<()> {
+    // The parent of a bare name.
+    let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     File::open(path)
         .and_then(|dir| dir.sync_all())
         .map_err(StoreError::io("write to the disk the folder", path))

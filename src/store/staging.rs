@@ -15,8 +15,8 @@ use uuid::Uuid;
 use super::Store;
 use super::error::{Result, StoreError};
 use super::locked::LockedFile;
-use super::{dir, on_files};
-use crate::job::{ResultFile, Sha256};
+use super::{DataDir, dir, on_files, upgrade};
+use crate::job::{ResultFile, Sha256, Timestamp};
 
 /// A temporary file or folder; its lock and its removal.
 #[derive(Debug)]
@@ -76,13 +76,20 @@ impl Store {
 
     /// Takes a file or a folder out of its place, at once and as a whole; its bytes go in the background, as large
     /// files take long and others wait for the lock of the database. It may be gone already.
-    pub(super) async fn discard(&self, place: PathBuf) -> Result<()> {
+    /// What the version before an update knows is kept for some days: what was there at `since`, or has not changed
+    /// since it was made.
+    pub(super) async fn discard(&self, place: PathBuf, since: Option<Timestamp>) -> Result<()> {
         let rest = self.temporary_path();
-        let moved = rest.clone();
-        let found = on_files(move || match fs::rename(&place, &moved) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
-            Err(error) => Err(StoreError::io("remove", &place)(error)),
-            Ok(()) => place.parent().map_or(Ok(()), dir::sync_dir).map(|()| true),
+        let (moved, root) = (rest.clone(), self.dir().clone());
+        let found = on_files(move || {
+            if keep(&root, &place, since)? {
+                return Ok(false);
+            }
+            match fs::rename(&place, &moved) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+                Err(error) => Err(StoreError::io("remove", &place)(error)),
+                Ok(()) => place.parent().map_or(Ok(()), dir::sync_dir).map(|()| true),
+            }
         })
         .await?;
         if found {
@@ -111,6 +118,20 @@ impl Store {
         let lock = File::open(&path).map_err(StoreError::io("open", &path))?;
         Ok(StagedDir(Temporary::new(path, lock)?))
     }
+}
+
+/// Moves a file or folder to those that are kept after an update, if it is one of them.
+fn keep(root: &DataDir, place: &Path, since: Option<Timestamp>) -> Result<bool> {
+    let Some(kept) = upgrade::keep_as(root, place, since)? else { return Ok(false) };
+    if let Some(folder) = kept.parent() {
+        fs::create_dir_all(folder).map_err(StoreError::io("make the folder", folder))?;
+    }
+    // The first one of this name is the one that the copy of the database knows.
+    if kept.exists() {
+        return Ok(false);
+    }
+    dir::rename_durably(place, &kept)?;
+    place.parent().map_or(Ok(()), dir::sync_dir).map(|()| true)
 }
 
 /// A file that is hashed while it is written.

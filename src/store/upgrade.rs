@@ -3,6 +3,7 @@
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
+use std::time::UNIX_EPOCH;
 
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
@@ -44,7 +45,9 @@ pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> 
     sql!("VACUUM INTO ?", [copy.to_string_lossy().into_owned()]).execute(&mut connection).await?;
     connection.close().await?;
     let synced = copy.clone();
+    let kept = dir.kept();
     on_files(move || {
+        dir::make_dir_durably(&kept)?;
         let file = File::open(&synced).map_err(StoreError::io("open", &synced))?;
         file.sync_all().map_err(StoreError::io("write to the disk", &synced))?;
         dir::sync_dir(&folder)?;
@@ -56,6 +59,53 @@ pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> 
     .await?;
     tracing::info!(from = found, to = schema, copy = %copy.display(), "the database is brought up to date");
     Ok(Some(copy))
+}
+
+/// Where a file or folder at `place` is kept when it is deleted, so that the last copy of the database can be gone back
+/// to; none if there was no update lately, or if it was made after the update. `since` is when it was made, if that is
+/// not the time of its last change.
+pub(super) fn keep_as(
+    dir: &DataDir,
+    place: &Path,
+    since: Option<Timestamp>,
+) -> Result<Option<PathBuf>> {
+    let kept = dir.kept();
+    if !kept.is_dir() || !place.exists() {
+        return Ok(None);
+    }
+    let Some(updated) = last_update(dir)? else { return Ok(None) };
+    let since = match since {
+        Some(since) => since,
+        None => last_change(place)?,
+    };
+    let name = place.strip_prefix(dir.root()).ok().filter(|_| since < updated);
+    Ok(name.map(|name| kept.join(name)))
+}
+
+fn last_change(place: &Path) -> Result<Timestamp> {
+    let changed = fs::metadata(place).and_then(|meta| meta.modified());
+    let changed = changed.map_err(StoreError::io("look at", place))?;
+    let age = changed.duration_since(UNIX_EPOCH).unwrap_or_default();
+    Ok(Timestamp(i64::try_from(age.as_millis()).unwrap_or(i64::MAX)))
+}
+
+/// Removes the files that are kept, unless the last update is younger than `before`. True if there were any.
+pub(super) fn release_kept(dir: &DataDir, before: Timestamp, draft: &Path) -> Result<bool> {
+    if !dir.kept().is_dir() || last_update(dir)?.is_some_and(|updated| updated >= before) {
+        return Ok(false);
+    }
+    // Moved as a whole, since workers may be about to add to it.
+    dir::rename_durably(&dir.kept(), draft)?;
+    dir::remove(draft)?;
+    Ok(true)
+}
+
+/// When the database was last brought up to date.
+fn last_update(dir: &DataDir) -> Result<Option<Timestamp>> {
+    let times = copies(&dir.before_updates())?
+        .into_iter()
+        .filter_map(|path| path.file_stem()?.to_str()?.split_once("-schema-")?.0.parse().ok());
+    Ok(times.max().map(Timestamp))
 }
 
 /// The last copy of a database that this program, whose newest migration is `schema`, can serve.

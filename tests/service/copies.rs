@@ -185,6 +185,11 @@ async fn what_is_missing_is_named_by_a_copy_and_by_verify() {
         let out = folder.path().join(name);
         figures(&command("backup", app.data()).arg("--out").arg(&out).output().unwrap())
     };
+    // By a name without a folder.
+    let mut bare = command("backup", &std::path::absolute(app.data()).unwrap());
+    let bare = bare.args(["--out", "bare"]).current_dir(folder.path()).output().unwrap();
+    assert!(figures(&bare).0, "{bare:?}");
+    assert!(verify(&folder.path().join("bare")).0);
     let (good, found) = back_up("whole");
     assert!(good && found["missing"] == json!([]), "{found}");
     assert!(verify(&folder.path().join("whole")).0);
@@ -242,6 +247,47 @@ async fn a_copy_that_was_killed_is_no_service() {
     assert!(verify(&out).0 && !unfinished.exists());
     let restored = TestApp::on(folder, "copy", &["--workers", "1"]).await;
     assert_eq!(results(&restored, &job).await, expected);
+}
+
+#[tokio::test]
+async fn a_copy_killed_while_it_removes_an_earlier_one_blocks_no_later_one() {
+    let shim = Shim::build();
+    let app = TestApp::with(&["--workers", "0"]).await;
+    for number in 0..10u32 {
+        app.upload(number.to_string().into_bytes()).await;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (out, unfinished) = (folder.path().join("copy"), folder.path().join("copy.unfinished"));
+    let kill = |at| disturbed(&shim, app.data(), &out, "kill", at).output().unwrap();
+    // One that has come far is left by a kill, and the next is killed earlier, while it removes that.
+    let far = (40..400).step_by(10).find(|at| {
+        kill(*at);
+        entries(&unfinished) > 12
+    });
+    let (far, mut removing) = (far.expect("a copy is killed while it copies files"), 0);
+    for at in 1..30 {
+        if entries(&unfinished) < 12 {
+            kill(far);
+        }
+        let before = entries(&unfinished);
+        kill(at);
+        let left = entries(&unfinished);
+        removing += u32::from(left > 0 && left < before);
+        let is_marked = unfinished.join("sci-recon.json").exists();
+        assert!(
+            is_marked || left == 0,
+            "killed at operation {at}: {left} of {before} entries are left"
+        );
+    }
+    assert!(removing >= 5, "{removing} were killed while they removed files");
+    let output = command("backup", app.data()).arg("--out").arg(&out).output().unwrap();
+    assert!(figures(&output).0 && verify(&out).0 && !unfinished.exists());
+}
+
+/// Number of files and folders below a folder.
+fn entries(folder: &Path) -> usize {
+    let found = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    found.map(|entry| 1 + entries(&entry.path())).sum()
 }
 
 struct Suspended(Child);

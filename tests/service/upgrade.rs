@@ -1,6 +1,8 @@
 //! A data folder of an earlier version is taken over with all that it holds.
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
@@ -69,6 +71,65 @@ async fn a_folder_of_the_version_before_finishes_its_waiting_job() {
         tokio::time::sleep(std::time::Duration::from_millis(100)).await;
     }
     assert_eq!(made().await["state"], "ready");
+}
+
+/// Names and contents of all files below a folder.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = PathBuf::from(path.file_name().unwrap());
+        if path.is_dir() {
+            found.extend(files(&path).into_iter().map(|(rest, bytes)| (name.join(rest), bytes)));
+        } else {
+            found.insert(name, std::fs::read(&path).unwrap());
+        }
+    }
+    found
+}
+
+#[tokio::test]
+async fn files_deleted_after_an_update_are_kept_for_a_rollback() {
+    let old = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/version-0.1");
+    for days in ["7", "0"] {
+        let folder = tempfile::tempdir().unwrap();
+        copy(&old, &folder.path().join("data"));
+        let line = ["--workers", "1", "--rollback-days", days, "--upload-hours", "0"];
+        let app = TestApp::on(folder, "data", &line).await;
+        // The job that waited takes the tiles with it that were done, ...
+        assert_eq!(app.ended(WAITING).await["state"], "succeeded");
+        // ... people delete, ...
+        for job in [FINISHED, WAITING, CANCELLED] {
+            app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
+        }
+        for kind in ["measurements", "calibrations"] {
+            let items = app.get(&format!("/v1/{kind}?limit=100")).await.expect(200).json();
+            for item in items["items"].as_array().unwrap() {
+                let path = format!("/v1/{kind}/{}", item["id"].as_str().unwrap());
+                app.delete(&path).await.expect(204);
+            }
+        }
+        // ... and what nobody uses any more is cleared away at the next start.
+        let app = app.again(&line).await;
+        let start = Instant::now();
+        let blobs = || files(&app.data().join("blobs")).len();
+        while blobs() > 0 {
+            assert!(start.elapsed() < Duration::from_secs(60), "{} files stay", blobs());
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        let kept = app.data().join("before-updates/kept");
+        if days == "0" {
+            assert!(!kept.exists(), "{:?}", files(&kept).keys());
+            continue;
+        }
+        let kept = files(&kept);
+        for place in ["blobs", "results"] {
+            for (name, bytes) in files(&old.join(place)) {
+                let name = Path::new(place).join(name);
+                assert!(kept.get(&name) == Some(&bytes), "{}: {:?}", name.display(), kept.keys());
+            }
+        }
+    }
 }
 
 /// What a command says of a folder, and whether it ended well.

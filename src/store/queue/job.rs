@@ -102,7 +102,7 @@ impl Store {
         sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
         // Under the lock and before the commit, so that no row is left whose files are gone for
         // longer than a crash takes; a second DELETE then removes the row.
-        self.discard(self.dir().results(id)).await?;
+        self.discard(self.dir().results(id), None).await?;
         transaction.commit().await?;
         Ok(())
     }

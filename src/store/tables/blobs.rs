@@ -181,7 +181,7 @@ impl Store {
         transaction: &mut SqliteConnection,
         sha256: Sha256,
     ) -> Result<()> {
-        let removed = sql!(
+        let removed: Option<Timestamp> = sql_scalar!(
             "DELETE FROM blobs WHERE sha256 = ?1
                  AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
@@ -189,16 +189,15 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM calibration_captures WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM check_files WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM models WHERE file = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)",
+                 AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)
+             RETURNING created_at",
             [sha256]
         )
-        .execute(transaction)
+        .fetch_optional(transaction)
         .await?;
-        if removed.rows_affected() == 0 {
-            return Ok(());
-        }
+        let Some(created_at) = removed else { return Ok(()) };
         // Before the commit: after it, another process could put the same content in place.
-        self.discard(self.dir().blob(&sha256)).await
+        self.discard(self.dir().blob(&sha256), Some(created_at)).await
     }
 
     /// Removes the uploads that nothing refers to and nobody has sent since `before`, and checks from before that
@@ -214,7 +213,7 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
-        let hashes: Vec<Sha256> = sql_scalar!(
+        let removed = sql_as!(
             "DELETE FROM blobs WHERE touched_at < ?
                AND NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
                AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
@@ -224,16 +223,15 @@ impl Store {
                AND NOT EXISTS (SELECT 1 FROM check_files AS f WHERE f.sha256 = blobs.sha256)
                AND NOT EXISTS (SELECT 1 FROM models WHERE file = sha256)
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
-             RETURNING sha256",
+             RETURNING sha256, created_at",
             [before]
-        )
-        .fetch_all(&mut *transaction)
-        .await?;
-        for sha256 in &hashes {
-            self.discard(self.dir().blob(sha256)).await?;
+        );
+        let removed: Vec<(Sha256, Timestamp)> = removed.fetch_all(&mut *transaction).await?;
+        for (sha256, created_at) in &removed {
+            self.discard(self.dir().blob(sha256), Some(*created_at)).await?;
         }
         transaction.commit().await?;
-        Ok(hashes.len())
+        Ok(removed.len())
     }
 
     /// Number and bytes of all stored files.

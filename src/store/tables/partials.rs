@@ -300,7 +300,7 @@ impl Store {
             .execute(&mut *transaction)
             .await?;
         transaction.commit().await?;
-        on_files(move || dir::remove(&path)).await?;
+        self.discard(path, None).await?;
         upload.result = Some(found);
         Ok(upload)
     }
@@ -319,8 +319,7 @@ impl Store {
     /// Removes the row and the file, whose lock must be held.
     async fn end_partial(&self, id: PartialId) -> Result<()> {
         sql!("DELETE FROM partials WHERE id = ?", [id]).execute(&self.writer).await?;
-        let path = self.dir().partial(id);
-        on_files(move || dir::remove(&path)).await
+        self.discard(self.dir().partial(id), None).await
     }
 
     /// Ends the uploads that have expired, but none to which a piece is being written, nor one that only a clock

@@ -162,7 +162,8 @@ async fn old_folder() -> (tempfile::TempDir, sqlx::SqliteConnection) {
 
 fn saved(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
     let entries = std::fs::read_dir(folder.join("before-updates"));
-    entries.into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
+    let paths = entries.into_iter().flatten().map(|entry| entry.unwrap().path());
+    paths.filter(|path| path.extension().is_some_and(|extension| extension == "db")).collect()
 }
 
 const SERVE: Purpose = Purpose::Serve { accept_database: false };

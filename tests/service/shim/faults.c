@@ -130,6 +130,11 @@ int unlink(const char *path) {
     fault(0);
     return real(path);
 }
+int unlinkat(int folder, const char *path, int flags) {
+    REAL(unlinkat);
+    fault(0);
+    return real(folder, path, flags);
+}
 int clock_gettime(clockid_t clock, struct timespec *now) {
     REAL(clock_gettime);
     int result = real(clock, now);
