@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
+use super::CliError;
 use super::wait::print_of_store;
 use crate::cli::error::Result;
 use crate::job::{Lab, Sha256};
@@ -38,10 +39,18 @@ enum Action {
         /// The SHA-256 of the file.
         sha256: Sha256,
     },
+    /// Takes a lab off the record, if it has no token that is not revoked, and no data.
+    Remove {
+        /// The lab's name.
+        lab: Lab,
+    },
     /// Sets what a lab is entitled to.
     Set {
         /// The lab's name.
         lab: Lab,
+        /// Put the lab on record if it is not there yet.
+        #[arg(long)]
+        new: bool,
         /// Its share of the machine, beside the shares of the other labs; every lab begins with 1.
         #[arg(long, value_name = "N", value_parser = share, required_unless_present_any = ["bytes", "jobs"])]
         share: Option<f64>,
@@ -83,7 +92,15 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
             store.delete_upload(lab, *sha256).await?;
             return Ok(format!("deleted {sha256} of {lab}"));
         }
-        Action::Set { lab, share, bytes, jobs } => {
+        Action::Remove { lab } => {
+            store.remove_lab(lab).await?;
+            return Ok(format!("removed {lab}"));
+        }
+        Action::Set { lab, new, share, bytes, jobs } => {
+            if !new && !store.knows_lab(lab).await? {
+                let text = format!("there is no lab {lab}; --new puts it on record");
+                return Err(CliError::Input(text));
+            }
             let to = Entitlement {
                 share: *share,
                 max_bytes: bytes.map(|limit| limit.0),

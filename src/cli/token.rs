@@ -174,6 +174,7 @@ impl From<StoreError> for CliError {
             | StoreError::State(_)
             | StoreError::NotFinal(_)
             | StoreError::Ended(_)
+            | StoreError::InUse { .. }
             | StoreError::FileInUse(_) => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }

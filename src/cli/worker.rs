@@ -96,6 +96,9 @@ async fn work(
         let remote = remote_settings(settings);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
         let ended = Worker::new(remote.clone(), network, model, stall, stop).run().await;
+        if let Some(refusal) = remote.refusal() {
+            return Err(refusal.into());
+        }
         remote.leave().await;
         return Ok(ended?);
     }

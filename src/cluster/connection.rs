@@ -3,12 +3,13 @@
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use async_nats::connection::State;
 use async_nats::jetstream::Context;
 use async_nats::jetstream::context::ContextBuilder;
-use async_nats::{Client, ConnectOptions, Event, ServerAddr};
+use async_nats::{Client, ClientError, ConnectErrorKind, ConnectOptions, Event, ServerAddr};
 use serde::Serialize;
 use tempfile::NamedTempFile;
 
@@ -21,6 +22,10 @@ const PING: Duration = Duration::from_secs(5);
 /// The longest pause between two tries to connect.
 const PAUSE: Duration = Duration::from_secs(2);
 
+/// Refusals in a row after which a credential is taken for revoked; a server that has just started may not know
+/// all credentials yet.
+const REFUSALS: u32 = 3;
+
 /// Why the cluster can't be worked with.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // the messages say it
@@ -31,6 +36,11 @@ pub enum ClusterError {
     Credential { path: String, reason: String },
     #[error("no NATS server answers at {url}: {reason}")]
     Unreachable { url: String, reason: String },
+    #[error(
+        "the NATS server at {url} refuses the credential (authorization violation): it is missing, revoked, past its \
+         end, or of another cluster; `sci-recon cluster worker list` shows which are good"
+    )]
+    Unauthorized { url: String },
     #[error("NATS: can't {action}: {reason}")]
     Nats { action: &'static str, reason: String },
     #[error("the server refuses this worker: {0}")]
@@ -103,6 +113,8 @@ pub struct Access {
     options: ConnectOptions,
     /// The file from which NATS reads the authority's certificate, at each new connection.
     authority: Option<Arc<NamedTempFile>>,
+    /// Tries in a row in which the server has refused the credential.
+    refusals: Arc<AtomicU32>,
 }
 
 impl Access {
@@ -130,6 +142,8 @@ impl Access {
                 url.trim().parse().map_err(wrong)
             })
             .collect();
+        let refusals = Arc::new(AtomicU32::new(0));
+        let counted = refusals.clone();
         let mut options = ConnectOptions::new()
             .name(name)
             .ping_interval(PING)
@@ -140,7 +154,10 @@ impl Access {
             .reconnect_delay_callback(|tries| {
                 PAUSE.min(Duration::from_millis(50 * u64::try_from(tries).unwrap_or(40)))
             })
-            .event_callback(|event| async move { tell(&event) });
+            .event_callback(move |event| {
+                count_refusals(&counted, &event);
+                async move { tell(&event) }
+            });
         if let Some(inbox) = &credential.inbox {
             options = options.custom_inbox_prefix(inbox);
         }
@@ -160,7 +177,7 @@ impl Access {
         if let Some(file) = &authority {
             options = options.add_root_certificates(file.path().to_owned());
         }
-        Ok(Self { urls: urls.to_owned(), servers: servers?, options, authority })
+        Ok(Self { urls: urls.to_owned(), servers: servers?, options, authority, refusals })
     }
 
     /// Connects to one of the servers.
@@ -169,7 +186,11 @@ impl Access {
     /// If none answers, or takes the credential.
     pub async fn connect(&self) -> Result<Connection, ClusterError> {
         let connected = self.options.clone().connect(self.servers.as_slice()).await;
+        let url = self.urls.clone();
         let client = connected.map_err(|error| {
+            if error.kind() == ConnectErrorKind::AuthorizationViolation {
+                return ClusterError::Unauthorized { url: url.clone() };
+            }
             let mut reason = error.to_string();
             let mut source = std::error::Error::source(&error);
             while let Some(error) = source {
@@ -179,11 +200,12 @@ impl Access {
                 }
                 source = error.source();
             }
-            ClusterError::Unreachable { url: self.urls.clone(), reason }
+            ClusterError::Unreachable { url: url.clone(), reason }
         })?;
         let context =
             ContextBuilder::new().timeout(ANSWER).ack_timeout(ANSWER).build(client.clone());
-        Ok(Connection { client, context, _authority: self.authority.clone() })
+        let (refusals, _authority) = (self.refusals.clone(), self.authority.clone());
+        Ok(Connection { client, context, url, refusals, _authority })
     }
 }
 
@@ -192,7 +214,9 @@ impl Access {
 pub struct Connection {
     pub(super) client: Client,
     pub(super) context: Context,
+    url: String,
     /// See [`Access`].
+    refusals: Arc<AtomicU32>,
     _authority: Option<Arc<NamedTempFile>>,
 }
 
@@ -200,6 +224,12 @@ impl Connection {
     /// Whether it is there at the moment.
     pub(super) fn is_up(&self) -> bool {
         self.client.connection_state() == State::Connected
+    }
+
+    /// The error of a connection that broke and can't be made anew, since the server refuses the credential.
+    pub(super) fn refusal(&self) -> Option<ClusterError> {
+        let is_refused = self.refusals.load(Ordering::Relaxed) >= REFUSALS;
+        is_refused.then(|| ClusterError::Unauthorized { url: self.url.clone() })
     }
 
     /// Says something to whoever listens, without a stream.
@@ -211,6 +241,18 @@ impl Connection {
         let failed = ClusterError::nats("send");
         let text = serde_json::to_vec(what).map_err(ClusterError::nats("write a message"))?;
         self.client.publish(subject, text.into()).await.map_err(failed)
+    }
+}
+
+fn count_refusals(refusals: &AtomicU32, event: &Event) {
+    // The client passes the kind of the error on as text.
+    let refused = ConnectErrorKind::AuthorizationViolation.to_string();
+    match event {
+        Event::Connected => refusals.store(0, Ordering::Relaxed),
+        Event::ClientError(ClientError::Other(text)) if *text == refused => {
+            refusals.fetch_add(1, Ordering::Relaxed);
+        }
+        _ => {}
     }
 }
 

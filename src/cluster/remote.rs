@@ -172,6 +172,9 @@ impl Remote {
             if let Some(ack_wait) = introduce(&connection, &pool, &hello).await? {
                 break ack_wait;
             }
+            if let Some(refusal) = connection.refusal() {
+                return Err(refusal);
+            }
             if settings.idle.is_some_and(|idle| start.elapsed() > idle) {
                 tracing::info!("no server has answered: the worker ends");
                 return Ok(None);
@@ -250,8 +253,17 @@ impl Remote {
         }
     }
 
+    /// Why the worker has ended, if the message server refuses its credential.
+    #[must_use]
+    pub fn refusal(&self) -> Option<ClusterError> {
+        self.0.connection.refusal()
+    }
+
     async fn give_signs(self) {
         while !self.0.stop.is_cancelled() {
+            if self.refusal().is_some() {
+                return self.0.stop.cancel();
+            }
             if self.held().is_none() {
                 let beat = Beat { worker: self.0.hello.worker, tile: None, leaves: false };
                 if let Err(error) = self.say("beat", &beat).await {

@@ -132,6 +132,28 @@ async fn the_command_line_sees_and_helps_all_labs() {
     assert_eq!(uploads.lines().filter(|line| line.ends_with("yes")).count(), 2, "{uploads}");
     assert_eq!(command(&["lab", "delete-upload", "a", &unused]).0, 0);
     app.get(&format!("/v1/blobs/{unused}")).await.problem(404, "not_found");
+
+    // A name that was mistyped makes no lab, and one that has nothing can go.
+    let (code, said) = command(&["lab", "set", "c", "--share", "2"]);
+    assert!(code == 2 && said.contains("--new"), "{said}");
+    let listed = command(&["lab", "set", "c", "--new", "--share", "2"]).1;
+    assert!(listed.lines().any(|line| line.starts_with("c ")), "{listed}");
+    assert_eq!(command(&["lab", "remove", "c"]).0, 0);
+    assert_eq!(command(&["lab", "remove", "c"]).0, 2, "it is gone");
+    let listed = command(&["lab", "list"]).1;
+    assert!(!listed.lines().any(|line| line.starts_with("c ")), "{listed}");
+    let tokens = app.token(&["list"]);
+    let token = tokens.lines().find(|line| line.contains(" b ")).unwrap();
+    let (code, said) = command(&["lab", "remove", "b"]);
+    assert!(code == 2 && said.contains("tokens"), "{said}");
+    app.token(&["revoke", token.split_whitespace().next().unwrap()]);
+    assert_eq!(command(&["lab", "remove", "b"]).0, 0);
+    app.upload(vec![8; 5000]).await;
+    for token in tokens.lines().filter(|line| line.contains(" a ")) {
+        app.token(&["revoke", token.split_whitespace().next().unwrap()]);
+    }
+    let (code, said) = command(&["lab", "remove", "a"]);
+    assert!(code == 2 && said.contains("delete those first"), "{said}");
 }
 
 #[tokio::test]

@@ -181,7 +181,42 @@ impl Store {
         .await?;
         Ok(transaction.commit().await?)
     }
+
+    /// Takes a lab off the record, with its share, its limits and its totals.
+    /// Errors: [`StoreError::NotFound`] if it is not on record; [`StoreError::InUse`] if it has a token or data.
+    pub async fn remove_lab(&self, lab: &Lab) -> Result<()> {
+        let mut transaction = self.write().await?;
+        for (by, query) in BELONGINGS {
+            let users: u64 =
+                sqlx::query_scalar(query).bind(lab).fetch_one(&mut *transaction).await?;
+            if users > 0 {
+                return Err(StoreError::InUse { what: "lab", by, users });
+            }
+        }
+        let removed =
+            sql!("DELETE FROM labs WHERE lab = ?", [lab]).execute(&mut *transaction).await?;
+        if removed.rows_affected() == 0 {
+            return Err(StoreError::missing("lab", lab.as_str()));
+        }
+        sql!("DELETE FROM lab_totals WHERE lab = ?", [lab]).execute(&mut *transaction).await?;
+        Ok(transaction.commit().await?)
+    }
 }
+
+/// Things that keep a lab on record, each with the query that counts those of one lab.
+const BELONGINGS: [(&str, &str); 8] = [
+    ("tokens", "SELECT count(*) FROM tokens WHERE lab = ? AND revoked_at IS NULL"),
+    ("jobs", "SELECT count(*) FROM jobs WHERE lab = ?"),
+    ("measurements", "SELECT count(*) FROM measurements WHERE lab = ?"),
+    ("calibrations", "SELECT count(*) FROM calibrations WHERE lab = ?"),
+    ("networks", "SELECT count(*) FROM models WHERE lab = ?"),
+    ("checks of files", "SELECT count(*) FROM checks WHERE lab = ?"),
+    ("uploads", "SELECT count(*) FROM holdings WHERE lab = ?"),
+    (
+        "uploads that are not complete",
+        "SELECT count(*) FROM partials WHERE lab = ? AND result IS NULL",
+    ),
+];
 
 /// What is wrong with a share, if something is.
 pub fn share_error(share: f64) -> Option<&'static str> {

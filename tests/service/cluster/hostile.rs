@@ -172,7 +172,7 @@ async fn a_revoked_credential_is_cut_off() {
     use std::os::unix::fs::PermissionsExt;
     assert_eq!(std::fs::metadata(&lost).unwrap().permissions().mode() & 0o777, 0o600);
     let mut first = RemoteWorker::with_credential(&kept, &[]);
-    let _second = RemoteWorker::with_credential(&lost, &[]);
+    let mut second = RemoteWorker::with_credential(&lost, &[]);
     until("both are there", || async { workers(&app).await.len() == 2 }).await;
     let listed = nats.cluster(&["worker", "list"]).unwrap();
     assert_eq!(listed.matches(" good ").count(), 2, "{listed}");
@@ -194,6 +194,16 @@ async fn a_revoked_credential_is_cut_off() {
         .connect(format!("tls://127.0.0.1:{}", nats.ports[0]))
         .await;
     assert!(again.is_err(), "it may not come back");
+    // The worker ends with the reason, and so does one that is started with the credential.
+    let mut third = RemoteWorker::with_credential(&lost, &[]);
+    for worker in [&mut second, &mut third] {
+        assert_eq!(worker.process.ended(Duration::from_secs(40)), Some(2));
+        assert!(worker.said().contains("refuses the credential"), "{}", worker.said());
+    }
+    let mut check = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let ran = check.args(["cluster", "check", "--nats-creds"]).arg(&lost).output().unwrap();
+    let said = String::from_utf8(ran.stderr).unwrap();
+    assert!(ran.status.code() == Some(2) && said.contains("authorization violation"), "{said}");
     assert!(first.process.lives());
     let listed = nats.cluster(&["worker", "list"]).unwrap();
     assert!(listed.contains("revoked") && listed.matches(" good ").count() == 1, "{listed}");
