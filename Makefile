@@ -55,6 +55,7 @@ ARCHIVE := sci-recon-$(PACKAGE)-x86_64-linux
 dist: release ## the same as an archive, dist/sci-recon-VERSION-x86_64-linux.tar.gz, which runs where it is unpacked
 	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
+	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
 	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
 

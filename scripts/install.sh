@@ -19,7 +19,7 @@ install -m 644 "$root"/runtime/libonnxruntime*.so "$folder/lib/sci-recon/"
 install -m 644 "$root"/runtime/onnxruntime-* "$root/LICENSE" "$share/doc/sci-recon/"
 # The program carries its networks; these are for training and for `--models`.
 cp -R "$root/models" "$root/docs/schedule.schema.json" "$share/sci-recon/"
-for unit in "$root"/deploy/systemd/*.service; do
+for unit in "$root"/deploy/systemd/*.service "$root"/deploy/systemd/*.timer; do
   sed "s|/usr/local/bin/|$prefix/bin/|" "$unit" >"$folder/lib/systemd/system/$(basename "$unit")"
 done
 "$program" man --out "$share/man/man1"

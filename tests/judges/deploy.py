@@ -26,6 +26,8 @@ from docker.utils.build import exclude_paths
 from image import services
 
 VERSION = "1.31"
+# Tenths of the exposure that `systemd-analyze security` finds, at most.
+EXPOSURE = 30
 # An image name that no sample has: kustomize must put it everywhere.
 IMAGE = {"newName": "registry.example/sci-recon", "newTag": "1.2.3"}
 
@@ -85,7 +87,44 @@ def kustomize(root, wrong, program):
     if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
         wrong.append(f"kubectl kustomize makes {kinds}")
     wrong += [f"kubectl kustomize: {reason}" for reason in unresolved(documents)]
+    for name, _, template in templates(documents):
+        wrong += [f"kubectl kustomize: {name}: {reason}" for reason in unrestricted(template["spec"])]
     return None
+
+
+# Kinds of volumes in the Pod Security Standard "restricted"
+# (kubernetes.io/docs/concepts/security/pod-security-standards).
+VOLUMES = {"configMap", "csi", "downwardAPI", "emptyDir", "ephemeral", "persistentVolumeClaim", "projected", "secret"}
+
+
+def unrestricted(pod):
+    """Where a pod does not keep to "restricted", of which "baseline" is a part."""
+    for name in ("hostNetwork", "hostPID", "hostIPC"):
+        if pod.get(name):
+            yield name
+    for volume in pod.get("volumes", []):
+        kinds = set(volume) - {"name"}
+        if not kinds <= VOLUMES:
+            yield f"a volume of the kind {kinds - VOLUMES}"
+    whole = pod.get("securityContext", {})
+    if whole.get("sysctls") or whole.get("seLinuxOptions"):
+        yield "sysctls or seLinuxOptions"
+    for container in [*pod.get("initContainers", []), *pod["containers"]]:
+        own = container.get("securityContext", {})
+        both = {**whole, **own}
+        rules = {
+            "privileged": not own.get("privileged"),
+            "procMount": own.get("procMount", "Default") == "Default",
+            "hostPort": not any("hostPort" in port for port in container.get("ports", [])),
+            "allowPrivilegeEscalation": own.get("allowPrivilegeEscalation") is False,
+            "capabilities.drop": "ALL" in own.get("capabilities", {}).get("drop", []),
+            "capabilities.add": set(own.get("capabilities", {}).get("add", [])) <= {"NET_BIND_SERVICE"},
+            "runAsNonRoot": both.get("runAsNonRoot") is True,
+            "runAsUser": both.get("runAsUser") != 0,
+            "seccompProfile": both.get("seccompProfile", {}).get("type") in ("RuntimeDefault", "Localhost"),
+            "seLinuxOptions": not own.get("seLinuxOptions"),
+        }
+        yield from (f"{container['name']}: {name}" for name, kept in rules.items() if not kept)
 
 
 def templates(documents):
@@ -242,9 +281,15 @@ def image(root, wrong, program):
 def systemd(root, wrong):
     if not shutil.which("systemd-analyze"):
         return "systemd-analyze"
-    for unit in sorted((root / "deploy/systemd").glob("*.service")):
+    units = (root / "deploy/systemd").iterdir()
+    for unit in sorted(unit for unit in units if unit.suffix in (".service", ".timer")):
         # With its drop-ins.
         _, said = run("systemd-analyze", "verify", str(unit))
+        if unit.suffix == ".timer":
+            continue
+        status, exposure = run("systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}", str(unit))
+        if status:
+            wrong.append(f"{unit.name}: {exposure.splitlines()[-1]}")
         # The program is not installed where this runs.
         said = [line for line in said.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
         if said:
@@ -252,6 +297,41 @@ def systemd(root, wrong):
         texts = [file.read_text() for file in [unit, *unit.parent.glob(f"{unit.name}.d/*.conf")]]
         wrong += [f"{unit.name}: {reason}" for reason in unreadable("\n".join(texts))]
     return None
+
+
+def filtered(root, wrong, program):
+    """The server and a worker under the unit's system call filter: a job, with all confinement."""
+    if not shutil.which("systemd-analyze"):
+        return "a service under its system call filter (systemd-analyze)"
+    with tempfile.TemporaryDirectory() as folder:
+        # Where a user without rights may read and run them.
+        pathlib.Path(folder).chmod(0o777)
+        copy = shutil.copy2(program, folder)
+        for library in (root / "runtime").glob("*.so"):
+            shutil.copy2(library, folder)
+        unit = root / "deploy/systemd/sci-recon.service"
+        before = [sys.executable, root / "tests/judges/filtered.py", unit]
+        with served(copy, folder, before, workers=1) as url:
+            state, confinement = sample_job(url), ask(f"{url}/readyz")["confinement"]
+        if (state, confinement) != ("succeeded", "ok"):
+            wrong.append(f"{unit.name}: under SystemCallFilter= a job is {state}, confinement says {confinement}")
+    return None
+
+
+def ask(url, body=None):
+    request = urllib.request.Request(url, body and json.dumps(body).encode(), {"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=60) as answer:
+        return json.load(answer)
+
+
+def sample_job(url):
+    """How a short job ends."""
+    job = ask(f"{url}/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
+    for _ in range(6):
+        state = ask(f"{url}/v1/jobs/{job}?wait=20")["state"]
+        if state not in ("queued", "running"):
+            break
+    return state
 
 
 def unreadable(text):
@@ -307,9 +387,10 @@ def free_port():
 
 
 @contextlib.contextmanager
-def served(program, folder):
-    """A service without tokens that is reached as bench.example; its address."""
-    line = [program, "serve", "--data", f"{folder}/data", "--listen", "127.0.0.1:0", "--workers", "0", "--host", "bench.example"]
+def served(program, folder, before=(), workers=0):
+    """A service without tokens that is reached as bench.example, started by a command before it; its address."""
+    line = [*before, program, "serve", "--data", f"{folder}/data", "--listen", "127.0.0.1:0", "--workers", str(workers),
+            "--host", "bench.example"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
         try:
             yield json.loads(server.stdout.readline())["url"]
@@ -359,6 +440,9 @@ def promtool(root, wrong):
     status, told = run("promtool", "check", "rules", str(root / "deploy/prometheus/alerts.yml"))
     if status:
         wrong.append(f"promtool check rules: {told}")
+    status, said = run("promtool", "check", "config", "--syntax-only", str(root / "deploy/prometheus/prometheus.yml"))
+    if status:
+        wrong.append(f"promtool check config: {said}")
     return None
 
 
@@ -382,7 +466,7 @@ def main():
     kubernetes(root, wrong)
     figures(root, wrong)
     context(root, wrong, program)
-    absent = [check(root, wrong, program) for check in (kustomize, image, nginx)]
+    absent = [check(root, wrong, program) for check in (kustomize, image, nginx, filtered)]
     absent += [check(root, wrong) for check in (compose, systemd, caddy, promtool)]
     absent = [name for name in absent if name]
     if absent:

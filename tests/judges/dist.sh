@@ -19,6 +19,9 @@ mount -t proc proc "$root/proc"
 mknod -m 666 "$root/dev/null" c 1 3
 mknod -m 444 "$root/dev/urandom" c 1 9
 tar --extract --gzip --file "$archive" --directory "$root/opt" --strip-components 1 --one-top-level=sci-recon
+for file in docs/operations.md docs/cluster.md deploy/systemd/sci-recon.service deploy/kubernetes/worker.yaml deploy/prometheus/prometheus.yml; do
+  [ -s "$root/opt/sci-recon/$file" ] || { echo "the archive has no $file" >&2; exit 1; }
+done
 chroot=$(command -v chroot)
 run() { env -i RUST_LOG=warn "$chroot" "$root" /opt/sci-recon/bin/sci-recon "$@"; }
 
