@@ -150,7 +150,7 @@ impl FrameReader for DarkCorrected {
     }
 }
 
-/// Checks up to [`SNAPSHOTS`] snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
+/// Checks a few snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
 /// the first green sub-image is checked. `saturated` is the share of saturated pixels of each snapshot;
 /// `dark_subtracted` is true if dark frames were subtracted.
 ///

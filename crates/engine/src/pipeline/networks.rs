@@ -254,7 +254,7 @@ impl NetworkSource {
     }
 }
 
-/// Path of libonnxruntime: the stated one or, for `None`, the first one in [`LIBRARY_FOLDERS`]. It is not opened.
+/// Path of libonnxruntime: the stated one or, for `None`, the first one near the program. It is not opened.
 ///
 /// Errors: [`NetworkError::Missing`].
 pub fn find_library(stated: Option<&Path>) -> Result<PathBuf, NetworkError> {
