@@ -262,7 +262,6 @@ fn unfamiliar_masks_finding() -> Finding {
 }
 
 /// Names of the ninths of the picture, by row and column.
-
 const PARTS: [[&str; 3]; 3] = [
     ["the top left", "the top centre", "the top right"],
     ["the left", "the centre", "the right"],
