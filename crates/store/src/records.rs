@@ -120,7 +120,7 @@ pub(super) async fn stands(connection: &mut SqliteConnection, record: &Record) -
 /// Uploads in pieces that are not stored yet, and the bytes that are known to have come.
 pub(super) async fn partials(connection: &mut SqliteConnection) -> Result<Vec<(PartialId, u64)>> {
     let partials = "SELECT id, received FROM partials WHERE result IS NULL";
-    Ok(sql_as!(partials).fetch_all(connection).await?)
+    sql_as!(partials).fetch_all(connection).await
 }
 
 /// The snapshots of a job of which a file is known to be damaged, [`WHOLE_JOB`] among them.
@@ -130,5 +130,5 @@ pub(super) async fn damaged_snapshots(
 ) -> Result<Vec<i64>> {
     let snapshots = "SELECT DISTINCT snapshot FROM result_files
                      WHERE job = ? AND damaged_at IS NOT NULL";
-    Ok(sql_as!(snapshots, [job]).fetch_all(connection).await?)
+    sql_as!(snapshots, [job]).fetch_all(connection).await
 }

@@ -162,5 +162,5 @@ pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Resu
 
 async fn running_tasks(connection: &mut SqliteConnection, id: JobId) -> Result<u64> {
     let count = "SELECT count(*) FROM tasks WHERE job = ? AND state = ?";
-    Ok(sql_as!(count, [id, TaskState::Running]).fetch_one(connection).await?)
+    sql_as!(count, [id, TaskState::Running]).fetch_one(connection).await
 }

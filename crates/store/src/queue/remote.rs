@@ -120,13 +120,13 @@ impl FromRow for RemoteTask {
 impl Store {
     /// The tiles that are out.
     pub async fn remote_tasks(&self) -> Result<Vec<RemoteTask>, StoreError> {
-        Ok(sql_as!(rows!()).fetch_all(&self.readers).await?)
+        sql_as!(rows!()).fetch_all(&self.readers).await
     }
 
     /// A tile that is out; none if it is not.
     pub async fn remote_task(&self, task: TaskId) -> Result<Option<RemoteTask>, StoreError> {
         let found = sql_as!(concat!(rows!(), " WHERE task = ?"), [task]);
-        Ok(found.fetch_optional(&self.readers).await?)
+        found.fetch_optional(&self.readers).await
     }
 
     /// Those of these jobs that are not wanted any more.
@@ -139,7 +139,7 @@ impl Store {
                  (SELECT 1 FROM jobs WHERE id = value AND state IN (?, ?))",
             [list(jobs), JobState::Queued, JobState::Running]
         );
-        Ok(found.fetch_all(&self.readers).await?)
+        found.fetch_all(&self.readers).await
     }
 
     /// The number of tiles that are out, by pool.

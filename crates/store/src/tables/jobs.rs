@@ -126,7 +126,7 @@ impl Store {
 
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
         let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
-        Ok(sql_as!(counts).fetch_all(&self.readers).await?)
+        sql_as!(counts).fetch_all(&self.readers).await
     }
 }
 

@@ -81,7 +81,7 @@ impl Store {
                  (SELECT count(*) FROM jobs WHERE lab = ?1 AND finished_at IS NULL) AS jobs",
             [lab]
         );
-        Ok(found.fetch_one(&self.readers).await?)
+        found.fetch_one(&self.readers).await
     }
 
     /// All labs, by name.
@@ -107,7 +107,7 @@ impl Store {
              GROUP BY labs.lab ORDER BY labs.lab",
             [name]
         );
-        Ok(rows.fetch_all(&self.readers).await?)
+        rows.fetch_all(&self.readers).await
     }
 
     /// Figures of all labs, by name.

@@ -17,7 +17,7 @@ impl Store {
     /// A picture of a report, as PNG; none if there is none of this name.
     pub async fn map(&self, id: CalibrationId, name: &str) -> Result<Option<Vec<u8>>> {
         let png = "SELECT png FROM calibration_maps WHERE calibration = ? AND name = ?";
-        Ok(sql_as!(png, [id, name]).fetch_optional(&self.readers).await?)
+        sql_as!(png, [id, name]).fetch_optional(&self.readers).await
     }
 }
 

@@ -102,7 +102,7 @@ impl Store {
     pub async fn find_request(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<Option<Request>> {
         let request = concat!("SELECT * FROM ", requests!(), " WHERE id = ? AND lab = ?");
         let request = sql_as!(request, [id.into(), lab]);
-        Ok(request.fetch_optional(&self.readers).await?)
+        request.fetch_optional(&self.readers).await
     }
 
     /// True if the uploads of a request are checked, or nobody wants that any more.
@@ -235,7 +235,7 @@ pub async fn insert(
     }
     let size =
         "SELECT coalesce(sum(size), 0) FROM request_files JOIN blobs USING (sha256) WHERE id = ?";
-    Ok(sql_as!(size, [id]).fetch_one(connection).await?)
+    sql_as!(size, [id]).fetch_one(connection).await
 }
 
 /// The request for this thing, whoever made it.

@@ -208,7 +208,7 @@ impl Store {
 
     /// What has been done in all, by kind of task.
     pub async fn totals(&self) -> Result<Vec<TaskTotals>> {
-        Ok(sql_as!("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await?)
+        sql_as!("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await
     }
 
     /// The number of tasks by kind and state, with zeros for what there is none of.

@@ -86,7 +86,7 @@ impl Store {
         let token = "SELECT * FROM tokens
                      WHERE hash = ? AND revoked_at IS NULL AND (expires_at IS NULL OR expires_at > ?)";
         let token = sql_as!(token, [secret.hash(), Timestamp::now()]);
-        Ok(token.fetch_optional(&self.readers).await?)
+        token.fetch_optional(&self.readers).await
     }
 
     /// Whether a token still opens anything.
@@ -103,7 +103,7 @@ impl Store {
                      WHERE sessions.hash = ?1 AND sessions.expires_at > ?2
                        AND revoked_at IS NULL AND (tokens.expires_at IS NULL OR tokens.expires_at > ?2)";
         let token = sql_as!(token, [secret.hash(), Timestamp::now()]);
-        Ok(token.fetch_optional(&self.readers).await?)
+        token.fetch_optional(&self.readers).await
     }
 
     /// Records a session by the hash of its secret. Those that have expired are forgotten.

@@ -93,7 +93,7 @@ impl Store {
     /// The last sign of life of a worker; none if it is not on record.
     pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>> {
         let seen = sql_as!("SELECT seen_at FROM workers WHERE id = ?", [id]);
-        Ok(seen.fetch_optional(&self.readers).await?)
+        seen.fetch_optional(&self.readers).await
     }
 
     /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
