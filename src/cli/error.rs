@@ -1,4 +1,4 @@
-//! How a command ends when it does not end well.
+//! Errors of commands, with their exit codes.
 
 use std::fmt::Display;
 use std::path::Path;
@@ -16,7 +16,7 @@ pub type Result<T, E = CliError> = std::result::Result<T, E>;
 /// Why a command failed, as a sentence for the user.
 #[derive(Debug, thiserror::Error)]
 pub enum CliError {
-    /// What the user gave can't be used; exit code 2, as for wrong arguments.
+    /// The input can't be used; exit code 2, as for wrong arguments.
     #[error("{0}")]
     Input(String),
     /// The machine or the program failed; exit code 1.

@@ -31,7 +31,7 @@ enum Action {
         /// Only those in these states [default: all].
         #[arg(long, value_name = "STATE", value_delimiter = ',')]
         state: Vec<JobState>,
-        /// So many at most.
+        /// Largest number of jobs.
         #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
         limit: u32,
     },

@@ -48,16 +48,16 @@ enum Action {
     Set {
         /// The lab's name.
         lab: Lab,
-        /// Put the lab on record if it is not there yet.
+        /// Create the lab if it does not exist.
         #[arg(long)]
         new: bool,
-        /// Its share of the machine, beside the shares of the other labs; every lab begins with 1.
+        /// The share of the machine, relative to the shares of other labs, which start at 1.
         #[arg(long, value_name = "N", value_parser = share, required_unless_present_any = ["bytes", "jobs"])]
         share: Option<f64>,
-        /// Bytes that it may keep here, in uploads, what is prepared of them, and results, or none for no limit.
+        /// Bytes that the lab may store in uploads, prepared arrays and results; none: no limit.
         #[arg(long, value_name = "N", value_parser = limit)]
         bytes: Option<Limit>,
-        /// Jobs that it may have waiting and running, or none for no limit of its own.
+        /// Jobs of the lab that may wait and run; none: only the limit of the service.
         #[arg(long, value_name = "N", value_parser = limit)]
         jobs: Option<Limit>,
     },

@@ -32,14 +32,13 @@ pub struct MaskArguments {
     /// random, half of it open].
     #[arg(long, value_name = "FILE")]
     lithography: Option<PathBuf>,
-    /// What a mask value of 1 means.
+    /// Meaning of a mask value of 1.
     #[arg(long, value_name = "HOW", default_value = "maximum")]
     normalise: Normalise,
-    /// What a lens blurs the masks by, beside what the optics do: the standard deviation in sensor
-    /// pixels.
+    /// Blur of the masks by a lens, beyond that of the optics: standard deviation in sensor pixels.
     #[arg(long, value_name = "PIXELS", default_value_t = 0.0)]
     blur: f64,
-    /// Light that closed pixels let through, as a share of that of open ones.
+    /// Light that closed pixels transmit, as a share of the light of open ones.
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     leak: f32,
 }
@@ -51,11 +50,11 @@ enum Pattern {
     Iid,
     /// The hybrid coded aperture: a lithography mask seen through random sub-apertures.
     RandomSquares,
-    /// The same, seen through an open circle that turns from frame to frame.
+    /// The lithography mask seen through an open circle that turns from frame to frame.
     RotatingCircle,
-    /// The same, seen through one sub-aperture in each frame: no multiplexing.
+    /// The lithography mask seen through one sub-aperture in each frame: no multiplexing.
     SingleApertures,
-    /// The same, seen through patterns of your own (--images).
+    /// The lithography mask seen through patterns of your own (--images).
     Images,
 }
 

@@ -420,7 +420,7 @@ fn write(
 ) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(failed)?;
-    // A failure on the way leaves an earlier result as it was.
+    // If writing fails, an earlier result stays.
     let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
     write_result(made.path(), manifest, error, |k| Ok(frame(k)))?;
     Ok(replace_result(made.path(), out)?)
@@ -431,14 +431,14 @@ fn write(
 struct Report {
     algorithm: &'static str,
     snapshots: usize,
-    /// Of all snapshots.
+    /// Number of frames of all snapshots.
     frames: usize,
     height: usize,
     width: usize,
     psnr_db: Option<f64>,
     /// How good the frames are, as far as that can be told without a truth: the mean over the snapshots.
     assessment: Option<Assessment>,
-    /// Of each snapshot, where the truth is known.
+    /// PSNR of each snapshot, where the truth is known.
     psnr_db_by_snapshot: Vec<f64>,
     ssim: Option<f64>,
     seconds: f64,

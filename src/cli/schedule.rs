@@ -1,4 +1,4 @@
-//! `sci-recon schedule`: what an algorithm does by itself, as a file to change.
+//! `sci-recon schedule`: the default schedule of an algorithm, to be edited.
 
 use clap::Args;
 use serde_json::json;

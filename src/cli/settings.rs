@@ -74,13 +74,15 @@ pub fn expand(root: &Command, line: Vec<OsString>) -> Result<Expanded> {
             return Err(CliError::Input(text));
         }
         names.push(name);
-        for arg in options(below).filter(|arg| !is_set(arg, set_below)) {
+        for arg in options(below).filter(|arg| !is_on_line(arg, set_below)) {
             let key = arg.get_long().unwrap_or_default();
             if let Some((_, value)) = given.iter().find(|(given, _)| given == key) {
                 let mut token = OsString::from(format!("--{key}="));
                 token.push(value);
                 expanded.push(token);
-            } else if let Some(file) = file.as_ref().filter(|_| !is_excluded(below, arg, set_below))
+            } else if let Some(file) = &file
+                && !is_set(arg, set_below)
+                && !is_excluded(below, arg, set_below)
             {
                 let tokens = file.tokens(&names, arg)?;
                 added.extend((!tokens.is_empty()).then(|| key.to_owned()));
@@ -197,10 +199,14 @@ fn is_set(arg: &Arg, set: &ArgMatches) -> bool {
     matches!(source, Some(ValueSource::CommandLine | ValueSource::EnvVariable))
 }
 
+fn is_on_line(arg: &Arg, set: &ArgMatches) -> bool {
+    set.value_source(arg.get_id().as_str()) == Some(ValueSource::CommandLine)
+}
+
 /// Options before the name of a command, for that command, with their values.
 fn passed_on(command: &Command, set: &ArgMatches) -> Vec<(String, OsString)> {
     let of_program = command.get_name() == PROGRAM;
-    let given = options(command).filter(|arg| of_program && is_set(arg, set));
+    let given = options(command).filter(|arg| of_program && is_on_line(arg, set));
     let value = |arg: &Arg| set.get_raw(arg.get_id().as_str())?.next_back().map(OsStr::to_owned);
     given.filter_map(|arg| Some((arg.get_long()?.to_owned(), value(arg)?))).collect()
 }

@@ -41,7 +41,7 @@ pub struct Arguments {
     snapshots: u16,
     #[command(flatten)]
     masks: MaskArguments,
-    /// Seed of all that is random.
+    /// Seed of the random numbers.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Also write the raw captures that a lab would take, with this number of repeats of each, as
@@ -62,7 +62,7 @@ pub struct Arguments {
 struct Record {
     program_version: &'static str,
     pattern: &'static str,
-    /// Of the masks: standard deviation in sensor pixels, and the share that closed pixels let through.
+    /// Standard deviation of the masks' blur in sensor pixels.
     blur: f64,
     leak: f32,
     seed: u64,

@@ -35,25 +35,25 @@ pub(in crate::cli) struct Progress {
     pub(in crate::cli) percent: f64,
 }
 
-/// What of a job is fetched.
+/// Files of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum Wanted {
     /// The frames of each snapshot, float32.
     #[value(name = "frames.npy")]
     Array,
-    /// The same as a multi-part EXR.
+    /// The frames of each snapshot as a multi-part EXR.
     #[value(name = "stack.exr")]
     Stack,
-    /// The same with the expected error as a layer `sigma`.
+    /// The same with the expected error in a layer `sigma`.
     #[value(name = "stack-sigma.exr")]
     StackWithError,
-    /// The same as a BigTIFF for Fiji and napari.
+    /// The frames of each snapshot as a BigTIFF for Fiji and napari.
     #[value(name = "stack.tif")]
     Tiff,
     /// A movie of each snapshot.
     #[value(name = "movie.mp4")]
     Movie,
-    /// The frames of a colour sensor as it saw them, float32.
+    /// The frames of a colour sensor before demosaicking, float32.
     #[value(name = "mosaic.npy")]
     Mosaic,
     /// The expected error of blocks of the frames, float32.
@@ -62,19 +62,19 @@ pub(in crate::cli) enum Wanted {
     /// Each frame as an EXR.
     #[value(name = "frames")]
     Frames,
-    /// Each frame as a PNG, to look at.
+    /// Each frame as a PNG.
     #[value(name = "png")]
     Pictures,
-    /// How they were made.
+    /// Inputs, schedule, versions and quality of the results.
     #[value(name = "manifest.json")]
     Manifest,
     /// The frames of all snapshots, one after the other.
     #[value(name = "sequence.npy")]
     SequenceArray,
-    /// The same as a BigTIFF.
+    /// The frames of all snapshots as a BigTIFF.
     #[value(name = "sequence.tif")]
     SequenceTiff,
-    /// The same as a movie.
+    /// A movie of all snapshots.
     #[value(name = "sequence.mp4")]
     SequenceMovie,
     /// All files as one archive.

@@ -1,5 +1,5 @@
-//! What became of each file of a watched folder: one JSON object a line, of which the last one of a file holds.
-//! A line is on the disk before what it says is done, so that nothing is done twice under another key.
+//! The state of each file of a watched folder, one JSON object per line. The last line of a file is valid.
+//! A line is on the disk before the step that it announces, so no step is repeated under another key.
 
 use std::collections::HashMap;
 use std::fs::{self, OpenOptions};
@@ -13,7 +13,7 @@ use crate::cli::error::Result;
 use crate::cli::submission::Recipe;
 use store::LockedFile;
 
-/// A file as it was when it was taken up: another size or time is another file.
+/// A file, identified by its name, size and time when it was first recorded.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub(super) struct Shot {
     pub(super) name: String,
@@ -22,16 +22,16 @@ pub(super) struct Shot {
     pub(super) time: (i64, i64),
 }
 
-/// How far a file is.
+/// Progress of a file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "state")]
 pub(super) enum Stage {
-    /// To be sent; by this key the service knows its job again.
+    /// Not submitted yet, or perhaps submitted under its key.
     Taken,
     Submitted {
         job: String,
     },
-    /// Its results are there.
+    /// The results are downloaded.
     Done {
         job: String,
     },
@@ -50,11 +50,11 @@ impl Stage {
 pub(super) struct Entry {
     #[serde(flatten)]
     pub(super) shot: Shot,
-    /// Of the requests that make its measurement and job.
+    /// Idempotency key of its measurement and its job.
     pub(super) key: String,
-    /// What is asked for, as it was decided when the file was taken up.
+    /// The requests, as decided when the file was recorded.
     pub(super) recipe: Recipe,
-    /// Where results come, or the reason of a failure: a name that was free.
+    /// Name of the results, or of the reason of a failure; it was free.
     pub(super) results: String,
     #[serde(flatten)]
     pub(super) stage: Stage,
@@ -67,18 +67,18 @@ pub(super) struct Ledger {
 }
 
 impl Ledger {
-    /// Opens the ledger of a folder, which is made if there is none.
-    /// Errors: another process has it open; a line in it is none of ours.
+    /// Opens or creates the ledger of a folder.
+    /// Errors: another process has it open; a line can't be read.
     pub(super) fn open(path: PathBuf) -> Result<Self> {
         let failed = |error: std::io::Error| CliError::file("open", &path, &error);
         let mut options = OpenOptions::new();
         let file = options.create(true).read(true).append(true).open(&path).map_err(failed)?;
         let file = LockedFile::take(file).map_err(|error| {
-            let text = "another watch-folder is at it";
+            let text = "another watch-folder watches this folder";
             CliError::Input(format!("{}: {text} ({error})", path.display()))
         })?;
         let text = fs::read_to_string(&path).map_err(failed)?;
-        // A line that was being written when the power went: what it says was not done.
+        // An incomplete last line announces a step that was not begun.
         let whole = text.rfind('\n').map_or(0, |end| end + 1);
         file.set_len(whole as u64).map_err(failed)?;
         let mut entries = HashMap::new();
@@ -96,12 +96,12 @@ impl Ledger {
         self.entries.contains_key(shot)
     }
 
-    /// Whether results of some file come there.
+    /// True if results of a file have this name.
     pub(super) fn has_results(&self, name: &str) -> bool {
         self.entries.values().any(|entry| entry.results == name)
     }
 
-    /// What is not at its end yet, the oldest file first.
+    /// Entries that have not ended, the oldest file first.
     pub(super) fn open_entries(&self) -> Vec<Entry> {
         let mut open: Vec<Entry> =
             self.entries.values().filter(|entry| !entry.stage.is_final()).cloned().collect();
@@ -109,7 +109,7 @@ impl Ledger {
         open
     }
 
-    /// Writes down how far a file is; it is on the disk when this returns.
+    /// Records the progress of a file. It is on the disk when this returns.
     pub(super) fn note(&mut self, entry: Entry) -> Result<()> {
         let failed = |error: std::io::Error| CliError::file("write", &self.path, &error);
         let line = serde_json::to_string(&entry).map_err(|error| failed(error.into()))?;
