@@ -18,7 +18,8 @@ use tempfile::TempDir;
 
 use super::{
     ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob, NewMeasurement,
-    Product, Purpose, Source, StagedDir, Store, StoreError, Work, WorkerEnd, WorkerPlace,
+    Product, Purpose, RequestKey, Source, StagedDir, Store, StoreError, Work, WorkerEnd,
+    WorkerPlace,
 };
 use engine::job::{
     Algorithm, JobId, JobRequest, JobState, MeasurementId, ResultFile, Sequence, Sha256,
@@ -172,8 +173,7 @@ impl Lab {
             most_jobs: 1000,
             lab: lab.clone(),
             spec,
-            request: Sha256::of(request),
-            idempotency_key: key.map(Into::into),
+            key: key.map(|key| RequestKey { key: key.into(), request: Sha256::of(request) }),
         };
         self.store.add_job(new).await
     }
