@@ -107,7 +107,8 @@ CREATE TABLE scrub (
 CREATE TABLE request_keys (
     -- Idempotency keys: a request that is repeated with its key creates nothing new.
     lab     TEXT NOT NULL,
-    what    TEXT NOT NULL CHECK (what IN ('calibration', 'measurement', 'model', 'upload')),
+    what    TEXT NOT NULL CHECK (what IN
+                ('calibration', 'job', 'measurement', 'model', 'upload')),
     key     TEXT NOT NULL,
     request TEXT NOT NULL, -- hash of the request, which distinguishes a repetition from another request
     id      TEXT NOT NULL, -- identifier of the created row
@@ -200,25 +201,23 @@ CREATE INDEX models_calibration ON models (calibration);
 CREATE INDEX models_file ON models (file);
 
 CREATE TABLE jobs (
-    id              TEXT PRIMARY KEY,
-    lab             TEXT NOT NULL,
-    calibration     TEXT NOT NULL REFERENCES calibrations (id),
-    measurement     TEXT NOT NULL REFERENCES measurements (id),
-    model           TEXT REFERENCES models (id),
-    label           TEXT,
-    spec            TEXT NOT NULL, -- JobSpec as JSON
-    state           TEXT NOT NULL CHECK (state IN
-                        ('queued', 'running', 'succeeded', 'failed', 'cancelling', 'cancelled')),
-    priority        INTEGER NOT NULL,
-    error           TEXT, -- the reason of a failure
-    idempotency_key TEXT UNIQUE,
-    request         TEXT NOT NULL, -- hash of the request, which distinguishes a repetition
-    disk_bytes      INTEGER NOT NULL, -- reserved for its results until it ends
-    result_bytes    INTEGER NOT NULL DEFAULT 0, -- sum over its result files
-    assessment      TEXT, -- expected quality, as JSON; NULL until it is known
-    created_at      INTEGER NOT NULL,
-    started_at      INTEGER, -- first claim of a task
-    finished_at     INTEGER
+    id           TEXT PRIMARY KEY,
+    lab          TEXT NOT NULL,
+    calibration  TEXT NOT NULL REFERENCES calibrations (id),
+    measurement  TEXT NOT NULL REFERENCES measurements (id),
+    model        TEXT REFERENCES models (id),
+    label        TEXT,
+    spec         TEXT NOT NULL, -- JobSpec as JSON
+    state        TEXT NOT NULL CHECK (state IN
+                      ('queued', 'running', 'succeeded', 'failed', 'cancelling', 'cancelled')),
+    priority     INTEGER NOT NULL,
+    error        TEXT, -- the reason of a failure
+    disk_bytes   INTEGER NOT NULL, -- reserved for its results until it ends
+    result_bytes INTEGER NOT NULL DEFAULT 0, -- sum over its result files
+    assessment   TEXT, -- expected quality, as JSON; NULL until it is known
+    created_at   INTEGER NOT NULL,
+    started_at   INTEGER, -- first claim of a task
+    finished_at  INTEGER
 ) STRICT, WITHOUT ROWID;
 
 CREATE INDEX jobs_lab ON jobs (lab, id);
@@ -425,4 +424,5 @@ END;
 CREATE TRIGGER jobs_end AFTER DELETE ON jobs
 BEGIN
     DELETE FROM tasks WHERE thing = OLD.id;
+    DELETE FROM request_keys WHERE id = OLD.id;
 END;

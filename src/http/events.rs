@@ -65,6 +65,7 @@ type Kind = fn(&Told) -> &HashMap<Lab, String>;
 
 fn kind(what: Made) -> Kind {
     match what {
+        Made::Job => |told| &told.jobs,
         Made::Calibration => |told| &told.calibrations,
         Made::Measurement => |told| &told.measurements,
         Made::Model | Made::Upload => |told| &told.models,

@@ -192,7 +192,15 @@ pub(super) fn request_key<T: Serialize>(
     headers: &HeaderMap,
     request: &T,
 ) -> Result<Option<RequestKey>> {
-    let Some(key) = idempotency_key(headers)? else { return Ok(None) };
+    hashed_key(idempotency_key(headers)?, request)
+}
+
+/// A key with the hash of its request.
+pub(super) fn hashed_key<T: Serialize>(
+    key: Option<String>,
+    request: &T,
+) -> Result<Option<RequestKey>> {
+    let Some(key) = key else { return Ok(None) };
     let text = serde_json::to_vec(request).map_err(|error| ApiError::internal(&error))?;
     Ok(Some(RequestKey { key, request: Sha256::of(&text) }))
 }

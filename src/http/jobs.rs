@@ -13,15 +13,16 @@ use super::access::Access;
 use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, idempotency_key};
+use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Limit, PageBody, ShowQuery};
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec,
     JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule, Sequence,
-    Sha256, SnapshotRange, TileSpec, Timestamp, priority_error,
+    SnapshotRange, TileSpec, Timestamp, priority_error,
 };
 use store::{
-    Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob, Page, Span, StoreError,
+    Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, Made, NewJob, Page, RequestKey,
+    Span, StoreError,
 };
 
 #[derive(Debug, Serialize)]
@@ -152,7 +153,7 @@ pub(super) async fn create(
     headers: HeaderMap,
     Body(request): Body<JobRequest>,
 ) -> Result<Response> {
-    let key = idempotency_key(&headers)?;
+    let key = request_key(&headers, &request)?;
     let (status, body) = make(&app, &access, request, key).await?;
     let location = [(header::LOCATION, body.place())];
     Ok((status, location, Json(body)).into_response())
@@ -163,32 +164,27 @@ pub(super) async fn make(
     app: &App,
     access: &Access,
     request: JobRequest,
-    idempotency_key: Option<String>,
+    key: Option<RequestKey>,
 ) -> Result<(StatusCode, JobBody)> {
-    // Hashed as it was understood, so that white space and the order of fields do not matter.
-    let text = serde_json::to_vec(&request).map_err(|error| ApiError::internal(&error))?;
-    let inserted = insert(app, access, request, Sha256::of(&text), idempotency_key);
-    let (status, id) = created(inserted.await?);
+    let inserted = match app.store.made_with(&access.lab, Made::Job, key.as_ref()).await? {
+        Some(id) => Inserted::Before(id),
+        None => insert(app, access, request, key).await?,
+    };
+    let (status, id) = created(inserted);
     Ok((status, body(app, &access.lab, id).await?))
 }
 
-/// Accepts a job, unless it was accepted before, if there is room for it.
+/// Accepts a job, if there is room for it.
 async fn insert(
     app: &App,
     access: &Access,
     request: JobRequest,
-    hash: Sha256,
-    idempotency_key: Option<String>,
+    key: Option<RequestKey>,
 ) -> Result<Inserted> {
-    if let Some(key) = &idempotency_key
-        && let Some(job) = app.store.job_with_key(&access.lab, key, hash).await?
-    {
-        return Ok(Inserted::Before(job));
-    }
     let spec = resolve(app, access, request).await?;
     let lab = access.lab.clone();
     let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
-    let new = NewJob { most_jobs, lab, spec, request: hash, idempotency_key };
+    let new = NewJob { most_jobs, lab, spec, key };
     app.admission.with_room("the job", needed, app.store.add_job(new)).await
 }
 

@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::error::{ApiError, Result};
-use super::extract::{Body, Caller, idempotency_key};
+use super::extract::{Body, Caller, hashed_key, idempotency_key};
 use super::intake;
 use super::jobs::{self, JobBody};
 use super::submissions::make;
@@ -79,6 +79,7 @@ pub(super) async fn create(
         priority: 0,
         label: request.label,
     };
+    let key = hashed_key(key, &job)?;
     let (status, job) = jobs::make(&app, &access, job, key).await?;
     let location = [(header::LOCATION, job.place())];
     Ok((status, location, Json(SampleBody { masks, data, truth, job })).into_response())

@@ -22,7 +22,7 @@ async fn a_copy_of_a_newer_version_is_refused_unchanged() {
     let new = folder.path().join("new");
     let out = new.display().to_string();
     assert!(run(&["backup", "--out", &out], app.data()).0);
-    // As a later version would have made it.
+    // A later version leaves a database like this.
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(new.join("sci-recon.db"));
     let mut database = sqlx::ConnectOptions::connect(&options).await.unwrap();
     let later =

@@ -132,7 +132,7 @@ impl Store {
                 Ok(()) => {
                     removed += 1;
                     // Before the disk is asked again.
-                    self.discarded().await;
+                    self.removals.finished().await;
                 }
                 // Taken up again or deleted meanwhile.
                 Err(StoreError::NotFinal(_) | StoreError::NotFound { .. }) => {}

@@ -28,6 +28,7 @@ mod locked;
 mod migrations;
 mod queue;
 mod records;
+mod removal;
 mod rows;
 mod staging;
 mod submit;
@@ -38,7 +39,6 @@ mod upgrade;
 mod watch;
 
 use std::path::Path;
-use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -84,8 +84,7 @@ pub struct Store {
     forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
     /// Hashes of files that were read before they were handed out.
     hashes: Arc<hashes::Hashes>,
-    /// How much is being removed from the disk.
-    going: Arc<AtomicUsize>,
+    removals: removal::Removals,
     /// What was last found wrong with the database.
     damage: Arc<Mutex<Option<String>>>,
     /// The number of the newest migration.
@@ -151,7 +150,7 @@ impl Store {
             readers,
             forecast,
             hashes,
-            going: Arc::default(),
+            removals: removal::Removals::default(),
             damage: Arc::default(),
             schema: schema.newest(),
             _server: server,
@@ -186,8 +185,9 @@ impl Store {
         &self.dir
     }
 
-    /// Waits for running statements and closes all connections.
+    /// Waits for running statements and removals, and closes all connections.
     pub async fn close(&self) {
+        self.removals.finished().await;
         self.readers.close().await;
         self.writer.close().await;
     }

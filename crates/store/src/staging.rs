@@ -6,8 +6,6 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
-use std::time::Duration;
 
 use uuid::Uuid;
 
@@ -93,22 +91,9 @@ impl Store {
         })
         .await?;
         if found {
-            let going = self.going.clone();
-            going.fetch_add(1, Ordering::AcqRel);
-            tokio::spawn(async move {
-                // What a crash or an error leaves of it is swept.
-                let _ = on_files(move || dir::remove(&rest)).await;
-                going.fetch_sub(1, Ordering::AcqRel);
-            });
+            self.removals.begin(rest);
         }
         Ok(())
-    }
-
-    /// Waits until the bytes of all that was discarded are gone.
-    pub(super) async fn discarded(&self) {
-        while self.going.load(Ordering::Acquire) > 0 {
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
     }
 
     /// A new empty folder for the results of a task. Blocks on the disk.
@@ -216,23 +201,22 @@ impl StagedBlob {
         &self.temporary.path
     }
 
-    /// Moves the file to its place, and gives its identity there. The writer's lock of the database must be held.
-    pub(super) fn put(mut self, place: &Path) -> Result<Identity> {
+    /// Moves the file to its place. Gives its identity there, and the file that it replaced, which the caller removes.
+    /// The writer's lock of the database must be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<(Identity, Option<PathBuf>)> {
         if let Some(folder) = place.parent() {
             dir::make_dir_durably(folder)?;
         }
-        // Also over a file that is there: it has the same bytes, or is damaged. Its bytes go in the background:
-        // how long that takes would tell that another lab had sent the same.
+        // A file that is there has the same bytes, or is damaged. It is removed in the background: the time that
+        // this takes would reveal that another lab had sent the same bytes.
         let old = self.temporary.path.with_extension("old");
         let replaced = fs::hard_link(place, &old).is_ok();
         dir::rename_durably(&self.temporary.path, place)?;
-        if replaced {
-            std::thread::spawn(move || dir::remove(&old));
-        }
         // Two names of one file stay two: it was stored before, by an attempt that a crash ended.
         dir::remove(&self.temporary.path)?;
         self.temporary.moved = true;
-        Ok(Identity::of(&fs::metadata(place).map_err(StoreError::io("read", place))?))
+        let identity = Identity::of(&fs::metadata(place).map_err(StoreError::io("read", place))?);
+        Ok((identity, replaced.then_some(old)))
     }
 }
 
@@ -246,18 +230,19 @@ impl StagedDir {
         &self.0.path
     }
 
-    /// Moves the folder to `place`; what was there goes. The writer's lock must be held.
-    pub(super) fn put(mut self, place: &Path) -> Result<()> {
+    /// Moves the folder to `place`. Gives the folder that it replaced, which the caller removes. The writer's lock must
+    /// be held.
+    pub(super) fn put(mut self, place: &Path) -> Result<Option<PathBuf>> {
         if place.exists() {
             let old = self.0.path.with_extension("old");
             dir::rename_durably(place, &old)?;
             dir::rename_durably(&self.0.path, place)?;
             self.0.moved = true;
-            return dir::remove(&old);
+            return Ok(Some(old));
         }
         dir::rename_durably(&self.0.path, place)?;
         self.0.moved = true;
-        Ok(())
+        Ok(None)
     }
 
     /// Moves the files, not the folder, into the folder `place`. The writer's lock must be held.

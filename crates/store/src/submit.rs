@@ -2,17 +2,14 @@
 
 use std::str::FromStr;
 
-use sqlx::SqliteConnection;
-
 use super::Store;
-use super::error::{Result, StoreError};
+use super::error::Result;
 use super::queue::graph;
 use super::rows::{Reference, require};
 use super::tables::keys::{self, Inserted, Made, RequestKey};
 use super::tables::{jobs, quota, requests};
-use crate::columns::sql_as;
 use engine::job::{
-    CheckLimits, InvalidId, JobId, JobSpec, Lab, Sha256, Submission, TaskKind, ThingId, TokenId,
+    CheckLimits, InvalidId, JobId, JobSpec, Lab, Submission, TaskKind, ThingId, TokenId,
 };
 
 #[derive(Debug, Clone)]
@@ -21,10 +18,7 @@ pub struct NewJob {
     pub most_jobs: u64,
     pub lab: Lab,
     pub spec: JobSpec,
-    /// The hash of the request as it was sent.
-    pub request: Sha256,
-    /// The user's key against double submission.
-    pub idempotency_key: Option<String>,
+    pub key: Option<RequestKey>,
 }
 
 /// A request for something that is made of uploads.
@@ -70,10 +64,9 @@ impl Store {
     /// the measurement or the model is gone.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted> {
         let mut transaction = self.write().await?;
-        if let Some(key) = &new.idempotency_key
-            && let Some(job) = with_key(&mut transaction, &new.lab, key, new.request).await?
-        {
-            return Ok(Inserted::Before(job));
+        let key = new.key.as_ref();
+        if let Some(before) = keys::found(&mut transaction, &new.lab, Made::Job, key).await? {
+            return Ok(Inserted::Before(before));
         }
         quota::check_jobs(&mut transaction, &new.lab, new.most_jobs).await?;
         quota::check(&mut transaction, &new.lab, None, new.spec.disk_bytes()).await?;
@@ -81,46 +74,10 @@ impl Store {
         references.extend(new.spec.model.as_ref().map(|model| Reference::Model(model.id)));
         require(&mut transaction, &references).await?;
         let id = JobId::new();
-        let key = new.idempotency_key.as_ref().map(|key| key_of(&new.lab, key));
-        jobs::insert(&mut transaction, id, &new.lab, &new.spec, (new.request, key)).await?;
+        jobs::insert(&mut transaction, id, &new.lab, &new.spec).await?;
         graph::insert(&mut transaction, &new.lab, id, &new.spec).await?;
+        keys::insert(&mut transaction, &new.lab, Made::Job, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
-    }
-
-    /// The job that the lab made with this key, if it made one.
-    /// Errors: [`StoreError::KeyReused`] if it asked for another one with it.
-    pub async fn job_with_key(
-        &self,
-        lab: &Lab,
-        key: &str,
-        request: Sha256,
-    ) -> Result<Option<JobId>> {
-        let mut connection = self.readers.acquire().await?;
-        with_key(&mut connection, lab, key, request).await
-    }
-}
-
-/// A key as it is stored: good for one job of a lab.
-fn key_of(lab: &Lab, key: &str) -> String {
-    format!("{lab} {key}")
-}
-
-/// The job that the lab made with this key; an error if its request was another one.
-async fn with_key(
-    connection: &mut SqliteConnection,
-    lab: &Lab,
-    key: &str,
-    request: Sha256,
-) -> Result<Option<JobId>> {
-    let found: Option<(JobId, Sha256)> =
-        sql_as!("SELECT id, request FROM jobs WHERE idempotency_key = ?", [key_of(lab, key)])
-            .fetch_optional(connection)
-            .await?;
-    match found {
-        Some((job, asked)) if asked != request => {
-            Err(StoreError::KeyReused { key: key.to_owned(), what: "job", id: job.to_string() })
-        }
-        found => Ok(found.map(|(job, _)| job)),
     }
 }

@@ -20,8 +20,8 @@ use tempfile::TempDir;
 
 use super::{
     Checked, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob,
-    NewMeasurement, NewRequest, Product, Purpose, StagedDir, Store, StoreError, Work, WorkerEnd,
-    WorkerPlace,
+    NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError, Work,
+    WorkerEnd, WorkerPlace,
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
@@ -184,8 +184,7 @@ impl Lab {
             most_jobs: 1000,
             lab: lab.clone(),
             spec,
-            request: Sha256::of(request),
-            idempotency_key: key.map(Into::into),
+            key: key.map(|key| RequestKey { key: key.into(), request: Sha256::of(request) }),
         };
         self.store.add_job(new).await
     }

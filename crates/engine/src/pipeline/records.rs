@@ -169,7 +169,7 @@ pub struct TileTaskRecord {
     pub tile: TileRecord,
     /// The snapshots that have frames here, by their place in the run; the others are left to another run.
     pub solved: Vec<usize>,
-    /// None where nothing can be estimated.
+    /// `None` if nothing can be estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assessment: Option<TileAssessment>,
     /// From reading its window to its frames.

@@ -131,14 +131,15 @@ impl Store {
     ) -> Result<()> {
         let folder = self.dir().results(job);
         let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));
-        on_files(move || {
+        let replaced = on_files(move || {
             dir::make_dir_durably(&folder)?;
             match place {
                 Some(place) => staged.put(&place),
-                None => staged.put_files(&folder, &files),
+                None => staged.put_files(&folder, &files).map(|()| None),
             }
-        })
-        .await
+        });
+        replaced.await?.into_iter().for_each(|path| self.removals.begin(path));
+        Ok(())
     }
 
     /// Records the outcome of a check, and has the report of a calibration made.

@@ -161,7 +161,8 @@ impl Store {
     ) -> Result<()> {
         let (sha256, size) = (staged.sha256(), staged.size());
         let (place, digests) = (self.dir().blob(&sha256), staged.digests());
-        let identity = on_files(move || staged.put(&place)).await?;
+        let (identity, replaced) = on_files(move || staged.put(&place)).await?;
+        replaced.into_iter().for_each(|path| self.removals.begin(path));
         self.hashes.remember(identity, digests);
         let now = Timestamp::now();
         sql!(

@@ -7,8 +7,7 @@ use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Page, Span};
 use engine::job::{
-    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
-    Timestamp,
+    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Timestamp,
 };
 
 #[derive(Debug, Clone, PartialEq)]
@@ -130,18 +129,17 @@ impl Store {
     }
 }
 
-/// Writes the row of a job with the hash of its request, and the user's key if there is one.
+/// Writes the row of a job.
 pub async fn insert(
     connection: &mut SqliteConnection,
     id: JobId,
     lab: &Lab,
     spec: &JobSpec,
-    (request, key): (Sha256, Option<String>),
 ) -> Result<()> {
     sql!(
         "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-             idempotency_key, request, created_at, lab, disk_bytes, model)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             created_at, lab, disk_bytes, model)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             id,
             spec.calibration,
@@ -150,8 +148,6 @@ pub async fn insert(
             Json(spec),
             JobState::Queued,
             spec.priority,
-            key,
-            request,
             Timestamp::now(),
             lab,
             spec.disk_bytes(),

@@ -1,4 +1,4 @@
-//! Table `request_keys`: the keys by which a request that comes twice makes one thing.
+//! Table `request_keys`: idempotency keys. A request that is repeated with its key creates nothing new.
 
 use std::fmt::Display;
 use std::str::FromStr;
@@ -16,6 +16,7 @@ use engine::job::{InvalidId, JobId, Lab, Sha256};
 #[strum(serialize_all = "lowercase", const_into_str)]
 pub enum Made {
     Calibration,
+    Job,
     Measurement,
     Model,
     Upload,

@@ -362,7 +362,7 @@ impl Store {
         Ok(ended)
     }
 
-    /// As [`promised`].
+    /// Bytes of the disk that are reserved and not written yet.
     pub async fn promised_bytes(&self) -> Result<u64> {
         promised(&mut *self.readers.acquire().await?).await
     }

@@ -3,7 +3,7 @@
 use super::{Lab, id};
 use crate::NewJob;
 use engine::job::{
-    Algorithm, JobId, JobState, RunSpec, Sequence, Sha256, SnapshotRange, TaskKind, TileSpec,
+    Algorithm, JobId, JobState, RunSpec, Sequence, SnapshotRange, TaskKind, TileSpec,
 };
 
 impl Lab {
@@ -19,8 +19,7 @@ impl Lab {
         spec.run = RunSpec { length: 2, overlap: 1 };
         spec.algorithm = Algorithm::GapTv3d;
         spec.tile = TileSpec { size: 64, overlap: 8 };
-        let request = Sha256::of(b"sequence");
-        let new = NewJob { most_jobs: 1000, lab: local, spec, request, idempotency_key: None };
+        let new = NewJob { most_jobs: 1000, lab: local, spec, key: None };
         id(self.store.add_job(new).await.unwrap())
     }
 }
