@@ -32,7 +32,7 @@ pub struct NewRequest {
 
 impl Store {
     /// Records a request for something that is made of uploads, and puts their check in the queue.
-    /// Errors: [`StoreError::KeyReused`]; [`StoreError::ManyChecks`]; [`StoreError::NotFound`] if an upload or the
+    /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused); [`StoreError::ManyChecks`](crate::StoreError::ManyChecks); [`StoreError::NotFound`](crate::StoreError::NotFound) if an upload or the
     /// calibration is gone.
     pub async fn request<Id>(
         &self,
@@ -59,8 +59,8 @@ impl Store {
     }
 
     /// Accepts a job: the job and its tasks, or nothing.
-    /// Errors: [`StoreError::KeyReused`]; [`StoreError::QueueFull`]; [`StoreError::Quota`];
-    /// [`StoreError::NotFound`] if
+    /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused); [`StoreError::QueueFull`](crate::StoreError::QueueFull); [`StoreError::Quota`](crate::StoreError::Quota);
+    /// [`StoreError::NotFound`](crate::StoreError::NotFound) if
     /// the measurement or the model is gone.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted> {
         let mut transaction = self.write().await?;
