@@ -3,6 +3,8 @@
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::mpsc;
+use std::time::Duration;
 
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
@@ -118,7 +120,9 @@ impl TestApp {
     ) -> Self {
         let data = folder.path().join(subfolder);
         let (arguments, token) = (owned(arguments), std::sync::RwLock::default());
-        Self { _folder: folder, data, process, url, client: Client::new(), arguments, token }
+        // A server that stops answering fails the test.
+        let client = Client::builder().read_timeout(LONGEST_SILENCE).build().unwrap();
+        Self { _folder: folder, data, process, url, client, arguments, token }
     }
 
     /// Restarts the service on the same data with other arguments.
@@ -169,6 +173,7 @@ impl TestApp {
     pub fn stop(&mut self) -> std::process::ExitStatus {
         let pid = rustix::process::Pid::from_raw(self.process.id() as i32).unwrap();
         rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+        let _limit = kill_after(self.process.id(), LONGEST_SILENCE);
         self.process.wait().unwrap()
     }
 
@@ -325,6 +330,32 @@ impl Drop for TestApp {
     }
 }
 
+/// Longest time in which a healthy server starts, answers or ends, on a busy machine.
+const LONGEST_SILENCE: Duration = Duration::from_secs(180);
+
+/// A command line of the program that is ended with an error if it runs for too long, as a server does
+/// that should have been refused.
+pub fn bounded_program() -> Command {
+    let mut command = Command::new("timeout");
+    command.arg(LONGEST_SILENCE.as_secs().to_string()).arg(env!("CARGO_BIN_EXE_sci-recon"));
+    command
+}
+
+/// Kills the process after this time, unless the returned value is dropped before.
+fn kill_after(process: u32, limit: Duration) -> mpsc::Sender<()> {
+    let (alive, dropped) = mpsc::channel();
+    std::thread::spawn(move || {
+        let expired = dropped.recv_timeout(limit) == Err(mpsc::RecvTimeoutError::Timeout);
+        if let Some(pid) = rustix::process::Pid::from_raw(process.cast_signed()).filter(|_| expired)
+        {
+            eprintln!("process {process} is killed after {limit:?}");
+            // The process may have ended already.
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::KILL);
+        }
+    });
+    alive
+}
+
 fn owned(arguments: &[&str]) -> Vec<String> {
     arguments.iter().map(|&text| text.to_owned()).collect()
 }
@@ -348,7 +379,9 @@ fn spawn(
         .spawn()
         .unwrap();
     let mut line = String::new();
+    let limit = kill_after(process.id(), LONGEST_SILENCE);
     BufReader::new(process.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    drop(limit);
     let Ok(announced) = serde_json::from_str::<Value>(&line) else {
         process.wait().unwrap();
         return None;

@@ -89,9 +89,11 @@ async fn queued_jobs_have_a_position_and_can_be_searched() {
 
 #[tokio::test]
 async fn a_first_listener_reads_again_after_the_first_poll() {
-    let app = TestApp::start().await;
+    let mut app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    // No request waits any longer, so the listener is the first one.
+    app.restart();
     let mut stream = app.request(Method::GET, "/v1/events").send().await.unwrap().bytes_stream();
     let mut text = String::new();
     // Otherwise a change between the greeting and the first poll would be lost.
@@ -105,6 +107,8 @@ async fn a_first_listener_reads_again_after_the_first_poll() {
 async fn listeners_receive_changes_and_do_not_delay_a_stop() {
     let mut app = TestApp::start().await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // No request waits any longer, so the listener is the first one.
+    app.restart();
     let response = app.request(Method::GET, "/v1/events").send().await.unwrap();
     assert_eq!(response.headers()["content-type"], "text/event-stream");
     let mut stream = response.bytes_stream();

@@ -3,13 +3,13 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, bounded_program};
 use crate::faults::sha256;
 
 fn run(arguments: &[&str], data: &Path) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let mut command = bounded_program();
     command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
     command.env("RUST_LOG", "error").output().unwrap()
 }

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, bounded_program};
 
 /// The error output of a command on a folder, and whether the command succeeded.
 fn run(arguments: &[&str], data: &Path) -> (bool, String) {
-    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let mut command = bounded_program();
     let output = command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
     let output = output.output().unwrap();
     (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())

@@ -45,8 +45,10 @@ async fn metrics_of_labs_require_a_token_for_all_labs() {
 
 #[tokio::test]
 async fn listeners_receive_changes_of_calibrations() {
-    let app = TestApp::start().await;
+    let mut app = TestApp::start().await;
     app.calibrate(Scene::SMALL.masks()).await.expect(201);
+    // No request waits any longer, so the listener is the first one.
+    app.restart();
     let response = app.request(Method::GET, "/v1/events").send().await.unwrap();
     let mut stream = response.bytes_stream();
     let mut text = String::new();
@@ -62,15 +64,10 @@ async fn listeners_receive_changes_of_calibrations() {
         }
     };
     heard("event: hello").await;
-    // Later polls are compared with the first one, which may ask to read the list again.
-    tokio::time::sleep(Duration::from_millis(2500)).await;
+    // The first poll asks to read the list again. Later polls are compared with it.
+    assert_eq!(heard("event: calibrations\ndata: ").await["more"], true);
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
-    let change = loop {
-        let change = heard("event: calibrations\ndata: ").await;
-        if change["more"] != true {
-            break change;
-        }
-    };
+    let change = heard("event: calibrations\ndata: ").await;
     assert_eq!(change, json!({"changed": [calibration], "deleted": [], "more": false}));
     let place = format!("/v1/calibrations/{calibration}");
     let rename = app.request(Method::PATCH, &place).json(&json!({"name": "May"}));

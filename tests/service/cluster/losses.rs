@@ -145,7 +145,7 @@ async fn a_server_connects_when_the_message_server_appears() {
 async fn an_invalid_address_or_credential_stops_the_server() {
     let serve = |line: &[&str]| {
         let folder = tempfile::tempdir().unwrap();
-        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        let mut command = crate::app::bounded_program();
         let data = folder.path().join("data");
         let ran = command.args(["serve", "--data"]).arg(data).args(line).output().unwrap();
         assert!(!ran.status.success());
