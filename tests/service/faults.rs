@@ -54,6 +54,20 @@ impl TestApp {
         children(self.pid()).into_iter().find(|pid| is_light(*pid))
     }
 
+    /// Ends the server and its workers at once, so that none of them tidies up.
+    pub fn cut_power(&mut self) {
+        let workers = children(self.pid());
+        let send = |signal| {
+            for pid in &workers {
+                // The process may have ended already.
+                let _ = rustix::process::kill_process(*pid, signal);
+            }
+        };
+        send(rustix::process::Signal::STOP);
+        self.kill();
+        send(rustix::process::Signal::KILL);
+    }
+
     /// Sends SIGKILL to one worker.
     pub fn kill_worker(&self, choice: usize) {
         let workers = self.workers();

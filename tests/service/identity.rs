@@ -128,9 +128,9 @@ async fn a_foreign_or_older_database_is_rejected() {
     std::fs::write(database(&data), newer).unwrap();
     app.restart();
     assert_eq!(files(&data).len(), 4);
-    // The write-ahead log is lost. After a kill, the last records are only there.
+    // The write-ahead log is lost. After a power cut, the last records are only there.
     send(&app, 1, "c").await;
-    app.kill();
+    app.cut_power();
     remove_log(&data);
     refused(&data, "the database is older than the folder, or has lost its -wal file");
     let app = app.again(&["--workers", "0", "--accept-database"]).await;
@@ -141,7 +141,7 @@ async fn a_foreign_or_older_database_is_rejected() {
 #[tokio::test]
 async fn a_database_from_before_a_token_is_rejected() {
     let mut app = TestApp::start().await;
-    app.kill();
+    app.cut_power();
     let older = ["sci-recon.db", "sci-recon.db-wal"].map(|name| (name, app.data().join(name)));
     let older = older.map(|(name, path)| (name, std::fs::read(path).unwrap()));
     app.token(&["create", "--lab", "a"]);
@@ -172,7 +172,7 @@ async fn many_orphans_are_rejected_and_few_are_quarantined() {
     assert_eq!((app.blobs_in("blobs"), app.blobs_in("quarantine")), (9, 1));
     // Many orphans.
     forget(4).await;
-    app.kill();
+    app.cut_power();
     let data = app.data().to_owned();
     let before = files(&data);
     let output = run(&["serve", "--listen", "127.0.0.1:0", "--workers", "0"], &data);
