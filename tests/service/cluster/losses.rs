@@ -152,7 +152,7 @@ async fn an_invalid_address_or_credential_stops_the_server() {
         String::from_utf8(ran.stderr).unwrap()
     };
     let report = serve(&["--listen", "127.0.0.1:0", "--nats", "nowhere at all"]);
-    assert!(report.contains("is no address of a NATS server"), "{report}");
+    assert!(report.contains("is not an address of a NATS server"), "{report}");
     let report = serve(&["--listen", "127.0.0.1:0", "--nats-creds", "/nowhere/hub.creds"]);
     assert!(report.contains("hub.creds"), "{report}");
 }
