@@ -158,11 +158,11 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        let (place, light) = (WorkerPlace::default(), self.claimant == Claimant::Light);
-        Ok(self.store.worker_started(self.worker, std::process::id(), &place, light).await?)
+        let (location, light) = (WorkerPlace::default(), self.claimant == Claimant::Light);
+        Ok(self.store.worker_started(self.worker, std::process::id(), &location, light).await?)
     }
 
-    async fn seen(&self) -> Result<(), TransportError> {
+    async fn report_alive(&self) -> Result<(), TransportError> {
         Ok(self.store.worker_seen(self.worker).await?)
     }
 

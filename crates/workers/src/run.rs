@@ -105,7 +105,7 @@ impl<T: Transport> Worker<T> {
                 Ok(None) => {
                     if last_sign.elapsed() >= SIGN {
                         last_sign = Instant::now();
-                        if let Err(error) = self.transport.seen().await {
+                        if let Err(error) = self.transport.report_alive().await {
                             tracing::warn!(%error, "the worker's sign of life is not recorded");
                         }
                     }

@@ -44,7 +44,7 @@ pub trait Transport: Clone + Send + 'static {
     async fn started(&self) -> Result<(), TransportError>;
 
     /// Reports that an idle worker is alive.
-    async fn seen(&self) -> Result<(), TransportError>;
+    async fn report_alive(&self) -> Result<(), TransportError>;
 
     async fn claim(&self) -> Result<Option<Claim>, TransportError>;
 

@@ -1,5 +1,5 @@
-//! The pilot of a job: which of its planned iterations pay, and which of its snapshots belong together,
-//! decided once for all its tiles.
+//! The pilot of a job. It decides once for all tiles how many of the planned iterations are useful, and which snapshots
+//! are reconstructed together.
 
 use ndarray::{ArrayView2, s};
 
@@ -15,20 +15,24 @@ use reconstruction::sequence::SequencePlan;
 use reconstruction::solver::Observer;
 use reconstruction::tile::Window;
 
-/// What is to be found out, and on which piece of the snapshots.
+/// The task of a pilot.
 #[derive(Debug, Clone, Copy)]
 pub struct Pilot<'a> {
-    /// The index of the first snapshot in the measurement.
+    /// Index of the first snapshot in the measurement.
     pub first: usize,
-    /// The piece's place in the picture.
-    pub place: &'a Window,
+    /// The part of the picture that the pilot solves.
+    pub window: &'a Window,
     pub schedule: &'a Schedule,
     pub runs: &'a SequencePlan,
 }
 
-/// Where in a snapshot \[H,W\] the pilot is run: in the picture, or in the first green sub-image of a mosaic.
-/// `light` is the sum \[H,W\] of all masks.
-pub fn place(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, mosaic: Option<Mosaic>) -> Window {
+/// Chooses the window of the pilot in a snapshot \[H,W\], or in the first green sub-image of a mosaic. `light` is the sum
+/// \[H,W\] of all masks.
+pub fn window(
+    light: ArrayView2<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    mosaic: Option<Mosaic>,
+) -> Window {
     let Some(mosaic) = mosaic else {
         let (rows, columns) = pilot::piece(light, y);
         return Window { rows, columns, step: 1 };
@@ -39,23 +43,23 @@ pub fn place(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, mosaic: Option<
     Window::of_plane(rows, columns, first)
 }
 
-/// Runs the pilot on a piece of all snapshots: how long the stages of an adaptive schedule should be, on the
-/// first of them, and then, by the schedule so decided, whether those that runs hold together are better
-/// apart. None where there is nothing to be decided, or no light reaches the piece.
+/// Runs the pilot on a window of all snapshots. It first decides the lengths of the stages of an adaptive schedule on the
+/// first snapshot. With that schedule it then decides whether consecutive snapshots of a run should be cut. Returns `None`
+/// if there is nothing to decide, or if no light reaches the window.
 pub fn decide(
     input: TileInput,
     task: &Pilot<'_>,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Option<PilotRecord>, ReconError> {
-    let &Pilot { first, place, schedule, runs } = task;
+    let &Pilot { first, window, schedule, runs } = task;
     let candidates = runs.joints();
     if !schedule.adaptive && candidates.is_empty() {
         return Ok(None);
     }
-    let (row, column) = (place.rows.start, place.columns.start);
+    let (row, column) = (window.rows.start, window.columns.start);
     let (_, height, width) = input.y.dim();
-    let (height, width) = (height * place.step, width * place.step);
+    let (height, width) = (height * window.step, width * window.step);
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
     let mut record = PilotRecord {
         snapshot: first,
@@ -74,8 +78,9 @@ pub fn decide(
         record.stages = schedule.stages.iter().zip(findings).map(stage).collect();
     }
     let decided = record.decide(schedule);
-    let found = joints::compare(&op, (first, y.view()), &candidates, &decided, networks, observer)?;
-    record.joints = found.into_iter().map(joint).collect();
+    let findings =
+        joints::compare(&op, (first, y.view()), &candidates, &decided, networks, observer)?;
+    record.joints = findings.into_iter().map(joint).collect();
     Ok(Some(record))
 }
 
@@ -109,8 +114,7 @@ fn joint(finding: JointFinding) -> JointRecord {
     }
 }
 
-/// A schedule as the tiles run it: with all defaults filled in, and ended where the pilot found that
-/// it should.
+/// The schedule that the tiles run, with the pilot's decisions and all defaults.
 pub fn full_schedule(schedule: &Schedule, pilot: Option<&PilotRecord>) -> Schedule {
     pilot.map_or_else(|| schedule.clone(), |pilot| pilot.decide(schedule)).filled()
 }

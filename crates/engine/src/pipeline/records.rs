@@ -1,4 +1,4 @@
-//! What the tasks of a job leave for those that follow, and for the manifests.
+//! Records of a job's tasks, for later tasks and for the manifests.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +17,7 @@ pub struct PreparedRecord {
     pub white: f32,
 }
 
-/// What the pilot of a job found out.
+/// The pilot's decisions for a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PilotRecord {
     pub snapshot: usize,
@@ -25,12 +25,12 @@ pub struct PilotRecord {
     pub column: usize,
     pub height: usize,
     pub width: usize,
-    /// The stages of the schedule that was asked for; none if it is fixed.
+    /// The stages of the requested schedule. Empty for a fixed schedule.
     pub stages: Vec<StageRecord>,
-    /// Whether snapshots that follow one another belong together, joint by joint.
+    /// The decisions on the joints between consecutive snapshots.
     #[serde(default)]
     pub joints: Vec<JointRecord>,
-    /// What it tells of the error of an adaptive schedule's frames.
+    /// Evidence on the error of an adaptive schedule's frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
 }
@@ -52,73 +52,72 @@ impl PilotRecord {
         schedule.decided(&self.stages.iter().map(decision).collect::<Vec<_>>())
     }
 
-    /// The joints that are taken apart, each given by the snapshot before it.
+    /// The snapshots after which the sequence is cut.
     pub fn cuts(&self) -> Vec<usize> {
-        let apart = self.joints.iter().filter(|joint| !joint.together);
-        apart.map(|joint| joint.after).collect()
+        let cut = self.joints.iter().filter(|joint| !joint.together);
+        cut.map(|joint| joint.after).collect()
     }
 }
 
-/// What the pilot found out about a joint.
+/// The pilot's decision on the joint between two snapshots.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct JointRecord {
-    /// The index of the snapshot before it; that behind it is the next.
+    /// Index of the snapshot before the joint.
     pub after: usize,
-    /// Whether both snapshots are reconstructed together.
+    /// True if both snapshots are reconstructed together.
     pub together: bool,
-    /// Error at the held-out pixels of both snapshots, each alone, relative to the measurement; null where
-    /// the solver diverged.
+    /// Hold-out error of both snapshots when each is solved alone, relative to the measurement. `None` if the solver
+    /// diverged.
     pub error_alone: Option<f64>,
-    /// The same of both together.
+    /// Hold-out error of both snapshots when they are solved together, relative to the measurement.
     pub error_together: Option<f64>,
 }
 
-/// What the pilot found out about a stage.
+/// The pilot's decision on a stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageRecord {
     pub prior: &'static dyn Prior,
-    /// The most iterations that might have been.
+    /// Largest number of iterations in the requested schedule.
     pub planned: usize,
-    /// Those that pay.
+    /// Chosen number of iterations.
     pub iterations: usize,
-    /// Weight of the total variation along time that was asked for; 0 for none.
+    /// Requested weight of the temporal total variation; 0 for none.
     #[serde(default)]
     pub planned_temporal_weight: f32,
-    /// The same if it pays; else 0.
+    /// Chosen weight of the temporal total variation: the requested one, or 0.
     #[serde(default)]
     pub temporal_weight: f32,
-    /// Shrinkage of changes along time that was asked for; 0 for none.
+    /// Requested temporal shrinkage; 0 for none.
     #[serde(default)]
     pub planned_temporal_shrinkage: f32,
-    /// The one that pays; 0 if none does.
+    /// Chosen temporal shrinkage; 0 for none.
     #[serde(default)]
     pub temporal_shrinkage: f32,
-    /// The same where nothing moves, if four times as much or more pays.
+    /// Chosen temporal shrinkage of static regions, at least four times the requested one. `None` if it does not help.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rest_shrinkage: Option<f32>,
-    /// Whether all is taken to be at rest then.
+    /// True if the whole scene is treated as static.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub rest_everywhere: bool,
-    /// Static variance of the projection that was asked for; none if it was not.
+    /// Requested static variance of the projection.
     #[serde(default)]
     pub planned_static_variance: Option<f32>,
-    /// The one that pays, if one does.
+    /// Chosen static variance of the projection.
     #[serde(default)]
     pub static_variance: Option<f32>,
-    /// Noise term of the projection, where it is not the schedule's: asked for, or one that pays.
+    /// Chosen noise term of the projection. `None` if it is that of the schedule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gamma: Option<f32>,
-    /// Why no more: `fixed`, `max-iterations`, `converged` or `diverged`.
+    /// Reason of the end: `fixed`, `max-iterations`, `converged` or `diverged`.
     pub end: String,
-    /// Error at the held-out pixels before the stage, relative to the measurement.
+    /// Hold-out error before the stage, relative to the measurement.
     pub error_before: f64,
-    /// The same after its iterations.
+    /// Hold-out error after the stage, relative to the measurement.
     pub error_after: f64,
 }
 
 impl StageRecord {
-    /// What became of the total variation along time, of the shrinkage of changes, of the static variance and
-    /// of the noise term, as far as there are any.
+    /// Describes the decisions on temporal total variation, temporal shrinkage, static variance and noise term.
     pub fn fates(&self) -> Vec<String> {
         let kept = if self.temporal_weight > 0.0 { "kept" } else { "left out" };
         let along_time = (self.planned_temporal_weight > 0.0)
@@ -129,8 +128,8 @@ impl StageRecord {
                 shrinkage => format!("shrinkage along time {shrinkage}"),
             });
         let rest = self.rest_shrinkage.map(|level| match self.rest_everywhere {
-            true => format!("shrinkage {level}, as all is at rest"),
-            false => format!("shrinkage where nothing moves {level}"),
+            true => format!("shrinkage {level}, as the scene is static"),
+            false => format!("shrinkage in static regions {level}"),
         });
         let variance = self.planned_static_variance.map(|_| match self.static_variance {
             Some(variance) => format!("static variance {variance}"),
@@ -167,30 +166,30 @@ impl From<&Outcome> for TileRecord {
 pub struct TileTaskRecord {
     #[serde(flatten)]
     pub tile: TileRecord,
-    /// The snapshots that have frames here, by their place in the run; the others are left to another run.
+    /// The solved snapshots, as indices in the run. Another run solves the others.
     pub solved: Vec<usize>,
     /// `None` if nothing can be estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assessment: Option<TileAssessment>,
-    /// From reading its window to its frames.
+    /// Cost of the tile, from reading its window to its frames.
     #[serde(flatten)]
     pub cost: CostRecord,
 }
 
-/// What computing took, and on what.
+/// Cost of a computation, and the runtime that performed it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct CostRecord {
-    /// Execution provider of the network; none without a network.
+    /// Execution provider of the network. `None` without a network.
     pub provider: Option<String>,
-    /// Build of ONNX Runtime; none without a network.
+    /// Version of ONNX Runtime. `None` without a network.
     pub onnxruntime: Option<String>,
     pub cpu_seconds: f64,
-    /// Largest resident memory of a process that computed.
+    /// Largest resident memory of a computing process.
     pub peak_rss_bytes: u64,
 }
 
 impl CostRecord {
-    /// Of several parts taken together.
+    /// The total cost of several parts.
     pub fn sum<'a>(parts: impl Iterator<Item = &'a Self>) -> Self {
         parts.fold(Self::default(), |sum, part| Self {
             provider: sum.provider.or_else(|| part.provider.clone()),
@@ -203,32 +202,32 @@ impl CostRecord {
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
-    /// The job; none on the command line.
+    /// The job. `None` on the command line.
     pub job: Option<String>,
-    /// Of all tiles together.
+    /// Total cost of all tiles.
     #[serde(flatten)]
     pub cost: CostRecord,
-    /// Wall time of computing; none for a job, whose workers share their time with others'.
+    /// Wall time of the computation. `None` for a job, because its workers also serve other jobs.
     pub seconds: Option<f64>,
-    /// When it ended, RFC 3339 in UTC.
+    /// End of the run, RFC 3339 in UTC.
     pub finished_at: String,
 }
 
 impl RunRecord {
-    /// Of a run that ends now.
+    /// The record of a run that ends now.
     pub fn ended(job: Option<String>, cost: CostRecord, seconds: Option<f64>) -> Self {
         Self { job, cost, seconds, finished_at: Timestamp::now().to_string() }
     }
 }
 
-/// The tiles of a snapshot taken together.
+/// Summary of a snapshot's tiles.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Most of any tile.
+    /// Largest value of the tiles.
     pub tv_iterations: usize,
-    /// Most of any tile.
+    /// Largest value of the tiles.
     pub denoiser_passes: usize,
-    /// Largest of any tile.
+    /// Largest value of the tiles.
     pub residual: f32,
     /// `converged` if all tiles converged, else `max-iterations`.
     pub stop_reason: String,
@@ -267,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_summary_tells_the_worst_of_the_tiles() {
+    fn a_summary_has_the_largest_values_of_the_tiles() {
         let tiles = [record(0.01, "converged", 20), record(0.03, "max-iterations", 24)];
         let summary = Summary::of(&tiles);
         assert_eq!((summary.denoiser_passes, summary.residual), (24, 0.03));

@@ -191,8 +191,8 @@ impl Authority {
         days: u32,
         out: &Path,
     ) -> Result<(), ClusterError> {
-        let taken = |issued: &Issued| issued.name == name && issued.revoked_at.is_none();
-        if self.workers.iter().any(taken) {
+        let has_name = |issued: &Issued| issued.name == name && issued.revoked_at.is_none();
+        if self.workers.iter().any(has_name) {
             let reason = format!(
                 "a credential is already called {name:?}: revoke it first, or choose another name"
             );

@@ -91,10 +91,10 @@ fn version(connection: &Connection) -> Check {
 }
 
 fn payload(connection: &Connection) -> Check {
-    let found = connection.client.max_payload();
-    let good = found >= PAYLOAD;
+    let limit = connection.client.max_payload();
+    let good = limit >= PAYLOAD;
     let hint = if good { String::new() } else { format!(": set max_payload to {PAYLOAD} or more") };
-    Check::new("payload of a message", good, format!("{found} bytes{hint}"))
+    Check::new("payload of a message", good, format!("{limit} bytes{hint}"))
 }
 
 async fn round_trip(connection: &Connection) -> Check {
@@ -112,9 +112,9 @@ async fn round_trip(connection: &Connection) -> Check {
 
 /// Checks what `sci-recon serve` needs.
 async fn server(connection: &Connection) -> Vec<Check> {
-    let made = connection.make_streams().await;
+    let streams = connection.make_streams().await;
     let mut checks =
-        vec![Check::of("streams", made, |_| "exist, with the right to change them".into())];
+        vec![Check::of("streams", streams, |_| "exist, with the right to change them".into())];
     if checks.iter().any(|check| !check.good) {
         return checks;
     }

@@ -592,7 +592,7 @@ impl Transport for Remote {
         Ok(())
     }
 
-    async fn seen(&self) -> Result<(), TransportError> {
+    async fn report_alive(&self) -> Result<(), TransportError> {
         Ok(())
     }
 

@@ -70,7 +70,7 @@ impl Connection {
 
     async fn make_stream(&self, config: Config) -> Result<(), ClusterError> {
         let copies = Config { num_replicas: REPLICAS, ..config.clone() };
-        let made = match self.context.create_stream(copies).await {
+        let created = match self.context.create_stream(copies).await {
             Err(error) => match error.kind() {
                 // A single server keeps one copy. A cluster without enough nodes is an error.
                 CreateStreamErrorKind::JetStream(error)
@@ -80,9 +80,9 @@ impl Connection {
                 }
                 _ => Err(error),
             },
-            made => made,
+            created => created,
         };
-        made.map(|_| ()).map_err(ClusterError::nats("create a stream"))
+        created.map(|_| ()).map_err(ClusterError::nats("create a stream"))
     }
 
     /// Creates the consumer from which all workers of a pool pull.
@@ -103,8 +103,8 @@ impl Connection {
             max_waiting: AT_ONCE,
             ..Consumer::default()
         };
-        let made = self.context.create_consumer_on_stream(config, names::TASKS).await;
-        made.map(|_| ()).map_err(ClusterError::nats("create the consumer of a pool"))
+        let created = self.context.create_consumer_on_stream(config, names::TASKS).await;
+        created.map(|_| ()).map_err(ClusterError::nats("create the consumer of a pool"))
     }
 
     /// Finds the consumer of a pool.
@@ -149,7 +149,7 @@ impl Connection {
             max_ack_pending: AT_ONCE,
             ..Consumer::default()
         };
-        let made = self.context.create_consumer_on_stream(config, names::EVENTS).await;
-        made.map_err(ClusterError::nats("create the consumer of a pool's events"))
+        let created = self.context.create_consumer_on_stream(config, names::EVENTS).await;
+        created.map_err(ClusterError::nats("create the consumer of a pool's events"))
     }
 }

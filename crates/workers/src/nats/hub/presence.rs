@@ -112,14 +112,14 @@ impl Presence {
 
     /// Takes the workers with a new sign of life since the last call, and their tiles' progress.
     pub fn news(&mut self) -> (Vec<WorkerId>, Vec<(WorkerId, Pool, TileBeat)>) {
-        let (mut seen, mut tiles) = (Vec::new(), Vec::new());
+        let (mut alive, mut tiles) = (Vec::new(), Vec::new());
         for (worker, sign) in self.workers.iter_mut().filter(|(_, sign)| sign.fresh) {
             sign.fresh = false;
-            seen.push(*worker);
+            alive.push(*worker);
             if let Some(tile) = sign.tile.take() {
                 tiles.push((*worker, sign.pool.clone(), tile));
             }
         }
-        (seen, tiles)
+        (alive, tiles)
     }
 }

@@ -117,8 +117,8 @@ impl Core {
     }
 
     async fn flush(&self) -> Result<(), StoreError> {
-        let (seen, tiles) = lock(&self.presence).news();
-        if seen.is_empty() {
+        let (alive, tiles) = lock(&self.presence).news();
+        if alive.is_empty() {
             return Ok(());
         }
         let beats: Vec<RemoteBeat> = tiles
@@ -132,7 +132,7 @@ impl Core {
                 history: tile.history.clone(),
             })
             .collect();
-        let answers = self.store.remote_beats(&beats, &seen).await?;
+        let answers = self.store.remote_beats(&beats, &alive).await?;
         for ((worker, pool, tile), answer) in tiles.iter().zip(answers) {
             let (task, attempt) = (tile.task, tile.attempt);
             match answer {
@@ -162,12 +162,12 @@ impl Core {
             tracing::error!(%error, "the consumer of a pool can't be created");
             return None;
         }
-        let place = WorkerPlace {
+        let location = WorkerPlace {
             host: Some(host.clone()),
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        if let Err(error) = self.store.worker_started(worker, pid, &place, false).await {
+        if let Err(error) = self.store.worker_started(worker, pid, &location, false).await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
         }

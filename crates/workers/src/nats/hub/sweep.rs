@@ -56,9 +56,9 @@ impl Core {
     /// # Errors
     /// If the message server refuses, or has no quorum.
     pub async fn find_streams(&self) -> Result<(), ClusterError> {
-        let made = self.connection.make_streams().await?;
-        let before = std::mem::replace(&mut *lock(&self.stream), made.clone());
-        if !before.is_empty() && before != made {
+        let identity = self.connection.make_streams().await?;
+        let before = std::mem::replace(&mut *lock(&self.stream), identity.clone());
+        if !before.is_empty() && before != identity {
             tracing::warn!("the message server has lost its streams: they are created again");
             self.forget_all_put();
         }
@@ -243,11 +243,11 @@ impl Core {
         let info = stream.info_builder().with_deleted(true).fetch().await.map_err(failed())?;
         let state = &info.info.state;
         let deleted: HashSet<u64> = state.deleted.iter().flatten().copied().collect();
-        let all = state.first_sequence..state.last_sequence.saturating_add(1);
+        let range = state.first_sequence..state.last_sequence.saturating_add(1);
         if state.messages == 0 {
             return Ok(HashSet::new());
         }
-        Ok(all.filter(|seq| !deleted.contains(seq)).map(u64::cast_signed).collect())
+        Ok(range.filter(|seq| !deleted.contains(seq)).map(u64::cast_signed).collect())
     }
 
     /// Sequence number of the last event.
