@@ -20,9 +20,9 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     let paid = stages[1]["iterations"].as_u64().unwrap();
     assert!(paid > 0, "the stage has run: {stages:#?}");
     let temporal = stages[0]["temporal_weight"].as_f64().unwrap() as f32;
-    let asked = stages[0]["planned_temporal_weight"].as_f64().unwrap() as f32;
+    let requested_weight = stages[0]["planned_temporal_weight"].as_f64().unwrap() as f32;
     assert_eq!(
-        (asked, temporal),
+        (requested_weight, temporal),
         (0.004, 0.004),
         "temporal weight is kept, because the scene moves slowly"
     );

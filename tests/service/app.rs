@@ -95,7 +95,7 @@ impl TestApp {
         Self::try_in_environment(arguments, environment).await.expect("the server starts")
     }
 
-    /// Starts the service; none if it does not start.
+    /// Starts the service. Returns `None` if it does not start.
     pub async fn try_in_environment(
         arguments: &[&str],
         environment: &[(&str, &str)],
@@ -218,7 +218,7 @@ impl TestApp {
         let request = request.unwrap();
         let (method, path) = (request.method().clone(), request.url().path().to_owned());
         let answer = Answer::read(client.execute(request).await.unwrap()).await;
-        contract::hold(&method, &path, &answer);
+        contract::check(&method, &path, &answer);
         answer
     }
 
@@ -274,7 +274,7 @@ impl TestApp {
     }
 }
 
-/// Python with the packages of tests/judges/requirements.txt, or none after [`skip`].
+/// Path of a Python with the packages of tests/judges/requirements.txt. Calls [`skip`] if there is none.
 #[track_caller]
 pub fn judges() -> Option<String> {
     let python = std::env::var("SCI_RECON_JUDGES").ok();
@@ -333,8 +333,7 @@ impl Drop for TestApp {
 /// Longest time in which a healthy server starts, answers or ends, on a busy machine.
 const LONGEST_SILENCE: Duration = Duration::from_secs(180);
 
-/// A command line of the program that is ended with an error if it runs for too long, as a server does
-/// that should have been refused.
+/// The program with a time limit. Without the limit, a server that should have been refused would run forever.
 pub fn bounded_program() -> Command {
     let mut command = Command::new("timeout");
     command.arg(LONGEST_SILENCE.as_secs().to_string()).arg(env!("CARGO_BIN_EXE_sci-recon"));
@@ -360,7 +359,7 @@ fn owned(arguments: &[&str]) -> Vec<String> {
     arguments.iter().map(|&text| text.to_owned()).collect()
 }
 
-/// The server and its address; none if it ends before it prints one.
+/// Starts a server, and returns it with its address. Returns `None` if it ends before it prints the address.
 fn spawn(
     data: &Path,
     arguments: &[String],

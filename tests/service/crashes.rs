@@ -99,10 +99,10 @@ async fn attempt(app: &TestApp) -> Option<String> {
     let job = post("/v1/jobs", small(&measurement)).await?;
     loop {
         let request = app.request(reqwest::Method::GET, &format!("/v1/jobs/{job}"));
-        let found: Value = request.send().await.ok()?.error_for_status().ok()?.json().await.ok()?;
-        match found["state"].as_str()? {
+        let shown: Value = request.send().await.ok()?.error_for_status().ok()?.json().await.ok()?;
+        match shown["state"].as_str()? {
             "succeeded" => return Some(job),
-            "failed" => panic!("{found:#}"),
+            "failed" => panic!("{shown:#}"),
             _ => tokio::time::sleep(Duration::from_millis(20)).await,
         }
     }
@@ -167,12 +167,12 @@ async fn a_full_disk_does_no_permanent_harm() {
     let fill = || std::fs::write(&full, "").unwrap();
     let free = || std::fs::remove_file(&full).unwrap();
     let upload = |bytes| app.send(app.request(reqwest::Method::POST, "/v1/blobs").body(bytes));
-    // During an upload.
+    // The disk fills during an upload.
     fill();
     upload(Scene::SMALL.masks()).await.problem(507, "insufficient_storage");
     free();
     let masks = upload(Scene::SMALL.masks()).await.expect(201).json()["sha256"].clone();
-    // During the preparation of masks.
+    // The disk fills during the preparation of masks.
     fill();
     let refused = app.post("/v1/calibrations", &json!({ "masks": masks })).await;
     refused.problem(507, "insufficient_storage");
@@ -180,11 +180,11 @@ async fn a_full_disk_does_no_permanent_harm() {
     let calibration =
         id(&app.post("/v1/calibrations", &json!({ "masks": masks })).await.expect(201));
     let measurement = id(&app.measure(&calibration, Scene::SMALL.snapshots()).await.expect(201));
-    // During the submission of a job.
+    // The disk fills during the submission of a job.
     fill();
     app.post("/v1/jobs", &small(&measurement)).await.problem(507, "insufficient_storage");
     free();
-    // During a job: a failed job can be retried when there is space.
+    // The disk fills during a job. A failed job can be retried when there is space.
     let job = app.submit(&small(&measurement)).await;
     fill();
     tokio::time::sleep(Duration::from_millis(1500)).await;

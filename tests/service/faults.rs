@@ -191,9 +191,9 @@ pub async fn orphans(app: &mut TestApp) -> usize {
         let jobs = app.get("/v1/jobs?limit=200").await.json()["items"].as_array().unwrap().len();
         let results = std::fs::read_dir(app.data().join("results")).unwrap().count();
         let results = results.saturating_sub(jobs);
-        let left = count("blobs").abs_diff(known) + results + count("partial") + count("tmp");
-        if left == 0 || start.elapsed().as_secs() > 10 {
-            return left;
+        let surplus = count("blobs").abs_diff(known) + results + count("partial") + count("tmp");
+        if surplus == 0 || start.elapsed().as_secs() > 10 {
+            return surplus;
         }
         tokio::time::sleep(Duration::from_millis(100)).await;
     }

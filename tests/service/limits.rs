@@ -36,7 +36,7 @@ fn announce(app: &TestApp, length: u64) -> RequestBuilder {
     request.header("upload-length", length)
 }
 
-fn taken(answers: &[Answer]) -> usize {
+fn count_created(answers: &[Answer]) -> usize {
     answers.iter().filter(|answer| answer.status == StatusCode::CREATED).count()
 }
 
@@ -49,12 +49,12 @@ async fn concurrent_requests_do_not_exceed_the_limit() {
         app.send(request)
     };
     let answers = join_all((0..14).map(upload)).await;
-    assert_eq!(taken(&answers), 3);
+    assert_eq!(count_created(&answers), 3);
     for answer in answers.iter().filter(|answer| answer.status.as_u16() != 201) {
         answer.problem(507, "quota_exceeded");
     }
     let answers = join_all((0..20).map(|_| app.send(announce(&app, 90_000)))).await;
-    assert_eq!(taken(&answers), 1, "100,000 bytes were left");
+    assert_eq!(count_created(&answers), 1, "100,000 bytes were free");
 }
 
 #[tokio::test]

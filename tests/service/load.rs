@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::app::TestApp;
 use crate::crashes::Shim;
-use crate::downloads::{ask_beside_slow_readers, touch_all};
+use crate::downloads::{ask_during_slow_downloads, touch_all};
 use crate::samples::{Scene, npy_header};
 
 fn setting(name: &str, default: u64) -> u64 {
@@ -55,12 +55,12 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
         while Instant::now() < end {
             let start = Instant::now();
             let answer = app.request(Method::GET, &path).send().await;
-            let whole = match answer {
+            let is_complete = match answer {
                 Ok(answer) if answer.status() == 200 => answer.bytes().await.is_ok(),
                 _ => false,
             };
             times.push(start.elapsed());
-            errors += u64::from(!whole);
+            errors += u64::from(!is_complete);
             tokio::time::sleep(Duration::from_secs(1).saturating_sub(start.elapsed())).await;
         }
         (times, errors)
@@ -88,7 +88,7 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
 async fn two_hundred_slow_clients_download_while_another_lab_asks() {
     const CLIENTS: usize = 200;
     let seconds = setting("SCI_RECON_LOAD_SLOW_SECONDS", 120);
-    let answers = ask_beside_slow_readers(CLIENTS, Duration::from_secs(seconds)).await;
+    let answers = ask_during_slow_downloads(CLIENTS, Duration::from_secs(seconds)).await;
     let errors = answers.iter().filter(|(status, _)| *status != 200).count();
     let mut times: Vec<Duration> = answers.into_iter().map(|(_, took)| took).collect();
     times.sort();

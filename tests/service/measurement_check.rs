@@ -71,8 +71,8 @@ async fn a_measurement_is_checked_against_its_calibration() {
     lacking.as_object_mut().unwrap().remove("patterns");
     let wrong = app.calibrate_captures(&lacking).await;
     let lost = post(&|body| body["calibration"] = wrong["id"].clone()).await;
-    let seen = codes_and_frames(&lost["warnings"]);
-    assert!(seen.contains(&("missing_pattern".into(), vec![4])), "{lost:#}");
+    let found_codes = codes_and_frames(&lost["warnings"]);
+    assert!(found_codes.contains(&("missing_pattern".into(), vec![4])), "{lost:#}");
     // Warnings are copied to the job and its manifest.
     let body = json!({"measurement": moved["id"], "algorithm": "gap-tv"});
     let job = app.submit(&body).await;
@@ -173,8 +173,8 @@ async fn twelve_bits_in_sixteen_are_detected() {
         let sha256 = app.upload(file).await;
         let mut body = json!({ "calibration": calibration, "data": sha256 });
         let codes = async |body: &Value| {
-            let made = app.post("/v1/measurements", body).await.expect(201).json();
-            codes_and_frames(&made["warnings"])
+            let created = app.post("/v1/measurements", body).await.expect(201).json();
+            codes_and_frames(&created["warnings"])
                 .into_iter()
                 .map(|(code, _)| code)
                 .collect::<Vec<_>>()
