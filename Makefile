@@ -16,7 +16,8 @@ demo: runtime ## reconstruct a real clip through the real HTTP service
 # Most tests wait for services and clocks, so more threads than cores are useful.
 TEST_THREADS ?= $(shell expr 2 \* $$(nproc))
 test: runtime judges $(TRAINING)/.stamp ## run all tests
-	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --workspace
+	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python \
+		SCI_RECON_TRAINING=$(abspath $(TRAINING))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
 deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them

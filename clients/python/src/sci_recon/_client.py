@@ -261,6 +261,10 @@ class Client:
             ),
         )
 
+    def calibration(self, identifier: str) -> Calibration:
+        """A calibration that was made before, by this client or another."""
+        return Calibration(self, self._get(f"/v1/calibrations/{identifier}"))
+
     def job(self, identifier: str) -> Job:
         """A job that was submitted before, by this client or another."""
         return Job(self, self._get(f"/v1/jobs/{identifier}"))
@@ -342,6 +346,22 @@ class Calibration(Entity):
         """Waits until there are masks."""
         self._ready("calibrations")
         return self
+
+    def masks(self) -> npt.NDArray[np.float32]:
+        """The masks [B, H, W] on [0, 1], from the uploaded file. `ValueError` unless that is an npy file."""
+        record, name = self.record, self.record["masks"]
+        with TemporaryDirectory(prefix="sci-recon-") as folder:
+            path = Path(folder) / "masks.npy"
+            with self.client._bar("download masks") as bar:
+                transfer.download(self.client.http, f"/v1/blobs/{name}/content", path, name, bar)
+            with path.open("rb") as file:
+                if file.read(6) != b"\x93NUMPY":
+                    raise ValueError(f"the masks are a {record['format']} file; read it, and pass the array")
+            stored = np.load(path)
+        order = (record["axes"] or "frame-row-column").split("-")
+        stored = stored.transpose([order.index(axis) for axis in ("frame", "row", "column")])
+        masks: npt.NDArray[np.float32] = np.maximum(stored / np.float64(record["full_scale"]), 0).astype(np.float32)
+        return masks
 
     def report(self) -> Record:
         """What is known of the masks: a grade, findings, and what to do."""
