@@ -1,7 +1,7 @@
 """Checks the forward model of the Python client in numpy, torch and deepinv.
 
 Usage: python_physics.py [URL CALIBRATION FILE]. The masks of the calibration, read from the service, must be those of the
-npy file. The last line is JSON: relative errors, each of which must be at rounding level.
+npy file. The last line is JSON: errors, which must be at rounding level.
 """
 
 import json

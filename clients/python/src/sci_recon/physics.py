@@ -77,7 +77,7 @@ def deepinv_physics(masks: Any, **options: Any) -> Any:
     """The operator as `deepinv.physics.LinearPhysics`, for masks [B, H, W] (tensor or array).
 
     Images are [N, B, H, W]: the frames are the channels. Measurements are [N, 1, H, W]. The sum over the frames is not
-    divided by their number, as it is in deepinv's own spectral imager. `options` are those of `LinearPhysics`, such as
+    divided by their number; deepinv's own spectral imager divides it. `options` are those of `LinearPhysics`, such as
     `noise_model`.
     """
     import torch  # type: ignore[import-not-found, unused-ignore]
