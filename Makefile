@@ -61,8 +61,9 @@ dist: release wheel $(TOOLS)/bin/cargo-cyclonedx ## make the relocatable archive
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
 	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
-	@$(TOOLS)/bin/cargo-cyclonedx cyclonedx --quiet --format json --target all --override-filename components
-	@mv components.json dist/$(ARCHIVE).cdx.json && find . -name components.json -path './[cr]*' -delete
+	@$(TOOLS)/bin/cargo-cyclonedx cyclonedx --quiet --format json --spec-version 1.5 --target all --override-filename components
+	@sed 's|$(CURDIR)|.|g' components.json > dist/$(ARCHIVE).cdx.json
+	@rm components.json crates/*/components.json research/experiments/components.json
 	@cd dist && rm -rf $(ARCHIVE) && sha256sum *.tar.gz *.cdx.json *.whl > SHA256SUMS && ls -l
 
 $(TOOLS)/bin/cargo-cyclonedx:
