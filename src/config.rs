@@ -12,7 +12,7 @@ use clap::{Args, ValueEnum};
 use engine::job::Pool;
 use engine::job::WorkerId;
 use engine::pipeline::networks::{NetworkError, find_library};
-use reconstruction::prior::onnx::Device;
+use reconstruction::priors::onnx::Device;
 
 /// The version of the program, with the commit that it was built from where `make` has told it.
 pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {

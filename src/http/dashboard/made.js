@@ -64,9 +64,7 @@ export function ran(job, content) {
   const [planned, decided] = [iterationsOf(job.schedule), iterationsOf(schedule)];
   if (decided === 0) return "one pass of the model on each tile";
   if (summary.stop_reason === "converged") {
-    // Of the nonlocal prior's iterations the manifest keeps no count.
-    const counted = !schedule.stages.some((stage) => stage.prior === "nonlocal");
-    return counted ? `${summary.tv_iterations + summary.denoiser_passes} of at most ${planned} iterations on each tile, then it had converged` : `converged within ${decided} iterations on each tile`;
+    return `${summary.iterations} of at most ${planned} iterations on each tile, then it had converged`;
   }
   return `${decided} of at most ${planned} iterations on each tile${decided < planned ? "; the pilot found that the others would not pay" : ""}`;
 }
@@ -79,19 +77,20 @@ export function networks(content) {
 /** What the pilot decided of the stages of an adaptive schedule, and why. */
 function pilot(content) {
   const why = { "max-iterations": "all that were planned", converged: "later ones raise the error", diverged: "later ones diverge" };
-  const row = (stage) => {
-    const decided = [
-      why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
-      stage.planned_temporal_shrinkage > 0 && `shrinkage along time ${stage.temporal_shrinkage > 0 ? figure(stage.temporal_shrinkage) : "left out"}`,
-      stage.rest_shrinkage != null && (stage.rest_everywhere ? `as all is at rest ${figure(stage.rest_shrinkage)}` : `where nothing moves ${figure(stage.rest_shrinkage)}`),
-      stage.planned_static_variance && `static variance ${stage.static_variance ?? "left out"}`,
-      stage.gamma != null && `noise term ${stage.gamma}`,
-      stage.planned_temporal_weight > 0 && `total variation along time ${stage.temporal_weight > 0 ? "kept" : "left out"}`,
-    ].filter(Boolean);
-    const error = `error at held-out pixels ${figure(stage.error_before)} to ${figure(stage.error_after)}`;
+  const row = ({ planned, stage, end, error_before: before, error_after: after }) => {
+    const decided = [why[end] && `${stage.iterations} of ${planned.iterations} iterations (${why[end]})`, ...changes(planned, stage)].filter(Boolean);
+    const error = `error at held-out pixels ${figure(before)} to ${figure(after)}`;
     return decided.length > 0 && [`Pilot, ${stage.prior}`, [...decided, error].join(", ")];
   };
   return (content.pilot?.stages ?? []).map(row).filter(Boolean);
+}
+
+/** The settings of a stage that the pilot changed, by their names in the schedule. */
+export function changes(planned, stage) {
+  const own = ["iterations", "sigma"];
+  const changed = Object.keys(stage).filter((name) => !own.includes(name) && stage[name] !== planned[name]);
+  const value = (setting) => (typeof setting === "number" ? figure(setting) : setting);
+  return changed.map((name) => `${name.replaceAll("_", " ")} ${stage[name] ? value(stage[name]) : "left out"}`);
 }
 
 /** Which snapshots were reconstructed together, and why not others. */

@@ -6,7 +6,7 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
 use super::request::JobSpec;
 use super::shape::SceneShape;
 use super::text::Sha256;
-use reconstruction::{ReconError, joints, pilot, preview};
+use reconstruction::{ReconError, crop, joints, preview};
 
 /// CPU-seconds for each voxel that is read, or blended and written in all formats (measured).
 const READ_S: f64 = 12e-9;
@@ -123,15 +123,18 @@ impl JobSpec {
         tasks.extend(snapshots.map(|snapshot| (TaskKind::Preview { snapshot }, preview)));
         let joints = runs.joints().len() as f64;
         if self.schedule.adaptive || joints > 0.0 {
-            let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
+            let voxels = pixels.min((crop::SIDE * crop::SIDE) as f64) * frames;
             let decided = if self.schedule.adaptive {
                 self.schedule.pilot_ns_per_voxel() * 1e-9
             } else {
                 0.0
             };
             // Of each joint both snapshots together, and the second one alone.
-            let compared =
-                if joints > 0.0 { (3.0 * joints + 1.0) / joints::SHORTER as f64 } else { 0.0 };
+            let compared = if joints > 0.0 {
+                (3.0 * joints + 1.0) / joints::ITERATION_DIVISOR as f64
+            } else {
+                0.0
+            };
             // The preview of the first snapshot is there at once; the others may wait.
             tasks.insert(2, (TaskKind::Pilot, voxels * (decided + per_voxel * compared)));
         }

@@ -13,9 +13,9 @@ use sha2::Digest;
 
 use crate::job::{JobSpec, Label, Schedule, Sha256};
 use reconstruction::ReconError;
-use reconstruction::prior::network::{ClipDenoiser, ClipEncoder};
-use reconstruction::prior::onnx::{Device, EndToEndNetwork, Runtime};
-use reconstruction::prior::{Denoiser, Encoder, Network, Networks};
+use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
+use reconstruction::priors::onnx::{Device, EndToEndNetwork, Runtime};
+use reconstruction::priors::{Denoiser, Encoder, Network, Networks};
 
 /// A network in its ONNX files, embedded so that the program needs nothing beside libonnxruntime.
 #[derive(Debug, Clone, Copy)]
@@ -354,8 +354,8 @@ mod tests {
         version_in,
     };
     use crate::job::{Algorithm, Sha256};
-    use reconstruction::prior::Network;
-    use reconstruction::prior::onnx::Device;
+    use reconstruction::priors::Network;
+    use reconstruction::priors::onnx::Device;
 
     #[test]
     fn the_version_is_that_of_the_symbols() {

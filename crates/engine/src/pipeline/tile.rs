@@ -6,11 +6,11 @@ use ndarray::{Array3, Array4, ArrayView3, Axis, s};
 
 use reconstruction::ReconError;
 use reconstruction::assessment::Model;
+use reconstruction::evidence;
 use reconstruction::learned::SnapshotNetwork;
-use reconstruction::pilot;
-use reconstruction::prior::Networks;
+use reconstruction::operator::SensingOperator;
+use reconstruction::priors::Networks;
 use reconstruction::schedule::Schedule;
-use reconstruction::sensing::SensingOperator;
 use reconstruction::solver::{self, Observer, Outcome, StopReason};
 
 /// What a tile is made of: arrays alone, wherever they come from.
@@ -36,9 +36,9 @@ impl TileInput {
     ) -> Result<Option<(SensingOperator, Array3<f32>)>, ReconError> {
         if !(self.white.is_finite() && self.white > 0.0) {
             return Err(ReconError::Parameter {
-                name: "white level",
+                name: "white level".into(),
                 value: self.white.to_string(),
-                range: "a finite number above 0",
+                range: "a finite number above 0".into(),
             });
         }
         let snapshots = self.y.dim().0;
@@ -68,6 +68,7 @@ impl TileInput {
         let pieces = self.pieces.clone();
         let mut whole = Outcome {
             frames: Array3::zeros((self.y.dim().0 * frames, height, width)),
+            iterations: 0,
             tv_iterations: 0,
             denoiser_passes: 0,
             residual: 0.0,
@@ -96,6 +97,7 @@ impl TileInput {
                 let place = s![.., piece.start * frames..piece.end * frames, .., ..];
                 whole.features.get_or_insert_with(none).slice_mut(place).assign(&seen);
             }
+            whole.iterations = whole.iterations.max(outcome.iterations);
             whole.tv_iterations = whole.tv_iterations.max(outcome.tv_iterations);
             whole.denoiser_passes = whole.denoiser_passes.max(outcome.denoiser_passes);
             whole.residual = whole.residual.max(outcome.residual);
@@ -134,7 +136,7 @@ pub fn reconstruct_tile(
                 ..=MOST_FOR_EVIDENCE => schedule.clone(),
                 _ => schedule.clone().with_iterations(MOST_FOR_EVIDENCE),
             };
-            evidence = pilot::evidence(op, y, &bounded, networks)?;
+            evidence = evidence::collect(op, y, &bounded, networks)?;
         }
         solver::reconstruct_assessed(op, y, schedule, networks, observer)
     })?;
@@ -156,6 +158,7 @@ pub fn run_network(
             features: None,
             evidence: None,
             frames,
+            iterations: 0,
             tv_iterations: 0,
             denoiser_passes: 1,
             residual: (squares(rest.view()) / norm).sqrt() as f32,
