@@ -18,11 +18,14 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result, shape_text};
 use super::motion::Steps;
-pub use super::prior::BLOCK;
-use super::prior::{CHANNELS, Encoder};
-use super::schedule::{Method, Schedule, Stage};
-use super::sensing::SensingOperator;
+use super::operator::SensingOperator;
+pub use super::priors::BLOCK;
+use super::priors::nonlocal::NonlocalSpec;
+use super::priors::registry::PriorSpec;
+use super::priors::{CHANNELS, Encoder};
+use super::schedule::{Method, Schedule};
 use super::signs::Signs;
+use super::stage::Stage;
 
 /// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames
 /// of the result, and of those that total variation alone had left, where other priors followed. Nothing
@@ -273,7 +276,7 @@ impl Energies {
 fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
     let masks = op.masks();
     let (_, height, width) = masks.dim();
-    let (gram, steady) = (op.gram(), op.steady_gram());
+    let (gram, steady) = (op.gram(), op.static_gram());
     let energy = over_blocks((height, width), |i, j| gram[[i, j]]);
     let steady = over_blocks((height, width), |i, j| steady[[i, j]]);
     let steps = over_blocks((height, width), |i, j| {
@@ -440,23 +443,26 @@ impl Model {
         if schedule.method != Method::Gap {
             return None;
         }
-        let first = schedule.stages.first()?.prior.name();
+        let (first, rest) = schedule.stages.split_first()?;
         let known = |stage: &Stage| {
-            ["fastdvdnet", "fastdvdnet-int8", "nonlocal"].contains(&stage.prior.name())
+            use PriorSpec::{Fastdvdnet, FastdvdnetInt8, Nonlocal};
+            matches!(stage.prior, Fastdvdnet(_) | FastdvdnetInt8(_) | Nonlocal(_))
         };
-        let shrunk = |stage: &Stage| {
-            let most = stage.rest_shrinkage.or(stage.temporal_shrinkage);
-            most.is_some_and(|level| level > SHRUNK)
-        };
-        let rest = &schedule.stages[1..];
-        match (first, rest.iter().all(known), rest.is_empty()) {
-            ("tv", true, true) => MODELS.get("gap-tv"),
-            ("tv", true, false) if rest.iter().any(shrunk) => {
-                MODELS.get("pnp-tv-fastdvdnet, shrunk")
-            }
-            ("tv", true, false) => MODELS.get(LITTLE_SHRUNK),
-            _ => None,
+        if !matches!(first.prior, PriorSpec::Tv(_)) || !rest.iter().all(known) {
+            return None;
         }
+        let strongly_shrunk = |stage: &Stage| {
+            let nonlocal = stage.prior.nonlocal();
+            let level = |nonlocal: &NonlocalSpec| {
+                nonlocal.static_shrinkage.unwrap_or(nonlocal.temporal_shrinkage)
+            };
+            nonlocal.is_some_and(|nonlocal| level(nonlocal) > SHRUNK)
+        };
+        MODELS.get(match rest {
+            [] => "gap-tv",
+            _ if rest.iter().any(strongly_shrunk) => "pnp-tv-fastdvdnet, shrunk",
+            _ => LITTLE_SHRUNK,
+        })
     }
 
     /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is
@@ -611,9 +617,9 @@ mod tests {
         features, unfamiliar_masks, with_first_run,
     };
     use crate::error::ReconError;
-    use crate::prior::{CHANNELS, Encoder};
+    use crate::operator::SensingOperator;
+    use crate::priors::{CHANNELS, Encoder};
     use crate::schedule::Schedule;
-    use crate::sensing::SensingOperator;
     use crate::signs::{SIGNS, Signs};
     use ndarray::{Array3, Array4, ArrayView3, s};
     use optics::{iid_masks, random_squares, soften};
@@ -732,8 +738,8 @@ mod tests {
         let mut schedule = Schedule::pnp_tv_fastdvdnet();
         let low = |schedule: &Schedule| Model::of(schedule).unwrap().interval[0];
         let planned = low(&schedule);
-        let stage = schedule.stages.last_mut().unwrap();
-        stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
+        let nonlocal = schedule.stages.last_mut().unwrap().prior.nonlocal_mut().unwrap();
+        nonlocal.static_shrinkage = Some(4.0 * nonlocal.temporal_shrinkage);
         assert!(low(&schedule) < planned, "it knows less");
     }
 
@@ -762,8 +768,8 @@ mod tests {
         let (result, first) = (see(&ramp()), see(&ripple));
         let mut schedule = Schedule::pnp_tv_fastdvdnet();
         let little = Model::of(&schedule).unwrap();
-        let stage = schedule.stages.last_mut().unwrap();
-        stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
+        let nonlocal = schedule.stages.last_mut().unwrap().prior.nonlocal_mut().unwrap();
+        nonlocal.static_shrinkage = Some(4.0 * nonlocal.temporal_shrinkage);
         let much = Model::of(&schedule).unwrap();
         let with = |frames: &Array3<f32>| {
             let frames = (ramp(), frames.clone());

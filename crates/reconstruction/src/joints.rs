@@ -1,45 +1,46 @@
-//! Whether snapshots that follow one another belong together, found out on a piece of them.
+//! Decides by hold-out validation on a crop whether neighbouring snapshots are reconstructed together.
 //!
-//! As for [`super::pilot`], only the measurement can judge: some pixels are kept from the solver, and what the
-//! frames say about them is compared with what was measured there. Where the scene goes on, the error of two
-//! snapshots together is less than that of each alone; behind a cut or a jump it is more.
+//! Some pixels are hidden from the solver, and the frames predict them, as in [`super::pilot`]. In a continuous scene
+//! the hold-out error of two snapshots together is below that of each alone. Across a cut or jump it is above.
 
 use std::ops::Range;
 
 use ndarray::{ArrayView3, s};
 
 use super::error::{ReconError, Result};
-use super::held_out::HeldOut;
-use super::prior::Networks;
+use super::hold_out::HoldOut;
+use super::operator::SensingOperator;
+use super::priors::Networks;
 use super::schedule::Schedule;
-use super::sensing::SensingOperator;
 use super::solver::{self, Observer};
 
-/// What was found out about the joint between two snapshots.
+/// Comparison of the two snapshots at a joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JointFinding {
-    /// The index of the snapshot before it.
+    /// Index of the snapshot before the joint.
     pub after: usize,
-    /// Error at the held-out pixels of both, `||y - Hv|| / ||y||`, each alone; infinite if one diverged.
+    /// Hold-out error of both snapshots, `||y - Hv|| / ||y||`, each reconstructed alone; infinite if one diverged.
     pub alone: f64,
-    /// The same of both together.
+    /// Hold-out error of both snapshots reconstructed together.
     pub together: f64,
 }
 
 impl JointFinding {
-    /// Whether they are as good together.
+    /// True if the snapshots are at least as good together.
     pub fn belong_together(&self) -> bool {
         self.together <= self.alone
     }
 }
 
-/// One in so many iterations of each stage is enough: which is better shows early.
-pub const SHORTER: usize = 3;
+/// Divisor of the iterations of each stage. The better choice shows early.
+pub const ITERATION_DIVISOR: usize = 3;
 
-/// Compares the two snapshots of each joint, given by the index of the one before it, alone and together, by
-/// a schedule whose stages are shortened, their levels falling as far. `op` is that of a snapshot, `y`
-/// \[S,H,W\] has all of them, the first with the index `first`.
-/// Errors: as [`solver::reconstruct`].
+/// Compares the two snapshots of each joint, given by the index of the first one, alone and together, with shortened
+/// stages. `op` is the operator of one snapshot; `y` \[S,H,W\] contains all snapshots, of which the first has the
+/// index `first`.
+///
+/// # Errors
+/// As [`solver::reconstruct`].
 pub fn compare(
     op: &SensingOperator,
     (first, y): (usize, ArrayView3<'_, f32>),
@@ -50,11 +51,11 @@ pub fn compare(
 ) -> Result<Vec<JointFinding>> {
     let mut schedule = schedule.clone();
     for stage in &mut schedule.stages {
-        stage.iterations = stage.iterations.div_ceil(SHORTER);
+        stage.iterations = stage.iterations.div_ceil(ITERATION_DIVISOR);
     }
     let mut errors = |snapshots: Range<usize>| {
         let op = op.clone().over(snapshots.len())?;
-        let held_out = HeldOut::of(&op, snapshots.start);
+        let held_out = HoldOut::draw(&op, snapshots.start);
         let y = y.slice(s![snapshots.start - first..snapshots.end - first, .., ..]);
         let seen = op.clone().without(&held_out.pixels);
         match solver::reconstruct(&seen, y, &schedule, networks, observer) {
@@ -64,7 +65,7 @@ pub fn compare(
         }
     };
     let mut findings = Vec::with_capacity(joints.len());
-    // The snapshot that was looked at last, alone.
+    // The latest snapshot that was reconstructed alone.
     let mut last = None;
     for &after in joints {
         let mut alone = |snapshot: usize| match last {
@@ -86,8 +87,8 @@ pub fn compare(
 #[cfg(test)]
 mod tests {
     use super::{JointFinding, compare};
+    use crate::operator::SensingOperator;
     use crate::schedule::Schedule;
-    use crate::sensing::SensingOperator;
     use ndarray::{Array3, Axis, stack};
     use optics::{iid_masks, measure};
 

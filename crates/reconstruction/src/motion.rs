@@ -1,27 +1,27 @@
-//! How a picture moves, told from reconstructed frames.
+//! Motion estimation from reconstructed frames (Lucas and Kanade, 1981).
 //!
-//! What moves fast comes out smooth, and looks as good as a smooth scene. Its coarse structure survives, and how that
-//! moves from frame to frame tells the motion: frames are averaged over cells of some pixels, and of each window the one
-//! motion is found that explains the change best (Lucas and Kanade, 1981).
+//! Fast motion is reconstructed blurred, and then looks as good as a smooth scene. But coarse structure survives. So
+//! frames are averaged over cells, and the motion of a window of cells is the one that explains its temporal change
+//! best.
 
 use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 
-/// Side of the cells in pixels: motion by much more than that from frame to frame is told wrongly.
+/// Side of the cells in pixels. Motion by much more than this from frame to frame is estimated wrongly.
 const CELL: usize = 8;
 /// Side of the windows in cells.
 const WINDOW: usize = 16;
-/// Cells to each side that the motion of a cell is told from.
+/// Radius, in cells, of the window from which the motion of a cell is estimated.
 const REACH: usize = 4;
-/// The share of the change that a motion explains at the least, else there is none.
+/// Smallest share of the change that a motion must explain.
 const EXPLAINED: f32 = 0.1;
-/// The share of the gradient's energy that is taken to be along an edge, where nothing is known of a motion.
+/// Share of the gradient's energy that is treated as along an edge, where motion cannot be observed.
 const EDGE: f32 = 0.01;
-/// Below this, energies are rounding.
+/// Energies below this are rounding errors.
 const FLOOR: f32 = 1e-7;
 
-/// Energies of the steps to the next row and column and of the slope along time, and their products.
+/// Energies of the spatial differences and of the temporal slope, and their products.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Steps {
     pub down: f32,
@@ -53,8 +53,8 @@ impl Steps {
         }
     }
 
-    /// The motion that explains the slope best, in steps down and to the right, and the share of the slope that it
-    /// leaves. These are of means over pixels.
+    /// The motion that explains the slope best, in differences down and to the right, and the share of the slope that
+    /// it leaves unexplained. The energies are means over pixels.
     pub(super) fn motion(&self) -> ((f32, f32), f32) {
         let ridge = EDGE * (self.down + self.right) + FLOOR;
         let (down, right) = (self.down + ridge, self.right + ridge);
@@ -66,14 +66,14 @@ impl Steps {
     }
 }
 
-/// The speed of the fastest window of frames \[K,H,W\], whose white level this is, in pixels a frame.
+/// Speed of the fastest window of frames \[K,H,W\] with this white level, in pixels per frame.
 pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
     let coarse = averaged(frames) / white;
     let (count, rows, columns) = coarse.dim();
     if count < 2 || rows < 3 || columns < 3 {
         return 0.0;
     }
-    // Windows are larger where the sides are no multiples, and none is smaller but in a smaller picture.
+    // Windows grow where a side is not a multiple, and shrink only in a smaller picture.
     let parts = |length: usize| (length / WINDOW).max(1);
     let range = |part: usize, length: usize| {
         part * length / parts(length)..(part + 1) * length / parts(length)
@@ -91,23 +91,28 @@ pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
     most
 }
 
-/// How each part of a clip moves, in pixels from frame to frame.
+/// Motion of each part of a clip, in pixels per frame.
 #[derive(Debug)]
 pub(super) struct Motion {
-    /// Down and to the right, of each cell; what lies beyond the last one has that one's. A clip too small or too short is one
-    /// cell at rest.
+    /// Motion down and to the right of each cell. Pixels beyond the last cell take its motion. A clip that is too
+    /// small or too short is one static cell.
     of_cells: Array2<(f32, f32)>,
 }
 
 impl Motion {
-    /// Of frames \[K,H,W\]. A cell has the motion of the [`REACH`] cells around it, or that of the whole picture, or none:
-    /// the one that leaves the least difference between the frames near the cell. So where Lucas and Kanade's motion is
-    /// wrong (periodic texture, more than a cell from frame to frame) there is none.
+    /// No motion anywhere.
+    pub(super) fn none() -> Self {
+        Self { of_cells: Array2::default((1, 1)) }
+    }
+
+    /// Estimates the motion of frames \[K,H,W\]. A cell takes the motion of the [`REACH`] cells around it, the global
+    /// motion or none: the one with the smallest frame difference near the cell. Where the estimate is wrong
+    /// (periodic texture, more than a cell per frame) that is none.
     pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
         let coarse = averaged(frames);
         let (count, rows, columns) = coarse.dim();
         if count < 2 || rows < 3 || columns < 3 {
-            return Self { of_cells: Array2::default((1, 1)) };
+            return Self::none();
         }
         let told = |window: ArrayView3<'_, f32>| {
             let ((down, right), _) = steps(window).motion();
@@ -115,7 +120,7 @@ impl Motion {
             (most <= 1.0).then_some((down * CELL as f32, right * CELL as f32))
         };
         let whole = told(coarse.view());
-        // At least three cells: fewer have no gradient.
+        // At least three cells, because fewer have no gradient.
         let near = |at: usize, reach: usize, length: usize| {
             let start = at.saturating_sub(reach).min(length - 3);
             start..(at + reach + 1).clamp(start + 3, length)
@@ -137,22 +142,22 @@ impl Motion {
         Self { of_cells }
     }
 
-    /// At this pixel.
+    /// The motion at this pixel.
     pub(super) fn at(&self, row: usize, column: usize) -> (f32, f32) {
         let (rows, columns) = self.of_cells.dim();
         self.of_cells[[(row / CELL).min(rows - 1), (column / CELL).min(columns - 1)]]
     }
 }
 
-/// Mean squared difference of these rows and columns of each frame \[K,H,W\] from those of the next one to which a motion
-/// leads; infinite where it leads outside.
+/// Mean squared difference between these rows and columns of each frame \[K,H,W\] and those of the next frame
+/// displaced by a motion; infinite if the motion leads outside.
 fn difference(
     frames: ArrayView3<'_, f32>,
     (rows, columns): &(Range<usize>, Range<usize>),
     (down, right): (f32, f32),
 ) -> f32 {
     let (count, height, width) = frames.dim();
-    // Here and in the next frame, as far as both are inside.
+    // The ranges in this and the next frame, as far as both are inside.
     let ranges = |range: &Range<usize>, by: f32, length: usize| {
         let by = by.round() as isize;
         let start = (range.start as isize).max(-by);
@@ -174,7 +179,7 @@ fn difference(
     sum / pixels as f32
 }
 
-/// Means over cells \[K, H / CELL, W / CELL\], without what is left at the far edges.
+/// Means over cells \[K, H / CELL, W / CELL\]. Incomplete cells at the far edges are dropped.
 fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
     let (count, height, width) = frames.dim();
     Array3::from_shape_fn((count, height / CELL, width / CELL), |(k, row, column)| {
@@ -183,7 +188,7 @@ fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
     })
 }
 
-/// In the mean over a window, by central differences in the middle between two frames.
+/// Mean energies of a window, by central differences halfway between two frames.
 fn steps(window: ArrayView3<'_, f32>) -> Steps {
     let (count, rows, columns) = window.dim();
     let mut sums = Steps::default();

@@ -1,32 +1,32 @@
-//! A coarse reconstruction in a second or so, to be looked at while the real one is made.
+//! A coarse reconstruction in about a second, for display while the full one runs.
 //!
-//! Over a block of `s` x `s` pixels a frame is taken as even: its `s^2` pixels are then equations
-//! `y_p = sum_k C_kp x_k` for `B` unknowns, more than enough of them, and least squares solve them.
-//! Summing masks and measurement over the block first (binning) would leave one equation of the many:
-//! on street (Cr 10, independent masks, `s` = 7) total variation then gives 21.8 dB, this 28.4 dB.
+//! Within a block of `s` x `s` pixels each frame is taken as flat. The `s^2` pixels are then equations `y_p = sum_k
+//! C_kp x_k` for `B` unknowns, which least squares solve. Summing masks and measurement over the block first
+//! (binning) would leave a single equation: on street (Cr 10, independent masks, `s` = 7) total variation then
+//! reaches 21.8 dB, this method 28.4 dB.
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 
 use super::error::{ReconError, Result, shape_text};
-use super::prior::tv::TotalVariation;
+use super::operator::SensingOperator;
+use super::priors::tv::TotalVariation;
 use super::schedule::Schedule;
-use super::sensing::SensingOperator;
 use super::solver;
 
-/// Voxels that total variation does in a second or two; pictures of more are done by blocks.
+/// Number of voxels that total variation solves in a second or two; larger pictures are solved by blocks.
 pub const WHOLE: usize = 8 << 20;
-/// Iterations where a picture is done whole.
+/// Iterations for a picture that is not divided into blocks.
 const ITERATIONS: usize = 40;
-/// The longer side of a preview by blocks, about.
+/// Approximate longer side of a preview by blocks, in pixels.
 const LONGER_SIDE: usize = 640;
 /// Weight of the deviation from the block's mean over all frames, in units of the masks' squares.
 const RIDGE: f32 = 1.0;
 /// Total variation after the blocks: weight on the \[0,1\] scale, and dual updates.
 const SMOOTHING: (f32, usize) = (0.05, 4);
-/// Values of a register, or two.
+/// Number of values in a register, or two.
 const LANES: usize = 16;
 
-/// Side of the blocks for frames of this size; 1 where the picture is small enough to be done whole.
+/// Side of the blocks for frames of this size; 1 for a picture that is not divided.
 pub fn block(frames: usize, height: usize, width: usize) -> usize {
     if frames * height * width <= WHOLE {
         return 1;
@@ -36,9 +36,11 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
     enough.max(height.max(width).div_ceil(LONGER_SIDE))
 }
 
-/// Frames of a small picture, by a few iterations of GAP-TV. `y` \[S,H,W\] is on the scale on which
-/// the scene is on \[0,1\].
-/// Errors: as [`solver::reconstruct`].
+/// Frames of a small picture, by a few iterations of GAP-TV. `y` \[S,H,W\] is on the scale on which the scene is on
+/// \[0,1\].
+///
+/// # Errors
+/// As [`solver::reconstruct`].
 pub fn whole(op: &SensingOperator, y: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
     Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
@@ -51,7 +53,7 @@ pub struct Blocks {
     frames: usize,
     /// Masks of the block \[B, pixels\], rounded up to whole registers with zeros.
     masks: Vec<f32>,
-    /// What is left of the measurement.
+    /// Residual of the measurement.
     rest: Vec<f32>,
     /// Lower triangle of the normal matrix \[B,B\], and then its Cholesky factor.
     normal: Vec<f32>,
@@ -59,7 +61,7 @@ pub struct Blocks {
 }
 
 impl Blocks {
-    /// For blocks of `side` x `side` pixels of `frames` frames.
+    /// A solver for blocks of `side` x `side` pixels of `frames` frames.
     pub fn new(frames: usize, side: usize) -> Self {
         let pixels = (side * side).next_multiple_of(LANES);
         Self {
@@ -72,9 +74,11 @@ impl Blocks {
         }
     }
 
-    /// One row of blocks: masks \[B,h,W\] and measurement \[h,W\] of at most `side` rows give frames
-    /// \[B, W / side rounded up\]. The last block may be narrower.
-    /// Errors: sizes that disagree.
+    /// Solves one row of blocks: masks \[B,h,W\] and measurement \[h,W\] of at most `side` rows give frames \[B, W /
+    /// side rounded up\]. The last block may be narrower.
+    ///
+    /// # Errors
+    /// Sizes that disagree.
     pub fn row(
         &mut self,
         masks: ArrayView3<'_, f32>,
@@ -146,8 +150,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
     sums.iter().sum()
 }
 
-/// Solves `A x = b` in place of `b` for a positive definite `A`, of which the lower triangle is
-/// given and lost.
+/// Solves `A x = b` in place of `b` for a positive definite `A`, given by its lower triangle, which is overwritten.
 fn cholesky(a: &mut [f32], b: &mut [f32]) {
     let n = b.len();
     for i in 0..n {

@@ -1,20 +1,19 @@
-//! What pixels that the solver did not see tell of the error of its frames.
+//! Error estimates from the hold-out pixels of a reconstruction.
 //!
-//! At a held-out pixel `y - Hv = sum_k C_k e_k + n` of the frames' errors `e` and the noise `n`. The pixel's
-//! masks had no part in `v`, so that `E (y - Hv)^2 = a S + b D + sigma^2`, with the variances `a` of what the
-//! errors have in common and `b` of their changes (cosines along time), and the gram's two parts, `S` of what
-//! the masks have in common and `D`. These parts differ from pixel to pixel: a fit tells `a`, `b` and
-//! `sigma^2` apart, and `(a + (B - 1) b) / B` is the mean squared error of the frames. Errors are larger in
-//! some places than in others, so `a` and `b` are multiples of what is seen nearby: of the residuals of other
-//! held-out pixels, and of the frames' texture and motion.
+//! At a hold-out pixel `y - Hv = sum_k C_k e_k + n` with the frames' errors `e` and the noise `n`. The masks at that
+//! pixel had no influence on `v`, so `E (y - Hv)^2 = a S + b D + sigma^2`. Here `a` is the variance of the static
+//! part of the errors and `b` that of their changes (DCT along time); `S` is the static part of the Gram diagonal and
+//! `D` the remainder. `S` and `D` differ from pixel to pixel, so a fit separates `a`, `b` and `sigma^2`. Then `(a +
+//! (B - 1) b) / B` is the mean squared error of the frames. Errors vary in space: `a` and `b` are multiples of local
+//! estimates, from the residuals of other hold-out pixels and from texture and motion.
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
 
-use super::held_out::HeldOut;
-use super::sensing::SensingOperator;
+use super::hold_out::HoldOut;
+use super::operator::SensingOperator;
 
-/// What is told, in dB, of the mean square of a voxel.
+/// The estimates, each in dB of the mean square of a voxel.
 pub const SIGNS: [&str; 8] = [
     "residual after the first stage",
     "residual of the frames",
@@ -31,26 +30,26 @@ pub const SIGNS: [&str; 8] = [
 #[serde(transparent)]
 pub struct Signs(pub [f32; SIGNS.len()]);
 
-/// Below this, squares are rounding.
+/// Squares below this are rounding errors.
 const FLOOR: f64 = 1e-7;
-/// Standard deviation, in pixels, of the weights of residuals nearby.
+/// Standard deviation of the weights of nearby residuals, in pixels.
 const NEARBY: f64 = 3.0;
-/// The weight of the mean of all residuals among them.
+/// Weight of the mean of all residuals.
 const FAR: f64 = 0.1;
-/// Texture is that of a square of so many pixels to each side.
+/// Radius of the square over which texture is measured, in pixels.
 const REACH: usize = 3;
-/// The share of pixels that have least texture, and that have most.
+/// Share of the pixels that have the least, and the most, texture.
 const QUIET: f64 = 0.2;
-/// Steps of the fit, after which nothing changes any more.
+/// Number of steps of the fit, after which it no longer changes.
 const STEPS: usize = 150;
 
 impl Signs {
-    /// Of one snapshot `y` \[1,H,W\] at the pixels that were held out of its reconstruction: `early` are the
-    /// frames \[B,H,W\] after the first stage, `last` those at its end, all on the scale on which the scene
-    /// is on \[0,1\]. None if no pixel was held out.
+    /// Estimates for one snapshot `y` \[1,H,W\] from its hold-out pixels: `early` are the frames \[B,H,W\] after the
+    /// first stage, `last` those at the end, all on the scale on which the scene is on \[0,1\]. None without hold-out
+    /// pixels.
     pub(super) fn of(
         (op, y): (&SensingOperator, ArrayView3<'_, f32>),
-        held_out: &HeldOut,
+        held_out: &HoldOut,
         early: ArrayView3<'_, f32>,
         last: ArrayView3<'_, f32>,
     ) -> Option<Self> {
@@ -60,7 +59,7 @@ impl Signs {
         }
         let residuals = held_out.residuals(op, y, last);
         let gram = op.gram();
-        let common = op.steady_gram();
+        let common = op.static_gram();
         let at = |image: &dyn Fn((usize, usize)) -> f64| -> Vec<f64> {
             held_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
         };
@@ -109,8 +108,8 @@ fn scaled(values: impl Iterator<Item = f64>) -> Vec<f64> {
     values
 }
 
-/// The weighted mean of the residuals around each pixel without its own, in units of the mean of all.
-fn nearby(held_out: &HeldOut, residuals: &[f64]) -> Vec<f64> {
+/// Weighted mean of the residuals around each pixel, without the pixel, in units of the mean of all.
+fn nearby(held_out: &HoldOut, residuals: &[f64]) -> Vec<f64> {
     let mean = residuals.iter().sum::<f64>() / residuals.len() as f64;
     let around = |(index, &(_, i, j)): (usize, &(usize, usize, usize))| {
         let (mut sum, mut weights) = (FAR * mean, FAR);
@@ -127,8 +126,8 @@ fn nearby(held_out: &HeldOut, residuals: &[f64]) -> Vec<f64> {
     scaled(held_out.pixels.iter().enumerate().map(around))
 }
 
-/// Squared steps from pixel to pixel and from frame to frame, in the mean over the frames and a square around
-/// each pixel \[H,W\].
+/// Squared differences from pixel to pixel and from frame to frame, averaged over the frames and a square around each
+/// pixel \[H,W\].
 fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
     let (count, height, width) = frames.dim();
     let mut steps = Array2::<f64>::zeros((height, width));
@@ -150,7 +149,7 @@ fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
     })
 }
 
-/// The mean square where there is least texture, and where there is most.
+/// Mean squares where there is the least texture, and where there is the most.
 fn extremes(texture: &[f64], squares: &[f64]) -> [f64; 2] {
     let mut order: Vec<usize> = (0..texture.len()).collect();
     order.sort_by(|a, b| texture[*a].total_cmp(&texture[*b]));
@@ -159,9 +158,8 @@ fn extremes(texture: &[f64], squares: &[f64]) -> [f64; 2] {
     [mean(&order[..count]), mean(&order[order.len() - count..])]
 }
 
-/// The factors, none below 0, of parts whose sum is the expectation of each square: the most likely ones
-/// where these are squares of Gaussian numbers, by multiplicative steps (Févotte, Bertin and Durrieu, Neural
-/// Computation 2009).
+/// Non-negative factors of parts that add up to the expected square of each value: the maximum-likelihood ones for
+/// Gaussian values, by multiplicative updates (Févotte, Bertin and Durrieu, Neural Computation 2009).
 fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
     let mean = squares.iter().sum::<f64>() / squares.len() as f64;
     let all = parts.iter().flatten().sum::<f64>() / squares.len() as f64;
@@ -186,8 +184,8 @@ fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::{Signs, variances};
-    use crate::held_out::HeldOut;
-    use crate::sensing::SensingOperator;
+    use crate::hold_out::HoldOut;
+    use crate::operator::SensingOperator;
     use ndarray::Array3;
     use optics::iid_masks;
     use rand::{Rng, SeedableRng};
@@ -219,7 +217,7 @@ mod tests {
         let (frames, side) = (8, 192);
         let masks = iid_masks(frames, side, side, 3).unwrap();
         let op = SensingOperator::new(masks).unwrap();
-        let held_out = HeldOut::of(&op, 0);
+        let held_out = HoldOut::draw(&op, 0);
         let left = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
         let truth = Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
             0.5 + 0.2 * left(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
