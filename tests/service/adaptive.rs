@@ -16,11 +16,11 @@ async fn an_adaptive_schedule_is_decided_once_and_can_be_repeated() {
     ]});
     let (first, content) = run(&app, &measurement, &adaptive).await;
     let stages = content["pilot"]["stages"].as_array().unwrap();
-    let first = &stages[0]["stage"];
-    assert_eq!((&stages[0]["end"], &first["iterations"]), (&json!("fixed"), &json!(20)));
+    let tv = &stages[0]["stage"];
+    assert_eq!((&stages[0]["end"], &tv["iterations"]), (&json!("fixed"), &json!(20)));
     let iterations = stages[1]["stage"]["iterations"].as_u64().unwrap();
     assert!(iterations > 0, "the stage has run: {stages:#?}");
-    let temporal = first["temporal_weight"].as_f64().unwrap() as f32;
+    let temporal = tv["temporal_weight"].as_f64().unwrap() as f32;
     let planned = stages[0]["planned"]["temporal_weight"].as_f64().unwrap() as f32;
     assert_eq!(
         (planned, temporal),

@@ -36,8 +36,8 @@ impl JointFinding {
 pub const ITERATION_DIVISOR: usize = 3;
 
 /// Compares the two snapshots of each joint, given by the index of the first one, alone and together, with shortened
-/// stages. `op` is the operator of one snapshot; `y` \[S,H,W\] contains all snapshots, of which the first has the
-/// index `first`.
+/// stages. `op` is the operator of one snapshot; `y` \[S,H,W\] contains all snapshots, and `first` is the index of the
+/// first one.
 ///
 /// # Errors
 /// As [`solver::reconstruct`].

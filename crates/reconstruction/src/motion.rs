@@ -106,8 +106,8 @@ impl Motion {
     }
 
     /// Estimates the motion of frames \[K,H,W\]. A cell takes the motion of the [`REACH`] cells around it, the global
-    /// motion or none: the one with the smallest frame difference near the cell. Where the estimate is wrong
-    /// (periodic texture, more than a cell per frame) that is none.
+    /// motion or none: the one with the smallest frame difference near the cell. A wrong estimate
+    /// (periodic texture, more than a cell per frame) therefore gives no motion.
     pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
         let coarse = averaged(frames);
         let (count, rows, columns) = coarse.dim();

@@ -381,7 +381,7 @@ mod tests {
     use crate::schedule::{Heuristic, Schedule};
     use crate::solver::{Control, Observer, Progress};
     use crate::stage::Stage;
-    use ndarray::{Array2, Array3, Axis, s};
+    use ndarray::{Array2, Array3, Axis};
     use optics::{iid_masks, measure};
     use rand::{Rng, SeedableRng};
     use std::ops::Range;

@@ -115,7 +115,6 @@ mod tests {
     use super::{Problem, Projection, Settings};
     use crate::iterate::{Change, Iterate};
     use crate::operator::SensingOperator;
-    use crate::priors::Prior;
     use crate::schedule::Schedule;
     use ndarray::Array3;
     use rand::{Rng, SeedableRng};

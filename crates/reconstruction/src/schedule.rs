@@ -432,7 +432,9 @@ mod tests {
         let mut schedule: Value = serde_json::from_str(&text).unwrap();
         let root = schedule.as_object_mut().unwrap();
         let parts = root.remove("$defs").unwrap();
-        ["$id", "$schema", "title"].map(|name| root.remove(name));
+        for name in ["$id", "$schema", "title"] {
+            root.remove(name);
+        }
         let mut components = json!({"Schedule": schedule});
         components.as_object_mut().unwrap().extend(parts.as_object().unwrap().clone());
         let yaml = serde_yaml_ng::to_string(&components).unwrap();
