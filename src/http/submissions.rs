@@ -87,7 +87,9 @@ where
         if patience.is_zero() {
             return Ok(made);
         }
-        let waiting = settled(app.clone(), lab.clone(), (what, made.id().into()), patience);
+        let is_new = matches!(made, Inserted::New(_));
+        let thing = (what, made.id().into());
+        let waiting = settled(app.clone(), lab.clone(), thing, is_new, patience);
         // Runs to completion even if the client disconnects.
         let waiting = match REQUEST_ID.try_with(Clone::clone) {
             Ok(id) => tokio::spawn(REQUEST_ID.scope(id, waiting)),
@@ -95,7 +97,7 @@ where
         };
         let there = waiting.await.unwrap_or_else(|_| Err(StoreError::Interrupted.into()))?;
         // A request with this key was refused meanwhile: the key is free again.
-        if there || matches!(made, Inserted::New(_)) {
+        if there || is_new {
             return Ok(made);
         }
     }
@@ -124,11 +126,13 @@ where
 }
 
 /// Waits for a check. False if its request was deleted.
-/// Errors: why the uploads are refused; the request is not kept then.
+/// Errors: why the uploads are refused. The HTTP request that made the record then removes it; others with the same
+/// key leave it for that one to read.
 async fn settled(
     app: App,
     lab: Lab,
     (what, id): (Made, ThingId),
+    is_new: bool,
     patience: Duration,
 ) -> Result<bool> {
     if let Err(error) = app.events.checked(&app.store, &lab, (what, id), patience).await {
@@ -137,7 +141,7 @@ async fn settled(
     }
     let Some(request) = app.store.find_request(&lab, id).await? else { return Ok(false) };
     let Some(refusal) = request.refusal else { return Ok(true) };
-    if app.store.drop_refused(id).await? {
+    if !is_new || app.store.drop_refused(id).await? {
         return Err(refusal.into());
     }
     Ok(app.store.find_request(&lab, id).await?.is_some())

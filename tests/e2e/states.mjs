@@ -27,7 +27,7 @@ export async function faults(browser, checks, program, services) {
   await page.click("#play");
   await checks.look(page, "warning");
   const stages = [{ prior: "tv", iterations: 10000, tv_weight: 0.05, tv_updates: 40, tolerance: 0 }];
-  const long = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "to be cancelled", schedule: { stages } });
+  const long = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "stopped early", schedule: { stages } });
   await service.when(long.id, (job) => job.progress.tiles_running > 0 && job.progress.previews_done > 0);
   await page.goto(`${service.url}/#/jobs/${long.id}`);
   await page.waitForSelector(".onpicture:has-text('Preview')");

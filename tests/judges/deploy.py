@@ -449,7 +449,7 @@ def promtool(root, wrong):
 def known(root, wrong, file_name, expressions):
     names = {name for expression in expressions for name in words(expression)}
     described = set()
-    for file in (root / "src").rglob("*.rs"):
+    for file in [*(root / "src").rglob("*.rs"), *(root / "crates").rglob("*.rs")]:
         described |= words(file.read_text())
     missing = {name for name in names if name.removesuffix("_bucket") not in described}
     if missing or not names:

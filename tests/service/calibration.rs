@@ -316,7 +316,7 @@ async fn invalid_captures_are_rejected() {
     };
     let answer = post(&|captures| captures["masks"][2] = json!([])).await;
     let detail = answer.problem(422, "invalid_request");
-    assert!(detail.contains("missing"), "{detail}");
+    assert!(detail.contains("0 uploads"), "{detail}");
     assert_eq!(answer.json()["pointer"], "/captures/masks/2");
     let small = app.upload(npy(&[20, 30], (0..600).map(|_| 1.0))).await;
     let answer = post(&|captures| captures["masks"][1] = json!([small])).await;

@@ -211,7 +211,7 @@ fn impossible_optics_are_rejected_at_once() {
     assert!(message.contains("rank 5 can't be reached"), "{message}");
     let two = "[sub_apertures]\nrows = 1\ncolumns = 2";
     let message = refuse(two, "single-apertures", "4", &[]);
-    assert!(message.contains("4 frames need as many"), "{message}");
+    assert!(message.contains("4 frames need 4 sub-apertures"), "{message}");
     let folder = files.path("pictures");
     std::fs::create_dir_all(&folder).unwrap();
     for (name, size) in [("1.png", 4), ("2.png", 5)] {

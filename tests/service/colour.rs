@@ -75,9 +75,11 @@ impl Lab {
         command.args(arguments).current_dir(self.folder.path()).output().unwrap()
     }
 
+    /// Runs a command that must do its work. The checks may find errors in the small scene, which gives status 3.
     fn run(&self, arguments: &[&str]) -> String {
         let output = self.command(arguments);
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let done = [Some(0), Some(3)].contains(&output.status.code());
+        assert!(done, "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap()
     }
 

@@ -93,7 +93,7 @@ async fn masks_with_ambiguous_axes_are_rejected_until_the_order_is_stated() {
         assert_eq!(answer.json()["reason"], "axes_ambiguous");
         assert_eq!(answer.json()["pointer"], "/axes");
     }
-    // So many masks would keep a worker busy for hours.
+    // A file with that many masks would keep a worker busy for hours.
     for shape in [[4096, 8, 8], [65, 72, 72]] {
         let detail = app.calibrate(constant(&shape, 0.5)).await.problem(422, "size_mismatch");
         assert!(

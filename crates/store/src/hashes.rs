@@ -15,7 +15,7 @@ use super::error::{Result, StoreError};
 use super::on_files;
 use engine::job::Sha256;
 
-/// Files of which the hash is remembered.
+/// Number of files whose hash is remembered.
 const REMEMBERED: usize = 65_536;
 /// Bytes that are read at a time.
 const SLICE: usize = 1 << 20;

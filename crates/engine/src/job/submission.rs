@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{CalibrationId, Captures, InvalidField, Label, Mosaic, Sequence, Sha256};
-use formats::Axes;
+use formats::{Axes, FullScale};
 
 /// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
 const CHECK_S: f64 = 20e-9;
@@ -136,11 +136,23 @@ impl Submission {
     /// Errors: all that is wrong, each with its place.
     pub fn check(&self) -> Result<(), Vec<InvalidField>> {
         match self {
-            Self::Calibration(request) => request.check(),
-            Self::Measurement(request) => request.check_times(),
+            Self::Calibration(request) => {
+                request.check()?;
+                check_full_scale(request.full_scale)
+            }
+            Self::Measurement(request) => {
+                request.check_times()?;
+                check_full_scale(request.full_scale)
+            }
             Self::Model(_) => Ok(()),
         }
     }
+}
+
+/// Refuses what is no full scale. Requests are stored as JSON, which would turn an infinity into null.
+fn check_full_scale(full_scale: Option<f32>) -> Result<(), Vec<InvalidField>> {
+    let error = full_scale.and_then(|value| FullScale::new(value).err());
+    error.map_or(Ok(()), |error| Err(vec![InvalidField::new("/full_scale", error.to_string())]))
 }
 
 impl CalibrationRequest {
