@@ -190,7 +190,7 @@ class Case:
         least, greatest = APERTURE_CONTRAST
         self.unfamiliar = contrast < greatest and (contrast < least or gradient - contrast < APERTURE_SHARPNESS)
         # The default's pilot shrinks changes along time; gap-tv has none.
-        stages = about['pilot']['stages'] if about.get('pilot') else []
+        stages = [decided['stage'] for decided in about['pilot']['stages']] if about.get('pilot') else []
         self.shrunk = any((stage.get('static_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
 
     def set_evidence(self, evidence):

@@ -65,7 +65,7 @@ async fn invalid_requests_are_rejected_with_all_errors() {
     for (field, value, pointer) in [
         ("algorithm", json!("magic"), "/algorithm"),
         ("snapshots", json!("some"), "/snapshots"),
-        ("schedule", json!({"stages": [{"prior": "tv", "steps": 5}]}), "/schedule/stages/0"),
+        ("schedule", json!({"stages": [{"prior": "tv", "steps": 5}]}), "/schedule/stages/0/steps"),
         ("measurement", json!("019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d"), "/measurement"),
     ] {
         let mut body = json!({"measurement": measurement, "algorithm": "gap-tv"});

@@ -56,6 +56,39 @@ pub(crate) fn check(value: &Value, schema: &Value, root: &Value, pointer: &str) 
     faults
 }
 
+/// Refuses the value of a field that does not have a type of its schema, or a list of the wrong length.
+///
+/// # Errors
+/// A message that names the field and the types.
+pub(crate) fn check_type(field: &str, value: &Value, schema: &Value) -> Result<(), String> {
+    let types: Vec<&str> = match &schema["type"] {
+        Value::Array(types) => types.iter().filter_map(Value::as_str).collect(),
+        one => one.as_str().into_iter().collect(),
+    };
+    let is = |name: &&str| match *name {
+        "null" => value.is_null(),
+        "boolean" => value.is_boolean(),
+        "integer" => value.is_u64(),
+        "number" => value.is_number(),
+        "string" => value.is_string(),
+        "array" => value.is_array(),
+        _ => true,
+    };
+    if !types.is_empty() && !types.iter().any(is) {
+        let types = types.join(" or ");
+        return Err(format!("{field}: invalid type: {value}, expected {types}"));
+    }
+    let Value::Array(items) = value else { return Ok(()) };
+    let length = |bound: &str| schema[bound].as_u64();
+    if length("minItems").is_some_and(|least| (items.len() as u64) < least)
+        || length("maxItems").is_some_and(|most| items.len() as u64 > most)
+    {
+        let expected = length("minItems").unwrap_or_default();
+        return Err(format!("{field}: invalid length {}, expected {expected}", items.len()));
+    }
+    items.iter().try_for_each(|item| check_type(field, item, &schema["items"]))
+}
+
 /// True if each constant property of `alternative` is that of `value`.
 fn matches_tag(value: &Value, alternative: &Value) -> bool {
     let properties = alternative["properties"].as_object().into_iter().flatten();

@@ -60,8 +60,8 @@ impl Schedule {
     }
 }
 
-/// The weight from 0.002 to 0.01 with the largest mean gain over scenes, masks and noise. A larger one blurs motion. Where
-/// even this one does, the pilot drops it.
+/// The weight from 0.002 to 0.01 with the largest mean gain over scenes, masks and noise. A larger one blurs motion. The
+/// pilot drops total variation along time from a stage that is better without it.
 const TEMPORAL_WEIGHT: f32 = 0.004;
 
 /// The best static variance behind independent pixels at Cr 6 to 24; the projection reduces it for correlated masks.

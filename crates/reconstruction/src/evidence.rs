@@ -13,8 +13,8 @@ use super::signs::Signs;
 use super::solver;
 
 /// Evidence from the crop of the first snapshot that [`crop::choose`] selects; measurement and frames are on the scale on
-/// which the scene is on \[0,1\]. None if no light reaches the crop, or the iteration diverges. Costs a run of the schedule
-/// on the crop.
+/// which the scene is on \[0,1\]. Returns `None` if no light reaches the crop, or the iteration diverges. Costs a run of
+/// the schedule on the crop.
 ///
 /// # Errors
 /// As [`solver::reconstruct`].

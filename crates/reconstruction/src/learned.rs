@@ -56,7 +56,7 @@ pub trait SnapshotNetwork {
 pub fn all_finite(frames: &Array3<f32>) -> Result<()> {
     let Some(value) = frames.iter().find(|value| !value.is_finite()) else { return Ok(()) };
     Err(ReconError::Shape {
-        what: "what the network gave",
+        what: "the network's output",
         found: format!("{value} among others"),
         expected: format!("1x{} of finite numbers", shape_text(frames.shape())),
     })

@@ -576,7 +576,7 @@ mod tests {
         assert!(!is_better(&strong(others, 2.0), &planned), "it is clearly worse");
         assert!(
             !is_better(&strong(fewer, 1.0), &planned),
-            "the remaining changes were there before"
+            "the remaining changes existed before shrinkage"
         );
         let disabled = vec![Heuristic::StaticScene];
         let without = Schedule { disabled, ..schedule.clone() };

@@ -126,12 +126,12 @@ impl Problem {
             let (first, pixel) = (p / plane * mask.len(), p % plane);
             let voxels = || (pixel..mask.len()).step_by(plane);
             let seen: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
-            let of_all = |part: &dyn Fn(usize) -> f64| -> f64 {
+            let total_of = |part: &dyn Fn(usize) -> f64| -> f64 {
                 voxels().map(|voxel| mask[voxel] * part(voxel)).sum::<f64>() + f64::from(gamma)
             };
-            let least = -f64::from(MAX_OPPOSITION) * of_all(&|voxel| direction[voxel]);
+            let least = -f64::from(MAX_OPPOSITION) * total_of(&|voxel| direction[voxel]);
             let bounded = |voxel: usize| direction[voxel].max(least / mask[voxel]);
-            let total = of_all(&bounded);
+            let total = total_of(&bounded);
             let mut target = f64::from(y);
             if self.schedule.accelerated {
                 y1[p] = target + f64::from(memory) * (y1[p] - seen);

@@ -23,8 +23,8 @@ impl ScaleEstimator {
         Self { light }
     }
 
-    /// White level of the scene behind measurement `y` \[H,W\]: the measurement (and thereby the frames) is divided
-    /// by it before reconstruction, and the frames are scaled back by it afterwards.
+    /// White level of the scene behind measurement `y` \[H,W\]. The measurement is divided by it before reconstruction,
+    /// and the frames are multiplied by it afterwards.
     ///
     /// # Errors
     /// Sizes that differ, or a measurement without light.

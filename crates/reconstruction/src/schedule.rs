@@ -19,7 +19,7 @@ use super::stage::Stage;
 #[serde(deny_unknown_fields)]
 #[schemars(title = "Schedule of a reconstruction", extend("$id" = "urn:sci-recon:schema:schedule"))]
 pub struct Schedule {
-    /// How projection and prior alternate.
+    /// The alternation of projection and prior.
     #[serde(default)]
     pub method: Method,
     /// Accelerated GAP: residuals accumulate through all stages, as far as the memory of each stage keeps them.
@@ -41,7 +41,7 @@ pub struct Schedule {
     pub stages: Vec<Stage>,
 }
 
-/// How projection and prior alternate. P(w) = w + R H^T (H R H^T + gamma)^-1 (y - H w), where R = 1 unless a stage sets
+/// The alternation of projection and prior. P(w) = w + R H^T (H R H^T + gamma)^-1 (y - H w), where R = 1 unless a stage sets
 /// static_variance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
@@ -392,11 +392,6 @@ mod tests {
             "half of the network's iterations"
         );
         assert_eq!(schedule.share_done(2, 0), 1.0);
-    }
-
-    fn text(path: &str) -> String {
-        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path))
-            .unwrap()
     }
 
     fn place(path: &str) -> PathBuf {

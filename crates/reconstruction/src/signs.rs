@@ -49,19 +49,19 @@ impl Signs {
     /// pixels.
     pub(super) fn of(
         (op, y): (&SensingOperator, ArrayView3<'_, f32>),
-        held_out: &HoldOut,
+        hold_out: &HoldOut,
         early: ArrayView3<'_, f32>,
         last: ArrayView3<'_, f32>,
     ) -> Option<Self> {
-        let count = held_out.pixels.len() as f64;
-        if held_out.pixels.is_empty() {
+        let count = hold_out.pixels.len() as f64;
+        if hold_out.pixels.is_empty() {
             return None;
         }
-        let residuals = held_out.residuals(op, y, last);
+        let residuals = hold_out.residuals(op, y, last);
         let gram = op.gram();
         let common = op.static_gram();
         let at = |image: &dyn Fn((usize, usize)) -> f64| -> Vec<f64> {
-            held_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
+            hold_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
         };
         let shared = at(&|p| f64::from(common[p]));
         let changing = at(&|p| f64::from((gram[p] - common[p]).max(0.0)));
@@ -69,7 +69,7 @@ impl Signs {
         let texture = texture(last);
         let texture = at(&|p| texture[p]);
 
-        let near = nearby(held_out, &residuals);
+        let near = local_residuals(hold_out, &residuals);
         let rough = scaled(texture.iter().map(|texture| texture.sqrt()));
         let both = scaled(near.iter().zip(&rough).map(|(near, rough)| (near * rough).sqrt()));
         let frames = last.len_of(Axis(0)) as f64;
@@ -82,7 +82,7 @@ impl Signs {
             let variances = variances(&residuals, &parts);
             ((variances[0] + (frames - 1.0) * variances[1]) / frames, variances[0] / frames)
         };
-        let first = held_out.residuals(op, y, early);
+        let first = hold_out.residuals(op, y, early);
         let mean = |squares: &[f64]| squares.iter().sum::<f64>() / squares.len() as f64 / mean_gram;
         let [quiet, loud] = extremes(&texture, &residuals);
         let (told, common) = error(&both, true);
@@ -109,11 +109,11 @@ fn scaled(values: impl Iterator<Item = f64>) -> Vec<f64> {
 }
 
 /// Weighted mean of the residuals around each pixel, without the pixel, in units of the mean of all.
-fn nearby(held_out: &HoldOut, residuals: &[f64]) -> Vec<f64> {
+fn local_residuals(hold_out: &HoldOut, residuals: &[f64]) -> Vec<f64> {
     let mean = residuals.iter().sum::<f64>() / residuals.len() as f64;
     let around = |(index, &(_, i, j)): (usize, &(usize, usize, usize))| {
         let (mut sum, mut weights) = (FAR * mean, FAR);
-        for (other, &(_, row, column)) in held_out.pixels.iter().enumerate() {
+        for (other, &(_, row, column)) in hold_out.pixels.iter().enumerate() {
             let distance = (i.abs_diff(row).pow(2) + j.abs_diff(column).pow(2)) as f64;
             if other != index && distance < (4.0 * NEARBY).powi(2) {
                 let weight = (-0.5 * distance / NEARBY.powi(2)).exp();
@@ -123,7 +123,7 @@ fn nearby(held_out: &HoldOut, residuals: &[f64]) -> Vec<f64> {
         }
         sum / weights
     };
-    scaled(held_out.pixels.iter().enumerate().map(around))
+    scaled(hold_out.pixels.iter().enumerate().map(around))
 }
 
 /// Squared differences from pixel to pixel and from frame to frame, averaged over the frames and a square around each
@@ -217,7 +217,7 @@ mod tests {
         let (frames, side) = (8, 192);
         let masks = iid_masks(frames, side, side, 3).unwrap();
         let op = SensingOperator::new(masks).unwrap();
-        let held_out = HoldOut::draw(&op, 0);
+        let hold_out = HoldOut::draw(&op, 0);
         let left = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
         let truth = Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
             0.5 + 0.2 * left(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
@@ -228,7 +228,7 @@ mod tests {
             let mut found = truth.clone();
             found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * left(j));
             let y = op.forward(truth.view()).unwrap().mapv(|y| y + normal(noise));
-            let told = Signs::of((&op, y.view()), &held_out, found.view(), found.view()).unwrap();
+            let told = Signs::of((&op, y.view()), &hold_out, found.view(), found.view()).unwrap();
             let decibels = |square: f32| 10.0 * square.log10();
             let expected = decibels(error.powi(2) / 2.0);
             let Signs([early, late, both, _, without_noise, by_texture, quiet, _]) = told;

@@ -90,12 +90,12 @@ pub fn reconstruct_assessed(
         let encoder = if learned { networks.encoder()? } else { None };
         assessment::encoded_features(op, early, frames, encoder)
     };
-    let of_result = features(outcome.frames.view())?;
+    let final_features = features(outcome.frames.view())?;
     outcome.features = Some(match &weakly_shrunk {
-        None => of_result,
+        None => final_features,
         Some(weak) => {
             let frames = (outcome.frames.view(), weak.view());
-            assessment::with_first_run(&of_result, &features(weak.view())?, frames)?
+            assessment::with_first_run(&final_features, &features(weak.view())?, frames)?
         }
     });
     Ok(outcome)

@@ -7,6 +7,7 @@ use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
+use super::bounds;
 use super::error::ReconError;
 use super::fields::{self, Fields};
 use super::priors::registry::{PriorName, PriorSpec};
@@ -160,14 +161,10 @@ impl Stage {
             tolerance: f32,
         }
 
-        let name = fields.get("prior").ok_or("missing field `prior`")?;
-        let name = PriorName::parse(name.as_str().unwrap_or_default())?;
+        let name = prior_name(fields)?.ok_or("missing field `prior`")?;
         // Before the check for missing fields, because a misspelt field is also a missing one.
-        let known = field_names(name);
-        if let Some(unknown) = fields.keys().find(|field| !known.contains(field)) {
-            let known = known.join("`, `");
-            return Err(format!("unknown field `{unknown}`, expected one of `{known}`"));
-        }
+        let known = field_schemas(Some(name));
+        fields.keys().try_for_each(|field| known_field(&known, field))?;
         let prior = PriorSpec::read(name, fields)?;
         let projection = fields::read(fields)?;
         let Own { iterations, momentum, tolerance } = fields::read(fields)?;
@@ -175,18 +172,51 @@ impl Stage {
     }
 }
 
-/// The fields of a stage with this prior, by the schema.
-fn field_names(prior: PriorName) -> Vec<String> {
+/// The prior of a stage, if its name has been read.
+///
+/// # Errors
+/// A message that lists the names.
+fn prior_name(fields: &Fields) -> Result<Option<PriorName>, String> {
+    let name = fields.get("prior").map(|name| name.as_str().unwrap_or_default());
+    name.map(PriorName::parse).transpose()
+}
+
+/// The schemas of the fields of a stage with this prior; with any prior if none is given.
+fn field_schemas(prior: Option<PriorName>) -> Fields {
     static SCHEMA: LazyLock<Value> = LazyLock::new(|| schemars::schema_for!(Stage).to_value());
     let alternatives = SCHEMA["oneOf"].as_array().into_iter().flatten();
-    let mut own = alternatives.filter(|one| one["properties"]["prior"]["const"] == prior.as_str());
-    let parts = [&*SCHEMA, own.next().unwrap_or(&Value::Null)];
-    let properties = parts.into_iter().filter_map(|part| part["properties"].as_object());
-    properties.flatten().map(|(name, _)| name.clone()).collect()
+    let possible = alternatives.filter(|alternative| {
+        let name = &alternative["properties"]["prior"]["const"];
+        prior.is_none_or(|prior| name == prior.as_str())
+    });
+    let parts = std::iter::once(&*SCHEMA).chain(possible);
+    let properties = parts.filter_map(|part| part["properties"].as_object());
+    properties.flatten().map(|(name, schema)| (name.clone(), schema.clone())).collect()
+}
+
+fn known_field(known: &Fields, field: &str) -> Result<(), String> {
+    if known.contains_key(field) {
+        return Ok(());
+    }
+    let known: Vec<_> = known.keys().map(String::as_str).collect();
+    Err(format!("unknown field `{field}`, expected one of `{}`", known.join("`, `")))
+}
+
+/// Refuses a field that no stage with the prior has, and a value of another type. The prior may also follow later.
+fn check_field(before: &Fields, field: &str, value: Option<&Value>) -> Result<(), String> {
+    let known = field_schemas(prior_name(before)?);
+    match value {
+        None => known_field(&known, field),
+        Some(value) if field == "prior" => {
+            PriorName::parse(value.as_str().unwrap_or_default()).map(|_| ())
+        }
+        Some(value) => bounds::check_type(field, value, &known[field]),
+    }
 }
 
 impl<'de> Deserialize<'de> for Stage {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        Self::from_fields(&Fields::deserialize(deserializer)?).map_err(D::Error::custom)
+        let fields = deserializer.deserialize_map(fields::Reader(check_field))?;
+        Self::from_fields(&fields).map_err(D::Error::custom)
     }
 }

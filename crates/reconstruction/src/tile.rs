@@ -254,7 +254,7 @@ pub(super) fn parts(
     multiple: usize,
 ) -> Vec<Range<usize>> {
     let count = 1 + length.saturating_sub(size).div_ceil((size - overlap).max(1));
-    // No more overlap than requested, because it is computed twice.
+    // The smallest possible overlap, because shared pixels are computed twice.
     let least = (length + (count - 1) * overlap).div_ceil(count);
     let size = least.next_multiple_of(multiple).min(size);
     let start = |k: usize| if k == 0 { 0 } else { k * (length - size) / (count - 1) };

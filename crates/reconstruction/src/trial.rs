@@ -15,8 +15,8 @@ const EARLY_STOPPING_SLACK: f64 = 0.005;
 /// than the error shows.
 const MAX_FULL_SCHEDULE_T: f64 = 1.5;
 
-/// Smallest t-statistic for which a candidate is accepted. Where noise outweighs the frames' error, few pixels could show
-/// more.
+/// Smallest t-statistic for which a candidate is accepted. A larger one would rarely be reached if noise outweighs the
+/// frames' error.
 const ACCEPT_T: f64 = 1.0;
 
 /// [`ACCEPT_T`] for another static variance. It trades changes for the static part, which counts more in a measurement than
@@ -96,8 +96,8 @@ impl Trial {
         if complete && t_statistic(last, self.best_squares()) <= MAX_FULL_SCHEDULE_T {
             return self.errors.len();
         }
-        let near = self.smallest_error() * (1.0 + EARLY_STOPPING_SLACK);
-        self.errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1)
+        let limit = self.smallest_error() * (1.0 + EARLY_STOPPING_SLACK);
+        self.errors.iter().rposition(|error| *error <= limit).map_or(0, |index| index + 1)
     }
 
     /// The frames of the result. With noise the smallest error may come first, when little is shrunk.

@@ -80,9 +80,9 @@ function pilot(content) {
   const row = ({ planned, stage, end, error_before: before, error_after: after }) => {
     const decided = [why[end] && `${stage.iterations} of ${planned.iterations} iterations (${why[end]})`, ...changes(planned, stage)].filter(Boolean);
     const error = `hold-out error ${figure(before)} to ${figure(after)}`;
-    return decided.length > 0 && [`Pilot, ${stage.prior}`, [...decided, error].join(", ")];
+    return [`Pilot, ${stage.prior}`, `${decided.join(", ") || "as planned"}, ${error}`];
   };
-  return (content.pilot?.stages ?? []).map(row).filter(Boolean);
+  return (content.pilot?.stages ?? []).map(row);
 }
 
 /** The settings of a stage that the pilot changed, by their names in the schedule. */

@@ -38,8 +38,8 @@ pub fn place(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, mosaic: Option<
 }
 
 /// Runs the pilot on a crop of all snapshots: it adapts the schedule to the first one, and then compares neighbouring
-/// snapshots, together and alone, with the decided schedule. None if there is nothing to decide, or no light reaches the
-/// crop.
+/// snapshots, together and alone, with the decided schedule. Returns `None` if there is nothing to decide, or no light
+/// reaches the crop.
 ///
 /// # Errors
 /// As [`pilot::decide`] and [`joints::compare`].

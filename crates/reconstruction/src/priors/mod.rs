@@ -167,7 +167,7 @@ pub const BLOCK: usize = 16;
 /// Number of features of a block.
 pub const CHANNELS: usize = 128;
 
-/// Where the solver gets its networks from.
+/// A source of networks for the solver.
 pub trait Networks {
     /// The network, loaded at its first use.
     ///
@@ -184,7 +184,7 @@ pub trait Networks {
     }
 }
 
-/// No networks.
+/// A source without networks.
 impl Networks for () {
     fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser> {
         Err(ReconError::NoDenoiser)

@@ -215,7 +215,7 @@ impl SnapshotNetwork for EndToEndNetwork {
         let (shape, values) = outputs[FRAMES].try_extract_tensor::<f32>().map_err(failed)?;
         let frames = Array3::from_shape_vec(masks.raw_dim(), values.to_vec());
         let frames = frames.map_err(|_| ReconError::Shape {
-            what: "what the network gave",
+            what: "the network's output",
             found: shape.to_string(),
             expected: format!("1x{}", shape_text(masks.shape())),
         })?;

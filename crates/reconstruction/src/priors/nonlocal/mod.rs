@@ -37,9 +37,9 @@ pub struct NonlocalSpec {
     #[schemars(range(min = 0.0, max = 1e6))]
     pub temporal_shrinkage: f32,
     /// Temporal shrinkage of static regions, only beside temporal_shrinkage. The stage is then run twice from its start,
-    /// with either shrinkage, and blended: a region is static if the temporal changes before the stage and after its
-    /// first run, over 17x17 pixels, have a correlation below 0.65, and moving above 0.8. With null the stage is run
-    /// once. An adaptive schedule sets it where strong shrinkage is better.
+    /// with either shrinkage, and blended. The temporal changes before the stage and after its first run are compared
+    /// over 17x17 pixels. With a correlation below 0.65 a region is static, above 0.8 it is moving. With null the stage
+    /// is run once. An adaptive schedule sets it where strong shrinkage is better.
     #[serde(default)]
     #[schemars(range(min = 0.0, max = 1e6))]
     pub static_shrinkage: Option<f32>,

@@ -13,7 +13,7 @@ type Size = (usize, usize, usize);
 
 /// Rows of a window that are compared at once: their sums stay in registers.
 pub(super) const ROWS: usize = 8;
-/// Number of candidates of a group above which all but the best are dropped.
+/// Largest number of candidates that a group keeps between frames; beyond it, only the best [`PATCHES`] stay.
 const KEPT: usize = 128;
 
 /// Finds the patches most similar to each reference patch, near it in time and near the place where its motion leads,
