@@ -12,7 +12,7 @@ use strum::IntoStaticStr;
 use engine::job::Pool;
 use engine::job::WorkerId;
 use engine::pipeline::networks::{NetworkError, find_library};
-use reconstruction::prior::onnx::Device;
+use reconstruction::priors::onnx::Device;
 use store::Claimant;
 
 /// The version of the program, with its commit if `make` built it.

@@ -245,7 +245,7 @@ mod tests {
     use ndarray::{Array2, Array3, Axis};
     use optics::{iid_masks, measure};
     use reconstruction::ReconError;
-    use reconstruction::prior::onnx::Device;
+    use reconstruction::priors::onnx::Device;
     use reconstruction::schedule::Schedule;
     use reconstruction::sequence::SequencePlan;
     use reconstruction::tile::TilePlan;

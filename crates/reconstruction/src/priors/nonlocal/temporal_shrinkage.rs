@@ -1,32 +1,32 @@
-//! Shrinkage of what changes along time.
+//! Temporal shrinkage: an empirical Wiener filter of DCT coefficients along time (Ghael, Sayeed and Baraniuk 1997).
 //!
-//! A group of patches in fine texture spans all directions, so that its filter passes everything, also what
-//! differs from frame to frame where nothing moves. Along time alone such differences are told from motion:
-//! they are weak in each frequency.
+//! A group of patches of fine texture spans all directions. Its filter then passes everything, including
+//! frame-to-frame error in static regions. Along time such error can be distinguished from motion, because it is weak
+//! in each frequency.
 
 use std::f32::consts::PI;
 
 use multiversion::multiversion;
 
-/// Half of the side of the square over which energies are averaged, in pixels.
+/// Radius of the square over which energies are averaged, in pixels.
 const RADIUS: usize = 2;
 
-/// Cosines along time of frames \[B,H,W\] of one size, but for the constant one, and their shrinkage.
+/// The DCT along time of frames \[B,H,W\] of one size, without its constant coefficient, and its shrinkage.
 #[derive(Debug)]
-pub(super) struct Changes {
+pub(super) struct TemporalShrinkage {
     frames: usize,
     height: usize,
     width: usize,
     /// The DCT-II without its first row \[B-1,B\].
     cosines: Vec<f32>,
-    /// Of the rows of a square: coefficients and the sums of their squares along the row \[rows,B-1,W\].
+    /// Coefficients, and the means of their squares along the row, of the rows of a square \[rows,B-1,W\].
     rows: Vec<f32>,
     squares: Vec<f32>,
-    /// What is taken off a row of a coefficient.
+    /// The part of a coefficient that is subtracted, for one row.
     excess: Vec<f32>,
 }
 
-impl Changes {
+impl TemporalShrinkage {
     pub(super) fn new((frames, height, width): (usize, usize, usize)) -> Self {
         let changes = frames.saturating_sub(1);
         let cosine = |m: usize, k: usize| {
@@ -39,9 +39,9 @@ impl Changes {
         Self { frames, height, width, cosines, rows: ring, squares, excess }
     }
 
-    /// Each coefficient becomes `g` times itself with `g = e^2 / (e^2 + level^4)`, where `e` is the mean of
-    /// its square over 5x5 pixels, cut at the edges. `level` is above 0. Frames lie one after the other in
-    /// `clip`, row by row, each row of `row_length` or, with its margin, more.
+    /// Multiplies each coefficient by `g = e^2 / (e^2 + level^4)`, where `e` is the mean of its square over 5x5
+    /// pixels, cut at the edges. `level` is above 0. `clip` has frame after frame, row by row, with at least
+    /// `row_length` values in a row.
     pub(super) fn shrink(&mut self, clip: &mut [f32], row_length: usize, level: f32) {
         let Self { frames, height, width, .. } = *self;
         let (plane, changes) = (height * row_length, frames.saturating_sub(1));
@@ -49,7 +49,7 @@ impl Changes {
         let mut analysed = 0;
         for row in 0..height {
             let near = row.saturating_sub(RADIUS)..height.min(row + RADIUS + 1);
-            // Rows above have been shrunk by now; all that are still to be analysed are as they came.
+            // The rows above are already shrunk; rows that are not yet analysed are unchanged.
             while analysed < near.end {
                 let slot = analysed % (2 * RADIUS + 1) * changes * width;
                 let (rows, squares) = (&mut self.rows[slot..], &mut self.squares[slot..]);
@@ -76,7 +76,7 @@ impl Changes {
     }
 }
 
-/// A coefficient of a row, and the means of its squares over `2 RADIUS + 1` columns, cut at the edges.
+/// Computes a coefficient of a row, and the means of its squares over `2 RADIUS + 1` columns, cut at the edges.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn analyse<'a>(
     cosine: &[f32],
@@ -97,7 +97,7 @@ fn analyse<'a>(
     }
 }
 
-/// `(1 - g) c` of the coefficients `c` of a row, from `e / level^2`: the sum of some rows, times `scale`.
+/// Computes `(1 - g) c` for the coefficients `c` of a row. `e / level^2` is the sum of some rows times `scale`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn excess<'a>(
     squares: impl Iterator<Item = &'a [f32]>,
@@ -119,7 +119,7 @@ fn excess<'a>(
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::{Changes, RADIUS};
+    use super::{RADIUS, TemporalShrinkage};
     use ndarray::{Array3, Axis};
     use rand::{Rng, SeedableRng};
     use std::f64::consts::PI;
@@ -154,7 +154,7 @@ pub(super) mod tests {
     fn changes_are_those_of_the_reference() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2);
         for (size, margin) in [((7, 9, 13), 0), ((2, 3, 4), 5), ((1, 6, 6), 1), ((5, 1, 2), 3)] {
-            // Much motion to the left, none to the right, below the level and above it.
+            // The changes fall from left to right, from far above the level to below it.
             let clip = Array3::from_shape_fn(size, |(_, _, j)| {
                 let noise = rng.random::<f32>();
                 0.5 + noise / (1 + 3 * j) as f32
@@ -162,8 +162,8 @@ pub(super) mod tests {
             let mut rows = Array3::from_elem((size.0, size.1, size.2 + margin), 7.0f32);
             rows.slice_axis_mut(Axis(2), (..size.2).into()).assign(&clip);
             let mut flat = rows.into_raw_vec_and_offset().0;
-            let mut changes = Changes::new(size);
-            changes.shrink(&mut flat, size.2 + margin, 0.05);
+            let mut filter = TemporalShrinkage::new(size);
+            filter.shrink(&mut flat, size.2 + margin, 0.05);
             let expected = shrunk(&clip, 0.05);
             for (row, expected) in flat.chunks_exact(size.2 + margin).zip(expected.rows()) {
                 for (found, expected) in row.iter().zip(expected) {
@@ -175,16 +175,16 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_is_far_above_the_level_stays_and_what_is_far_below_goes() {
+    fn coefficients_far_above_the_level_stay_and_those_far_below_vanish() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(4);
         let clip = Array3::from_shape_simple_fn((6, 12, 12), || rng.random::<f32>());
-        for (level, left) in [(1e-3, 1.0), (30.0, 0.0), (f32::MIN_POSITIVE, 1.0)] {
+        for (level, share) in [(1e-3, 1.0), (30.0, 0.0), (f32::MIN_POSITIVE, 1.0)] {
             let mut flat = clip.clone().into_raw_vec_and_offset().0;
-            Changes::new(clip.dim()).shrink(&mut flat, 12, level);
+            TemporalShrinkage::new(clip.dim()).shrink(&mut flat, 12, level);
             let found = Array3::from_shape_vec(clip.dim(), flat).unwrap();
             let mean = clip.mean_axis(Axis(0)).unwrap();
             for (found, clip) in found.outer_iter().zip(clip.outer_iter()) {
-                let expected = &mean + &(left * (&clip - &mean));
+                let expected = &mean + &(share * (&clip - &mean));
                 assert!((&found - &expected).iter().all(|d| d.abs() < 1e-4), "{level}");
             }
         }

@@ -13,13 +13,12 @@ type Size = (usize, usize, usize);
 
 /// Rows of a window that are compared at once: their sums stay in registers.
 pub(super) const ROWS: usize = 8;
-/// Candidates of a group that are kept before all but the best are dropped.
+/// Largest number of candidates that a group keeps between frames; beyond it, only the best [`PATCHES`] stay.
 const KEPT: usize = 128;
 
-/// Finds the patches most similar to each reference patch, near it in time and near where its motion leads in space, and
-/// counts how many cover a pixel; the grid of references depends on the number of searches before. Of patches equally
-/// similar those that come first in the clip are taken; of a group they are in the clip's order, which does not depend on
-/// how they were found.
+/// Finds the patches most similar to each reference patch, near it in time and near the place where its motion leads,
+/// and counts how many cover each pixel. The grid of references depends on the number of earlier searches. Among
+/// equally similar patches, the first in the clip is taken. The patches of a group are in the order of the clip.
 #[inline(always)]
 pub(super) fn search<S: Simd>(
     simd: S,
@@ -39,7 +38,7 @@ pub(super) fn search<S: Simd>(
     count_cover(groups, cover, row_length(size.2));
 }
 
-/// The same with `V` vectors for a row of a window.
+/// The search with `V` vectors for a row of a window.
 #[inline(always)]
 fn search_with<S: Simd, const V: usize>(
     simd: S,
@@ -55,7 +54,7 @@ fn search_with<S: Simd, const V: usize>(
     groups.clear();
     for frame in 0..frames {
         let near = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
-        // The own frame first: there the most similar ones are likely, and the bound falls at once.
+        // The reference's frame first: it probably has the most similar patches, and the bound falls at once.
         let order = || [frame].into_iter().chain(near.clone().filter(|&other| other != frame));
         let (down, right) = shift(frame, searches);
         let (rows, columns) = (positions(height, down), positions(width, right));
@@ -87,7 +86,7 @@ fn search_with<S: Simd, const V: usize>(
                 }
             }
             best.reduce(PATCHES);
-            // A clip too small for a full group repeats what it has.
+            // A clip too small for a full group repeats its patches.
             let start = groups.len();
             groups.extend(best.places().cycle().take(PATCHES));
             groups[start..].sort_unstable();
@@ -95,12 +94,12 @@ fn search_with<S: Simd, const V: usize>(
     }
 }
 
-/// Where what is at `at` in a frame is in another one, if it moves by so many pixels from frame to frame.
+/// Position in another frame of an object at `at` that moves by `by` pixels per frame.
 fn moved(at: usize, by: f32, frame: usize, other: usize) -> usize {
     (at as f32 + by * (other as f32 - frame as f32)).round().max(0.0) as usize
 }
 
-/// Positions that are searched around `at`.
+/// Positions of the search window around `at`.
 pub(super) fn window(at: usize, length: usize) -> Range<usize> {
     let count = length - SIDE + 1;
     let start = at.saturating_sub(WINDOW / 2).min(count.saturating_sub(WINDOW));
@@ -109,15 +108,15 @@ pub(super) fn window(at: usize, length: usize) -> Range<usize> {
 
 /// The candidates of a group.
 struct Best {
-    /// Distance (the bits of a positive float are in its order) before place: their order is total.
+    /// Distance (the bits of a positive float sort like the float), then position: the order is total.
     keys: Vec<u64>,
     count: usize,
-    /// Distance from which on a candidate is none any more.
+    /// Distance from which on a patch is no candidate.
     bound: f32,
 }
 
 impl Default for Best {
-    /// With room for a window, before anything is dropped, or for one more block.
+    /// An empty list with room for a window, or for the kept candidates and one more block.
     fn default() -> Self {
         let most = (WINDOW * WINDOW).max(KEPT + ROWS * WINDOW);
         Self { keys: vec![0; most], count: 0, bound: f32::INFINITY }
@@ -129,8 +128,8 @@ impl Best {
         (self.count, self.bound) = (0, f32::INFINITY);
     }
 
-    /// Takes those below the bound of some places side by side. Without a branch: which ones they are
-    /// can't be foretold.
+    /// Adds the patches at consecutive positions that are below the bound. The code has no branch, because the
+    /// outcome cannot be predicted.
     #[inline(always)]
     fn add(&mut self, distances: &[f32], first: usize) {
         let room = &mut self.keys[self.count..][..distances.len()];
@@ -142,12 +141,12 @@ impl Best {
         self.count += taken;
     }
 
-    /// The reference comes first even among its equals: every pixel is covered.
+    /// Adds the reference before its equals, so that every pixel is covered.
     fn put_first(&mut self, reference: usize) {
         let known = self.keys[..self.count].iter_mut().find(|key| place(**key) == reference as u32);
         match known {
             Some(key) => *key = reference as u64,
-            // No number, so below no bound.
+            // NaN, so never below a bound.
             None => {
                 self.keys[self.count] = reference as u64;
                 self.count += 1;
@@ -173,7 +172,8 @@ fn place(key: u64) -> u32 {
     key as u32
 }
 
-/// Squared distances of the patch at `reference` to those side by side from `start` and in the rows below.
+/// Squared distances between the patch at `reference` and those at consecutive positions from `start` on, and in the
+/// rows below.
 #[inline(always)]
 fn distances<S: Simd, const V: usize>(
     simd: S,
@@ -201,7 +201,7 @@ fn distances<S: Simd, const V: usize>(
     sums
 }
 
-/// How many patches cover a pixel: the sums of the patches that begin here over squares of `SIDE`.
+/// Number of patches that cover each pixel: box sums, over squares of `SIDE`, of the patches that begin at a pixel.
 fn count_cover(groups: &[u32], cover: &mut [f32], row_length: usize) {
     cover.fill(0.0);
     for &place in groups.iter() {

@@ -1,111 +1,100 @@
 //! Networks as priors: FFDNet, frame by frame (Zhang, Zuo and Zhang, IEEE TIP 2018), and FastDVDNet over whole
 //! clips (Tassano et al., CVPR 2020), with floating point or 8 bits.
 
-use std::ops::Range;
-
 use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, ArrayViewMut2, Axis};
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use super::onnx::{ClipNetwork, Runtime};
 use super::{
-    BLOCK, CHANNELS, Denoiser, Encoder, Memory, Network, Networks, Parameter, Pass, Prior, Ready,
-    SIGMA, Settings,
+    BLOCK, CHANNELS, Denoiser, Encoder, Family, Network, Networks, Prior, Size, Spec, WorkingSet,
+    noise_levels,
 };
 use crate::error::{ReconError, Result};
 
-/// FFDNet, frame by frame.
-pub const FFDNET: NetworkPrior = NetworkPrior {
-    name: "ffdnet",
-    summary: "FFDNet, frame by frame",
-    network: Network::FfdNet,
-    pass_ns: 1_450.0,
-    memory: FLOAT_MEMORY,
-};
-/// FastDVDNet over the clip, with a shared first stage.
-pub const FASTDVDNET: NetworkPrior = NetworkPrior {
-    name: "fastdvdnet",
-    summary: "FastDVDNet over the clip",
-    network: Network::FastDvdNet,
-    pass_ns: 4_900.0,
-    memory: Memory { per_network_pixel: FLOAT_MEMORY.per_network_pixel + ENCODER, ..FLOAT_MEMORY },
-};
-/// The same with weights and activations of 8 bits.
-pub const FASTDVDNET_INT8: NetworkPrior = NetworkPrior {
-    name: "fastdvdnet-int8",
-    summary: "FastDVDNet with weights and activations of 8 bits",
-    network: Network::FastDvdNetInt8,
-    // 0.36 of it, with AVX-512 VNNI.
-    pass_ns: 1_800.0,
-    // It stays loaded beside its twin.
-    memory: Memory {
-        per_network_pixel: FLOAT_MEMORY.per_network_pixel + 2000 + ENCODER,
-        ..FLOAT_MEMORY
-    },
-};
+/// Declares the parameters of priors that are a network alone.
+macro_rules! network_priors {
+    ($($(#[$doc:meta])+ $spec:ident => $network:expr, $iteration_ns:expr, $working_set:expr;)+) => {$(
+        $(#[$doc])+
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+        pub struct $spec {
+            /// Noise level on [0, 1] at the first and the last iteration, geometric between them.
+            #[schemars(transform = noise_levels)]
+            pub sigma: [f32; 2],
+        }
+
+        impl Spec for $spec {
+            fn family(&self) -> Family {
+                Family::Learned
+            }
+
+            fn network(&self) -> Option<Network> {
+                Some($network)
+            }
+
+            fn sigma(&self) -> Option<[f32; 2]> {
+                Some(self.sigma)
+            }
+
+            fn set_sigma(&mut self, sigma: [f32; 2]) {
+                self.sigma = sigma;
+            }
+
+            fn iteration_ns(&self) -> f64 {
+                $iteration_ns
+            }
+
+            fn looks_along_time(&self) -> bool {
+                $network != Network::FfdNet
+            }
+
+            fn working_set(&self) -> WorkingSet {
+                $working_set
+            }
+
+            fn start<'n>(
+                &self,
+                _: Size,
+                networks: &'n mut dyn Networks,
+            ) -> Result<Box<dyn Prior + 'n>> {
+                Ok(Box::new(NetworkPrior(networks.network($network)?)))
+            }
+        }
+    )+};
+}
 
 /// Padded input, middle and output for each voxel, and the activations.
-const FLOAT_MEMORY: Memory = Memory { per_voxel: 24, per_network_pixel: 2600 };
-/// Bytes for each pixel of a frame of the encoder by which results are assessed.
-const ENCODER: u64 = 1100;
+const FLOAT: WorkingSet = WorkingSet { per_voxel: 24, per_network_pixel: 2600 };
+/// Bytes of the quality model's encoder for each pixel of a frame.
+const ENCODER_BYTES: u64 = 1100;
+/// Bytes of the 8-bit network for each pixel, which stays loaded together with the floating-point one.
+const INT8_BYTES: u64 = 2000;
 
-/// A network alone.
-pub struct NetworkPrior {
-    name: &'static str,
-    summary: &'static str,
-    network: Network,
-    pass_ns: f64,
-    memory: Memory,
+network_priors! {
+    /// Parameters of FFDNet, frame by frame.
+    FfdnetSpec => Network::FfdNet, 1_450.0, FLOAT;
+    /// Parameters of FastDVDNet over the clip.
+    FastdvdnetSpec => Network::FastDvdNet, 4_900.0, float_and(ENCODER_BYTES);
+    /// Parameters of FastDVDNet with weights and activations of 8 bits.
+    FastdvdnetInt8Spec => Network::FastDvdNetInt8, 1_800.0, float_and(INT8_BYTES + ENCODER_BYTES);
 }
 
-impl Prior for NetworkPrior {
-    fn name(&self) -> &'static str {
-        self.name
-    }
+/// The working set in floating point, with more bytes for each network pixel.
+fn float_and(bytes: u64) -> WorkingSet {
+    WorkingSet { per_network_pixel: FLOAT.per_network_pixel + bytes, ..FLOAT }
+}
 
-    fn summary(&self) -> &'static str {
-        self.summary
-    }
+/// A loaded network as a prior.
+struct NetworkPrior<'n>(&'n mut dyn Denoiser);
 
-    fn parameters(&self) -> Vec<&'static Parameter> {
-        vec![&SIGMA]
-    }
-
-    fn network(&self) -> Option<Network> {
-        Some(self.network)
-    }
-
-    fn cost(&self, _: &Settings) -> f64 {
-        self.pass_ns
-    }
-
-    fn looks_along_time(&self, _: &Settings) -> bool {
-        self.network != Network::FfdNet
-    }
-
-    fn memory(&self) -> Memory {
-        self.memory
-    }
-
-    fn begin(&self, _: (usize, usize, usize)) -> Box<dyn Pass> {
-        Box::new(self.network)
+impl Prior for NetworkPrior<'_> {
+    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
+        self.0.denoise(frames, sigma)
     }
 }
 
-impl Pass for Network {
-    fn apply(
-        &mut self,
-        x: &mut Array3<f32>,
-        rows: Range<usize>,
-        settings: &Settings,
-        networks: &mut dyn Networks,
-        ready: &mut Ready<'_>,
-    ) -> Result<()> {
-        networks.network(*self)?.denoise(x, settings.sigma)?;
-        (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
-        Ok(())
-    }
-}
-
-/// Pixels that go through a block at once, whole frames: more would take more memory and no less time.
+/// Pixels that a block processes at once, in whole frames. More take more memory and no less time.
 const PIXELS_AT_ONCE: usize = 2 * 256 * 256;
 
 /// A network for gray clips, loaded.
@@ -115,16 +104,16 @@ const PIXELS_AT_ONCE: usize = 2 * 256 * 256;
 /// not 4. Frames go through in chunks, which bounds the memory whatever the number of frames and changes no bit.
 pub struct ClipDenoiser {
     blocks: Vec<ClipNetwork>,
-    /// Frames before and after a frame that a block looks at.
+    /// Number of frames before and after a frame that a block uses.
     reach: usize,
-    /// Sides must be multiples of it: a network halves them once or twice.
+    /// Divisor of both sides, because a network halves them once or twice.
     multiple: usize,
     input: Vec<f32>,
     output: Vec<f32>,
 }
 
 impl ClipDenoiser {
-    /// Loads a network from its ONNX files, a block each (see [`ClipNetwork::load`] for their faces).
+    /// Loads a network from its ONNX files, a block each (see [`ClipNetwork::load`] for their inputs and outputs).
     pub fn load(runtime: &Runtime, which: Network, files: &[impl AsRef<[u8]>]) -> Result<Self> {
         let (names, reach, multiple): (&[_], _, _) = match which {
             Network::FfdNet => (&["FFDNet"], 0, 2),
@@ -160,19 +149,18 @@ impl Denoiser for ClipDenoiser {
     }
 }
 
-/// The first half of FastDVDNet's first stage, loaded: what the denoiser sees of a block and its two
-/// neighbours in time before it begins to draw it.
+/// The first half of FastDVDNet's first stage, loaded: its features of a block and its two neighbours in time.
 pub struct ClipEncoder {
     network: ClipNetwork,
     input: Vec<f32>,
     output: Vec<f32>,
 }
 
-/// The noise that it is told of: as little as there is in frames of a reconstruction.
-const LITTLE_NOISE: f32 = 10.0 / 255.0;
+/// Noise level given to the encoder: about that of reconstructed frames.
+const ENCODER_SIGMA: f32 = 10.0 / 255.0;
 
 impl ClipEncoder {
-    /// Loads it from its ONNX file (see [`ClipNetwork::load`] for its face).
+    /// Loads it from its ONNX file (see [`ClipNetwork::load`] for its inputs and outputs).
     pub fn load(runtime: &Runtime, file: &[u8]) -> Result<Self> {
         let network = ClipNetwork::load(runtime, "FastDVDNet encoder", file)?;
         Ok(Self { network, input: Vec::new(), output: Vec::new() })
@@ -187,17 +175,17 @@ impl Encoder for ClipEncoder {
         let padded = (rows * BLOCK, columns * BLOCK);
         pad(frames, input, padded, 1);
         output.resize(count * CHANNELS * rows * columns, 0.0);
-        // Several frames at once would take as much memory each.
+        // Several frames at once would multiply the memory.
         let each = (1, CHANNELS * rows * columns);
-        run_chunked(network, (input, output), padded, each, LITTLE_NOISE)?;
-        let seen = ArrayView4::from_shape((count, CHANNELS, rows, columns), output)
+        run_chunked(network, (input, output), padded, each, ENCODER_SIGMA)?;
+        let features = ArrayView4::from_shape((count, CHANNELS, rows, columns), output)
             .map_err(|error| ReconError::Runtime(error.to_string()))?;
-        Ok(seen.permuted_axes([1, 0, 2, 3]).as_standard_layout().into_owned())
+        Ok(features.permuted_axes([1, 0, 2, 3]).as_standard_layout().into_owned())
     }
 }
 
-/// Copies a clip into one of frames of `rows` x `columns` pixels with so many more at both ends, mirrored in space
-/// and time.
+/// Copies a clip into one of frames of `rows` x `columns` pixels, with `margin` more frames at both ends, mirrored in
+/// space and time.
 fn pad(
     frames: ArrayView3<'_, f32>,
     padded: &mut Vec<f32>,
@@ -212,8 +200,7 @@ fn pad(
     }
 }
 
-/// Copies a frame into one with rows of `columns` pixels and as many rows as fit, mirrored at its
-/// lower and right ends.
+/// Copies a frame into one with rows of `columns` pixels and as many rows as fit, mirrored at its lower and right edges.
 fn pad_frame(frame: ArrayView2<'_, f32>, padded: &mut [f32], columns: usize) {
     let (height, width) = frame.dim();
     for (i, row) in padded.chunks_exact_mut(columns).enumerate() {
@@ -224,15 +211,15 @@ fn pad_frame(frame: ArrayView2<'_, f32>, padded: &mut [f32], columns: usize) {
     }
 }
 
-/// Takes a frame out of one that was padded by [`pad_frame`].
+/// Inverse of [`pad_frame`].
 fn unpad_frame(padded: &[f32], columns: usize, mut frame: ArrayViewMut2<'_, f32>) {
     for (mut row, padded) in frame.outer_iter_mut().zip(padded.chunks_exact(columns)) {
         row.iter_mut().zip(padded).for_each(|(value, &x)| *value = x);
     }
 }
 
-/// One block over a clip of `rows` x `columns` pixels, so many frames at a time, with so many values of
-/// output for each.
+/// Runs one block over a clip of `rows` x `columns` pixels, `chunk` frames at a time, with `values` output values for
+/// each.
 fn run_chunked(
     block: &mut ClipNetwork,
     (input, output): (&[f32], &mut [f32]),
@@ -241,9 +228,9 @@ fn run_chunked(
     sigma: f32,
 ) -> Result<()> {
     let plane = rows * columns;
-    let beside = input.len() / plane - output.len() / values;
+    let margins = input.len() / plane - output.len() / values;
     for (index, output) in output.chunks_mut(chunk * values).enumerate() {
-        let count = output.len() / values + beside;
+        let count = output.len() / values + margins;
         let frames = &input[index * chunk * plane..][..count * plane];
         let frames = ArrayView4::from_shape((count, 1, rows, columns), frames)
             .map_err(|error| ReconError::Runtime(error.to_string()))?;
@@ -252,7 +239,7 @@ fn run_chunked(
     Ok(())
 }
 
-/// The index inside `0..length` that mirrors `index` at the ends, without repeating them.
+/// The index in `0..length` that mirrors `index` at the ends, without repeating them.
 fn reflect(index: isize, length: usize) -> usize {
     if length == 1 {
         return 0;
@@ -268,8 +255,8 @@ mod tests {
 
     #[test]
     fn reflection_mirrors_without_repeating_the_ends() {
-        let seen: Vec<usize> = (-3..7).map(|index| reflect(index, 4)).collect();
-        assert_eq!(seen, [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
+        let reflected: Vec<usize> = (-3..7).map(|index| reflect(index, 4)).collect();
+        assert_eq!(reflected, [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
         assert_eq!((reflect(-2, 1), reflect(5, 1)), (0, 0));
         assert_eq!((reflect(-2, 2), reflect(2, 2)), (0, 0));
     }

@@ -8,23 +8,24 @@ use std::f32::consts::PI;
 
 use super::error::{ReconError, Result, shape_text};
 
-/// `H` of `y_s = (Hx)_s = sum_k C_k x_(sB+k)`, for one set of masks `C` \[B,H,W\] on \[0,1\] and a
-/// run of `S` snapshots, one after the other, whose frames `x` \[S B,H,W\] are joined: block by block it is
-/// the operator of one snapshot.
+/// The operator `H` of `y_s = sum_k C_k x_(sB+k)`, for masks `C` \[B,H,W\] on \[0,1\] and a run of `S` snapshots with the
+/// frames `x` \[S B,H,W\]: block by block it is the operator of one snapshot.
 ///
-/// `H H^T` is diagonal with `sum_k C_k^2` on it (the sum of *squares*: the sum of the masks
-/// is the same only if they are binary). Where it is 0 the pixel is dead: no frame reaches
-/// it, and the projection leaves it alone.
+/// `H H^T` is diagonal with `sum_k C_k^2` on it: the sum of *squares*, which is the sum of the masks only if they are binary.
+/// A pixel with 0 there is dead: no frame reaches it, and the projection leaves it alone.
 #[derive(Debug, Clone)]
 pub struct SensingOperator {
     masks: Array3<f32>,
     gram: Array2<f32>,
-    /// Of each snapshot \[S,H,W\]: they differ where pixels are kept from the projection.
+    /// For each snapshot \[S,H,W\]: they differ where pixels are held out.
     inverse_gram: Array3<f32>,
 }
 
 impl SensingOperator {
-    /// Of one snapshot. Takes masks \[B,H,W\], all finite and not all 0.
+    /// The operator of one snapshot behind masks \[B,H,W\].
+    ///
+    /// # Errors
+    /// No frame or pixel, a mask value that is not finite, or masks that are 0 everywhere.
     pub fn new(masks: Array3<f32>) -> Result<Self> {
         let (frames, height, width) = masks.dim();
         if frames == 0 || height == 0 || width == 0 {
@@ -36,9 +37,9 @@ impl SensingOperator {
         }
         if let Some(((k, i, j), value)) = masks.indexed_iter().find(|(_, v)| !v.is_finite()) {
             return Err(ReconError::Parameter {
-                name: "a mask value",
+                name: "a mask value".into(),
                 value: format!("{value} at frame {k}, row {i}, column {j}"),
-                range: "finite",
+                range: "finite".into(),
             });
         }
         let masks = masks.as_standard_layout().into_owned();
@@ -53,21 +54,23 @@ impl SensingOperator {
         Ok(Self { masks, gram, inverse_gram })
     }
 
-    /// The same for a run of so many snapshots, at least 1, behind these masks.
+    /// The operator of a run of snapshots behind the same masks.
+    ///
+    /// # Errors
+    /// A number of 0.
     pub fn over(self, snapshots: usize) -> Result<Self> {
         if snapshots == 0 {
             return Err(ReconError::Parameter {
-                name: "the number of snapshots",
+                name: "the number of snapshots".into(),
                 value: snapshots.to_string(),
-                range: "at least 1",
+                range: "at least 1".into(),
             });
         }
         let inverse_gram = invert(&self.gram, snapshots);
         Ok(Self { inverse_gram, ..self })
     }
 
-    /// Keeps some pixels of the measurement, given by snapshot, row and column, from the projection, as if
-    /// no mask reached them.
+    /// Holds out some pixels of the measurement, given by snapshot, row and column: the projection treats them as dead.
     pub(super) fn without(mut self, pixels: &[(usize, usize, usize)]) -> Self {
         for &pixel in pixels {
             self.inverse_gram[pixel] = 0.0;
@@ -80,7 +83,7 @@ impl SensingOperator {
         self.masks.view()
     }
 
-    /// Snapshots of the run.
+    /// Number of snapshots of the run.
     pub fn snapshots(&self) -> usize {
         self.inverse_gram.dim().0
     }
@@ -107,53 +110,54 @@ impl SensingOperator {
         pixels.map(|(gram, inverse)| gram.sqrt() * inverse).fold(0.0, f32::max)
     }
 
-    /// The share of the masks' energy that changes from frame to frame: 0 where all masks are alike, about 1/2 where
-    /// each opens half of its pixels by chance.
+    /// Share of the masks' energy that changes from frame to frame: 0 for equal masks, about 1/2 for independent masks that
+    /// are open in half of their pixels.
     fn contrast(&self) -> f32 {
-        (1.0 - self.steady_gram().sum() / self.gram.sum()).max(0.0)
+        (1.0 - self.static_gram().sum() / self.gram.sum()).max(0.0)
     }
 
-    /// Whether masks differ so much that a measurement tells the changes from what frames have in common.
-    pub(super) fn differ_much(&self) -> bool {
+    /// True if masks differ enough for a measurement to distinguish changes from the static part of the frames.
+    pub(super) fn has_high_contrast(&self) -> bool {
         self.contrast() >= HIGH_CONTRAST
     }
 
-    /// The part of the gram diagonal that masks have in common \[H,W\]: `B` times the square of their mean.
-    pub(super) fn steady_gram(&self) -> Array2<f32> {
+    /// The static part of the Gram diagonal \[H,W\]: `B` times the square of the mean mask.
+    pub(super) fn static_gram(&self) -> Array2<f32> {
         let frames = self.masks.dim().0 as f32;
         let mean = self.masks.mean_axis(Axis(0)).unwrap_or_default();
         mean.mapv(|mean| frames * mean.powi(2))
     }
 
-    /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a
-    /// snapshot's frames at a pixel, with the cosines `Psi` of the DCT-II, and `s` = `static_variance` times what
-    /// masks of this contrast and number bear of it ([`static_share`]).
+    /// Covariance `R = Psi^T diag(s, 1, 2^-DECAY, .., (B-1)^-DECAY) Psi` \[B,B\] of the errors of a snapshot's frames at a
+    /// pixel, with the DCT-II matrix `Psi`, and `s` = `static_variance` times [`static_share`].
     ///
-    /// Where masks are alike a measurement says well what all frames have in common, and hardly what changes from
-    /// one to the next: so this is where the error is, slow changes first. The projection along the masks
-    /// themselves puts nearly all of a residual into what the frames have in common, and the prior has to take it
-    /// out again.
+    /// Highly correlated masks measure the static part of the frames well and its changes hardly. So the error is in the
+    /// changes, mainly in the slow ones. A projection along the masks themselves puts nearly the whole residual into the
+    /// static part, and the prior has to remove it again.
     pub(super) fn error_covariance(&self, static_variance: f32) -> Array2<f32> {
         let frames = self.masks.dim().0;
         let share = static_share(self.contrast(), frames);
-        let common = (static_variance * share).max(LEAST_STATIC_VARIANCE);
+        let static_part = (static_variance * share).max(MIN_STATIC_VARIANCE);
         let count = frames as f32;
         let cosine = |m: usize, k: usize| {
             let norm = if m == 0 { 1.0 / count } else { 2.0 / count }.sqrt();
             norm * (PI * m as f32 * (k as f32 + 0.5) / count).cos()
         };
-        let variance = |m: usize| if m == 0 { common } else { (m as f32).powf(-DECAY) };
+        let variance = |m: usize| if m == 0 { static_part } else { (m as f32).powf(-DECAY) };
         Array2::from_shape_fn((frames, frames), |(j, k)| {
             (0..frames).map(|m| variance(m) * cosine(m, j) * cosine(m, k)).sum()
         })
     }
 
-    /// Pixels that no mask reaches.
+    /// Number of pixels that no mask reaches.
     pub fn dead_pixels(&self) -> usize {
         self.gram.iter().filter(|&&g| g == 0.0).count()
     }
 
     /// `Hx` \[S,H,W\] of frames `x` \[S B,H,W\].
+    ///
+    /// # Errors
+    /// Frames of another size.
     pub fn forward(&self, frames: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
         let (count, height, width) = self.dim();
         self.check("the frame stack", frames.shape(), &[count, height, width])?;
@@ -168,6 +172,9 @@ impl SensingOperator {
     }
 
     /// `H^T y` \[S B,H,W\] of a measurement `y` \[S,H,W\].
+    ///
+    /// # Errors
+    /// A measurement of another size.
     pub fn adjoint(&self, y: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
         self.check("the measurement", y.shape(), self.inverse_gram.shape())?;
         let mut frames = Array3::zeros(self.dim());
@@ -181,21 +188,18 @@ impl SensingOperator {
         Ok(frames)
     }
 
-    /// One projection of GAP: `x = v + R H^T (H R H^T + gamma)^-1 (t - H v)` with the target
-    /// `t = y`, or, accelerated, `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that
-    /// is the published `y1 += y - H v` (Liao et al. 2014), with 0 it is plain GAP.
+    /// One projection of GAP: `x = v + R H^T (H R H^T + gamma)^-1 (t - H v)` with the target `t = y` or, accelerated,
+    /// `t = y1` after `y1 = y + memory (y1 - H v)`. With `memory` 1 that is the published `y1 += y - H v` (Liao et al.
+    /// 2014), with 0 it is plain GAP. [`MAX_OPPOSITION`] bounds `R H^T`.
     ///
-    /// `R` and `gamma` are what is supposed of the frames' errors and of the noise. Of `R H^T` no frame takes more than
-    /// [`AGAINST`] against the residual.
-    ///
-    /// Only `rows` of each snapshot are done; they need no other. `y` and `y1` are \[S,H,W\], `v` and `x`
+    /// Only `rows` of each snapshot are computed; they depend on no other rows. `y` and `y1` are \[S,H,W\], `v` and `x`
     /// \[S B,H,W\], all of the operator's size and in standard layout. Returns `||y - H v||^2` of the rows.
-    pub(super) fn project(
+    pub(crate) fn project(
         &self,
         rows: Range<usize>,
         y: &Array3<f32>,
-        y1: Option<(&mut Array3<f32>, f32)>,
-        supposed: &Statistics,
+        accumulation: Option<Accumulation<'_>>,
+        statistics: &Statistics,
         v: &Array3<f32>,
         x: &mut Array3<f32>,
     ) -> f64 {
@@ -210,43 +214,44 @@ impl SensingOperator {
         ) else {
             unreachable!("arrays of the solver are in standard layout")
         };
-        let mut accelerated = y1.and_then(|(y1, memory)| Some((y1.as_slice_mut()?, memory)));
-        let covariance = supposed.covariance.as_ref().and_then(|covariance| covariance.as_slice());
-        let gamma = supposed.gamma;
+        let mut accumulation =
+            accumulation.and_then(|Accumulation { y1, memory }| Some((y1.as_slice_mut()?, memory)));
+        let covariance = statistics.covariance.as_ref().and_then(|matrix| matrix.as_slice());
+        let gamma = statistics.gamma;
         let mut sum = vec![0.0f32; width];
-        // `R C` of a row of all frames, and the inverse that belongs to it.
+        // `R C` of a row of all frames, and the inverse Gram diagonal that belongs to it.
         let mut directions = vec![0.0f32; if covariance.is_some() { frames * width } else { 0 }];
         let (mut weights, mut bounds) = (vec![0.0f32; width], vec![0.0f32; width]);
         let mut squares = 0.0f64;
         for snapshot in 0..self.snapshots() {
             let block = snapshot * frames * plane..(snapshot + 1) * frames * plane;
             let (v, x) = (&v[block.clone()], &mut x[block]);
-            // Row by row over all frames: a row of v and of the masks is still in cache when the
-            // correction is added.
+            // Row by row over all frames: a row of v and of the masks is still in cache when the correction is added.
             for start in rows.clone().map(|row| row * width) {
                 let stack = Stack { plane, start, width, frames };
                 let row = snapshot * plane + start..snapshot * plane + start + width;
-                let target =
-                    accelerated.as_mut().map(|(y1, memory)| (&mut y1[row.clone()], *memory));
+                let target = accumulation
+                    .as_mut()
+                    .map(|(y1, memory)| Target { y1: &mut y1[row.clone()], memory: *memory });
                 let (y, inverse) = (&y[row.clone()], &inverse[row]);
-                let (step, inverse) = match covariance {
-                    None if gamma == 0.0 => ((masks, stack), inverse),
+                let correction = match covariance {
+                    None if gamma == 0.0 => Correction { directions: masks, stack, inverse },
                     None => {
                         add_noise(gamma, inverse, &mut weights);
-                        ((masks, stack), &*weights)
+                        Correction { directions: masks, stack, inverse: &weights }
                     }
                     Some(covariance) => {
-                        directions_of_row(
-                            (masks, stack),
-                            (covariance, gamma),
-                            inverse,
-                            &mut directions,
-                            (&mut weights, &mut bounds),
-                        );
-                        ((&*directions, Stack { plane: width, start: 0, ..stack }), &*weights)
+                        let out = RowDirections {
+                            directions: &mut directions,
+                            weights: &mut weights,
+                            bounds: &mut bounds,
+                        };
+                        directions_of_row(masks, stack, covariance, gamma, inverse, out);
+                        let stack = Stack { plane: width, start: 0, ..stack };
+                        Correction { directions: &directions, stack, inverse: &weights }
                     }
                 };
-                squares += project_row(stack, masks, v, x, y, target, (step, inverse), &mut sum);
+                squares += project_row(stack, masks, v, x, y, target, correction, &mut sum);
             }
         }
         squares
@@ -260,56 +265,95 @@ impl SensingOperator {
     }
 }
 
-/// Of the brightest pixel's gram: what is darker than this is divided by this. At such a pixel noise outweighs
-/// light, and the division would make thousands of it.
-const DARKEST: f32 = 1e-3;
-/// The same where all pixels are dark.
-const BLACK: f32 = 1e-6;
+/// Smallest divisor, relative to the largest Gram value. At darker pixels noise outweighs light, and the division would
+/// amplify it a thousandfold.
+const MIN_RELATIVE_GRAM: f32 = 1e-3;
+/// Smallest divisor of all.
+const MIN_GRAM: f32 = 1e-6;
 
-/// `(H H^T)^-1` \[S,H,W\], bounded where hardly any light comes through.
+/// `(H H^T)^-1` \[S,H,W\], bounded where hardly any light arrives.
 fn invert(gram: &Array2<f32>, snapshots: usize) -> Array3<f32> {
     let brightest = gram.iter().copied().fold(0.0, f32::max);
-    let least = (DARKEST * brightest).max(BLACK);
+    let least = (MIN_RELATIVE_GRAM * brightest).max(MIN_GRAM);
     let inverse = gram.mapv(|g| if g > 0.0 { 1.0 / g.max(least) } else { 0.0 });
     let mut all = Array3::zeros((snapshots, gram.nrows(), gram.ncols()));
     all.outer_iter_mut().for_each(|mut of_one| of_one.assign(&inverse));
     all
 }
 
-/// What a projection supposes of the frames' errors and of the noise, both in the same unit.
+/// Statistics that a projection assumes of the frames' errors and of the noise, both in the same unit.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Statistics {
-    /// Covariance \[B,B\] of the frames' errors at a pixel of a snapshot; the identity where there is none.
-    pub(super) covariance: Option<Array2<f32>>,
+pub(crate) struct Statistics {
+    /// Covariance `R` \[B,B\] of the frames' errors at a pixel of a snapshot; the identity if none.
+    pub(crate) covariance: Option<Array2<f32>>,
     /// Variance of a measured pixel's noise. With 0 plain GAP forces `y = Hx`.
-    pub(super) gamma: f32,
+    pub(crate) gamma: f32,
 }
 
-/// How the variance of the error's changes falls from the slowest of them on: as `m^-DECAY` in the index `m` of
-/// the cosine. Measured after total variation and after the network, behind all kinds of masks, it falls by
-/// exponents of 0 to 2.6; as the projection's, more than 0.5 gains less, and 0 loses where there is noise.
-const DECAY: f32 = 0.4;
+/// Decay of the variance of the error's DCT coefficients along time: `m^-DECAY` for coefficient `m`. Measured after total
+/// variation and after the network, behind all kinds of masks, it decays with exponents of 0 to 2.6. For the projection,
+/// more than 0.5 gains less, and 0 is worse with noise.
+pub(crate) const DECAY: f32 = 0.4;
+/// Contrast above which masks distinguish frames well.
+pub(crate) const HIGH_CONTRAST: f32 = 0.125;
+/// Nine tenths of the contrast of independent binary masks, for many frames.
+pub(crate) const INDEPENDENT_CONTRAST: f32 = 0.45;
+/// Compression ratio for which a static variance is stated.
+pub(crate) const REFERENCE_RATIO: f32 = 10.0;
+/// Smallest share of the static variance for masks above [`HIGH_CONTRAST`].
+pub(crate) const MIN_STATIC_SHARE: f32 = 0.551;
 
-/// The contrast of masks at which they are no longer much alike.
-const HIGH_CONTRAST: f32 = 0.125;
-
-/// What `B` masks of contrast `c` bear of the static variance: `min((c / 0.125)^1.5, n, max(n (c / c0)^0.9, 0.55))`
-/// with `n = (10 / B)^0.5`, and nine tenths of the contrast of independent binary masks as `c0`.
+/// Share of the static variance for `B` masks of contrast `c`: `min((c / 0.125)^1.5, n, max(n (c / c0)^0.9, 0.551))` with
+/// `n = (10 / B)^0.5` and `c0 = 0.45 (1 - 1 / B)`.
 ///
 /// With the default's 0.55 the best static variance is 0.07 at a contrast of 0.03, 0.1 at 0.043, 0.15 to 0.2 at 0.06,
-/// 0.3 at 0.084, 0.25 to 0.3 from there to 0.17, and 0.3 to 0.4 at 0.25, where optics blur binary masks or let light
-/// through closed pixels; behind independent binary ones (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from
-/// Cr 16 on (`research/NOTEBOOK.md`).
+/// 0.3 at 0.084, 0.25 to 0.3 from there to 0.17, and 0.3 to 0.4 at 0.25, where optics blur binary masks or closed pixels
+/// leak light. Behind independent binary masks (0.45) it is 0.6 to 0.7 at Cr 6 and 8, and 0.3 to 0.45 from Cr 16 on
+/// (`research/NOTEBOOK.md`).
 fn static_share(contrast: f32, frames: usize) -> f32 {
     let count = frames as f32;
-    let many = (10.0 / count).sqrt();
-    let alike = (contrast / HIGH_CONTRAST).powf(1.5);
-    let blurred = many * (contrast / (0.45 * (1.0 - 1.0 / count))).powf(0.9);
-    alike.min(many).min(blurred.max(0.551))
+    let by_count = (REFERENCE_RATIO / count).sqrt();
+    let low_contrast = (contrast / HIGH_CONTRAST).powf(1.5);
+    let independent = INDEPENDENT_CONTRAST * (1.0 - 1.0 / count);
+    let blurred = by_count * (contrast / independent).powf(0.9);
+    low_contrast.min(by_count).min(blurred.max(MIN_STATIC_SHARE))
 }
 
-/// Of masks that are all alike nothing else than what frames have in common can be told, so it must not be 0.
-const LEAST_STATIC_VARIANCE: f32 = 0.01;
+/// Smallest static variance: behind equal masks only the static part can be observed, so it must not be 0.
+pub(crate) const MIN_STATIC_VARIANCE: f32 = 0.01;
+
+/// The accumulated residual of accelerated GAP.
+pub(crate) struct Accumulation<'a> {
+    /// The target `y1` \[S,H,W\].
+    pub(crate) y1: &'a mut Array3<f32>,
+    /// The share of the residual that is kept.
+    pub(crate) memory: f32,
+}
+
+/// A row of an [`Accumulation`].
+struct Target<'a> {
+    y1: &'a mut [f32],
+    memory: f32,
+}
+
+/// Directions and weights by which a row's residual is distributed over the frames.
+struct Correction<'a> {
+    /// `R C` of the frames, at the places that `stack` gives.
+    directions: &'a [f32],
+    stack: Stack,
+    /// `(H R H^T + gamma)^-1` \[W\].
+    inverse: &'a [f32],
+}
+
+/// The results of [`directions_of_row`].
+struct RowDirections<'a> {
+    /// `R C` \[B,W\].
+    directions: &'a mut [f32],
+    /// `(H R H^T + gamma)^-1` \[W\].
+    weights: &'a mut [f32],
+    /// Working memory \[W\].
+    bounds: &'a mut [f32],
+}
 
 /// One row through all frames of a stack in standard layout.
 #[derive(Clone, Copy)]
@@ -320,27 +364,28 @@ struct Stack {
     frames: usize,
 }
 
-/// The most that a frame may take against the correction of a measured pixel, as a share of it. A covariance
-/// lets a residual raise frames whose masks are more open than others, and lower the rest. Where a prior
-/// takes the error of some frames out and leaves that of others as it is, the error `e` left is multiplied by
-/// `1 - sum c d / (C R C^T)` over the frames that keep it, each time: if `c d < 0` there, it grows. Behind
-/// masks that are much alike single pixels of still fine texture came to values of -6 and 9 that way, for a
-/// loss of up to 11 dB.
-const AGAINST: f32 = 0.02;
+/// Bound on the correction of a frame against the sign of the residual, as a share of the total correction. A covariance
+/// lets a residual raise frames whose masks are more open than others, and lower the rest. Where a prior removes the error
+/// of some frames and keeps that of others, the remaining error `e` is multiplied by `1 - sum c d / (C R C^T)`, summed over
+/// the frames that keep it, in each iteration: with `c d < 0` it grows. Behind highly correlated masks single pixels of
+/// still fine texture reached values of -6 and 9 that way, at a loss of up to 11 dB.
+pub(crate) const MAX_OPPOSITION: f32 = 0.02;
 
-/// `R C` \[B,W\] of a row, no product with `C` below [`AGAINST`] of their sum, and its `(H R H^T + gamma)^-1`
-/// \[W\] from `(H H^T)^-1`, with the bound of [`invert`] in it; 0 where that is 0.
+/// Computes `R C` \[B,W\] of a row, with each product with `C` at least -[`MAX_OPPOSITION`] times their sum, and
+/// `(H R H^T + gamma)^-1` \[W\]. `inverse` is `(H H^T)^-1`, which [`invert`] has bounded; where it is 0 the result is 0.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn directions_of_row(
-    (masks, stack): (&[f32], Stack),
-    (covariance, gamma): (&[f32], f32),
+    masks: &[f32],
+    stack: Stack,
+    covariance: &[f32],
+    gamma: f32,
     inverse: &[f32],
-    directions: &mut [f32],
-    (weights, bounds): (&mut [f32], &mut [f32]),
+    out: RowDirections<'_>,
 ) {
     let Stack { plane, start, width, frames } = stack;
+    let RowDirections { directions, weights, bounds } = out;
     let mask = |k: usize| &masks[k * plane + start..][..width];
-    // The noise first, and what the bound has added.
+    // The noise first, and the part that `invert` added.
     weights.iter_mut().zip(inverse).for_each(|(weight, &inverse)| *weight = 1.0 / inverse + gamma);
     for k in 0..frames {
         let direction = &mut directions[k * width..][..width];
@@ -354,12 +399,12 @@ fn directions_of_row(
             *weight += c * (d - c);
         }
     }
-    bounds.iter_mut().zip(&*weights).for_each(|(bound, weight)| *bound = -AGAINST * weight);
+    bounds.iter_mut().zip(&*weights).for_each(|(bound, weight)| *bound = -MAX_OPPOSITION * weight);
     for k in 0..frames {
         let direction = &mut directions[k * width..][..width];
         let parts = direction.iter_mut().zip(mask(k)).zip(&*bounds);
         for (((d, &c), &bound), weight) in parts.zip(&mut *weights) {
-            // What is below the bound comes up to it; where no light comes through nothing is.
+            // Raise products below the bound to it; a closed pixel has none.
             let missing = (bound - c * *d).max(0.0);
             *weight += missing;
             *d += if c > 0.0 { missing / c } else { 0.0 };
@@ -385,11 +430,12 @@ fn project_row(
     v: &[f32],
     x: &mut [f32],
     y: &[f32],
-    y1: Option<(&mut [f32], f32)>,
-    ((directions, along), inverse): ((&[f32], Stack), &[f32]),
+    target: Option<Target<'_>>,
+    correction: Correction<'_>,
     sum: &mut [f32],
 ) -> f64 {
     let Stack { plane, start, width, frames } = stack;
+    let Correction { directions, stack: along, inverse } = correction;
     sum.fill(0.0);
     for k in 0..frames {
         let row = k * plane + start..k * plane + start + width;
@@ -398,8 +444,8 @@ fn project_row(
         }
     }
     let squares = squared_distance(y, sum);
-    match y1 {
-        Some((y1, memory)) => {
+    match target {
+        Some(Target { y1, memory }) => {
             for (((s, &y), t), &inverse) in sum.iter_mut().zip(y).zip(y1).zip(inverse) {
                 *t = y + memory * (*t - *s);
                 *s = (*t - *s) * inverse;
@@ -425,7 +471,7 @@ fn project_row(
 /// `||a - b||^2`.
 #[inline(always)]
 fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
-    // Sums side by side: one after the other they would wait for each other.
+    // Independent sums, which do not wait for each other.
     let mut sums = [0.0f32; 128];
     for (a, b) in a.chunks(128).zip(b.chunks(128)) {
         for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
@@ -437,7 +483,7 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use super::{SensingOperator, Statistics};
+    use super::{Accumulation, MIN_STATIC_SHARE, SensingOperator, Statistics};
     use ndarray::Array3;
     use proptest::prelude::{any, proptest};
 
@@ -478,7 +524,7 @@ mod tests {
             let after = &y - &op.forward(x.view()).unwrap();
             let expected: f64 = before.iter().map(|&r| f64::from(r * r)).sum();
             assert!((squares - expected).abs() <= 1e-4 * expected.max(1e-3));
-            let dark = op.gram().iter().copied().fold(0.0, f32::max) * super::DARKEST;
+            let dark = op.gram().iter().copied().fold(0.0, f32::max) * super::MIN_RELATIVE_GRAM;
             for after in after.outer_iter() {
                 for (residual, gram) in after.iter().zip(op.gram()) {
                     assert!(residual.abs() < 1e-4 || *gram <= dark, "{residual} {gram}");
@@ -487,51 +533,51 @@ mod tests {
         }
     }
 
-    /// The sum of the covariance is the variance of what frames have in common times their number.
+    /// The sum of the covariance is the static variance times the number of frames.
     #[test]
-    fn less_of_the_error_is_supposed_to_be_common_where_masks_are_alike() {
-        let common = |masks: Array3<f32>| {
+    fn correlated_masks_have_a_smaller_static_variance() {
+        let static_variance = |masks: Array3<f32>| {
             let frames = masks.dim().0 as f32;
             SensingOperator::new(masks).unwrap().error_covariance(0.5).sum() / frames
         };
-        let near = |found: f32, wanted: f32| {
-            assert!((found - wanted).abs() < 0.02, "{found}, not {wanted}")
+        let assert_close = |variance: f32, expected: f32| {
+            assert!((variance - expected).abs() < 0.02, "{variance}, not {expected}")
         };
         let masks = |contrast: f32| random(3, (4, 32, 32)).mapv(|c| 1.0 + contrast * (c - 0.5));
-        // Of the variance of four frames 3/4 shows as change.
-        near(common(masks(1.0)), 0.5 * (0.0577f32 / 0.125).powf(1.5));
-        near(common(masks(0.0)), 0.01);
+        // Three quarters of the variance of four independent frames are changes.
+        assert_close(static_variance(masks(1.0)), 0.5 * (0.0577f32 / 0.125).powf(1.5));
+        assert_close(static_variance(masks(0.0)), 0.01);
         let binary = |frames: usize| random(3, (frames, 32, 32)).mapv(f32::round);
-        near(common(binary(4)), 0.5 * 2.5f32.sqrt());
-        near(common(binary(20)), 0.5 * 0.5f32.sqrt());
+        assert_close(static_variance(binary(4)), 0.5 * 2.5f32.sqrt());
+        assert_close(static_variance(binary(20)), 0.5 * 0.5f32.sqrt());
         // Light through closed pixels: half and a third of the contrast of binary masks.
         let leaking = |frames: usize, light: f32| {
-            common(random(3, (frames, 32, 32)).mapv(|c| light + (1.0 - light) * c.round()))
+            static_variance(random(3, (frames, 32, 32)).mapv(|c| light + (1.0 - light) * c.round()))
         };
-        near(leaking(10, 0.23), 0.5 * 0.65);
-        near(leaking(10, 0.42), 0.5 * 0.551);
+        assert_close(leaking(10, 0.23), 0.5 * 0.65);
+        assert_close(leaking(10, 0.42), 0.5 * MIN_STATIC_SHARE);
     }
 
-    /// A prior that takes the error of all frames out but one leaves there what the projection makes of it.
+    /// A prior that removes the error of all frames but one leaves that one to the projection.
     #[test]
     fn an_error_that_a_prior_keeps_in_some_frames_does_not_grow() {
-        // As alike as those of a hybrid coded aperture.
+        // Correlated like the masks of a hybrid coded aperture.
         let masks = random(5, (16, 12, 12)).mapv(|c| 0.4 + 0.3 * c);
         let op = SensingOperator::new(masks).unwrap();
         let covariance = Some(op.error_covariance(0.5));
-        let supposed = Statistics { covariance, gamma: 0.0 };
+        let statistics = Statistics { covariance, gamma: 0.0 };
         let y = Array3::zeros((1, 12, 12));
         for kept in 0..16 {
             let mut v = Array3::zeros((16, 12, 12));
             v.slice_mut(ndarray::s![kept, .., ..]).fill(1.0);
             let mut x = Array3::zeros((16, 12, 12));
             for _ in 0..65 {
-                op.project(0..12, &y, None, &supposed, &v, &mut x);
+                op.project(0..12, &y, None, &statistics, &v, &mut x);
                 v.slice_mut(ndarray::s![kept, .., ..]).assign(&x.slice(ndarray::s![kept, .., ..]));
             }
             // 1.02^65.
-            let most = v.iter().copied().fold(0.0, f32::max);
-            assert!(most < 3.63, "frame {kept}: {most}");
+            let error = v.iter().copied().fold(0.0, f32::max);
+            assert!(error < 3.63, "frame {kept}: {error}");
         }
     }
 
@@ -547,7 +593,7 @@ mod tests {
         op.project(
             0..3,
             &Array3::from_elem((1, 3, 3), 1.0),
-            Some((&mut y1, 1.0)),
+            Some(Accumulation { y1: &mut y1, memory: 1.0 }),
             &Statistics::default(),
             &v,
             &mut x,
@@ -558,7 +604,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_where_hardly_any_light_comes_through_stays_noise() {
+    fn noise_of_dark_pixels_is_not_amplified() {
         let mut masks = random(3, (4, 3, 3));
         masks.slice_mut(ndarray::s![.., 1, 1]).fill(1e-7);
         let op = SensingOperator::new(masks).unwrap();

@@ -1,86 +1,134 @@
 //! A nonlocal low-rank prior that learns from the snapshot itself.
 //!
 //! Similar patches of several frames, stacked as the columns of a matrix `Y`, span few directions.
-//! Each group is filtered by its own covariance, as in nonlocal Bayes (Lebrun, Buades and Morel,
+//! Each group is filtered by its covariance, as in nonlocal Bayes (Lebrun, Buades and Morel,
 //! SIAM J. Imaging Sciences 2013) and in rank minimization for snapshots (Liu, Yuan, Suo, Brady and
 //! Dai, TPAMI 2019). Instead of singular values that are thresholded one by one, the filter is
 //! `G^2 (G^2 + tau^2)^-1` with `G = Y Y^T`: nearly as sharp (of second order in the eigenvalues),
 //! and one Cholesky factorisation instead of an eigenvalue problem.
 
-mod changes;
 mod layout;
 mod low_rank;
 mod search;
-
-use std::ops::Range;
+mod temporal_shrinkage;
 
 use ndarray::{Array3, ArrayView2, ArrayView3, ShapeBuilder};
 use pulp::{Arch, Simd, WithSimd};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
-use super::{Memory, Networks, Parameter, Pass, Prior, Ready, SIGMA, Settings, TEMPORAL_SHRINKAGE};
-use crate::error::ReconError;
+use super::{Family, Networks, Prior, Size, Spec, WorkingSet, noise_levels};
+use crate::error::Result;
 use crate::motion::Motion;
-use changes::Changes;
 use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
 use low_rank::Filter;
+use temporal_shrinkage::TemporalShrinkage;
 
-/// Groups of similar patches, filtered by their own covariance.
-pub const NONLOCAL: NonlocalPrior = NonlocalPrior;
+/// Parameters of the nonlocal low-rank prior.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct NonlocalSpec {
+    /// Noise level on [0, 1] at the first and the last iteration, geometric between them.
+    #[schemars(transform = noise_levels)]
+    pub sigma: [f32; 2],
+    /// Temporal shrinkage: DCT-II coefficients of a pixel along time, with mean square e over 5x5 pixels, lose the share
+    /// l^4 / (l^4 + e^2), where l is temporal_shrinkage times sigma; 0 for none. An adaptive schedule multiplies it by 2,
+    /// 4 or 8 where that is better.
+    #[serde(default)]
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub temporal_shrinkage: f32,
+    /// Temporal shrinkage of static regions, only beside temporal_shrinkage. The stage is then run twice from its start,
+    /// with either shrinkage, and blended. The temporal changes before the stage and after its first run are compared
+    /// over 17x17 pixels. With a correlation below 0.65 a region is static, above 0.8 it is moving. With null the stage
+    /// is run once. An adaptive schedule sets it where strong shrinkage is better.
+    #[serde(default)]
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub static_shrinkage: Option<f32>,
+    /// True if the whole picture is static: the result is that of the second run, and the first only serves to
+    /// estimate the error. Only beside static_shrinkage. An adaptive schedule sets it for a stage that stops in its first
+    /// half, when changes are mostly noise.
+    #[serde(default)]
+    pub all_static: bool,
+    /// True if search windows follow the estimated motion.
+    #[serde(default = "yes")]
+    pub motion_compensation: bool,
+    /// A pixel further than this times sigma outside the range of its eight neighbours is clamped; null clamps none.
+    #[serde(default = "default_outlier_limit")]
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub outlier_limit: Option<f32>,
+}
 
-/// See [`NONLOCAL`].
-pub struct NonlocalPrior;
+fn yes() -> bool {
+    true
+}
 
-impl Prior for NonlocalPrior {
-    fn name(&self) -> &'static str {
-        "nonlocal"
+fn default_outlier_limit() -> Option<f32> {
+    Some(OUTLIER_LIMIT)
+}
+
+impl NonlocalSpec {
+    /// Parameters with this noise level and shrinkage, and the default of all others.
+    pub fn new(sigma: [f32; 2], temporal_shrinkage: f32) -> Self {
+        Self {
+            sigma,
+            temporal_shrinkage,
+            static_shrinkage: None,
+            all_static: false,
+            motion_compensation: true,
+            outlier_limit: default_outlier_limit(),
+        }
+    }
+}
+
+impl Spec for NonlocalSpec {
+    fn family(&self) -> Family {
+        Family::Nonlocal
     }
 
-    fn summary(&self) -> &'static str {
-        "groups of similar patches, filtered by their own covariance"
+    fn sigma(&self) -> Option<[f32; 2]> {
+        Some(self.sigma)
     }
 
-    fn parameters(&self) -> Vec<&'static Parameter> {
-        vec![&SIGMA, &TEMPORAL_SHRINKAGE]
+    fn set_sigma(&mut self, sigma: [f32; 2]) {
+        self.sigma = sigma;
     }
 
-    fn cost(&self, _: &Settings) -> f64 {
+    fn iteration_ns(&self) -> f64 {
         200.0
     }
 
     /// Four clips with margins, and 40 indices for each 25 pixels.
-    fn memory(&self) -> Memory {
-        Memory { per_voxel: 30, per_network_pixel: 0 }
+    fn working_set(&self) -> WorkingSet {
+        WorkingSet { per_voxel: 30, per_network_pixel: 0 }
     }
 
-    fn begin(&self, size: (usize, usize, usize)) -> Box<dyn Pass> {
-        Box::new(Nonlocal::new(size))
+    fn start<'n>(&self, size: Size, _: &'n mut dyn Networks) -> Result<Box<dyn Prior + 'n>> {
+        let mut nonlocal = Nonlocal::new(size);
+        nonlocal.motion_compensation = self.motion_compensation;
+        nonlocal.outlier_limit = self.outlier_limit.unwrap_or(f32::INFINITY);
+        Ok(Box::new(NonlocalPrior { nonlocal, shrinkage: self.temporal_shrinkage }))
     }
 }
 
-impl Pass for Nonlocal {
-    fn apply(
-        &mut self,
-        x: &mut Array3<f32>,
-        rows: Range<usize>,
-        settings: &Settings,
-        _: &mut dyn Networks,
-        ready: &mut Ready<'_>,
-    ) -> Result<(), ReconError> {
-        self.denoise(x, settings.sigma, settings.temporal_shrinkage);
-        (0..x.dim().0).for_each(|k| ready(x, k, rows.clone()));
+struct NonlocalPrior {
+    nonlocal: Nonlocal,
+    shrinkage: f32,
+}
+
+impl Prior for NonlocalPrior {
+    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
+        self.nonlocal.denoise(frames, sigma, self.shrinkage);
         Ok(())
     }
 }
 
-/// Passes for which the groups are kept.
+/// Number of iterations for which groups are kept.
 const REFRESH: usize = 4;
 /// `tau` in units of `PATCHES sigma^2`, the eigenvalue that noise alone would have.
 const STRENGTH: f32 = 4.0;
-/// How far a pixel may lie outside the range of the eight around it, in units of `sigma`. A group takes a
-/// single pixel far from all others for a direction of its own, which it keeps whole; so nothing would ever
-/// take it out again, and behind masks that are much alike, where a projection does not hold a single frame,
-/// such specks grow.
-const OUTSIDE: f32 = 4.0;
+/// Distance by which a pixel may exceed the range of its eight neighbours, in units of `sigma`. An isolated outlier spans
+/// a separate direction of its group, so the filter never removes it. Behind highly correlated masks, where the projection
+/// does not fix a single frame, such outliers grow.
+const OUTLIER_LIMIT: f32 = 4.0;
 
 /// The prior with its groups and working memory, for clips of one size.
 #[derive(Debug)]
@@ -88,21 +136,26 @@ pub struct Nonlocal {
     frames: usize,
     height: usize,
     width: usize,
+    /// Number of calls of [`Nonlocal::denoise`].
     passes: usize,
-    /// The clip; all clips here have a margin to the right and below, so that a search reads whole vectors
-    /// and blocks of rows.
+    /// The input clip. All clips here have a margin to the right and below, so that a search reads whole vectors and blocks
+    /// of rows.
     noisy: Vec<f32>,
-    /// The result of the pass before: patches are compared in it.
+    /// The previous result, in which patches are compared.
     guide: Vec<f32>,
     sum: Vec<f32>,
-    changes: Changes,
-    /// How many patches cover a pixel.
+    temporal_shrinkage: TemporalShrinkage,
+    /// Number of patches that cover a pixel.
     cover: Vec<f32>,
     /// Top left pixels of all patches, `PATCHES` for a group.
     groups: Vec<u32>,
     filter: Filter,
     /// The vector instructions of this machine.
     arch: Arch,
+    /// True if search windows follow the motion.
+    motion_compensation: bool,
+    /// See [`OUTLIER_LIMIT`].
+    outlier_limit: f32,
 }
 
 impl Nonlocal {
@@ -117,20 +170,21 @@ impl Nonlocal {
             noisy: vec![0.0; size],
             guide: vec![0.0; size],
             sum: vec![0.0; size],
-            changes: Changes::new((frames, height, width)),
+            temporal_shrinkage: TemporalShrinkage::new((frames, height, width)),
             cover: vec![0.0; size],
             groups: Vec::new(),
             filter: Filter::default(),
             arch: Arch::new(),
+            motion_compensation: true,
+            outlier_limit: OUTLIER_LIMIT,
         }
     }
 
-    /// Removes noise of level `sigma` from frames \[B,H,W\] on \[0,1\], in place, after changes along time
-    /// have been shrunk at the level of `shrinkage` times `sigma`, where that is not 0. Frames smaller than a
-    /// patch (6x6) are left as they are.
+    /// Removes noise of level `sigma` from frames \[B,H,W\] on \[0,1\], in place, after temporal shrinkage at the level of
+    /// `shrinkage` times `sigma`, if that is not 0. Frames smaller than a patch (6x6) are left unchanged.
     ///
-    /// Passes of one object belong to one clip: patches are compared in the result of the pass
-    /// before, and the groups are kept for a few passes.
+    /// All calls of one object belong to one clip: patches are compared in the previous result, and the groups are kept for
+    /// a few iterations.
     pub fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32, shrinkage: f32) {
         debug_assert_eq!(frames.dim(), (self.frames, self.height, self.width));
         if self.height < SIDE || self.width < SIDE {
@@ -139,10 +193,10 @@ impl Nonlocal {
         let row_length = row_length(self.width);
         let planes = self.noisy.chunks_exact_mut(self.height * row_length);
         for (plane, frame) in planes.zip(frames.outer_iter()) {
-            without_specks(frame, OUTSIDE * sigma, plane.chunks_exact_mut(row_length));
+            limit_outliers(frame, self.outlier_limit * sigma, plane.chunks_exact_mut(row_length));
         }
         if shrinkage > 0.0 {
-            self.changes.shrink(&mut self.noisy, row_length, shrinkage * sigma);
+            self.temporal_shrinkage.shrink(&mut self.noisy, row_length, shrinkage * sigma);
         }
         if self.passes == 0 {
             self.guide.copy_from_slice(&self.noisy);
@@ -162,21 +216,21 @@ impl Nonlocal {
         }
     }
 
-    /// Does these parts of a pass on the clip as it stands.
+    /// Runs some parts of an iteration on the current clip, for benchmarks.
     pub fn work(&mut self, parts: &[Part], sigma: f32) {
         self.arch.dispatch(Work { prior: self, parts, sigma });
     }
 }
 
-/// Copies a frame \[H,W\], at least 2x2, into rows of its width or more; a pixel that lies further than
-/// `margin` outside the range of the eight around it, as far as that. At its edges the frame is reflected.
-fn without_specks<'a>(
+/// Copies a frame \[H,W\], at least 2x2, into rows of at least its width, and clamps each pixel to the range of its eight
+/// neighbours, extended by `margin` on both sides. The frame is reflected at its edges.
+fn limit_outliers<'a>(
     frame: ArrayView2<'_, f32>,
     margin: f32,
     rows: impl Iterator<Item = &'a mut [f32]>,
 ) {
     let (height, width) = frame.dim();
-    // Least and greatest of the pixels above and below, and of these and the pixel between them.
+    // Minimum and maximum of the pixels above and below, and of these with the pixel between them.
     let (mut pairs, mut triples) = (vec![[0.0f32; 2]; width], vec![[0.0f32; 2]; width + 2]);
     for (i, row) in rows.take(height).enumerate() {
         let above = frame.row(if i == 0 { 1 } else { i - 1 });
@@ -198,25 +252,25 @@ fn without_specks<'a>(
     }
 }
 
-/// A part of a pass, in their order.
+/// The parts of an iteration, in their order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
     /// Finds the patches of each group.
     Search,
-    /// Copies them from the clip.
+    /// Copies the patches from the clip.
     Gather,
-    /// `G = Y Y^T` of the patches less their mean.
+    /// Computes `G = Y Y^T` of the centred patches.
     Gram,
-    /// Cholesky factor of `G^2 + tau^2`.
+    /// Computes the Cholesky factor of `G^2 + tau^2`.
     Factor,
-    /// The filtered patches.
+    /// Computes the filtered patches.
     Solve,
-    /// Adds them up.
+    /// Accumulates the patches in the clip.
     Scatter,
 }
 
 impl Part {
-    /// A whole pass.
+    /// A whole iteration.
     pub const ALL: [Self; 6] =
         [Self::Search, Self::Gather, Self::Gram, Self::Factor, Self::Solve, Self::Scatter];
 }
@@ -235,6 +289,7 @@ impl WithSimd for Work<'_> {
         let (parts, sigma) = (self.parts, self.sigma);
         if parts.contains(&Part::Search) {
             {
+                let motion_compensation = self.prior.motion_compensation;
                 let Nonlocal { guide, groups, cover, frames, height, width, passes, .. } =
                     &mut *self.prior;
                 let (size, searches) = ((*frames, *height, *width), *passes / REFRESH);
@@ -242,7 +297,7 @@ impl WithSimd for Work<'_> {
                 let strides = (size.1 * row_length, row_length, 1);
                 let clip = ArrayView3::from_shape(size.strides(strides), guide.as_slice())
                     .expect("a clip with a margin");
-                let motion = Motion::of(clip);
+                let motion = if motion_compensation { Motion::of(clip) } else { Motion::none() };
                 search::search(simd, guide, size, searches, &motion, groups, cover);
             }
         }
@@ -265,7 +320,7 @@ impl WithSimd for Work<'_> {
     }
 }
 
-// Patch by patch and not group by group: what is written then fills whole lines of the cache.
+// Patch by patch, not group by group, so that writes fill whole cache lines.
 #[inline(always)]
 fn gather<S: Simd>(clip: &[f32], row_length: usize, batch: &[u32], patches: &mut [f32]) {
     for patch in 0..PATCHES {
@@ -298,7 +353,7 @@ fn scatter<S: Simd>(patches: &[f32], row_length: usize, batch: &[u32], sum: &mut
     }
 }
 
-/// From the first number of a patch to the end of its last one.
+/// Distance from the first number of a patch to the end of its last one.
 #[inline(always)]
 fn span<S: Simd>() -> usize {
     (PIXELS - 1) * PATCHES * S::F32_LANES + 1
@@ -308,7 +363,7 @@ fn span<S: Simd>() -> usize {
 mod tests {
     use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions, shift};
     use super::search::window;
-    use super::{Nonlocal, OUTSIDE, REFRESH, STRENGTH, changes, without_specks};
+    use super::{Nonlocal, OUTLIER_LIMIT, REFRESH, STRENGTH, limit_outliers, temporal_shrinkage};
     use ndarray::{Array2, Array3};
     use pulp::Arch;
     use rand::{Rng, SeedableRng};
@@ -329,13 +384,13 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_far_from_all_around_it_is_taken_out() {
+    fn an_isolated_outlier_is_removed() {
         let ramp = Array2::from_shape_fn((8, 9), |(i, j)| 0.01 * (3 * i + j) as f32);
         for (at, greatest) in [((4, 4), 0.2), ((0, 0), 0.04), ((7, 8), 0.28), ((3, 8), 0.2)] {
             let mut frame = ramp.clone();
             frame[at] = 5.0;
             let mut rows = vec![7.0; 8 * 16];
-            without_specks(frame.view(), 0.1, rows.chunks_exact_mut(16));
+            limit_outliers(frame.view(), 0.1, rows.chunks_exact_mut(16));
             let limited = Array2::from_shape_fn((8, 9), |(i, j)| rows[16 * i + j]);
             assert!((limited[at] - greatest - 0.1).abs() < 1e-6, "{at:?}: {}", limited[at]);
             frame[at] = limited[at];
@@ -357,7 +412,7 @@ mod tests {
             let mut prior = Nonlocal::new(size);
             prior.denoise(&mut video, 0.1, 0.0);
             let after = mean_square(&video, &clean);
-            // A handful of patches tells little.
+            // A handful of patches removes little noise.
             let least = if size.1 < 10 { 1.0 } else { 0.25 };
             assert!(after < least * before, "{size:?}: {before} to {after}");
         }
@@ -392,9 +447,9 @@ mod tests {
 
     impl Reference {
         fn denoise(&mut self, clip: &mut Array3<f32>, sigma: f32, shrinkage: f32) {
-            *clip = limited(clip, OUTSIDE * sigma);
+            *clip = limited(clip, OUTLIER_LIMIT * sigma);
             if shrinkage > 0.0 {
-                *clip = changes::tests::shrunk(clip, f64::from(shrinkage * sigma));
+                *clip = temporal_shrinkage::tests::shrunk(clip, f64::from(shrinkage * sigma));
             }
             if self.passes == 0 {
                 self.guide = clip.clone();
@@ -519,7 +574,7 @@ mod tests {
         }
     }
 
-    /// All vector instructions give the same, bit by bit, but for those without fused multiplication.
+    /// All vector instructions with fused multiplication give the same bits.
     #[test]
     fn vector_instructions_do_not_matter() {
         let size = (4, 27, 38);
@@ -539,9 +594,9 @@ mod tests {
         }
     }
 
-    /// Texture that moves by more than a window reaches in two frames, and never comes back.
+    /// Texture that moves out of the search window within two frames, and does not repeat.
     #[test]
-    fn patches_are_found_where_they_move_to() {
+    fn patches_are_found_along_their_motion() {
         let size = (6, 72, 96);
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(6);
         let fine = Array2::from_shape_fn((120, 120), |_| rng.random::<f32>());

@@ -1,29 +1,29 @@
-//! Pixels of a measurement that are kept from the solver, to judge its frames by.
+//! Hold-out pixels of a measurement, by which the frames of a reconstruction without them are judged.
 
 use ndarray::{ArrayView3, Axis};
 use rand::{Rng, SeedableRng};
 
-use super::sensing::SensingOperator;
+use super::operator::SensingOperator;
 
-/// The share of pixels that are kept from the solver.
-const HELD_OUT: f64 = 0.07;
+/// Share of pixels that are held out.
+const SHARE: f64 = 0.07;
 
-/// Pixels that the solver does not see.
-pub(super) struct HeldOut {
-    /// Snapshots, rows and columns.
+/// Pixels that are hidden from the solver.
+pub(super) struct HoldOut {
+    /// Snapshot, row and column of each pixel.
     pub(super) pixels: Vec<(usize, usize, usize)>,
 }
 
-impl HeldOut {
-    /// Drawn from those that a mask reaches; always the same for the same masks and the same snapshot, of
-    /// which the operator's first has the index `first`.
-    pub(super) fn of(op: &SensingOperator, first: usize) -> Self {
+impl HoldOut {
+    /// Draws pixels that light reaches; always the same ones for the same masks and snapshot. The operator's first snapshot
+    /// has the index `first`.
+    pub(super) fn draw(op: &SensingOperator, first: usize) -> Self {
         let gram = op.gram();
         let mut pixels = Vec::new();
         for snapshot in 0..op.snapshots() {
             let mut random = rand_chacha::ChaCha8Rng::seed_from_u64((first + snapshot) as u64);
             for ((row, column), &gram) in gram.indexed_iter() {
-                if random.random_bool(HELD_OUT) && gram > 0.0 {
+                if random.random_bool(SHARE) && gram > 0.0 {
                     pixels.push((snapshot, row, column));
                 }
             }
@@ -56,9 +56,19 @@ impl HeldOut {
     ) -> Vec<f64> {
         let frames = op.masks().len_of(Axis(0));
         let residual = |&(s, i, j): &(usize, usize, usize)| {
-            let seen = |k| op.masks()[[k, i, j]] * v[[s * frames + k, i, j]];
-            f64::from(y[[s, i, j]] - (0..frames).map(seen).sum::<f32>()).powi(2)
+            let masked = |k| op.masks()[[k, i, j]] * v[[s * frames + k, i, j]];
+            f64::from(y[[s, i, j]] - (0..frames).map(masked).sum::<f32>()).powi(2)
         };
         self.pixels.iter().map(residual).collect()
     }
+}
+
+/// t-statistic of the mean difference `one - other` of two candidates' squared hold-out errors, pixel by pixel; 0 if the
+/// difference does not vary.
+pub(super) fn t_statistic(one: &[f64], other: &[f64]) -> f64 {
+    let differences = || one.iter().zip(other).map(|(one, other)| one - other);
+    let count = one.len() as f64;
+    let mean = differences().sum::<f64>() / count;
+    let variance = differences().map(|difference| (difference - mean).powi(2)).sum::<f64>() / count;
+    if variance > 0.0 { mean / (variance / count).sqrt() } else { 0.0 }
 }

@@ -1,7 +1,7 @@
 //! The filter of groups of patches.
 //!
-//! Its loops are loops, not closures handed to iterators: such a closure is a function without the vector
-//! instructions, a call for each of them unless the compiler happens to inline it (ten times slower without).
+//! Loops are written as loops, not as closures passed to iterators. A closure is a function without the vector
+//! instructions, and calling it is ten times slower unless the compiler inlines it.
 
 #![allow(clippy::needless_range_loop)] // the indices of the algebra
 
@@ -9,12 +9,12 @@ use pulp::Simd;
 
 use super::layout::{BATCH, PATCHES, PIXELS};
 
-/// Rows of a tile of a product. A tile's sums stay in registers: 4x4 of the 32 that AVX-512 has, 4x2 of 16.
+/// Rows of a tile of a matrix product. The sums of a tile stay in registers: 4x4 of 32 with AVX-512, 4x2 of 16.
 const ROWS: usize = 4;
 const _: () = assert!(PIXELS.is_multiple_of(ROWS) && PATCHES.is_multiple_of(4));
 
-/// The patches of a batch of groups and what their filter needs: matrices, row by row, of vectors that hold a
-/// number of each of so many groups as they have lanes; so many matrices one after the other as make a batch.
+/// The patches of a batch of groups and the matrices of their filter. An element of a matrix is a vector with one
+/// number for each of several groups; a batch has several such matrices in sequence.
 #[derive(Debug)]
 pub(super) struct Filter {
     /// `Y`: \[PIXELS, PATCHES\].
@@ -23,7 +23,7 @@ pub(super) struct Filter {
     gram: Vec<f32>,
     /// Lower triangle of the Cholesky factor, with the reciprocals of its diagonal: \[PIXELS, PIXELS\].
     factor: Vec<f32>,
-    /// `Y - mean` and what is made of it: \[PIXELS, PATCHES\].
+    /// `Y - mean`, then intermediate results: \[PIXELS, PATCHES\].
     solved: Vec<f32>,
 }
 
@@ -35,8 +35,8 @@ impl Default for Filter {
     }
 }
 
-// The filter is `Y <- mean + G^2 (G^2 + tau^2)^-1 (Y - mean)` with `G` of the patches less their mean, in every
-// group: the same as `Y - tau^2 (G^2 + tau^2)^-1 (Y - mean)`.
+// The filter of a group is `Y <- mean + G^2 (G^2 + tau^2)^-1 (Y - mean)` with `G` of the centred patches, which
+// equals `Y - tau^2 (G^2 + tau^2)^-1 (Y - mean)`.
 
 /// `G = (Y - mean) (Y - mean)^T`.
 #[inline(always)]
@@ -72,7 +72,7 @@ pub(super) fn factorize<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
     }
 }
 
-/// The filtered patches in place of `Y`.
+/// Computes the filtered patches in place of `Y`.
 #[inline(always)]
 pub(super) fn solve<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
     match S::F32_LANES {
@@ -120,7 +120,7 @@ struct Part<'a, S: Simd, const C: usize> {
 type Tile<S, const C: usize> = [[<S as Simd>::f32s; C]; ROWS];
 
 impl<S: Simd, const C: usize> Part<'_, S, C> {
-    /// `tau^2`. Far below the largest eigenvalue the square is lost in rounding: the filter passes nothing there.
+    /// `tau^2`. Far below the largest eigenvalue its square is lost in rounding, and the filter passes nothing.
     #[inline(always)]
     fn square(&self, tau: f32) -> S::f32s {
         let simd = self.simd;
@@ -192,7 +192,7 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
         }
     }
 
-    /// An element of the factor, of which only the products from column `first` on are left to be taken off.
+    /// An element of the factor, from which only the products from column `first` on remain to be subtracted.
     #[inline(always)]
     fn finish(&mut self, row: usize, column: usize, first: usize, square: S::f32s) {
         let simd = self.simd;
@@ -203,7 +203,7 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
             value = simd.negate_mul_add_e_f32s(a, b, value);
         }
         self.factor[at(row, column)] = if row == column {
-            // The pivots of a sum with tau^2 are at least that, but for rounding.
+            // The pivots of a sum with tau^2 are at least tau^2, up to rounding.
             let least = simd.mul_f32s(simd.splat_f32s(0.1), square);
             let pivot = simd.max_f32s(simd.add_f32s(value, square), least);
             simd.div_f32s(simd.splat_f32s(1.0), simd.sqrt_f32s(pivot))
@@ -225,7 +225,7 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
         }
     }
 
-    /// A tile of `L^-1 solved`, in place of `solved`; those above it are done.
+    /// A tile of `L^-1 solved`, in place of `solved`; the tiles above are done.
     #[inline(always)]
     fn forward(&mut self, i: usize, column: usize) {
         let simd = self.simd;
@@ -252,8 +252,8 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
         store(&tile, self.solved, PATCHES, (i, column));
     }
 
-    /// A tile of `X = L^-T solved`, in place of `solved`, and of `Y - square X`, in place of `Y`; those below it
-    /// are done.
+    /// A tile of `X = L^-T solved`, in place of `solved`, and of `Y - square X`, in place of `Y`; the tiles below are
+    /// done.
     #[inline(always)]
     fn backward(&mut self, i: usize, column: usize, square: S::f32s) {
         let simd = self.simd;
@@ -301,7 +301,7 @@ impl<S: Simd, const C: usize> Part<'_, S, C> {
     }
 }
 
-/// Adds up `f(a_ik, a_jk, sum)` over the first `count` columns, for the rows of a tile from `i` and `j` on of a
+/// Accumulates `f(a_ik, a_jk, sum)` over the first `count` columns, for the rows of a tile from `i` and `j` on of a
 /// matrix with `columns` columns.
 #[inline(always)]
 fn products<S: Simd, const C: usize>(

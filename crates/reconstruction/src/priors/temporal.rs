@@ -5,15 +5,15 @@ use std::ops::Range;
 use multiversion::multiversion;
 use ndarray::{Array3, Axis};
 
-/// Cost of one dual update, CPU-nanoseconds per voxel: 0.37 of one of each frame.
+/// Cost of one dual update, CPU-nanoseconds per voxel.
 pub(super) const UPDATE_NS: f64 = 0.21;
-/// Step of the dual ascent: `1 / ||D||^2`, and the difference `D` along one dimension has a squared norm
-/// below 4 for any number of frames.
+/// Step of the dual ascent, `1 / ||D||^2`. The difference `D` along one dimension has a squared norm below 4 for any
+/// number of frames.
 const TAU: f32 = 0.25;
-/// Pixels that are worked on at once: their values in all frames stay in the first-level cache.
+/// Pixels processed at once: their values in all frames stay in the first-level cache.
 const LANES: usize = 64;
 
-/// Of what the solver makes.
+/// Guaranteed by the solver.
 const CONTIGUOUS: &str = "frames are in standard layout";
 
 /// The values of `LANES` pixels in one frame.
@@ -22,22 +22,21 @@ type Lanes = [f32; LANES];
 /// Working memory, kept so that the loop allocates nothing.
 #[derive(Debug)]
 pub struct TemporalVariation {
-    /// `x`, a row for each frame.
+    /// The input `x`, a row for each frame.
     values: Vec<Lanes>,
-    /// The dual field between a frame and the next; the last one stays 0.
+    /// The dual field between a frame and the next one; the last stays 0.
     dual: Vec<Lanes>,
 }
 
 impl TemporalVariation {
-    /// For clips of so many frames.
+    /// For clips of `frames` frames.
     pub fn new(frames: usize) -> Self {
         Self { values: vec![[0.0; LANES]; frames], dual: vec![[0.0; LANES]; frames] }
     }
 
-    /// Goes towards the least `||u - x||^2 / 2 + weight * sum_k |u_(k+1) - u_k|` for each pixel of
-    /// some rows of `frames` \[B,H,W\], in place: `updates` steps of projected gradient ascent on
-    /// the dual from 0 (`p <- clamp(p - tau (u_(k+1) - u_k), +-weight)`, `u_k = x_k - p_k +
-    /// p_(k-1)`).
+    /// Approximates the minimum of `||u - x||^2 / 2 + weight * sum_k |u_(k+1) - u_k|` for each pixel of some rows of
+    /// `frames` \[B,H,W\], in place, by `updates` steps of projected gradient ascent on the dual from 0:
+    /// `p <- clamp(p - tau (u_(k+1) - u_k), +-weight)`, `u_k = x_k - p_k + p_(k-1)`.
     ///
     /// # Panics
     /// If the frames are not in standard layout.
@@ -76,7 +75,7 @@ impl TemporalVariation {
 /// One update of the dual field of all pixels.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn update(values: &[Lanes], dual: &mut [Lanes], weight: f32) {
-    // `u` of this frame and the field before it, as they were before the update.
+    // `u` of this frame and the dual field before it, both from before the update.
     let (mut here, mut before) = ([0.0; LANES], [0.0; LANES]);
     for k in 0..values.len() {
         let field = dual[k];

@@ -1,4 +1,4 @@
-//! ONNX Runtime: the only file that knows `ort`.
+//! ONNX Runtime. No other file uses `ort`.
 
 use std::path::Path;
 use std::sync::OnceLock;
@@ -21,7 +21,7 @@ pub enum Device {
     /// The processor, one thread a session.
     #[default]
     Cpu,
-    /// The CUDA device of this number.
+    /// The CUDA device with this number.
     Cuda(i32),
 }
 
@@ -33,9 +33,9 @@ impl Device {
             ("cpu", _) => Ok(Self::Cpu),
             (_, Some(number)) if number >= 0 => Ok(Self::Cuda(number)),
             _ => Err(ReconError::Parameter {
-                name: "device",
+                name: "device".into(),
                 value: format!("{text:?}"),
-                range: "cpu or cuda:N (cuda:0 is the first GPU)",
+                range: "cpu or cuda:N (cuda:0 is the first GPU)".into(),
             }),
         }
     }
@@ -49,25 +49,27 @@ impl Device {
     }
 }
 
-/// The loaded libonnxruntime and the device that sessions are made for.
+/// The loaded libonnxruntime, and the device of its sessions.
 #[derive(Debug, Clone)]
 pub struct Runtime {
     environment: Environment,
     device: Device,
 }
 
-/// Where weights lie that a network keeps in other files. Ours have none, and one that was sent in
-/// must not name files of this machine: without this it may name any below the working folder.
+/// Folder of external weights of a network. Our networks have none. Without this setting, an uploaded network could
+/// name any file below the working folder.
 const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
 const NOWHERE: &str = "/dev/null/nowhere";
 
-/// The library can be loaded once a process; the first outcome holds.
+/// The library can be loaded once per process; the first outcome stays.
 static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
 
 impl Runtime {
     /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`.
-    /// Errors: the library is missing or too old. A device that can't be had shows when a network
-    /// is loaded; there is no silent fall-back.
+    ///
+    /// # Errors
+    /// The library is missing or too old. If the device is unavailable, loading a network fails; there is no silent
+    /// fallback.
     pub fn open(library: &Path, device: Device) -> Result<Self> {
         let loaded = ENVIRONMENT.get_or_init(|| {
             let builder = ort::init_from(library).map_err(|error| {
@@ -91,7 +93,7 @@ impl Runtime {
         self.device
     }
 
-    /// What the library tells of its build, for records.
+    /// Description of the library's build, for records.
     pub fn build_info(&self) -> &'static str {
         ort::info()
     }
@@ -148,7 +150,7 @@ impl ClipNetwork {
         Ok(Self { name: name.to_string(), session })
     }
 
-    /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes what it gives for the n middle ones.
+    /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes the output for the n middle ones.
     pub fn run(
         &mut self,
         frames: ArrayView4<'_, f32>,
@@ -178,13 +180,15 @@ pub struct EndToEndNetwork {
 }
 
 impl EndToEndNetwork {
-    /// Loads a network; [`Self::interface`] says whether it is one of this kind.
-    /// Errors: [`ReconError::Runtime`]: no network that ONNX Runtime takes.
+    /// Loads a network; [`Self::interface`] describes its inputs and outputs.
+    ///
+    /// # Errors
+    /// [`ReconError::Runtime`]: ONNX Runtime refuses the network.
     pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self> {
         Ok(Self { session: runtime.session("of the file", model)? })
     }
 
-    /// What it takes and gives.
+    /// Inputs and outputs of the network.
     pub fn interface(&self) -> Interface {
         let tensors = |outlets: &[Outlet]| outlets.iter().map(tensor).collect();
         Interface {
@@ -211,7 +215,7 @@ impl SnapshotNetwork for EndToEndNetwork {
         let (shape, values) = outputs[FRAMES].try_extract_tensor::<f32>().map_err(failed)?;
         let frames = Array3::from_shape_vec(masks.raw_dim(), values.to_vec());
         let frames = frames.map_err(|_| ReconError::Shape {
-            what: "what the network gave",
+            what: "the network's output",
             found: shape.to_string(),
             expected: format!("1x{}", shape_text(masks.shape())),
         })?;
@@ -226,14 +230,14 @@ fn tensor(outlet: &Outlet) -> TensorInfo {
         ValueType::Tensor { ty, shape, .. } => TensorInfo {
             name,
             element: element(*ty),
-            // -1 stands for any length.
+            // -1 means any length.
             sides: shape.iter().map(|&side| usize::try_from(side).ok()).collect(),
         },
         other => TensorInfo { name, element: format!("{other:?}"), sides: Vec::new() },
     }
 }
 
-/// The type's name as ONNX and NumPy have it.
+/// Name of the type in ONNX and NumPy.
 fn element(element: TensorElementType) -> String {
     match element {
         TensorElementType::Float32 => "float32".to_owned(),

@@ -1,85 +1,128 @@
-//! Isotropic total variation, frame by frame (Chambolle, "An algorithm for total variation
-//! minimization and applications", 2004).
+//! Isotropic total variation, frame by frame (Chambolle, "An algorithm for total variation minimization and
+//! applications", 2004), after total variation along time where that has a weight.
 
 use std::ops::{Deref, DerefMut, Range};
 
 use multiversion::multiversion;
 use ndarray::{Array3, Axis};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use super::temporal::{self, TemporalVariation};
-use super::{
-    Networks, Parameter, Pass, Prior, Ready, Settings, TEMPORAL_WEIGHT, TV_UPDATES, TV_WEIGHT,
-};
+use super::{Family, Networks, Prior, Size, Spec};
 use crate::error::Result;
+use crate::projection::Projection;
 
-/// Total variation along time where it has a weight, then of each frame.
-pub const TV: Tv = Tv;
+/// Parameters of total variation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct TvSpec {
+    /// Weight of the total variation of each frame on the [0, 1] scale; 0 for none.
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub tv_weight: f32,
+    /// Dual (Chambolle) updates in each iteration.
+    #[serde(default = "four")]
+    #[schemars(range(min = 1, max = 1000))]
+    pub tv_updates: usize,
+    /// Weight of the total variation along time, pixel by pixel, which precedes that of each frame and takes as many
+    /// dual updates; 0 for none. An adaptive schedule drops it where it is worse.
+    #[serde(default)]
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub temporal_weight: f32,
+}
 
-/// See [`TV`].
-pub struct Tv;
+fn four() -> usize {
+    4
+}
 
 /// Cost of one dual update, CPU-nanoseconds per voxel.
 const UPDATE_NS: f64 = 0.56;
+/// Values of a strip of all frames: three arrays of strips (frames, masks, projection) stay in a second-level cache.
+const STRIP_VALUES: usize = 48 * 1024;
+/// Smallest height of a strip: with fewer rows, going from frame to frame costs more than the cache saves.
+const MIN_STRIP_ROWS: usize = 16;
 
-impl Prior for Tv {
-    fn name(&self) -> &'static str {
-        "tv"
+impl Spec for TvSpec {
+    fn family(&self) -> Family {
+        Family::TotalVariation
     }
 
-    fn summary(&self) -> &'static str {
-        "isotropic total variation of each frame"
+    fn has_total_variation(&self) -> bool {
+        self.tv_weight > 0.0
     }
 
-    fn parameters(&self) -> Vec<&'static Parameter> {
-        vec![&TV_WEIGHT, &TV_UPDATES, &TEMPORAL_WEIGHT]
+    fn iteration_ns(&self) -> f64 {
+        let temporal_ns = if self.temporal_weight > 0.0 { temporal::UPDATE_NS } else { 0.0 };
+        (UPDATE_NS + temporal_ns) * self.tv_updates as f64
     }
 
-    fn cost(&self, settings: &Settings) -> f64 {
-        let in_time = settings.temporal_weight > 0.0;
-        let update_ns = UPDATE_NS + if in_time { temporal::UPDATE_NS } else { 0.0 };
-        update_ns * settings.tv_updates as f64
+    fn looks_along_time(&self) -> bool {
+        self.temporal_weight > 0.0
     }
 
-    fn looks_along_time(&self, settings: &Settings) -> bool {
-        settings.temporal_weight > 0.0
-    }
-
-    fn by_strips(&self) -> bool {
-        true
-    }
-
-    fn begin(&self, size: (usize, usize, usize)) -> Box<dyn Pass> {
-        Box::new((TemporalVariation::new(size.0), TotalVariation::new(size)))
+    fn start<'n>(&self, size: Size, _: &'n mut dyn Networks) -> Result<Box<dyn Prior + 'n>> {
+        Ok(Box::new(TvPrior::new(self, size)))
     }
 }
 
-impl Pass for (TemporalVariation, TotalVariation) {
-    fn apply(
+/// Total variation along time, then of each frame.
+pub(super) struct TvPrior {
+    spec: TvSpec,
+    temporal: TemporalVariation,
+    spatial: TotalVariation,
+}
+
+impl TvPrior {
+    pub(super) fn new(spec: &TvSpec, size: Size) -> Self {
+        let (temporal, spatial) = (TemporalVariation::new(size.0), TotalVariation::new(size));
+        Self { spec: spec.clone(), temporal, spatial }
+    }
+
+    /// Denoises the rows of a strip, the strips above having come before. Reports for each frame the rows that are
+    /// complete now; they lag behind the strip by the number of dual updates.
+    fn denoise_strip(
         &mut self,
-        x: &mut Array3<f32>,
-        rows: Range<usize>,
-        settings: &Settings,
-        _: &mut dyn Networks,
-        ready: &mut Ready<'_>,
-    ) -> Result<()> {
-        let Settings { tv_weight, tv_updates, temporal_weight, .. } = *settings;
-        let (temporal, spatial) = self;
+        frames: &mut Array3<f32>,
+        strip: Range<usize>,
+        mut completed: impl FnMut(&Array3<f32>, usize, Range<usize>),
+    ) {
+        let TvSpec { tv_weight, tv_updates, temporal_weight } = self.spec;
         if temporal_weight > 0.0 {
-            temporal.denoise(x, rows.clone(), temporal_weight, tv_updates);
+            self.temporal.denoise(frames, strip.clone(), temporal_weight, tv_updates);
         }
-        for k in 0..x.dim().0 {
-            let done = spatial.advance(k, x, rows.clone(), tv_weight, tv_updates);
-            ready(x, k, done);
+        for k in 0..frames.dim().0 {
+            let rows = self.spatial.advance(k, frames, strip.clone(), tv_weight, tv_updates);
+            completed(frames, k, rows);
         }
+    }
+}
+
+impl Prior for TvPrior {
+    fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<()> {
+        self.denoise_strip(frames, 0..frames.dim().1, |_, _, _| ());
         Ok(())
+    }
+
+    /// Strip by strip, so that projection, denoising and the comparison with the last iterate find a strip in cache.
+    fn step(&mut self, projection: &mut Projection<'_>, _: f32) -> Result<Array3<f32>> {
+        let (count, height, width) = projection.size();
+        let strip_rows = (STRIP_VALUES / (count * width)).max(MIN_STRIP_ROWS);
+        let mut frames = projection.take_buffer();
+        for start in (0..height).step_by(strip_rows) {
+            let strip = start..height.min(start + strip_rows);
+            projection.rows(strip.clone(), &mut frames);
+            self.denoise_strip(&mut frames, strip, |frames, k, rows| {
+                projection.compare(frames, k, rows);
+            });
+        }
+        Ok(frames)
     }
 }
 
 /// Step of the dual ascent: 1 / (2 * dimensions).
 const TAU: f32 = 0.25;
 /// Added to squares, so that the inverse of their root is finite.
-const LEAST: f32 = 1e-30;
-/// Values of a cache line.
+const MIN_SQUARE: f32 = 1e-30;
+/// Values in a cache line.
 const LINE: usize = 16;
 
 /// The dual fields of a few rows of every frame, kept so that the loop allocates nothing.
@@ -90,15 +133,14 @@ const LINE: usize = 16;
 pub struct TotalVariation {
     height: usize,
     width: usize,
-    /// For each frame one level for each number of updates done; the first stays 0 in its dual
-    /// fields.
-    frames: Vec<Vec<Level>>,
+    /// For each frame the rows after each number of updates; after none, the dual fields are 0.
+    frames: Vec<Vec<FieldRows>>,
     zeros: Vec<f32>,
 }
 
-/// The two latest rows of the fields after a number of updates, by the rows' parity.
+/// The two latest rows of the fields after some number of updates, by the parity of the row.
 #[derive(Debug)]
-struct Level {
+struct FieldRows {
     /// Dual field along rows (downwards).
     down: [Row; 2],
     /// Dual field along columns, after a 0.
@@ -107,14 +149,14 @@ struct Level {
     primal: [Row; 2],
 }
 
-impl Level {
+impl FieldRows {
     fn new(width: usize) -> Self {
         let rows = |length, aligned| [Row::new(length, aligned), Row::new(length, aligned)];
         Self { down: rows(width, 0), right: rows(width + 1, 1), primal: rows(width + 1, 0) }
     }
 }
 
-/// Values of which one lies where a cache line begins: a register of them is then one access.
+/// Values aligned so that one of them begins a cache line: loading a register of them is then one access.
 #[derive(Debug)]
 struct Row {
     values: Vec<f32>,
@@ -148,7 +190,7 @@ impl DerefMut for Row {
 impl TotalVariation {
     /// For `frames` frames of `height` x `width` pixels.
     pub fn new((frames, height, width): (usize, usize, usize)) -> Self {
-        let frames = (0..frames).map(|_| vec![Level::new(width)]).collect();
+        let frames = (0..frames).map(|_| vec![FieldRows::new(width)]).collect();
         Self { height, width, frames, zeros: vec![0.0; width] }
     }
 
@@ -161,8 +203,8 @@ impl TotalVariation {
         }
     }
 
-    /// The same for frame `k`, as far as it goes with the rows up to `arriving.end`: frames come
-    /// strip by strip, in order. Returns the rows that are done now.
+    /// Denoises frame `k` as far as the rows up to `arriving.end` allow: frames come strip by strip, in order. Returns the
+    /// rows that are complete now.
     fn advance(
         &mut self,
         k: usize,
@@ -177,7 +219,7 @@ impl TotalVariation {
         }
         let (width, height) = (self.width, self.height);
         let levels = &mut self.frames[k];
-        levels.resize_with((updates + 1).max(levels.len()), || Level::new(width));
+        levels.resize_with((updates + 1).max(levels.len()), || FieldRows::new(width));
         let end = if arriving.end == height { height + updates } else { arriving.end };
         if let Some(frame) = frames.index_axis_mut(Axis(0), k).as_slice_mut() {
             let levels = &mut levels[..=updates];
@@ -187,12 +229,12 @@ impl TotalVariation {
     }
 }
 
-/// The dual updates that the arriving rows allow, and `u` written over the rows that are done:
-/// row `i` is when row `i + updates` arrives, or would.
+/// Makes the dual updates that the arriving rows allow, and writes `u` over the rows that are complete: row `i` is
+/// complete when row `i + updates` arrives, or would arrive.
 #[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn sweep(
     image: &mut [f32],
-    levels: &mut [Level],
+    levels: &mut [FieldRows],
     zeros: &[f32],
     arriving: Range<usize>,
     step: f32,
@@ -207,7 +249,7 @@ fn sweep(
 #[inline(always)]
 fn sweep_rows<const FMA: bool>(
     image: &mut [f32],
-    levels: &mut [Level],
+    levels: &mut [FieldRows],
     zeros: &[f32],
     arriving: Range<usize>,
     step: f32,
@@ -244,8 +286,8 @@ fn sweep_rows<const FMA: bool>(
     }
 }
 
-/// `p = (p - tau grad u) / (1 + tau/weight |grad u|)` for one row; forward differences, 0 at
-/// the far edges. `step` is `tau / weight`.
+/// `p = (p - tau grad u) / (1 + tau/weight |grad u|)` for one row. Differences are forward, and 0 at the far edges;
+/// `step` is `tau / weight`.
 #[inline(always)]
 fn dual_row<const FMA: bool>(
     here: &[f32],
@@ -254,13 +296,13 @@ fn dual_row<const FMA: bool>(
     (new_down, new_right): (&mut [f32], &mut [f32]),
     step: f32,
 ) {
-    // All loops run over the whole width, which for most sizes leaves no rest of a register.
+    // All loops run over the whole width, which fills whole registers for most sizes.
     let width = new_down.len();
     let (here, ahead, below) = (&here[..width], &here[1..=width], &below[..width]);
     let (down, right, new_right) = (&down[..width], &right[1..=width], &mut new_right[1..=width]);
     for j in 0..width {
         let (g0, g1) = (below[j] - here[j], ahead[j] - here[j]);
-        let squares = add_product::<FMA>(add_product::<FMA>(LEAST, g0, g0), g1, g1);
+        let squares = add_product::<FMA>(add_product::<FMA>(MIN_SQUARE, g0, g0), g1, g1);
         let norm = root::<FMA>(squares);
         let scale = inverse::<FMA>(add_product::<FMA>(1.0, step, norm));
         new_down[j] = add_product::<FMA>(down[j], -TAU, g0) * scale;
@@ -281,7 +323,7 @@ fn primal_row(x: &[f32], above: &[f32], (down, right): (&[f32], &[f32]), out: &m
     out[width] = out[width - 1];
 }
 
-/// The same in place of `x`.
+/// Writes that row of `u` in place of `x`.
 #[inline(always)]
 fn add_divergence(x: &mut [f32], above: &[f32], (down, right): (&[f32], &[f32])) {
     let width = x.len();
@@ -307,7 +349,7 @@ fn root<const FMA: bool>(q: f32) -> f32 {
     root * add_product::<FMA>(2.452_720_8, h, p)
 }
 
-/// `1 / d` for `d` >= 1 to a relative error of 1e-6, in the same way: `e / (d e)` with a parabola for `d e`
+/// `1 / d` for `d` >= 1 to a relative error of 1e-6, by the method of [`root`]: `e / (d e)` with a parabola for `d e`
 /// from 0.707 to 0.7285.
 #[inline(always)]
 fn inverse<const FMA: bool>(d: f32) -> f32 {
@@ -317,7 +359,7 @@ fn inverse<const FMA: bool>(d: f32) -> f32 {
     estimate * add_product::<FMA>(4.180_136_6, h, p)
 }
 
-/// `a + b c`: rounded once where the processor does so in one step, for that is faster.
+/// `a + b c`, rounded once where the processor computes it in one step, which is faster.
 #[inline(always)]
 fn add_product<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { b.mul_add(c, a) } else { a + b * c }
@@ -391,7 +433,7 @@ mod tests {
                     for (k, done) in done.iter_mut().enumerate() {
                         let strip = start..height.min(start + rows);
                         let ready = tv.advance(k, &mut strips, strip, 0.1, updates);
-                        assert_eq!(ready.start, *done, "every row is told once");
+                        assert_eq!(ready.start, *done, "every row is reported once");
                         *done = ready.end;
                     }
                 }
