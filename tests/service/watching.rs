@@ -62,16 +62,15 @@ async fn listeners_receive_changes_of_calibrations() {
         }
     };
     heard("event: hello").await;
-    // Later polls are compared with the first one, which may ask to read the list again.
-    tokio::time::sleep(Duration::from_millis(2500)).await;
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     let change = loop {
         let change = heard("event: calibrations\ndata: ").await;
-        if change["more"] != true {
+        // The first event may name the calibration that was made before.
+        if change["changed"][0] == json!(calibration) {
             break change;
         }
     };
-    assert_eq!(change, json!({"changed": [calibration], "deleted": [], "more": false}));
+    assert_eq!((&change["deleted"], &change["more"]), (&json!([]), &json!(false)));
     let place = format!("/v1/calibrations/{calibration}");
     let rename = app.request(Method::PATCH, &place).json(&json!({"name": "May"}));
     app.send(rename).await.expect(200);

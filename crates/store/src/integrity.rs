@@ -148,6 +148,13 @@ impl Store {
         let verdicts: Vec<String> =
             sql_as!("PRAGMA integrity_check(10)", []).fetch_all(&self.readers).await?;
         audit.database = verdicts.join("; ");
+        let wrong = self.wrong_totals().await?;
+        if audit.database == "ok" && !wrong.is_empty() {
+            audit.database = format!(
+                "running totals differ from a new sum: {}; `serve --accept-database` repairs them",
+                wrong.join(", ")
+            );
+        }
         let mut after = None;
         loop {
             let page = records::page(&mut *self.readers.acquire().await?, after.as_ref()).await?;

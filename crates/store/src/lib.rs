@@ -57,18 +57,18 @@ pub use locked::LockedFile;
 use migrations::Schema;
 pub use queue::{
     Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, Claimant, ClaimedTask, Completion,
-    Estimate, Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES,
-    MAX_STARVED, MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask,
-    Work, WorkerEnd,
+    Estimate, Heartbeat, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
+    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
+    WorkerEnd,
 };
 pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Asked, Blob, BlobRow, Calibration, Entitlement, FIRST_RESERVE, FoundPartial, Inserted, Job,
-    JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration,
-    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request, RequestKey,
-    RequestMark, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
+    Asked, Blob, BlobRow, Calibration, Change, Changes, Entitlement, FIRST_RESERVE, FoundPartial,
+    Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model,
+    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request,
+    RequestKey, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
     WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
@@ -80,8 +80,7 @@ pub struct Store {
     /// One connection: within a process, writers wait for each other here and not in SQLite.
     writer: SqlitePool,
     readers: SqlitePool,
-    /// What is ahead of every job, as it was a moment ago.
-    forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
+    forecasts: Arc<queue::Forecasts>,
     /// Hashes of files that were read before they were handed out.
     hashes: Arc<hashes::Hashes>,
     removals: removal::Removals,
@@ -118,6 +117,8 @@ impl Store {
             .foreign_keys(true)
             .busy_timeout(Duration::from_secs(15))
             .journal_mode(SqliteJournalMode::Wal)
+            // Rows of jobs and tasks have one to two kilobytes. In smaller pages they would overflow.
+            .page_size(8192)
             // A worker may write to the data folder alone, and not where SQLite puts its temporary files.
             .pragma("temp_store", "memory")
             // NORMAL survives a killed process, but a power cut could take back the last commits,
@@ -143,13 +144,12 @@ impl Store {
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
-        let (forecast, hashes) = (Arc::default(), Arc::default());
         let store = Self {
             dir,
             writer,
             readers,
-            forecast,
-            hashes,
+            forecasts: Arc::default(),
+            hashes: Arc::default(),
             removals: removal::Removals::default(),
             damage: Arc::default(),
             schema: schema.newest(),
@@ -164,6 +164,9 @@ impl Store {
             store.note_time(Duration::ZERO).await?;
             identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
             store.write_marker().await?;
+            if purpose == (Purpose::Serve { accept_database: true }) {
+                store.recount_totals().await?;
+            }
             store.advance_generation().await?;
         }
         Ok(store)

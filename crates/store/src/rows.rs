@@ -54,7 +54,7 @@ macro_rules! listed_text {
         concat!(
             "SELECT * FROM ",
             $place,
-            " lab = ?1 AND (?2 IS NULL OR id < ?2)
+            " lab = ?1 AND id < coalesce(?2, 'g')
                AND (?3 IS NULL OR calibration = ?3)
                AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
              ORDER BY id DESC LIMIT ?4"

@@ -9,6 +9,7 @@ mod movies;
 mod remote;
 mod sequences;
 mod statements;
+mod totals;
 mod turns;
 
 use std::io::Write;

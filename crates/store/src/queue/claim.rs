@@ -110,13 +110,33 @@ pub enum Claimant<'a> {
 /// Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
 macro_rules! look_text {
     ($kinds:expr, $by_lab:literal) => {
-        concat!(
-            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks ",
+        look_text!(@ concat!(
+            "EXISTS (SELECT 1 FROM tasks INDEXED BY ",
             $by_lab,
             " WHERE state = 'ready' ",
             $kinds,
-            " AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
-                 OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
+            " AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)"))
+    };
+    // The tasks of things, and those of jobs that have begun.
+    ($kinds:expr, $by_lab:literal, $by_job:literal) => {
+        look_text!(@ concat!(
+            "EXISTS (SELECT 1 FROM tasks INDEXED BY ",
+            $by_lab,
+            " WHERE state = 'ready' ",
+            $kinds,
+            " AND job IS NULL AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
+             OR EXISTS (SELECT 1 FROM jobs CROSS JOIN tasks INDEXED BY ",
+            $by_job,
+            " ON job = jobs.id
+                        WHERE jobs.state = 'running' AND tasks.state = 'ready' ",
+            $kinds,
+            " AND job IS NOT NULL AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)"))
+    };
+    (@ $ready:expr) => {
+        concat!(
+            "SELECT 1 WHERE ",
+            $ready,
+            " OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
                                 AND lease_until NOT BETWEEN ?1 AND ?1 + ?3)"
         )
     };
@@ -125,29 +145,30 @@ macro_rules! look_text {
 /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of the
 /// lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see [`take`].
 macro_rules! take_text {
-    ($kinds:expr, $by_lab:literal, $by_job:literal) => {
+    ($kinds:expr, $of_lab:literal, $by_lab:literal, $by_job:literal) => {
         take_text!(@
             concat!("state = 'ready' ", $kinds, " AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6"),
-            $by_lab, $by_job)
+            $of_lab, $by_lab, $by_job)
     };
-    (@ $ready:expr, $by_lab:literal, $by_job:literal) => {
+    (@ $ready:expr, $of_lab:literal, $by_lab:literal, $by_job:literal) => {
         concat!(
             "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
                  stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
              WHERE id = (
                  SELECT tasks.id FROM (
                      -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
-                     SELECT finish, (SELECT id FROM tasks ", $by_lab, "
-                                     WHERE ", $ready, " AND tasks.lab = labs.lab
+                     SELECT finish, (SELECT id FROM tasks INDEXED BY ", $by_lab, "
+                                     WHERE ", $ready, $of_lab, " AND tasks.lab = labs.lab
                                      ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
                      FROM labs
                      UNION ALL
-                     SELECT finish, (SELECT id FROM tasks ", $by_job, "
-                                     WHERE ", $ready, "
+                     SELECT finish, (SELECT id FROM tasks INDEXED BY ", $by_job, "
+                                     WHERE ", $ready, " AND job IS NOT NULL
                                        AND job = (SELECT id FROM jobs
                                                   WHERE jobs.state = 'running' AND jobs.lab = labs.lab
-                                                    AND EXISTS (SELECT 1 FROM tasks ", $by_job, "
-                                                                WHERE job = jobs.id AND ", $ready, ")
+                                                    AND EXISTS (SELECT 1 FROM tasks INDEXED BY ", $by_job, "
+                                                                WHERE job = jobs.id AND job IS NOT NULL
+                                                                  AND ", $ready, ")
                                                   ORDER BY priority DESC, id LIMIT 1)
                                      ORDER BY ordinal LIMIT 1)
                      FROM labs)
@@ -161,37 +182,30 @@ macro_rules! take_text {
     };
 }
 
-/// The condition for tasks of the light worker: short ones, of jobs that have begun.
-macro_rules! light {
-    () => {
-        "AND light = 1 AND (job IS NULL OR EXISTS
-             (SELECT 1 FROM jobs WHERE id = tasks.job AND state = 'running'))"
-    };
-}
-
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
     fn look(self) -> &'static str {
         match self {
-            Self::Local => look_text!("", ""),
-            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "INDEXED BY tasks_others"),
-            Self::Light => look_text!(light!(), "INDEXED BY tasks_light"),
-            Self::Pool(_) => look_text!("AND kind = 'tile'", ""),
+            Self::Local => look_text!("", "tasks_ready"),
+            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "tasks_others"),
+            Self::Light => look_text!("AND light = 1", "tasks_light", "tasks_light_of_job"),
+            Self::Pool(_) => look_text!("AND kind = 'tile'", "tasks_tiles"),
         }
     }
 
     fn take(self) -> &'static str {
         match self {
-            Self::Local => take_text!("", "", ""),
-            Self::WithoutTiles => take_text!(
-                "AND kind <> 'tile'",
-                "INDEXED BY tasks_others",
-                "INDEXED BY tasks_others_of_job"
-            ),
-            Self::Light => {
-                take_text!(light!(), "INDEXED BY tasks_light", "INDEXED BY tasks_light_of_job")
+            Self::Local => take_text!("", "", "tasks_ready", "tasks_ready_of_job"),
+            Self::WithoutTiles => {
+                take_text!("AND kind <> 'tile'", "", "tasks_others", "tasks_others_of_job")
             }
-            Self::Pool(_) => take_text!("AND kind = 'tile'", "", ""),
+            // It begins no job.
+            Self::Light => {
+                take_text!("AND light = 1", " AND job IS NULL", "tasks_light", "tasks_light_of_job")
+            }
+            Self::Pool(_) => {
+                take_text!("AND kind = 'tile'", "", "tasks_tiles", "tasks_tiles_of_job")
+            }
         }
     }
 }
@@ -416,7 +430,10 @@ mod tests {
         let store = Store::open(folder.path(), purpose).await.unwrap();
         // The look for leases that have run out reads what runs.
         let (no_tiles, light) = (Claimant::WithoutTiles, Claimant::Light);
+        let pool = Claimant::Pool("gpu");
         for (text, index, others) in [
+            (pool.look(), "INDEX tasks_tiles", 1),
+            (pool.take(), "INDEX tasks_tiles", 0),
             (no_tiles.look(), "INDEX tasks_others", 1),
             (no_tiles.take(), "INDEX tasks_others", 0),
             (light.look(), "INDEX tasks_light", 1),

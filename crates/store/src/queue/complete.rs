@@ -249,13 +249,16 @@ async fn finish(
     .execute(&mut *connection)
     .await?;
     sql!(
-        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost,
+             onnxruntime)
              SELECT kind, 1, coalesce(seconds, 0), iterations, passes, coalesce(seconds, 0),
-                 iif(kind = 'tile', cost * fraction, cost) FROM tasks WHERE id = ?
+                 iif(kind = 'tile', cost * fraction, cost), record ->> '$.onnxruntime'
+             FROM tasks WHERE id = ?
          ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
              iterations = iterations + excluded.iterations, passes = passes + excluded.passes,
              recent_seconds = 0.97 * recent_seconds + excluded.recent_seconds,
-             recent_cost = 0.97 * recent_cost + excluded.recent_cost",
+             recent_cost = 0.97 * recent_cost + excluded.recent_cost,
+             onnxruntime = coalesce(excluded.onnxruntime, onnxruntime)",
         [lease.task]
     )
     .execute(&mut *connection)

@@ -119,6 +119,7 @@ impl Store {
                 .execute(&mut *transaction)
                 .await?;
             self.drop_tiles(transaction, id).await?;
+            shorten_records(transaction, id).await?;
         }
         Ok(())
     }
@@ -135,6 +136,34 @@ impl Store {
         }
         Ok(())
     }
+}
+
+/// Shortens the records of a job that has succeeded. About 16 points of each convergence history remain. The
+/// assessments of tiles go, since the assemblies have read them, and lists of files that `result_files` has, too.
+async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
+    sql!(
+        "UPDATE tasks SET record = json_remove(record, '$.assessment'),
+             history = (SELECT json_group_array(json(value)) FROM json_each(history)
+                        WHERE key % (json_array_length(history) / 16 + 1) = 0
+                           OR key = json_array_length(history) - 1)
+         WHERE job = ? AND kind = 'tile'",
+        [id]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!(
+        "UPDATE tasks SET record = json_remove(record, '$.files') WHERE job = ? AND kind = 'assemble'",
+        [id]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!(
+        "DELETE FROM attempts WHERE outcome = 'done' AND task IN (SELECT id FROM tasks WHERE job = ?)",
+        [id]
+    )
+    .execute(connection)
+    .await?;
+    Ok(())
 }
 
 /// True if the job's tasks are still to be done.

@@ -250,8 +250,8 @@ pub(super) async fn held(
 /// Takes back the tasks of workers that have fallen silent.
 pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<()> {
     let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
-    let tasks = "SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?";
-    let tasks = sql_as!(tasks, [TaskState::Running, now, now + LONGEST_LEASE]);
+    let tasks = "SELECT id FROM tasks WHERE state = 'running' AND lease_until NOT BETWEEN ? AND ?";
+    let tasks = sql_as!(tasks, [now, now + LONGEST_LEASE]);
     for task in tasks.fetch_all(&mut *connection).await? {
         lose(connection, task, &silent).await?;
     }

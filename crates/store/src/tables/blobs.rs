@@ -236,7 +236,7 @@ impl Store {
 
     /// Number and bytes of all stored files.
     pub async fn blob_totals(&self) -> Result<(u64, u64)> {
-        let totals = "SELECT count(*), coalesce(sum(size), 0) FROM blobs";
+        let totals = "SELECT coalesce(sum(files), 0), coalesce(sum(bytes), 0) FROM stored_files";
         sql_as!(totals).fetch_one(&self.readers).await
     }
 }

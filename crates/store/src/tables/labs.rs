@@ -22,11 +22,9 @@ pub struct LabRow {
     pub max_jobs: Option<u64>,
     /// Jobs that wait and run.
     pub jobs: u64,
-    /// Planned CPU-seconds that are left of them.
-    pub cost_left: f64,
 }
 
-from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs, cost_left });
+from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs });
 
 /// What a lab has here.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -72,13 +70,15 @@ impl Store {
     pub async fn lab_use(&self, lab: &Lab) -> Result<LabUse> {
         let found = sql_as!(
             "SELECT
-                 (SELECT count(*) FROM holdings WHERE lab = ?1) AS uploads,
-                 (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                  WHERE lab = ?1) AS upload_bytes,
-                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE lab = ?1)
-                 + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                    WHERE lab = ?1 AND thing IS NOT NULL AND result IS NOT NULL) AS result_bytes,
-                 (SELECT count(*) FROM jobs WHERE lab = ?1 AND finished_at IS NULL) AS jobs",
+                 coalesce((SELECT files FROM files_of_labs WHERE lab = ?1 AND kind = 'upload'), 0)
+                     AS uploads,
+                 coalesce((SELECT bytes FROM files_of_labs WHERE lab = ?1 AND kind = 'upload'), 0)
+                     AS upload_bytes,
+                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs_by_state WHERE lab = ?1)
+                 + coalesce((SELECT bytes FROM files_of_labs WHERE lab = ?1 AND kind = 'movie'), 0)
+                     AS result_bytes,
+                 (SELECT coalesce(sum(jobs), 0) FROM jobs_by_state
+                  WHERE lab = ?1 AND state IN ('queued', 'running', 'cancelling')) AS jobs",
             [lab]
         );
         found.fetch_one(&self.readers).await
@@ -98,13 +98,11 @@ impl Store {
 
     async fn find_labs(&self, name: Option<&str>) -> Result<Vec<LabRow>> {
         let rows = sql_as!(
-            "SELECT labs.lab, share, max_bytes, max_jobs, count(jobs.id) AS jobs,
-                 coalesce(sum(tiles_left + others_left), 0.0) AS cost_left
-             FROM labs
-             LEFT JOIN jobs ON jobs.lab = labs.lab AND finished_at IS NULL
-             LEFT JOIN job_sums ON job = jobs.id
-             WHERE ?1 IS NULL OR labs.lab = ?1
-             GROUP BY labs.lab ORDER BY labs.lab",
+            "SELECT lab, share, max_bytes, max_jobs,
+                 (SELECT coalesce(sum(jobs), 0) FROM jobs_by_state
+                  WHERE jobs_by_state.lab = labs.lab AND state IN ('queued', 'running', 'cancelling'))
+                     AS jobs
+             FROM labs WHERE ?1 IS NULL OR lab = ?1 ORDER BY lab",
             [name]
         );
         rows.fetch_all(&self.readers).await
@@ -115,9 +113,9 @@ impl Store {
         let rows: Vec<(Lab, u64, f64, f64, u64, Option<Timestamp>)> = sql_as!(
             "SELECT labs.lab, coalesce(jobs_begun, 0), coalesce(wait_seconds, 0.0),
                  coalesce(cpu_seconds, 0.0),
-                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE jobs.lab = labs.lab)
-                 + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                    WHERE tasks.lab = labs.lab AND thing IS NOT NULL AND result IS NOT NULL),
+                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs_by_state WHERE jobs_by_state.lab = labs.lab)
+                 + coalesce((SELECT bytes FROM files_of_labs
+                             WHERE files_of_labs.lab = labs.lab AND kind = 'movie'), 0),
                  (SELECT min(created_at) FROM jobs
                   WHERE jobs.lab = labs.lab AND finished_at IS NULL AND started_at IS NULL)
              FROM labs LEFT JOIN lab_totals USING (lab) ORDER BY labs.lab",
@@ -125,9 +123,7 @@ impl Store {
         .fetch_all(&self.readers)
         .await?;
         let counted: Vec<(Lab, JobState, u64)> =
-            sql_as!("SELECT lab, state, count(*) FROM jobs GROUP BY lab, state")
-                .fetch_all(&self.readers)
-                .await?;
+            sql_as!("SELECT lab, state, jobs FROM jobs_by_state").fetch_all(&self.readers).await?;
         let now = Timestamp::now();
         let figures = rows.into_iter().map(|row| {
             let (lab, jobs_begun, wait_seconds, cpu_seconds, result_bytes, oldest) = row;
@@ -201,7 +197,13 @@ impl Store {
         if removed.rows_affected() == 0 {
             return Err(StoreError::missing("lab", lab.as_str()));
         }
-        sql!("DELETE FROM lab_totals WHERE lab = ?", [lab]).execute(&mut *transaction).await?;
+        for totals in [
+            "DELETE FROM lab_totals WHERE lab = ?",
+            "DELETE FROM jobs_by_state WHERE lab = ?",
+            "DELETE FROM files_of_labs WHERE lab = ?",
+        ] {
+            sql!(totals, [lab]).execute(&mut *transaction).await?;
+        }
         Ok(transaction.commit().await?)
     }
 }

@@ -2,6 +2,7 @@
 
 pub(super) mod blobs;
 pub(super) mod calibrations;
+mod changes;
 pub(super) mod jobs;
 pub(super) mod keys;
 pub(super) mod labs;
@@ -15,17 +16,19 @@ pub(super) mod results;
 pub(super) mod sums;
 pub(super) mod tasks;
 mod tokens;
+mod totals;
 pub(super) mod workers;
 
 pub use blobs::{Blob, BlobRow, Origin};
 pub use calibrations::{Calibration, NewCalibration};
+pub use changes::{Change, Changes};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
 pub use labs::{Entitlement, LabFigures, LabRow, LabUse, share_error};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
-pub use requests::{Asked, Request, RequestMark};
+pub use requests::{Asked, Request};
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
 pub use workers::{WorkerPlace, WorkerRow, WorkerTask};

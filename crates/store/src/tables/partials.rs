@@ -376,10 +376,11 @@ pub async fn promised(connection: &mut SqliteConnection) -> Result<u64> {
                  FROM partials WHERE result IS NULL)
               + (SELECT coalesce(sum(prepared_bytes * iif(request ->> '$.captures' IS NULL, 1, 2)), 0)
                  FROM requests WHERE prepared_bytes > 0)
+              + (SELECT coalesce(sum(disk_bytes), 0) FROM jobs_by_state WHERE state = 'queued')
               + (SELECT coalesce(sum(disk_bytes * (
                      SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
                      FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
-                 FROM jobs WHERE finished_at IS NULL)",
+                 FROM jobs WHERE state IN ('running', 'cancelling'))",
         [TaskState::Done, FIRST_RESERVE]
     )
     .fetch_one(connection)

@@ -43,14 +43,6 @@ pub enum Asked<T> {
     Pending(Box<Request>),
 }
 
-/// Changes when a calibration, measurement or model does.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RequestMark {
-    /// Ordinal, state and progress of the latest task.
-    task: Option<(i64, TaskState, f64)>,
-    name: Option<Label>,
-}
-
 impl Made {
     /// The kind of thing that a submission makes.
     pub fn of(submission: &Submission) -> Self {
@@ -158,29 +150,6 @@ impl Store {
             None => Asked::Pending(Box::new(request)),
         };
         Ok(Page { items: page.items.into_iter().map(asked).collect(), more: page.more })
-    }
-
-    /// A mark of each calibration, measurement or model, by its lab and identifier.
-    pub async fn request_marks<Id>(&self, what: Made) -> Result<HashMap<(Lab, Id), RequestMark>>
-    where
-        Id: From<ThingId> + Eq + std::hash::Hash,
-    {
-        type Found = (Lab, ThingId, Option<Label>, Option<i64>, Option<TaskState>, Option<f64>);
-        // The columns are those of the row with the largest ordinal.
-        let rows: Vec<Found> = sql_as!(
-            "SELECT requests.lab, requests.id, name, max(ordinal), state, fraction
-             FROM requests LEFT JOIN tasks ON thing = requests.id WHERE what = ?
-             GROUP BY requests.id",
-            [what.into_str()]
-        )
-        .fetch_all(&self.readers)
-        .await?;
-        let mark = |(lab, id, name, ordinal, state, fraction): Found| {
-            let task = ordinal.zip(state).zip(fraction);
-            let task = task.map(|((ordinal, state), fraction)| (ordinal, state, fraction));
-            ((lab, id.into()), RequestMark { task, name })
-        };
-        Ok(rows.into_iter().map(mark).collect())
     }
 
     /// Removes a request that its check refused. False if there is no such request, as of captures that passed the

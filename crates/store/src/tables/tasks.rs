@@ -142,8 +142,16 @@ impl Store {
     /// What is known of all tasks of a job that are done, in order.
     pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>> {
         let rows = sql!(
-            "SELECT kind, snapshot, snapshots, tile, record, seconds, attempt FROM tasks
-             WHERE job = ? AND state = ? ORDER BY ordinal",
+            // A record that was shortened gets its files back.
+            "SELECT kind, snapshot, snapshots, tile, seconds, attempt,
+                 iif(kind = 'assemble' AND record ->> '$.summary' IS NOT NULL
+                         AND record ->> '$.files' IS NULL,
+                     json_set(record, '$.files',
+                         (SELECT json_group_array(json_object('name', name, 'size', size, 'sha256', sha256))
+                          FROM result_files
+                          WHERE result_files.job = tasks.job AND result_files.snapshot = tasks.snapshot)),
+                     record) AS record
+             FROM tasks WHERE job = ? AND state = ? ORDER BY ordinal",
             [job, TaskState::Done]
         )
         .fetch_all(&self.readers)
@@ -193,13 +201,10 @@ impl Store {
         Ok(history)
     }
 
-    /// Version of ONNX Runtime that the last worker told that finished a tile with it; none before.
+    /// Version of ONNX Runtime that the last worker reported which finished a tile with it; none before.
     pub async fn last_onnxruntime(&self) -> Result<Option<String>> {
         let version = sql_as!(
-            "SELECT record ->> 'onnxruntime' FROM tasks
-             WHERE state = ? AND kind = 'tile' AND record ->> 'onnxruntime' IS NOT NULL
-             ORDER BY job DESC LIMIT 1",
-            [TaskState::Done]
+            "SELECT onnxruntime FROM totals WHERE kind = 'tile' AND onnxruntime IS NOT NULL"
         )
         .fetch_optional(&self.readers)
         .await?;
@@ -214,7 +219,7 @@ impl Store {
     /// The number of tasks by kind and state, with zeros for what there is none of.
     pub async fn task_counts(&self) -> Result<TaskCounts> {
         let found: Vec<(String, TaskState, u64)> =
-            sql_as!("SELECT kind, state, count(*) FROM tasks GROUP BY kind, state")
+            sql_as!("SELECT kind, state, tasks FROM tasks_by_state")
                 .fetch_all(&self.readers)
                 .await?;
         let mut counts = TaskCounts::new();

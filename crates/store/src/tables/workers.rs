@@ -9,7 +9,7 @@ use sqlx::sqlite::SqliteRow;
 use crate::Store;
 use crate::columns::{Columns, FromRow, from_row, sql, sql_as};
 use crate::error::Result;
-use engine::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
+use engine::job::{CalibrationId, JobId, Timestamp, WorkerId};
 
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerRow {
@@ -81,9 +81,9 @@ impl Store {
                  coalesce(job, (SELECT id FROM jobs WHERE id = thing)) AS job,
                  (SELECT id FROM requests WHERE id = thing AND what = 'calibration') AS calibration,
                  kind, snapshot, tile, stage
-             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
+             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = 'running'
              WHERE seen_at >= ? AND workers.light = 0 ORDER BY workers.id",
-            [TaskState::Running, since(age)]
+            [since(age)]
         )
         .fetch_all(&self.readers)
         .await?;
