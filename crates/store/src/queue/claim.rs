@@ -143,7 +143,8 @@ macro_rules! look_text {
 }
 
 /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of the
-/// lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see [`take`].
+/// lab whose turn it is, of movies before jobs, of the jobs that have begun before others, of the oldest one.
+/// Parameters: see [`take`].
 macro_rules! take_text {
     ($kinds:expr, $of_lab:literal, $by_lab:literal, $by_job:literal) => {
         take_text!(@
@@ -175,7 +176,7 @@ macro_rules! take_text {
                  JOIN tasks ON tasks.id = task
                  LEFT JOIN jobs ON jobs.id = job
                  ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
-                     jobs.state = 'running' DESC, job, ordinal, tasks.id
+                     job IS NULL DESC, jobs.state = 'running' DESC, job, ordinal, tasks.id
                  LIMIT 1)
              RETURNING id, job, thing, lab, kind, snapshot, snapshots, tile, attempt, cost"
         )

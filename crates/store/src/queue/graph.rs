@@ -12,8 +12,8 @@ use engine::job::{JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState, Thi
 const CHECK_PRIORITY: i32 = 2000;
 /// Above that of every job: people wait for calibrations before they measure.
 const CALIBRATION_PRIORITY: i32 = 1000;
-/// Below that of every job: nobody waits for a reconstruction because somebody wants to look at another.
-const MOVIE_PRIORITY: i32 = -1000;
+/// That of most jobs: movies take the turns of their lab, and come before its jobs, which take longer.
+const MOVIE_PRIORITY: i32 = 0;
 
 pub async fn insert(
     connection: &mut SqliteConnection,
