@@ -252,6 +252,14 @@ CREATE INDEX jobs_calibration ON jobs (calibration);
 CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
 
+CREATE TABLE removals (
+    -- Files whose rows are deleted, until the files are gone, too. A start after a kill goes on with them.
+    kind       TEXT NOT NULL CHECK (kind IN ('blob', 'results')),
+    id         TEXT NOT NULL, -- SHA-256 of the blob, or the job
+    created_at INTEGER, -- of the deleted row; NULL where the time of the file counts
+    PRIMARY KEY (kind, id)
+) STRICT, WITHOUT ROWID;
+
 CREATE TABLE jobs_by_state (
     -- Running totals of `jobs`: figures cost the same for any number of jobs.
     lab          TEXT NOT NULL,

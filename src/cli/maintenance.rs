@@ -41,6 +41,7 @@ async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreErro
     // 1. What crashes have left.
     store.advance_generation().await?;
     store.dir().sweep_tmp()?;
+    store.finish_removals().await?;
     let orphans = store.quarantine_orphans(false).await?;
     store.empty_quarantine(store.ago(DAY * settings.quarantine_days).await?).await?;
     let full = store.dir().disk()?.0 < settings.low_water_bytes.max(settings.min_free_bytes);

@@ -65,6 +65,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     settings.check(store.is_open().await?)?;
     // 2. What an earlier server left.
     let swept = store.dir().sweep_tmp()?;
+    store.finish_removals().await?;
     store.quarantine_orphans(accept_database).await?;
     store.forget_workers(Duration::from_secs(60)).await?;
     // 3. The address, for those who wait for it; who has it may send a signal.

@@ -146,9 +146,15 @@ impl Store {
 async fn is_known(connection: &mut sqlx::SqliteConnection, thing: &Thing) -> Result<bool> {
     let query = match thing {
         Thing::Blob(sha256) => {
-            sql!("SELECT 1 FROM blobs WHERE sha256 = ?", [sha256])
+            let query = "SELECT 1 FROM blobs WHERE sha256 = ?1
+                         UNION ALL SELECT 1 FROM removals WHERE kind = 'blob' AND id = ?1";
+            sql!(query, [sha256])
         }
-        Thing::Results(job) => sql!("SELECT 1 FROM jobs WHERE id = ?", [job]),
+        Thing::Results(job) => {
+            let query = "SELECT 1 FROM jobs WHERE id = ?1
+                         UNION ALL SELECT 1 FROM removals WHERE kind = 'results' AND id = ?1";
+            sql!(query, [job])
+        }
         Thing::Partial(id) => {
             let query = "SELECT 1 FROM partials WHERE id = ? AND result IS NULL";
             sql!(query, [id])

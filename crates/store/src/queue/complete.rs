@@ -117,7 +117,12 @@ impl Store {
             job::settle(&mut transaction, job).await?;
             sums::recount(&mut transaction, job).await?;
         }
-        transaction.commit().await?;
+        // The end of a job removes its tiles.
+        if kind == TaskKind::Manifest {
+            self.commit_removals(transaction).await?;
+        } else {
+            transaction.commit().await?;
+        }
         Ok(Heartbeat::Continue)
     }
 

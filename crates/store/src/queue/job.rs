@@ -7,7 +7,7 @@ use crate::columns::{Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::jobs::{self, JobChanges};
 use crate::tables::sums;
-use crate::{Store, records};
+use crate::{Store, records, removal};
 use engine::job::{Assessment, IllegalTransition, JobId, JobState, Lab, TaskState};
 
 impl Store {
@@ -78,8 +78,7 @@ impl Store {
         self.drop_movies(&mut transaction, id, None).await?;
         graph::restart(&mut transaction, id).await?;
         sums::recount(&mut transaction, id).await?;
-        transaction.commit().await?;
-        Ok(())
+        self.commit_removals(transaction).await
     }
 
     /// Deletes a job that has come to its end, with all that it has made.
@@ -99,11 +98,8 @@ impl Store {
         self.drop_tiles(&mut transaction, id).await?;
         self.drop_movies(&mut transaction, id, None).await?;
         sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
-        // Under the lock and before the commit, so that no row is left whose files are gone for
-        // longer than a crash takes; a second DELETE then removes the row.
-        self.discard(self.dir().results(id), None).await?;
-        transaction.commit().await?;
-        Ok(())
+        removal::note_results(&mut transaction, id).await?;
+        self.commit_removals(transaction).await
     }
 
     /// Marks a job as succeeded, unless it is being cancelled. Its tiles are needed no more.

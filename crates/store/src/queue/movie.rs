@@ -60,7 +60,7 @@ impl Store {
         .await?;
         self.drop_movies(&mut transaction, job.id, Some(place)).await?;
         if let Some(reason) = failed {
-            transaction.commit().await?;
+            self.commit_removals(transaction).await?;
             return Ok(Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into())));
         }
         quota::check(&mut transaction, &job.lab, None, job.spec.movie_bytes(snapshot)).await?;
@@ -69,7 +69,7 @@ impl Store {
         known.ok_or_else(|| StoreError::missing("job", job.id))?;
         let (kind, cost) = (TaskKind::Movie { snapshot }, job.spec.movie_cost(snapshot));
         graph::insert_for(&mut transaction, (&job.lab, job.id.into()), kind, cost).await?;
-        transaction.commit().await?;
+        self.commit_removals(transaction).await?;
         Ok(Movie::Asked(None))
     }
 

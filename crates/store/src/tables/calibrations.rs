@@ -156,8 +156,7 @@ impl Store {
         if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
             self.release(&mut transaction, prepared).await?;
         }
-        transaction.commit().await?;
-        Ok(())
+        self.commit_removals(transaction).await
     }
 }
 

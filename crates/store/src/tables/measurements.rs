@@ -137,7 +137,7 @@ impl Store {
         if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
             self.release(&mut transaction, prepared).await?;
         }
-        Ok(transaction.commit().await?)
+        self.commit_removals(transaction).await
     }
 }
 
