@@ -220,7 +220,7 @@ impl From<StoreError> for ApiError {
             StoreError::Quota { .. } => Code::QuotaExceeded,
             StoreError::ManyPartials(_) => Code::TooManyUploads,
             StoreError::ManyChecks(_) => Code::TooManyChecks,
-            StoreError::NoRoom { .. } => Code::InsufficientStorage,
+            StoreError::NoRoom { .. } | StoreError::NoShare { .. } => Code::InsufficientStorage,
             StoreError::Short { .. } => {
                 tracing::error!(%error, "bytes of an upload are lost");
                 Code::UploadDamaged

@@ -185,7 +185,7 @@ async fn insert(
     let lab = access.lab.clone();
     let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
     let new = NewJob { most_jobs, lab, spec, key };
-    app.admission.with_room("the job", needed, app.store.add_job(new)).await
+    app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new)).await
 }
 
 /// Checks a request against the measurement that it names.

@@ -211,7 +211,7 @@ pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
             counter!("sci_recon_denoiser_passes_total").absolute(done.passes);
         }
     }
-    gauge!("sci_recon_disk_promised_bytes").set(app.store.promised_bytes().await? as f64);
+    gauge!("sci_recon_disk_promised_bytes").set(app.store.reservations().await?.total() as f64);
     let workers = app.store.live_workers(WORKER_AGE).await?.len();
     gauge!("sci_recon_workers").set(workers as f64);
     let (files, bytes) = app.store.blob_totals().await?;

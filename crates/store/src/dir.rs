@@ -10,6 +10,15 @@ use super::error::{Result, StoreError};
 use super::locked::LockedFile;
 use engine::job::{JobId, PartialId, Sha256};
 
+/// Reserved bytes as one lab sees them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Reserved {
+    pub own: u64,
+    pub others: u64,
+    /// True if other labs are on record, for which room must be left.
+    pub is_shared: bool,
+}
+
 /// The folder with all that the service keeps.
 ///
 /// ```text
@@ -147,21 +156,28 @@ impl DataDir {
         Ok((stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize))
     }
 
-    /// Refuses `what` if the disk has no room for its `needed` bytes beside those that are `promised` to others and
-    /// those that stay free.
-    /// Errors: [`StoreError::NoRoom`].
+    /// Refuses `what` if the disk has no room for its `needed` bytes beside those that are reserved and the `min_free`
+    /// ones that stay free. Where there are other labs, a lab may reserve half of what these leave, so that room
+    /// remains for each of them.
+    /// Errors: [`StoreError::NoRoom`]; [`StoreError::NoShare`].
     pub fn check_room(
         &self,
         what: &'static str,
         needed: u64,
-        promised: u64,
-        reserve: u64,
+        reserved: Reserved,
+        min_free: u64,
     ) -> Result<()> {
         let free = self.disk()?.0;
-        if free >= promised.saturating_add(needed).saturating_add(reserve) {
-            return Ok(());
+        let Reserved { own, others, is_shared } = reserved;
+        let promised = own.saturating_add(others);
+        if free < promised.saturating_add(needed).saturating_add(min_free) {
+            return Err(StoreError::NoRoom { what, needed, free, promised, reserve: min_free });
         }
-        Err(StoreError::NoRoom { what, needed, free, promised, reserve })
+        let share = free.saturating_sub(min_free).saturating_sub(others) / 2;
+        if is_shared && own.saturating_add(needed) > share {
+            return Err(StoreError::NoShare { what, needed, own, share });
+        }
+        Ok(())
     }
 }
 

@@ -48,8 +48,8 @@ use sqlx::sqlite::{
 use sqlx::{Connection, SqlitePool};
 
 pub use backup::Backup;
-pub use dir::DataDir;
 pub(crate) use dir::on_files;
+pub use dir::{DataDir, Reserved};
 pub use error::StoreError;
 pub use identity::Purpose;
 pub use integrity::Audit;
@@ -68,8 +68,8 @@ pub use tables::{
     Asked, Blob, BlobRow, Calibration, Change, Changes, Entitlement, FIRST_RESERVE, FoundPartial,
     Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model,
     NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request,
-    RequestKey, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
-    WorkerPlace, WorkerRow, WorkerTask, share_error,
+    RequestKey, Reservations, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
+    TileState, Token, WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

@@ -50,7 +50,9 @@ impl From<StoreError> for End {
         let refused = |code| Self::Refused(Refusal::new(code, error.to_string()));
         match &error {
             StoreError::Quota { .. } => refused(RefusalCode::QuotaExceeded),
-            StoreError::NoRoom { .. } => refused(RefusalCode::InsufficientStorage),
+            StoreError::NoRoom { .. } | StoreError::NoShare { .. } => {
+                refused(RefusalCode::InsufficientStorage)
+            }
             StoreError::Damaged { .. } => refused(RefusalCode::UploadDamaged),
             full if full.is_disk_full() => Self::Refused(Refusal::disk_full()),
             _ => Self::Failed(TaskError::Transport(error.into())),

@@ -12,8 +12,9 @@ use crate::staging::{StagedBlob, StagedDir};
 use crate::tables::blobs::Origin;
 use crate::tables::calibrations::{self, NewCalibration};
 use crate::tables::measurements::{self, NewMeasurement};
+use crate::tables::reservations::reservations;
 use crate::tables::tasks::Owner;
-use crate::tables::{models, partials, quota, reports, requests, results, sums};
+use crate::tables::{models, quota, reports, requests, results, sums};
 use crate::{Store, dir, on_files};
 use engine::intake::Refusal;
 use engine::job::{
@@ -178,8 +179,8 @@ impl Store {
     }
 
     /// Reserves `bytes` for the result of a check. The disk must have room for `copies` of them above `min_free`.
-    /// Errors: [`StoreError::Quota`]; [`StoreError::NoRoom`]; [`StoreError::Interrupted`] if the task is not the
-    /// worker's any more.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NoRoom`]; [`StoreError::NoShare`]; [`StoreError::Interrupted`] if
+    /// the task is not the worker's any more.
     pub async fn promise(
         &self,
         lease: &Lease,
@@ -194,8 +195,8 @@ impl Store {
         requests::promise(&mut transaction, id, 0).await?;
         let request = requests::find(&mut transaction, id).await?;
         quota::check(&mut transaction, &request.lab, request.token, bytes).await?;
-        let promised = partials::promised(&mut transaction).await?;
-        self.dir().check_room("the upload", copies * bytes, promised, min_free)?;
+        let reserved = reservations(&mut transaction).await?.seen_by(&request.lab);
+        self.dir().check_room("the upload", copies * bytes, reserved, min_free)?;
         requests::promise(&mut transaction, id, bytes).await?;
         Ok(transaction.commit().await?)
     }

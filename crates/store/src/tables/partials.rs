@@ -6,8 +6,6 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use sqlx::SqliteConnection;
-
 use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::locked::LockedFile;
@@ -15,7 +13,7 @@ use crate::rows::Page;
 use crate::tables::keys::{self, Inserted, Made, RequestKey};
 use crate::tables::quota;
 use crate::{Store, dir, on_files};
-use engine::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
+use engine::job::{Lab, PartialId, Sha256, Timestamp, TokenId};
 
 #[derive(Debug, Clone)]
 pub struct NewPartial {
@@ -361,32 +359,6 @@ impl Store {
         }
         Ok(ended)
     }
-
-    /// Bytes of the disk that are reserved and not written yet.
-    pub async fn promised_bytes(&self) -> Result<u64> {
-        promised(&mut *self.readers.acquire().await?).await
-    }
-}
-
-/// Bytes of the disk that are reserved and not written yet: the next ones of uploads in pieces, prepared arrays, and
-/// snapshots of jobs. Masks from captures count twice: they are scaled at the end.
-pub async fn promised(connection: &mut SqliteConnection) -> Result<u64> {
-    let bytes: f64 = sql_as!(
-        "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
-                 FROM partials WHERE result IS NULL)
-              + (SELECT coalesce(sum(prepared_bytes * iif(request ->> '$.captures' IS NULL, 1, 2)), 0)
-                 FROM requests WHERE prepared_bytes > 0)
-              + (SELECT coalesce(sum(disk_bytes), 0) FROM jobs_by_state WHERE state = 'queued')
-              + (SELECT coalesce(sum(disk_bytes * (
-                     SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
-                     FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
-                 FROM jobs WHERE state IN ('running', 'cancelling'))",
-        [TaskState::Done, FIRST_RESERVE]
-    )
-    .fetch_one(connection)
-    .await?;
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a sum of bytes
-    Ok(bytes as u64)
 }
 
 fn after(age: Duration) -> Timestamp {

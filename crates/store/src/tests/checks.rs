@@ -31,7 +31,7 @@ impl Lab {
     }
 
     async fn promised(&self) -> u64 {
-        self.store.promised_bytes().await.unwrap()
+        self.store.reservations().await.unwrap().total()
     }
 }
 
