@@ -20,10 +20,17 @@ CREATE TABLE labs (
     -- handed out last, its start and its end.
     start     REAL NOT NULL DEFAULT 0,
     finish    REAL NOT NULL DEFAULT 0,
-    -- Limits; NULL for no limit.
+    -- Limits; NULL for the default.
     max_bytes INTEGER CHECK (max_bytes >= 0),
     max_jobs  INTEGER CHECK (max_jobs >= 0)
 ) STRICT, WITHOUT ROWID;
+
+CREATE TABLE default_limits (
+    -- Limits of labs without limits of their own, while several labs are on record. The service sets them at its start.
+    one       INTEGER PRIMARY KEY CHECK (one = 1),
+    max_bytes INTEGER NOT NULL,
+    max_jobs  INTEGER NOT NULL
+) STRICT;
 
 CREATE TABLE lab_totals (
     -- Counters that only grow, although jobs are deleted.

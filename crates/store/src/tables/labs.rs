@@ -16,9 +16,9 @@ pub struct LabRow {
     pub lab: Lab,
     /// Its share of the machine, beside the shares of the others that want it.
     pub share: f64,
-    /// Bytes that it may keep here; none: no limit.
+    /// Bytes that it may keep here; none: the default.
     pub max_bytes: Option<u64>,
-    /// Jobs that it may have waiting and running; none: no limit of its own.
+    /// Jobs that it may have waiting and running; none: the default.
     pub max_jobs: Option<u64>,
     /// Jobs that wait and run.
     pub jobs: u64,
@@ -160,6 +160,23 @@ impl Store {
         Ok(Entitlement { share: Some(share), max_bytes, max_jobs })
     }
 
+    /// Sets the limits of labs without limits of their own.
+    pub async fn set_default_limits(&self, max_bytes: u64, max_jobs: u64) -> Result<()> {
+        sql!(
+            "INSERT INTO default_limits VALUES (1, ?, ?) ON CONFLICT (one) DO UPDATE
+             SET max_bytes = excluded.max_bytes, max_jobs = excluded.max_jobs",
+            [max_bytes, max_jobs]
+        )
+        .execute(&self.writer)
+        .await?;
+        Ok(())
+    }
+
+    /// The limits that hold for a lab: bytes and jobs. `None` for no limit.
+    pub async fn limits(&self, lab: &Lab) -> Result<(Option<u64>, Option<u64>)> {
+        limits(&mut *self.readers.acquire().await?, lab).await
+    }
+
     /// Sets what a lab is entitled to. A lab that is not on record yet is put there.
     pub async fn entitle(&self, lab: &Lab, to: Entitlement) -> Result<()> {
         let mut transaction = self.write().await?;
@@ -222,6 +239,21 @@ const BELONGINGS: [(&str, &str); 8] = [
         "SELECT count(*) FROM partials WHERE lab = ? AND result IS NULL",
     ),
 ];
+
+/// As [`Store::limits`].
+pub async fn limits(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+) -> Result<(Option<u64>, Option<u64>)> {
+    let limits = sql_as!(
+        "SELECT coalesce((SELECT max_bytes FROM labs WHERE lab = ?1),
+                         (SELECT max_bytes FROM default_limits WHERE (SELECT count(*) FROM labs) > 1)),
+                coalesce((SELECT max_jobs FROM labs WHERE lab = ?1),
+                         (SELECT max_jobs FROM default_limits WHERE (SELECT count(*) FROM labs) > 1))",
+        [lab]
+    );
+    limits.fetch_one(connection).await
+}
 
 /// What is wrong with a share, if something is.
 pub fn share_error(share: f64) -> Option<&'static str> {

@@ -6,6 +6,7 @@ use sqlx::SqliteConnection;
 use crate::Store;
 use crate::columns::sql_as;
 use crate::error::{Result, StoreError};
+use crate::tables::labs;
 use engine::job::{Lab, TokenId};
 
 /// Checks of a lab that may wait and run at a time.
@@ -38,8 +39,7 @@ pub async fn check(
     token: Option<TokenId>,
     needed: u64,
 ) -> Result<()> {
-    let limit = "SELECT max_bytes FROM labs WHERE lab = ? AND max_bytes IS NOT NULL";
-    if let Some(limit) = sql_as!(limit, [lab]).fetch_optional(&mut *connection).await? {
+    if let (Some(limit), _) = labs::limits(connection, lab).await? {
         let kept = lab_bytes(connection, lab).await?;
         within("lab", kept, needed, limit)?;
     }
@@ -96,9 +96,9 @@ async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> 
 /// a lab that has less than an equal part of them is let in nevertheless, so that none locks the others out.
 /// Errors: [`StoreError::QueueFull`].
 pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64) -> Result<()> {
-    let (all, own, limit): (u64, u64, Option<u64>) = sql_as!(
-        "SELECT coalesce(sum(jobs), 0), coalesce(sum(jobs) FILTER (WHERE lab = ?1), 0),
-             (SELECT max_jobs FROM labs WHERE lab = ?1)
+    let (_, limit) = labs::limits(connection, lab).await?;
+    let (all, own): (u64, u64) = sql_as!(
+        "SELECT coalesce(sum(jobs), 0), coalesce(sum(jobs) FILTER (WHERE lab = ?1), 0)
          FROM jobs_by_state WHERE state IN ('queued', 'running', 'cancelling')",
         [lab]
     )
