@@ -346,8 +346,16 @@ CREATE TABLE workers (
     pool       TEXT,
     device     TEXT,
     started_at INTEGER NOT NULL,
-    seen_at    INTEGER NOT NULL
-, light INTEGER NOT NULL DEFAULT 0) STRICT, WITHOUT ROWID;
+    seen_at    INTEGER NOT NULL,
+    light      INTEGER NOT NULL DEFAULT 0, -- 1 if it takes short tasks only
+    tiles      INTEGER NOT NULL DEFAULT 1  -- 1 if it takes tiles
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE tile_workers (
+    -- Last sign of life of a worker that takes tiles, among those that are no longer in `workers`.
+    one     INTEGER PRIMARY KEY CHECK (one = 1),
+    seen_at INTEGER NOT NULL
+) STRICT;
 
 CREATE TABLE totals (
     -- Counters by kind of task that only grow, although jobs are deleted.
@@ -473,6 +481,13 @@ END;
 CREATE TRIGGER result_files_remove AFTER DELETE ON result_files
 BEGIN
     UPDATE jobs SET result_bytes = result_bytes - OLD.size WHERE id = OLD.job;
+END;
+
+CREATE TRIGGER tile_workers_end AFTER DELETE ON workers
+    WHEN OLD.tiles = 1
+BEGIN
+    INSERT INTO tile_workers VALUES (1, OLD.seen_at)
+    ON CONFLICT (one) DO UPDATE SET seen_at = max(seen_at, excluded.seen_at);
 END;
 
 CREATE TRIGGER stored_files_add AFTER INSERT ON blobs

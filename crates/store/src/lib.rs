@@ -69,7 +69,7 @@ pub use tables::{
     Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model,
     NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request,
     RequestKey, Reservations, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
-    TileState, Token, WorkerPlace, WorkerRow, WorkerTask, share_error,
+    TileState, Token, WorkerPlace, WorkerRow, WorkerTakes, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

@@ -22,7 +22,7 @@ use tempfile::TempDir;
 use super::{
     Checked, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob,
     NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError, Work,
-    WorkerEnd, WorkerPlace,
+    WorkerEnd, WorkerPlace, WorkerTakes,
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
@@ -84,7 +84,7 @@ impl Lab {
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();
-        store.worker_started(worker, 1, &WorkerPlace::default(), false).await.unwrap();
+        store.worker_started(worker, 1, &WorkerPlace::default(), WorkerTakes::All).await.unwrap();
         let asked = Submission::Calibration(asked);
         let passed = Checked::Masks(facts, upload(b"prepared masks"));
         let calibration = make(&store, worker, asked, passed).await;

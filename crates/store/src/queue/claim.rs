@@ -12,10 +12,11 @@ use crate::Store;
 use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::calibrations::Calibration;
+use crate::tables::jobs;
 use crate::tables::measurements::Measurement;
 use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
-use crate::tables::{jobs, workers};
+use crate::tables::workers::{self, WorkerTakes};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Sha256, Submission, TaskKind,
     TaskStage, TaskState, ThingId, Timestamp, WorkerId,
@@ -185,6 +186,15 @@ macro_rules! take_text {
 
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
+    /// Which tasks a worker with these rights takes.
+    pub fn takes(self) -> WorkerTakes {
+        match self {
+            Self::Local | Self::Pool(_) => WorkerTakes::All,
+            Self::WithoutTiles => WorkerTakes::WithoutTiles,
+            Self::Light => WorkerTakes::ShortTasks,
+        }
+    }
+
     fn look(self) -> &'static str {
         match self {
             Self::Local => look_text!("", "tasks_ready"),

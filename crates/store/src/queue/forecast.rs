@@ -100,7 +100,7 @@ impl Store {
                 left: row.read("left")?,
             });
         }
-        let workers = self.live_workers(WORKER_AGE).await?.len();
+        let workers = self.live_tile_workers(WORKER_AGE).await?;
         Ok(Forecast::new(&unfinished, labs, workers, self.rates().await?))
     }
 

@@ -33,4 +33,4 @@ pub use requests::{Asked, Request};
 pub use reservations::Reservations;
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
-pub use workers::{WorkerPlace, WorkerRow, WorkerTask};
+pub use workers::{WorkerPlace, WorkerRow, WorkerTakes, WorkerTask};
