@@ -66,6 +66,10 @@ async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreErro
         unused = store.collect(old).await?;
         jobs += store.remove_jobs(old, settings.low_water_bytes).await?;
     }
+    // 4. Room for a start on a full disk.
+    if let Err(error) = store.dir().keep_reserve(settings.min_free_bytes) {
+        tracing::warn!(%error, "there is no reserve for a start on a full disk");
+    }
     if orphans + uploads + jobs + unused > 0 {
         tracing::info!(orphans, uploads, jobs, unused, "cleaned up");
     }

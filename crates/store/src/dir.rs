@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use rustix::fs::FallocateFlags;
+
 use super::error::{Result, StoreError};
 use super::locked::LockedFile;
 use engine::job::{JobId, PartialId, Sha256};
@@ -19,6 +21,9 @@ pub struct Reserved {
     pub is_shared: bool,
 }
 
+/// Bytes of the reserve file: the write-ahead log of thousands of deletions.
+const RESERVE_BYTES: u64 = 32 << 20;
+
 /// The folder with all that the service keeps.
 ///
 /// ```text
@@ -31,6 +36,7 @@ pub struct Reserved {
 /// before-updates/       copies of the database from before updates of the program
 /// before-updates/kept/  files that were deleted in the days after an update, for a return to such a copy
 /// tmp/                  files that are being written, locked by their writers
+/// reserve               empty room for a start on a full disk
 /// ```
 #[derive(Debug, Clone)]
 pub struct DataDir {
@@ -146,6 +152,34 @@ impl DataDir {
             }
         }
         Ok(removed)
+    }
+
+    fn reserve(&self) -> PathBuf {
+        self.root.join("reserve")
+    }
+
+    /// Removes the reserve file if the disk is full, so that a service can start and delete. True if it did.
+    pub(crate) fn give_up_reserve(&self) -> Result<bool> {
+        if self.disk()?.0 >= RESERVE_BYTES / 4 || !self.reserve().exists() {
+            return Ok(false);
+        }
+        remove(&self.reserve()).map(|()| true)
+    }
+
+    /// Makes the reserve file, if it is missing and the disk has room for it beside the `min_free` bytes that stay free.
+    pub fn keep_reserve(&self, min_free: u64) -> Result<()> {
+        let path = self.reserve();
+        if path.exists() || self.disk()?.0 < min_free.saturating_add(2 * RESERVE_BYTES) {
+            return Ok(());
+        }
+        let draft = self.tmp().join("reserve");
+        let file = File::create(&draft).map_err(StoreError::io("make", &draft))?;
+        let allocated = rustix::fs::fallocate(&file, FallocateFlags::empty(), 0, RESERVE_BYTES);
+        if let Err(error) = allocated {
+            remove(&draft)?;
+            return Err(StoreError::io("reserve room for", &path)(error.into()));
+        }
+        rename_durably(&draft, &path)
     }
 
     /// Bytes that are free on the disk of this folder, and its size.

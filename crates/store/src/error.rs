@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use engine::job::IllegalTransition;
+use formats::DiskTrouble;
 
 pub type Result<T, E = StoreError> = std::result::Result<T, E>;
 
@@ -162,14 +163,23 @@ impl StoreError {
         }
     }
 
-    /// True if the disk is full or a quota is used up.
-    pub fn is_disk_full(&self) -> bool {
-        use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+    /// The state of the disk that is the cause, if it is.
+    pub fn disk_trouble(&self) -> Option<DiskTrouble> {
         match self {
-            Self::Io { source, .. } => matches!(source.kind(), StorageFull | QuotaExceeded),
-            // SQLITE_FULL
-            Self::Database(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
-            _ => false,
+            Self::Io { source, .. } => DiskTrouble::of(source),
+            Self::Database(sqlx::Error::Database(error)) => {
+                match error.code()?.parse::<u32>().ok()? {
+                    // SQLITE_FULL
+                    13 => Some(DiskTrouble::Full),
+                    // SQLITE_READONLY, whose reason is in the upper bits, and the errors of SQLite for a write
+                    // (SQLITE_IOERR_WRITE) or a sync (SQLITE_IOERR_FSYNC) that a read-only file system refuses
+                    code if code & 0xff == 8 || matches!(code, 778 | 1034) => {
+                        Some(DiskTrouble::ReadOnly)
+                    }
+                    _ => None,
+                }
+            }
+            _ => None,
         }
     }
 }

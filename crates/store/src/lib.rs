@@ -108,6 +108,11 @@ impl Store {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
+        if serves && dir.give_up_reserve()? {
+            tracing::warn!(
+                "the disk is full: its reserve is given up, so that jobs and files can be deleted"
+            );
+        }
         identity::check(&dir, purpose, schema.newest()).await?;
         dir.fill()?;
         let copy = if serves { upgrade::save(&dir, schema.newest()).await? } else { None };

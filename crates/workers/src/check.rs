@@ -54,8 +54,10 @@ impl From<StoreError> for End {
                 refused(RefusalCode::InsufficientStorage)
             }
             StoreError::Damaged { .. } => refused(RefusalCode::UploadDamaged),
-            full if full.is_disk_full() => Self::Refused(Refusal::disk_full()),
-            _ => Self::Failed(TaskError::Transport(error.into())),
+            _ => match error.disk_trouble() {
+                Some(trouble) => Self::Refused(Refusal::disk_trouble(trouble)),
+                None => Self::Failed(TaskError::Transport(error.into())),
+            },
         }
     }
 }
