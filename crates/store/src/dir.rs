@@ -17,7 +17,7 @@ use engine::job::{JobId, PartialId, Sha256};
 pub struct Reserved {
     pub own: u64,
     pub others: u64,
-    /// True if other labs are on record, for which room must be left.
+    /// True if there are other labs, which need room, too.
     pub is_shared: bool,
 }
 
@@ -76,7 +76,7 @@ impl DataDir {
         self.root.join("sci-recon.db")
     }
 
-    /// Where the file with this hash lies, if it is in the store.
+    /// Path of the file with this hash, if it is in the store.
     pub fn blob(&self, sha256: &Sha256) -> PathBuf {
         let hex = sha256.to_string();
         self.blobs().join(&hex[..2]).join(&hex[2..])
@@ -120,12 +120,12 @@ impl DataDir {
         self.before_updates().join("kept")
     }
 
-    /// What no row knows of is kept here for some days.
+    /// Folder that keeps files without a row for some days.
     pub(crate) fn quarantine(&self) -> PathBuf {
         self.root.join("quarantine")
     }
 
-    /// Takes the lock of the server, of which there is one for each folder.
+    /// Takes the lock of the server. Each folder has one.
     pub(crate) fn lock_server(&self) -> Result<LockedFile> {
         let path = self.root.join("server.lock");
         let file = File::create(&path).map_err(StoreError::io("make", &path))?;
@@ -166,7 +166,7 @@ impl DataDir {
         remove(&self.reserve()).map(|()| true)
     }
 
-    /// Makes the reserve file, if it is missing and the disk has room for it beside the `min_free` bytes that stay free.
+    /// Makes the reserve file, if it is missing and the disk has room for it and for `min_free` more bytes.
     pub fn keep_reserve(&self, min_free: u64) -> Result<()> {
         let path = self.reserve();
         if path.exists() || self.disk()?.0 < min_free.saturating_add(2 * RESERVE_BYTES) {
@@ -191,7 +191,7 @@ impl DataDir {
     }
 
     /// Refuses `what` if the disk has no room for its `needed` bytes beside those that are reserved and the `min_free`
-    /// ones that stay free. Where there are other labs, a lab may reserve half of what these leave, so that room
+    /// ones that stay free. If there are other labs, a lab may reserve half of the bytes that these leave, so that room
     /// remains for each of them.
     /// Errors: [`StoreError::NoRoom`]; [`StoreError::NoShare`].
     pub fn check_room(
@@ -256,13 +256,13 @@ pub(crate) fn restrict(path: &Path) -> Result<()> {
     fs::set_permissions(path, mode).map_err(StoreError::io("keep for its owner", path))
 }
 
-/// Renames a file or folder that is on the disk already, for good.
+/// Renames a synced file or folder durably.
 pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<()> {
     fs::rename(from, to).map_err(StoreError::io("move a file to", to))?;
     to.parent().map_or(Ok(()), sync_dir)
 }
 
-/// Makes one folder, for good. It may be there already.
+/// Makes one folder durably. It may exist already.
 pub(crate) fn make_dir_durably(path: &Path) -> Result<()> {
     match fs::create_dir(path) {
         Ok(()) => path.parent().map_or(Ok(()), sync_dir),
@@ -271,7 +271,7 @@ pub(crate) fn make_dir_durably(path: &Path) -> Result<()> {
     }
 }
 
-/// Removes a file or a folder with all in it. It may be gone already.
+/// Removes a file or a folder with its contents. It is no error if it does not exist.
 pub(crate) fn remove(path: &Path) -> Result<()> {
     let result = match fs::symlink_metadata(path) {
         Ok(meta) if meta.is_dir() => fs::remove_dir_all(path),

@@ -1,4 +1,4 @@
-//! What can go wrong in the store.
+//! Errors of the store.
 
 use std::path::{Path, PathBuf};
 
@@ -75,13 +75,13 @@ pub enum StoreError {
     Ended(engine::job::JobState),
     #[error("the hash should be {expected}, the bytes have {found}")]
     HashMismatch { expected: engine::job::Sha256, found: engine::job::Sha256 },
-    /// Of an upload in pieces, bytes are lost that were on the disk.
+    /// An upload in pieces has lost recorded bytes.
     #[error(
         "{found} bytes of upload {id} are on the disk, fewer than the {recorded} on record: delete it \
          and send the file again"
     )]
     Short { id: engine::job::PartialId, found: u64, recorded: u64 },
-    /// A stored file is gone, or its bytes are not those on record.
+    /// A stored file is missing or differs from its recorded hash.
     #[error("the {what} {name} is damaged on the disk of the service; {}", if *what == "result" {
         "retry its job, and it is made again"
     } else {
@@ -139,12 +139,12 @@ fn unchecked(id: engine::job::MeasurementId, error: Option<&str>) -> String {
 }
 
 impl StoreError {
-    /// There is no such thing of this kind.
+    /// The error for an identifier that does not exist.
     pub(super) fn missing(what: &'static str, id: impl ToString) -> Self {
         Self::NotFound { what, id: id.to_string() }
     }
 
-    /// Wraps an I/O error with what was tried on what.
+    /// Adds the action and the path to an I/O error.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }

@@ -1,12 +1,10 @@
 //! All that lasts: SQLite for the records, content-addressed files for the arrays.
 //!
-//! The server and every worker process open the same folder. Files are put in place and removed
-//! while the writer's lock of the database is held, so that a file and its row can't part when two
-//! processes work on the same content: the database is the one mutex of the service. No transaction
-//! is open while anything is computed or uploaded.
+//! The server and every worker process open the same folder. Files move under the writer's lock of the database. So a
+//! file and its row stay together when two processes work on the same content: the database is the only mutex of the
+//! service. No transaction is open while anything is computed or uploaded.
 //!
-//! What comes in goes through `submit` to the `queue`, and from there to the `tables`; nothing
-//! goes the other way.
+//! Requests go through `submit` to the `queue`, and from there to the `tables`. Nothing goes the other way.
 //!
 //! # Errors
 //! Every function that asks the database fails if the database does, and every one that changes files
@@ -84,7 +82,7 @@ pub struct Store {
     /// Hashes of files that were read before they were handed out.
     hashes: Arc<hashes::Hashes>,
     removals: removal::Removals,
-    /// What was last found wrong with the database.
+    /// Damage of the database that the last check found.
     damage: Arc<Mutex<Option<String>>>,
     /// The number of the newest migration.
     schema: i64,
@@ -134,8 +132,8 @@ impl Store {
             .max_connections(1)
             .idle_timeout(None)
             .max_lifetime(None)
-            // After some errors, such as a full disk, SQLite has rolled back by itself; sqlx then
-            // fails to roll back again and holds the transaction to be open for ever.
+            // After some errors, such as a full disk, SQLite has rolled back already. sqlx then fails to roll back
+            // again and takes the transaction for open.
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         let writer = writer.await?;
@@ -217,7 +215,7 @@ impl Store {
         Ok(())
     }
 
-    /// What is wrong with the database, if the last look has found something.
+    /// Damage of the database, if the last check found any.
     pub fn database_damage(&self) -> Option<String> {
         self.damage.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

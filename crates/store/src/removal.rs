@@ -43,7 +43,7 @@ impl Removals {
         });
     }
 
-    /// Waits until all bytes are gone.
+    /// Waits until all files are removed.
     pub async fn finished(&self) {
         // The sender lives as long as this.
         let _ = self.0.subscribe().wait_for(|count| *count == 0).await;

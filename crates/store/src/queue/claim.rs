@@ -1,4 +1,4 @@
-//! How a worker gets a task, with all that it needs to do it.
+//! Claiming a task, with its inputs.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -52,9 +52,9 @@ pub struct JobTask {
     pub spec: JobSpec,
     pub calibration: Calibration,
     pub measurement: Measurement,
-    /// What the job's prepare task recorded; none for that task itself.
+    /// Record of the job's prepare task; `None` for that task.
     pub prepared: Option<Value>,
-    /// What its pilot recorded, if it has one that is done.
+    /// Record of its pilot, if it has one that is done.
     pub pilot: Option<Value>,
     /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan.
     pub tiles: Vec<TileResult>,
@@ -74,9 +74,9 @@ pub struct CheckTask {
 #[derive(Debug, Clone)]
 pub struct CalibrationTask {
     pub calibration: CalibrationId,
-    /// Captures, of which masks are to be made; none where only a report on the masks is.
+    /// Captures to compute masks from; `None` if only a report on existing masks is wanted.
     pub captures: Option<Captures>,
-    /// The masks, a planar array, if they are there.
+    /// The masks, a planar array, if they exist.
     pub masks: Option<Sha256>,
 }
 
@@ -86,13 +86,13 @@ pub struct MovieWork {
     pub job: JobId,
     pub spec: JobSpec,
     pub measurement: Measurement,
-    /// What the job's prepare task recorded.
+    /// Record of the job's prepare task.
     pub prepared: Option<Value>,
-    /// Of each snapshot the array with its frames, and the hash that it should have.
+    /// The array with the frames of each snapshot, and its recorded hash.
     pub arrays: Vec<(PathBuf, Sha256)>,
 }
 
-/// Who asks for a task, and so which tasks may be handed out.
+/// The claimant of a task, which decides what it may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Claimant<'a> {
     /// A worker of this machine that does all there is.
@@ -107,8 +107,8 @@ pub enum Claimant<'a> {
     Pool(&'a str),
 }
 
-/// The statement that tells whether there may be work: a task that is ready, or a lease that has run out.
-/// Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
+/// The statement that looks for work: a task that is ready, or a lease that has expired. Parameters: now,
+/// [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
 macro_rules! look_text {
     ($kinds:expr, $by_lab:literal) => {
         look_text!(@ concat!(
@@ -186,7 +186,7 @@ macro_rules! take_text {
 
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
-    /// Which tasks a worker with these rights takes.
+    /// The tasks that a worker with these rights takes.
     pub fn takes(self) -> WorkerTakes {
         match self {
             Self::Local | Self::Pool(_) => WorkerTakes::All,

@@ -1,4 +1,4 @@
-//! How a task ends well: what it has made is stored, and what waited for it goes on.
+//! Completion of a task: its result is stored, and the tasks that waited for it become ready.
 
 use serde::Deserialize;
 use serde_json::Value;
@@ -26,7 +26,7 @@ use engine::job::{
 pub struct Completion {
     /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
     pub progress: TaskProgress,
-    /// What is to be remembered of it, for the manifest.
+    /// Its record for the manifest.
     pub record: Value,
     pub product: Product,
 }
@@ -180,7 +180,7 @@ impl Store {
 
     /// Reserves `bytes` for the result of a check. The disk must have room for `copies` of them above `min_free`.
     /// Errors: [`StoreError::Quota`]; [`StoreError::NoRoom`]; [`StoreError::NoShare`]; [`StoreError::Interrupted`] if
-    /// the task is not the worker's any more.
+    /// the worker has lost the task.
     pub async fn promise(
         &self,
         lease: &Lease,
@@ -201,7 +201,7 @@ impl Store {
         Ok(transaction.commit().await?)
     }
 
-    /// Writes what was made for a calibration; its captures are needed no more.
+    /// Writes the masks and the report of a calibration; its captures are no longer needed.
     async fn calibrated(
         &self,
         transaction: &mut SqliteConnection,

@@ -1,8 +1,8 @@
-//! The order in which waiting jobs are served, and what that means in seconds.
+//! Forecast of the queue: the order in which jobs are served, and their waiting times.
 //!
-//! A task of a higher priority goes first. At the same priority labs take turns by their shares, and a
-//! lab's jobs go one after the other: when the lab of a job has been served `w` CPU-seconds, another
-//! lab has been served `w` times the ratio of their shares, or all that it wanted.
+//! A task of a higher priority goes first. At equal priority, labs take turns by their shares, and the jobs of a lab
+//! follow each other. When a lab has been served `w` CPU-seconds, another lab has been served `w` times the ratio of
+//! their shares, or all that it wanted.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -126,17 +126,17 @@ impl Store {
     }
 }
 
-/// What is ahead of every unfinished job.
+/// The load ahead of every unfinished job.
 #[derive(Debug)]
 pub struct Forecast {
     workers: u32,
     /// Seconds that a planned CPU-second of a tile takes.
     rate: f64,
-    /// The same of all other tasks: reading and writing are not as fast as computing is.
+    /// Seconds that a planned CPU-second of any other task takes: reading and writing are slower than computing.
     others_rate: f64,
     jobs: HashMap<JobId, Ahead>,
-    /// What is ahead of a job that was not there yet.
-    of_a_new_one: Ahead,
+    /// The load ahead of a new job.
+    of_new_job: Ahead,
     left_by_lab: HashMap<Lab, f64>,
     until: Instant,
 }
@@ -144,13 +144,13 @@ pub struct Forecast {
 /// Planned CPU-seconds that are left of some tasks of a job.
 #[derive(Debug, Clone, Copy)]
 pub struct Left {
-    /// Of all of them.
+    /// Sum over all of them.
     pub(crate) sum: f64,
-    /// Of the one that has most left.
+    /// The largest of them.
     pub(crate) longest: f64,
 }
 
-/// What is served before a job.
+/// The load that is served before a job.
 #[derive(Debug, Clone, Copy)]
 struct Ahead {
     /// Planned CPU-seconds.
@@ -171,9 +171,9 @@ struct Unfinished {
 }
 
 impl Forecast {
-    /// Seconds until a job ends, of whose tiles and other tasks so much is left; none if no worker lives.
-    /// `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge
-    /// about as early as each other.
+    /// Seconds until a job ends, from the work left of its tiles and of its other tasks; `None` without a worker that
+    /// takes tiles. `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge about as
+    /// early as each other.
     pub(crate) fn eta_seconds(
         &self,
         job: JobId,
@@ -207,7 +207,7 @@ impl Forecast {
         for job in unfinished {
             left[job.lab] += job.left;
         }
-        let of_a_new_one = Ahead {
+        let of_new_job = Ahead {
             cost: unfinished.iter().map(|job| job.left).sum(),
             position: 1 + unfinished.iter().filter(|job| job.waits).count(),
         };
@@ -216,13 +216,13 @@ impl Forecast {
             rate,
             others_rate,
             jobs: ahead(unfinished, &shares),
-            of_a_new_one,
+            of_new_job,
             left_by_lab: labs.into_iter().map(|(lab, _)| lab).zip(left).collect(),
             until: Instant::now() + (KEPT_PER_JOB * count(unfinished.len())).min(KEPT_AT_MOST),
         }
     }
 
-    /// False once it should be made anew.
+    /// False once it should be renewed.
     fn is_good(&self) -> bool {
         Instant::now() < self.until
     }
@@ -232,7 +232,7 @@ impl Forecast {
     }
 
     fn ahead(&self, job: JobId) -> Ahead {
-        self.jobs.get(&job).copied().unwrap_or(self.of_a_new_one)
+        self.jobs.get(&job).copied().unwrap_or(self.of_new_job)
     }
 }
 
@@ -240,8 +240,7 @@ fn count(things: usize) -> u32 {
     u32::try_from(things).unwrap_or(u32::MAX)
 }
 
-/// What is ahead of each of these jobs, which stand in the order in which they came, with the shares of
-/// the labs.
+/// The load ahead of each of these jobs, which are in the order of their submission. `shares` are those of the labs.
 fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
     let mut by_priority: BTreeMap<i64, Vec<&Unfinished>> = BTreeMap::new();
     for job in jobs {
@@ -265,7 +264,7 @@ fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
         }
         above += wanted.iter().sum::<f64>();
     }
-    // Who ends first is served first; a job that came earlier stands before an equal one.
+    // The job that ends first is served first; of two equal jobs, the older one.
     found.sort_by(|(a, before_a), (b, before_b)| {
         b.priority.cmp(&a.priority).then((before_a + a.left).total_cmp(&(before_b + b.left)))
     });
@@ -282,7 +281,7 @@ fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
 mod tests {
     use super::{Ahead, JobId, Unfinished, ahead};
 
-    /// Planned seconds ahead of jobs, and their places, from lab, priority and what is left of each.
+    /// Planned seconds ahead of each job and its place, from its lab, its priority and the seconds left of it.
     fn served(jobs: &[(usize, i64, f64)], shares: &[f64]) -> Vec<(f64, usize)> {
         let jobs: Vec<_> = jobs
             .iter()
@@ -300,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn jobs_of_one_lab_wait_for_those_before_them_and_for_urgent_ones() {
+    fn jobs_of_one_lab_wait_for_older_and_for_urgent_jobs() {
         let jobs = [(0, 0, 10.0), (0, 0, 20.0), (0, 5, 3.0)];
         assert_eq!(served(&jobs, &[1.0]), [(3.0, 2), (13.0, 3), (0.0, 1)]);
     }

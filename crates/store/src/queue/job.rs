@@ -11,8 +11,8 @@ use crate::{Store, records, removal};
 use engine::job::{Assessment, IllegalTransition, JobId, JobState, Lab, TaskState};
 
 impl Store {
-    /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
-    /// Cancelling twice is no error.
+    /// Cancels a job: at once if no worker has a task of it, else with the workers' next heartbeats. Cancelling twice
+    /// is no error.
     /// Errors: [`StoreError::State`] if the job has succeeded or failed.
     pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
@@ -61,8 +61,7 @@ impl Store {
         Ok(())
     }
 
-    /// Takes up a failed or cancelled job again, or one of which results are known to be damaged. What is
-    /// done and sound stays done.
+    /// Retries a failed or cancelled job, or one with damaged results. Sound results are kept.
     /// Errors: [`StoreError::State`] if the job has not failed or been cancelled, and nothing is damaged.
     pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
@@ -81,7 +80,7 @@ impl Store {
         self.commit_removals(transaction).await
     }
 
-    /// Deletes a job that has come to its end, with all that it has made.
+    /// Deletes a job that has ended, with its results.
     /// Errors: [`StoreError::NotFinal`] if it still runs or waits.
     pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
@@ -102,7 +101,7 @@ impl Store {
         self.commit_removals(transaction).await
     }
 
-    /// Marks a job as succeeded, unless it is being cancelled. Its tiles are needed no more.
+    /// Marks a job as succeeded, unless it is being cancelled, and removes its tiles.
     pub(super) async fn succeed(
         &self,
         transaction: &mut SqliteConnection,
@@ -172,7 +171,7 @@ pub(super) async fn fail(connection: &mut SqliteConnection, id: JobId, reason: &
     graph::cancel_waiting(connection, id).await
 }
 
-/// Ends a job that was being cancelled, once no worker is at it any more.
+/// Ends a job that was being cancelled, once no worker has a task of it.
 pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
     if jobs::state(connection, id).await? != JobState::Cancelling {
         return Ok(());

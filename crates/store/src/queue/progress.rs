@@ -1,5 +1,4 @@
-//! How far jobs are, what of them has changed, and how long they may still take, from what their tasks
-//! have reported.
+//! Progress of jobs and the time they still take, from the reports of their tasks.
 //!
 //! All shares are by planned cost. For the time left, `m` workers need at most `work / m + (1 - 1/m) *
 //! longest task` (Graham); tiles are taken to cost what those of the same job that are done did.
@@ -32,7 +31,7 @@ pub enum ProgressStage {
     Nonlocal,
     /// Frames are blended and written.
     Assembling,
-    /// The job has come to its end.
+    /// The job has ended.
     Ended,
 }
 
@@ -60,7 +59,7 @@ pub struct JobProgress {
     pub passes_done: u64,
 }
 
-/// What a job that is not there yet would wait for.
+/// The queue as a new job would find it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
     /// Seconds until it would end; none if no worker lives.
@@ -75,8 +74,8 @@ impl Store {
         all.pop().ok_or(StoreError::missing("job", job.id))
     }
 
-    /// How far each of these jobs is, in their order. Reads what their tasks add up to, and the tasks that
-    /// run: how many tasks there are, and how many jobs wait, makes no difference.
+    /// Progress of each of these jobs, in their order. Reads what their tasks add up to, and the tasks that run: how
+    /// many tasks there are, and how many jobs wait, makes no difference.
     pub async fn progress_of(&self, jobs: &[Job]) -> Result<Vec<JobProgress>> {
         let ids: Vec<Value> = jobs.iter().map(|job| job.id.to_string().into()).collect();
         let rows = sql!(
@@ -107,16 +106,16 @@ impl Store {
         } else {
             None
         };
-        let gone = |id: JobId| StoreError::missing("job", id);
+        let missing = |id: JobId| StoreError::missing("job", id);
         jobs.iter()
             .map(|job| {
-                let row = by_job.get(&job.id).ok_or_else(|| gone(job.id))?;
+                let row = by_job.get(&job.id).ok_or_else(|| missing(job.id))?;
                 progress(job, row, forecast.as_deref())
             })
             .collect()
     }
 
-    /// What a job with these tasks would wait for if it came now, at the priority that most have.
+    /// Forecast for a new job with these tasks and the default priority.
     pub async fn estimate(&self, tasks: &[(TaskKind, f64)]) -> Result<Estimate> {
         let forecast = self.forecast().await?;
         let left = |of_tiles: bool| {
@@ -127,7 +126,7 @@ impl Store {
                 longest: left.longest.max(cost),
             })
         };
-        // One that is not on record yet stands behind all others.
+        // An unknown job is behind all others.
         let job = JobId::new();
         let seconds = forecast.eta_seconds(job, (left(true), left(false)), None);
         Ok(Estimate {

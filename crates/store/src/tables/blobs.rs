@@ -45,7 +45,7 @@ macro_rules! in_use {
     };
 }
 
-/// Where a file comes from.
+/// Origin of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 #[strum(serialize_all = "snake_case")]
 pub enum Origin {
@@ -105,7 +105,7 @@ impl Store {
         held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))
     }
 
-    /// A page of the lab's uploads, newest first, after the one that `after` tells of.
+    /// A page of the lab's uploads, newest first. `after` has the time and the hash of the last one of the page before.
     pub async fn uploads(
         &self,
         lab: &Lab,
@@ -177,7 +177,7 @@ impl Store {
         Ok(())
     }
 
-    /// Deletes the row of a derived file if nothing refers to it any more. Uploads are left to [`Self::collect`]. The
+    /// Deletes the row of a derived file if nothing refers to it. Uploads are left to [`Self::collect`]. The
     /// transaction must end with [`Self::commit_removals`].
     pub(crate) async fn release(
         &self,

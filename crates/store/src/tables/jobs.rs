@@ -1,4 +1,4 @@
-//! Table `jobs`. What becomes of a job is the queue's business.
+//! Table `jobs`. The queue changes their states.
 
 use sqlx::SqliteConnection;
 
@@ -21,7 +21,7 @@ pub struct Job {
     /// When its first task was claimed.
     pub started_at: Option<Timestamp>,
     pub finished_at: Option<Timestamp>,
-    /// How good its frames are expected to be; none until they are there, and where nothing can be told.
+    /// Predicted quality of its frames; `None` before the job has succeeded, and where no prediction exists.
     pub assessment: Option<Assessment>,
 }
 
@@ -51,10 +51,10 @@ pub struct JobFilter {
     pub after: Option<JobId>,
 }
 
-/// What a user changes of a job.
+/// Changes of a job by a user.
 #[derive(Debug, Clone, Default)]
 pub struct JobChanges {
-    /// The new label, or none any more.
+    /// The new label; `Some(None)` removes it.
     pub label: Option<Option<Label>>,
     pub priority: Option<i32>,
 }
@@ -85,7 +85,7 @@ impl Store {
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
-    /// A job, whosever it is.
+    /// A job of any lab.
     pub async fn job_of_any_lab(&self, id: JobId) -> Result<Job> {
         let job = sql_as!("SELECT * FROM jobs WHERE id = ?", [id]);
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))

@@ -14,7 +14,7 @@ use engine::job::{JobState, Lab, Timestamp};
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabRow {
     pub lab: Lab,
-    /// Its share of the machine, beside the shares of the others that want it.
+    /// Its weight when labs compete for the machine.
     pub share: f64,
     /// Bytes that it may keep here; none: the default.
     pub max_bytes: Option<u64>,
@@ -26,7 +26,7 @@ pub struct LabRow {
 
 from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs });
 
-/// What a lab has here.
+/// Use of the service by a lab.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LabUse {
     /// Uploads, and their bytes.
@@ -55,7 +55,7 @@ pub struct LabFigures {
     pub result_bytes: u64,
 }
 
-/// What a lab is to be entitled to; what is none stays as it is.
+/// New entitlement of a lab; fields that are `None` stay unchanged.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Entitlement {
     /// Above 0.
@@ -90,7 +90,7 @@ impl Store {
     }
 
     /// The lab of this name.
-    /// Errors: [`StoreError::NotFound`] if none is on record.
+    /// Errors: [`StoreError::NotFound`] if there is none.
     pub async fn lab(&self, name: &str) -> Result<LabRow> {
         let found = self.find_labs(Some(name)).await?.pop();
         found.ok_or_else(|| StoreError::missing("lab", name))
@@ -144,13 +144,13 @@ impl Store {
         Ok(figures.collect())
     }
 
-    /// Whether a lab is on record: it has a token, something in the queue, or limits.
+    /// True if a lab has a row: it has or had a token, a job, or limits.
     pub async fn knows_lab(&self, lab: &Lab) -> Result<bool> {
         let found = sql!("SELECT 1 FROM labs WHERE lab = ?", [lab]);
         Ok(found.fetch_optional(&self.readers).await?.is_some())
     }
 
-    /// What a lab is entitled to.
+    /// Share and limits of a lab.
     pub async fn entitlement(&self, lab: &Lab) -> Result<Entitlement> {
         let found = sql_as!("SELECT share, max_bytes, max_jobs FROM labs WHERE lab = ?", [lab]);
         let found: Option<(f64, Option<u64>, Option<u64>)> =
@@ -160,7 +160,7 @@ impl Store {
         Ok(Entitlement { share: Some(share), max_bytes, max_jobs })
     }
 
-    /// Sets the limits of labs without limits of their own.
+    /// Sets the default limits of labs.
     pub async fn set_default_limits(&self, max_bytes: u64, max_jobs: u64) -> Result<()> {
         sql!(
             "INSERT INTO default_limits VALUES (1, ?, ?) ON CONFLICT (one) DO UPDATE
@@ -177,7 +177,7 @@ impl Store {
         limits(&mut *self.readers.acquire().await?, lab).await
     }
 
-    /// Sets what a lab is entitled to. A lab that is not on record yet is put there.
+    /// Sets what a lab is entitled to. A new lab gets a row.
     pub async fn entitle(&self, lab: &Lab, to: Entitlement) -> Result<()> {
         let mut transaction = self.write().await?;
         know(&mut transaction, lab).await?;
@@ -200,7 +200,7 @@ impl Store {
     }
 
     /// Takes a lab off the record, with its share, its limits and its totals.
-    /// Errors: [`StoreError::NotFound`] if it is not on record; [`StoreError::InUse`] if it has a token or data.
+    /// Errors: [`StoreError::NotFound`] if it is unknown; [`StoreError::InUse`] if it has a token or data.
     pub async fn remove_lab(&self, lab: &Lab) -> Result<()> {
         let mut transaction = self.write().await?;
         for (by, query) in BELONGINGS {
@@ -225,7 +225,7 @@ impl Store {
     }
 }
 
-/// Things that keep a lab on record, each with the query that counts those of one lab.
+/// Things that keep a lab from being removed, each with the query that counts those of one lab.
 const BELONGINGS: [(&str, &str); 8] = [
     ("tokens", "SELECT count(*) FROM tokens WHERE lab = ? AND revoked_at IS NULL"),
     ("jobs", "SELECT count(*) FROM jobs WHERE lab = ?"),
@@ -255,13 +255,13 @@ pub async fn limits(
     limits.fetch_one(connection).await
 }
 
-/// What is wrong with a share, if something is.
+/// The problem of a share, if it has one.
 pub fn share_error(share: f64) -> Option<&'static str> {
     let fits = (0.001..=1000.0).contains(&share);
     (!fits).then_some("a share is a number from 0.001 to 1000")
 }
 
-/// Puts a lab on record, if it is not there.
+/// Inserts the row of a lab, if it is missing.
 pub async fn know(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
     sql!("INSERT OR IGNORE INTO labs (lab) VALUES (?)", [lab]).execute(connection).await?;
     Ok(())

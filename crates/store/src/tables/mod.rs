@@ -1,4 +1,4 @@
-//! The tables: one file for each kind of thing on record.
+//! The tables: one file for each kind of row.
 
 pub(super) mod blobs;
 pub(super) mod calibrations;

@@ -26,7 +26,7 @@ impl Store {
         token_bytes(&mut *self.readers.acquire().await?, token).await
     }
 
-    /// Bytes that a lab keeps here: uploads, prepared arrays and results, and what was promised to it.
+    /// Bytes that a lab keeps here: uploads, prepared arrays and results, and bytes reserved for it.
     pub async fn lab_bytes(&self, lab: &Lab) -> Result<u64> {
         lab_bytes(&mut *self.readers.acquire().await?, lab).await
     }
@@ -76,7 +76,7 @@ async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Resul
     .await
 }
 
-/// Bytes of all files of a lab, and what is promised to its uploads and jobs.
+/// Bytes of all files of a lab, and bytes reserved for its uploads and jobs.
 async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> {
     sql_as!(
         "SELECT (SELECT coalesce(sum(bytes), 0) FROM files_of_labs WHERE lab = ?1)
@@ -92,8 +92,8 @@ async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> 
     .await
 }
 
-/// Refuses a job if enough wait and run. A lab has its own limit, if one was set. When all places are taken,
-/// a lab that has less than an equal part of them is let in nevertheless, so that none locks the others out.
+/// Refuses a job if enough wait and run. A lab has its own limit, if one was set. When all places are taken, a lab with
+/// less than an equal part of them is accepted nevertheless, so that no lab excludes the others.
 /// Errors: [`StoreError::QueueFull`].
 pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64) -> Result<()> {
     let (_, limit) = labs::limits(connection, lab).await?;

@@ -15,7 +15,7 @@ use engine::job::{Lab, TaskState};
 #[derive(Debug, Clone, Default)]
 pub struct Reservations {
     by_lab: HashMap<Lab, u64>,
-    /// Labs on record.
+    /// All labs.
     labs: Vec<Lab>,
 }
 
@@ -76,7 +76,7 @@ mod tests {
     use super::{Reservations, Reserved};
 
     #[test]
-    fn a_lab_sees_its_bytes_apart_from_those_of_others() {
+    fn a_lab_sees_its_bytes_and_those_of_others() {
         let (a, b) = ("a".parse().unwrap(), "b".parse().unwrap());
         let mut all = Reservations::default();
         all.add(&a, 10);

@@ -23,7 +23,7 @@ pub struct WorkerRow {
     pub task: Option<WorkerTask>,
 }
 
-/// Which tasks a worker takes.
+/// The tasks that a worker takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WorkerTakes {
     /// Tiles, and on this machine all other tasks, too.
@@ -123,7 +123,7 @@ impl Store {
         sql_as!(last).fetch_one(&self.readers).await
     }
 
-    /// The last sign of life of a worker; none if it is not on record.
+    /// The last sign of life of a worker; `None` if it is unknown.
     pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>> {
         let seen = sql_as!("SELECT seen_at FROM workers WHERE id = ?", [id]);
         seen.fetch_optional(&self.readers).await

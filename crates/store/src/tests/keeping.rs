@@ -1,4 +1,4 @@
-//! What is listed, what is kept, and what goes.
+//! Lists, idempotency keys, and removal of unused things.
 
 use std::io::Write;
 use std::time::Duration;
@@ -49,7 +49,7 @@ async fn pages_join_without_gaps() {
 }
 
 #[tokio::test]
-async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
+async fn used_things_are_kept_and_unused_ones_collected() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
     let calibration =
@@ -101,7 +101,7 @@ async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
     lab.store.delete_calibration(&local, calibration).await.unwrap();
 }
 
-/// Whether the job is there with all its files, or neither it nor a file of it.
+/// True if the job exists with all its files, or neither it nor a file of it.
 async fn is_whole(lab: &Lab, id: JobId) -> bool {
     let folder = lab.store.dir().results(id);
     let Ok(job) = lab.store.job(&engine::job::Lab::local(), id).await else {

@@ -53,7 +53,7 @@ async fn a_movie_that_fails_fails_nothing_else() {
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(Some(0.0)));
     lab.store.fail(&task.lease, "no codec", false).await.unwrap();
     lab.job(job.id).await;
-    // It is told once, and then tried again.
+    // The failure is reported once, and then another attempt begins.
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Failed("no codec".into()));
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(None));
 

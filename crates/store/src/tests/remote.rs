@@ -9,7 +9,7 @@ use crate::{Begun, Claimant, MessagePlace};
 async fn a_tile_that_waits_elsewhere_does_not_run() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    // What comes before the tiles.
+    // The tasks before the tiles.
     lab.work_on(3).await;
     let hub = WorkerId::new();
     let pool = Claimant::Pool("gpu");

@@ -1,4 +1,4 @@
-//! Whose turn it is: labs beside one another, and the jobs of a lab.
+//! Turns of labs, and the order of the jobs of a lab.
 
 use super::{Lab, id};
 use crate::Entitlement;
@@ -38,7 +38,7 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_lab_with_one_job_does_not_wait_for_all_jobs_of_another() {
+async fn a_single_job_of_a_lab_does_not_wait_for_all_jobs_of_another() {
     let lab = Lab::new().await;
     let mut first = Vec::new();
     for _ in 0..6 {
@@ -60,7 +60,7 @@ async fn a_share_is_a_share_of_what_is_computed() {
     lab.store.entitle(&named("second"), to).await.unwrap();
     let first = lab.submit_for("first", 0).await;
     let second = lab.submit_for("second", 0).await;
-    // Until tiles alone are left, of which each lab has four that cost the same.
+    // Until only tiles are left. Each lab has four, with equal costs.
     while lab.store.labs().await.unwrap().iter().any(|lab| lab.jobs > 0) {
         let task = lab.claim().await.unwrap();
         if matches!(task.kind, TaskKind::Tile { .. }) {
@@ -80,7 +80,7 @@ async fn a_share_is_a_share_of_what_is_computed() {
 }
 
 #[tokio::test]
-async fn who_wanted_nothing_is_owed_nothing() {
+async fn an_idle_lab_collects_no_credit() {
     let lab = Lab::new().await;
     for _ in 0..3 {
         lab.submit_for("busy", 0).await;
@@ -92,7 +92,7 @@ async fn who_wanted_nothing_is_owed_nothing() {
 }
 
 #[tokio::test]
-async fn begun_jobs_come_before_older_ones_that_have_not_begun() {
+async fn begun_jobs_precede_older_waiting_ones() {
     let lab = Lab::new().await;
     let (old, young) = (lab.submit_for("lab", 0).await, lab.submit_for("lab", 0).await);
     lab.store.cancel_job(&named("lab"), old).await.unwrap();
