@@ -23,9 +23,9 @@ pub(super) struct LabBody {
 
 #[derive(Debug, Serialize)]
 struct LimitsBody {
-    /// What it may keep here; none: no limit.
+    /// Bytes that it may keep; none: the default of the service.
     bytes: Option<u64>,
-    /// Jobs that may wait and run; none: no limit of its own.
+    /// Jobs that may wait and run; none: the default of the service.
     jobs: Option<u64>,
 }
 
@@ -44,7 +44,7 @@ pub(super) struct ListBody {
     items: Vec<LabBody>,
 }
 
-/// What a lab is to be entitled to: what is left out stays, null takes a limit away.
+/// New share and limits of a lab: missing fields stay, null sets the default of the service.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Changes {

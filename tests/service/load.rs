@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use reqwest::{Body, Method};
 use serde_json::{Value, json};
+use sqlx::Connection;
 
 use crate::app::TestApp;
 use crate::crashes::Shim;
@@ -260,6 +261,7 @@ async fn fill(app: &TestApp, finished: u64, waiting: u64) {
         let copy = sqlx::query(text).bind(finished as i64).bind(waiting as i64);
         copy.bind(finished as i64 / 2).execute(&mut database).await.unwrap();
     }
+    database.close().await.unwrap();
     for job in 1..=finished {
         let folder = format!("results/01a00000-0000-7000-8000-{job:012}");
         std::fs::create_dir(app.data().join(folder)).unwrap();

@@ -1,8 +1,10 @@
 //! Turns of labs, and the order of the jobs of a lab.
 
+use std::time::Duration;
+
 use super::{Lab, id};
-use crate::Entitlement;
-use engine::job::{Algorithm, JobId, TaskKind};
+use crate::{Entitlement, WorkerEnd, WorkerPlace, WorkerTakes};
+use engine::job::{Algorithm, JobId, TaskKind, WorkerId};
 
 fn named(name: &str) -> engine::job::Lab {
     name.parse().unwrap()
@@ -108,4 +110,29 @@ async fn priority_comes_before_turns() {
     let urgent = lab.submit_for("second", 5).await;
     let turns = lab.turns(10).await;
     assert!(turns.iter().all(|job| *job == urgent), "{turns:?}");
+}
+
+#[tokio::test]
+async fn jobs_have_an_eta_only_while_a_worker_takes_tiles() {
+    let lab = Lab::new().await;
+    let local = named("local");
+    let job = lab.submit_for("local", 0).await;
+    let eta = async || {
+        // A forecast of one job is valid for a fraction of a millisecond.
+        tokio::time::sleep(Duration::from_millis(2)).await;
+        let job = lab.store.job(&local, job).await.unwrap();
+        lab.store.progress(&job).await.unwrap().eta_seconds
+    };
+    let age = Duration::from_secs(15);
+    assert!(eta().await.is_some());
+    assert_eq!(lab.store.live_tile_workers(age).await.unwrap(), 1);
+    lab.store.worker_ended(lab.worker, &WorkerEnd::Left).await.unwrap();
+    let last = lab.store.last_tile_worker().await.unwrap();
+    for takes in [WorkerTakes::WithoutTiles, WorkerTakes::ShortTasks] {
+        let place = WorkerPlace::default();
+        lab.store.worker_started(WorkerId::new(), 1, &place, takes).await.unwrap();
+    }
+    assert_eq!((eta().await, lab.store.live_tile_workers(age).await.unwrap()), (None, 0));
+    assert!(last.is_some(), "the sign of a worker that has ended");
+    assert_eq!(lab.store.last_tile_worker().await.unwrap(), last);
 }
