@@ -26,7 +26,7 @@ CREATE TABLE labs (
 ) STRICT, WITHOUT ROWID;
 
 CREATE TABLE default_limits (
-    -- Limits of labs without limits of their own, while several labs are on record. The service sets them at its start.
+    -- Limits of labs whose own limits are NULL, if there are several labs. The service sets them at its start.
     one       INTEGER PRIMARY KEY CHECK (one = 1),
     max_bytes INTEGER NOT NULL,
     max_jobs  INTEGER NOT NULL
@@ -260,7 +260,7 @@ CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
 
 CREATE TABLE removals (
-    -- Files whose rows are deleted, until the files are gone, too. A start after a kill goes on with them.
+    -- Files whose rows are deleted, until the files are removed. A start after a kill continues with them.
     kind       TEXT NOT NULL CHECK (kind IN ('blob', 'results')),
     id         TEXT NOT NULL, -- SHA-256 of the blob, or the job
     created_at INTEGER, -- of the deleted row; NULL where the time of the file counts

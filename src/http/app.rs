@@ -100,8 +100,7 @@ impl App {
 pub(super) const WORKER_AGE: Duration = Duration::from_secs(15);
 
 impl App {
-    /// Whether a worker takes tiles; if not, the problem in words. A service that has just started has time to start
-    /// its workers.
+    /// The problem in words if no worker takes tiles. A service that has just started has time to start its workers.
     pub(super) async fn tiles(&self) -> Result<std::result::Result<(), String>> {
         if self.store.live_tile_workers(WORKER_AGE).await? > 0 {
             return Ok(Ok(()));

@@ -250,7 +250,7 @@ async fn message(store: &Store, changes: Changes) -> Result<Told, StoreError> {
                 labs.entry(lab.clone()).or_default().more = true;
             }
         }
-        return Ok(told(by_kind));
+        return Ok(texts(by_kind));
     };
     for item in items {
         let kind = match item.what.as_str() {
@@ -262,10 +262,10 @@ async fn message(store: &Store, changes: Changes) -> Result<Told, StoreError> {
         let change = by_kind[kind].entry(item.lab).or_default();
         if item.exists { &mut change.changed } else { &mut change.deleted }.push(item.id);
     }
-    Ok(told(by_kind))
+    Ok(texts(by_kind))
 }
 
-fn told(by_kind: [HashMap<Lab, Change>; 4]) -> Told {
+fn texts(by_kind: [HashMap<Lab, Change>; 4]) -> Told {
     let [jobs, calibrations, measurements, models] = by_kind.map(|labs| {
         let text =
             |(lab, change): (Lab, Change)| Some((lab, serde_json::to_string(&change.cut()).ok()?));

@@ -125,7 +125,7 @@ struct Readiness {
     database: String,
     disk: String,
     workers: String,
-    /// Whether a worker takes tiles.
+    /// The problem if no worker takes tiles.
     tiles: String,
     /// Only with `serve --nats`.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -109,8 +109,8 @@ pub enum StoreError {
     NoRoom { what: &'static str, needed: u64, free: u64, promised: u64, reserve: u64 },
     /// The lab has reserved its share of the disk.
     #[error(
-        "{what} needs {needed} bytes; this lab has reserved {own}, and may reserve {share}, half of what other labs \
-         leave free: wait until some of its jobs are done, or select fewer snapshots"
+        "{what} needs {needed} bytes; this lab has reserved {own}, and may reserve {share}, half of the bytes that \
+         other labs leave free: wait until some of its jobs are done, or select fewer snapshots"
     )]
     NoShare { what: &'static str, needed: u64, own: u64, share: u64 },
     #[error("the Idempotency-Key {key:?} was used for another request, which made {what} {id}")]

@@ -44,7 +44,7 @@ struct ResultRow {
 from_row!(ResultRow, row => { job, snapshot, name, sha256 });
 
 impl Record {
-    /// Its path below a data folder.
+    /// The path of the file below a data folder.
     pub(super) fn path(&self, dir: &DataDir) -> PathBuf {
         match &self.place {
             Place::Blob(sha256) => dir.blob(sha256),

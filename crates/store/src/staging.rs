@@ -196,7 +196,7 @@ impl StagedBlob {
         self.size
     }
 
-    /// Its path until it is stored.
+    /// The path of the file until it is stored.
     pub fn path(&self) -> &Path {
         &self.temporary.path
     }

@@ -26,7 +26,7 @@ use engine::job::{
 pub struct Completion {
     /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
     pub progress: TaskProgress,
-    /// Its record for the manifest.
+    /// The task's record, for the manifest.
     pub record: Value,
     pub product: Product,
 }

@@ -136,7 +136,7 @@ pub struct Forecast {
     others_rate: f64,
     jobs: HashMap<JobId, Ahead>,
     /// The load ahead of a new job.
-    of_new_job: Ahead,
+    new_job: Ahead,
     left_by_lab: HashMap<Lab, f64>,
     until: Instant,
 }
@@ -207,7 +207,7 @@ impl Forecast {
         for job in unfinished {
             left[job.lab] += job.left;
         }
-        let of_new_job = Ahead {
+        let new_job = Ahead {
             cost: unfinished.iter().map(|job| job.left).sum(),
             position: 1 + unfinished.iter().filter(|job| job.waits).count(),
         };
@@ -216,7 +216,7 @@ impl Forecast {
             rate,
             others_rate,
             jobs: ahead(unfinished, &shares),
-            of_new_job,
+            new_job,
             left_by_lab: labs.into_iter().map(|(lab, _)| lab).zip(left).collect(),
             until: Instant::now() + (KEPT_PER_JOB * count(unfinished.len())).min(KEPT_AT_MOST),
         }
@@ -232,7 +232,7 @@ impl Forecast {
     }
 
     fn ahead(&self, job: JobId) -> Ahead {
-        self.jobs.get(&job).copied().unwrap_or(self.of_new_job)
+        self.jobs.get(&job).copied().unwrap_or(self.new_job)
     }
 }
 

@@ -40,7 +40,7 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_single_job_of_a_lab_does_not_wait_for_all_jobs_of_another() {
+async fn a_single_job_does_not_wait_for_all_jobs_of_another_lab() {
     let lab = Lab::new().await;
     let mut first = Vec::new();
     for _ in 0..6 {
@@ -94,7 +94,7 @@ async fn an_idle_lab_collects_no_credit() {
 }
 
 #[tokio::test]
-async fn begun_jobs_precede_older_waiting_ones() {
+async fn running_jobs_precede_older_waiting_ones() {
     let lab = Lab::new().await;
     let (old, young) = (lab.submit_for("lab", 0).await, lab.submit_for("lab", 0).await);
     lab.store.cancel_job(&named("lab"), old).await.unwrap();

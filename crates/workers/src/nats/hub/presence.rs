@@ -9,7 +9,7 @@ use engine::job::{Pool, TaskId, WorkerId};
 /// A worker that was silent for longer is not counted on.
 const SILENCE: Duration = Duration::from_secs(15);
 
-/// Living workers that a pool may have. Introductions cost nothing, and each worker is on record and in answers.
+/// Living workers that a pool may have. An introduction costs its sender nothing, and takes a row and room in answers.
 pub const MOST_WORKERS: usize = 2000;
 
 /// The workers.
