@@ -75,7 +75,9 @@ async fn prepared_arrays_count_towards_the_quota() {
 
 #[tokio::test]
 async fn empty_announcements_do_not_exhaust_the_disk() {
-    let (app, a, b) = two_labs(&["--workers", "0", "--max-upload-bytes", "1000000000000000"]).await;
+    let most = "1000000000000000";
+    let limits = ["--workers", "0", "--max-upload-bytes", most, "--lab-bytes", most];
+    let (app, a, b) = two_labs(&limits).await;
     let disk = rustix::fs::statvfs(app.data()).unwrap();
     let free = disk.f_bavail * disk.f_frsize;
     app.sign_in(&a);
@@ -191,7 +193,7 @@ async fn labs_without_quotas_have_default_ones() {
         (&me["limits"]["lab_jobs"], &me["limits"]["lab_bytes"]),
         (&json!(2), &json!(1_000_000))
     );
-    entitle(&app, &["a", "--jobs", "10", "--bytes", "10000000"]);
+    entitle(&app, &["a", "--jobs", "10", "--bytes", "100000000"]);
     app.submit(&job).await;
 }
 

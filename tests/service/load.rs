@@ -213,30 +213,30 @@ const COPIES: [&str; 13] = [
          SELECT n FROM number",
     "CREATE TEMP TABLE copies AS
          SELECT n, printf('01a00000-0000-7000-8000-%012d', n) AS job,
-             (SELECT min(id) FROM jobs WHERE state = iif(n <= ?1, 'succeeded', 'queued')) AS model
+             (SELECT min(id) FROM jobs WHERE state = iif(n <= ?1, 'succeeded', 'queued')) AS original
          FROM numbers WHERE n <= ?1 + ?2",
     "INSERT INTO jobs (id, lab, calibration, measurement, spec, state, priority, disk_bytes, assessment,
          created_at, started_at, finished_at)
      SELECT job, lab, calibration, measurement, spec, state, priority, disk_bytes, assessment,
          created_at, started_at, finished_at
-     FROM copies JOIN jobs ON id = model",
+     FROM copies JOIN jobs ON id = original",
     "INSERT INTO tasks (id, job, lab, ordinal, kind, light, snapshot, snapshots, tile, state, priority, cost,
          attempt, iterations, passes, fraction, seconds, record, history)
      SELECT printf('01a00000-0000-7000-%04d-%012d', 8000 + ordinal, n), copies.job, lab, ordinal, kind, light,
          snapshot, snapshots, tile, state, priority, cost, attempt, iterations, passes, fraction, seconds, record,
          history
-     FROM copies JOIN tasks ON tasks.job = model",
+     FROM copies JOIN tasks ON tasks.job = original",
     "INSERT INTO attempts (task, attempt, worker, started_at, ended_at, outcome, reason)
      SELECT printf('01a00000-0000-7000-%04d-%012d', 8000 + ordinal, n), attempts.attempt, attempts.worker,
          started_at, ended_at, outcome, reason
-     FROM copies JOIN tasks ON tasks.job = model JOIN attempts ON task = tasks.id",
+     FROM copies JOIN tasks ON tasks.job = original JOIN attempts ON task = tasks.id",
     "INSERT INTO job_sums
      SELECT copies.job, cost, tiles_left, tiles_longest, others_left, others_longest, tiles_total,
          tiles_done, tile_seconds, tile_cost, prepared, previews_done, snapshots_done, iterations, passes
-     FROM copies JOIN job_sums ON job_sums.job = model",
+     FROM copies JOIN job_sums ON job_sums.job = original",
     "INSERT INTO result_files (job, snapshot, name, size, sha256)
      SELECT copies.job, snapshot, name, size, sha256
-     FROM copies JOIN result_files ON result_files.job = model",
+     FROM copies JOIN result_files ON result_files.job = original",
     "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)
      SELECT printf('%064x', n), 1000, iif(n % 2, 'upload', 'prepared'), created_at, touched_at
      FROM numbers, (SELECT * FROM blobs LIMIT 1) WHERE n <= 2 * ?3",
