@@ -158,8 +158,8 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        let (place, light) = (WorkerPlace::default(), self.claimant == Claimant::Light);
-        Ok(self.store.worker_started(self.worker, std::process::id(), &place, light).await?)
+        let (place, takes) = (WorkerPlace::default(), self.claimant.takes());
+        Ok(self.store.worker_started(self.worker, std::process::id(), &place, takes).await?)
     }
 
     async fn seen(&self) -> Result<(), TransportError> {

@@ -22,7 +22,7 @@ use engine::pipeline::manifest::{JobTasks, Recipe};
 use engine::pipeline::movie::MovieTask;
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::tile::TileInput;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 use reconstruction::assessment::Evidence;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
@@ -222,17 +222,16 @@ pub enum TaskError {
 }
 
 impl TaskError {
-    /// Whether there was no room on the disk: the task is not to blame, and goes on when there is.
-    pub(super) fn is_disk_full(&self) -> bool {
+    /// The state of the disk that is the cause, if it is: the task is not to blame, and goes on when it has ended.
+    pub(super) fn disk_trouble(&self) -> Option<DiskTrouble> {
         match self {
-            Self::Pipeline(error) => error.is_disk_full(),
-            Self::Intake(IntakeError::Format { source, .. }) => source.is_disk_full(),
-            Self::Intake(_) => false,
+            Self::Pipeline(error) => error.disk_trouble(),
+            Self::Intake(IntakeError::Format { source, .. }) => source.disk_trouble(),
+            Self::Intake(_) => None,
             Self::Transport(error) => {
-                let store =
-                    error.downcast_ref::<StoreError>().is_some_and(StoreError::is_disk_full);
+                let store = error.downcast_ref::<StoreError>().and_then(StoreError::disk_trouble);
                 let format = error.downcast_ref::<FormatError>();
-                store || format.is_some_and(FormatError::is_disk_full)
+                store.or_else(|| format.and_then(FormatError::disk_trouble))
             }
         }
     }

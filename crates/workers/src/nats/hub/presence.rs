@@ -9,6 +9,9 @@ use engine::job::{Pool, TaskId, WorkerId};
 /// A worker that was silent for longer is not counted on.
 const SILENCE: Duration = Duration::from_secs(15);
 
+/// Living workers that a pool may have. An introduction costs its sender nothing, and takes a row and room in answers.
+pub const MOST_WORKERS: usize = 2000;
+
 /// The workers.
 #[derive(Debug, Default)]
 pub struct Presence {
@@ -30,6 +33,13 @@ struct Sign {
 }
 
 impl Presence {
+    /// True if a worker may join a pool: it is known there, or the pool has fewer living workers than it may.
+    pub fn has_room(&self, worker: WorkerId, pool: &Pool) -> bool {
+        let lives = |sign: &&Sign| sign.pool == *pool && sign.at.elapsed() < SILENCE;
+        self.workers.get(&worker).is_some_and(|sign| sign.pool == *pool)
+            || self.workers.values().filter(lives).count() < MOST_WORKERS
+    }
+
     /// A worker has introduced itself.
     /// Nobody may take another's name.
     pub fn join(&mut self, worker: WorkerId, pool: &Pool) {
@@ -122,5 +132,28 @@ impl Presence {
             }
         }
         (seen, tiles)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MOST_WORKERS, Pool, Presence, WorkerId};
+
+    #[test]
+    fn a_pool_takes_a_limited_number_of_workers() {
+        let (gpu, cpu): (Pool, Pool) = ("gpu".parse().unwrap(), "cpu".parse().unwrap());
+        let mut presence = Presence::default();
+        let first = WorkerId::new();
+        presence.join(first, &gpu);
+        for _ in 1..MOST_WORKERS {
+            let worker = WorkerId::new();
+            assert!(presence.has_room(worker, &gpu));
+            presence.join(worker, &gpu);
+        }
+        assert!(!presence.has_room(WorkerId::new(), &gpu));
+        assert!(presence.has_room(first, &gpu), "it is one of them");
+        assert!(presence.has_room(WorkerId::new(), &cpu));
+        assert!(presence.leave(first, &gpu));
+        assert!(presence.has_room(WorkerId::new(), &gpu));
     }
 }

@@ -13,13 +13,14 @@ use super::accept::is_possible;
 use super::core::{Core, lock};
 use super::error::EventError;
 use super::figures;
+use super::presence::MOST_WORKERS;
 use crate::nats::connection::ClusterError;
 use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Tell, TileBeat, Want};
 use crate::nats::names;
 use engine::job::Pool;
 use engine::pipeline::progress::is_history;
 use reconstruction::schedule::MAX_ITERATIONS;
-use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
+use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace, WorkerTakes};
 
 /// Time between two transactions for what workers tell.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -156,6 +157,11 @@ impl Core {
             tracing::warn!(%worker, host, reason, "a worker is refused");
             return Some(HelloAnswer::Refused(reason));
         }
+        if !lock(&self.presence).has_room(worker, pool) {
+            tracing::warn!(%worker, host, %pool, "a worker is refused: its pool has enough");
+            let reason = format!("the pool has {MOST_WORKERS} workers, as many as it may");
+            return Some(HelloAnswer::Refused(reason));
+        }
         if let Err(error) = self.connection.make_pool(pool, self.ack_wait).await {
             tracing::error!(%error, "a pool can't be made");
             return None;
@@ -165,7 +171,7 @@ impl Core {
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        if let Err(error) = self.store.worker_started(worker, pid, &place, false).await {
+        if let Err(error) = self.store.worker_started(worker, pid, &place, WorkerTakes::All).await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
         }
