@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release version install dist dist-check wheel demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-latency bench-peers bench-scale eval-models eval-loop eval-wrong-inputs evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -16,16 +16,19 @@ demo: runtime ## reconstruct a real clip through the real HTTP service
 # Most tests wait for services and clocks, so more threads than cores are useful.
 TEST_THREADS ?= $(shell expr 2 \* $$(nproc))
 test: runtime judges $(TRAINING)/.stamp ## run all tests
-	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --workspace
+	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python \
+		SCI_RECON_TRAINING=$(abspath $(TRAINING))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
 deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them
 	$(CARGO) build --quiet
 	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
 
-client-check: judges ## check types and style of the Python client
+client-check: wheel ## check types, style and wheel of the Python client
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
 		$(abspath $(JUDGES))/bin/python -m ruff format --check src
+	@folder=$$(mktemp -d) && $(JUDGES)/bin/python -m pip install --quiet --no-deps --target "$$folder" dist/*.whl && \
+		PYTHONPATH=$$folder $(JUDGES)/bin/python -m sci_recon --help > /dev/null && rm -r "$$folder"
 
 clients: ## check the contract with Redocly and Spectral, and generate clients with openapi-python-client and openapi-typescript
 	@tests/judges/clients/run.sh $(VENV)/clients
@@ -51,13 +54,24 @@ version: ## print the version of a build of this commit
 install: release ## install program, library, models, unit, completions and man pages below PREFIX=/usr/local (DESTDIR for packages)
 	@scripts/install.sh "$(PROGRAM)" "$(DESTDIR)$(PREFIX)" "$(PREFIX)"
 
-ARCHIVE := sci-recon-$(PACKAGE)-x86_64-linux
-dist: release ## make the relocatable archive dist/sci-recon-VERSION-x86_64-linux.tar.gz of these files
+ARCHIVE := sci-recon-$(PACKAGE)-$(shell uname -m)-linux
+TOOLS := $(VENV)/tools
+dist: release wheel $(TOOLS)/bin/cargo-cyclonedx ## make the relocatable archive dist/sci-recon-VERSION-MACHINE-linux.tar.gz, its list of components (SBOM), the Python client, and checksums
 	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
 	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
-	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
+	@$(TOOLS)/bin/cargo-cyclonedx cyclonedx --quiet --format json --spec-version 1.5 --target all --override-filename components
+	@sed 's|$(CURDIR)|.|g' components.json > dist/$(ARCHIVE).cdx.json
+	@rm components.json crates/*/components.json research/experiments/components.json
+	@cd dist && rm -rf $(ARCHIVE) && sha256sum *.tar.gz *.cdx.json *.whl > SHA256SUMS && ls -l
+
+$(TOOLS)/bin/cargo-cyclonedx:
+	$(CARGO) install --locked --quiet --root $(TOOLS) cargo-cyclonedx@0.5.9
+
+wheel: judges ## make the wheel of the Python client in dist/
+	@mkdir -p dist && rm -f dist/*.whl
+	@$(JUDGES)/bin/python -m pip wheel --quiet --no-deps --wheel-dir dist clients/python
 
 dist-check: dist ## test the archive in an empty root with Debian's glibc and libstdc++: first token, health, the default job; needs root
 	@tests/judges/dist.sh dist/$(ARCHIVE).tar.gz
@@ -169,8 +183,8 @@ $(PUBLISHED): research/training/yardstick.txt
 	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest $(VENV) --requirement $<
 	touch $@
 
-deny: ## check licences, bans and sources of all crates; needs cargo install cargo-deny
-	$(CARGO) deny check licenses bans sources
+deny: ## check advisories, licences, bans and sources of all crates; needs cargo install cargo-deny
+	$(CARGO) deny check
 
 fmt:
 	$(CARGO) fmt --all --check

@@ -8,11 +8,11 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
 use rand::{Rng, SeedableRng};
-use reconstruction::prior::nonlocal::{Nonlocal, Part};
-use reconstruction::prior::temporal::TemporalVariation;
-use reconstruction::prior::tv::TotalVariation;
+use reconstruction::operator::SensingOperator;
+use reconstruction::priors::nonlocal::{Nonlocal, Part};
+use reconstruction::priors::temporal::TemporalVariation;
+use reconstruction::priors::tv::TotalVariation;
 use reconstruction::schedule::Schedule;
-use reconstruction::sensing::SensingOperator;
 use reconstruction::solver::reconstruct;
 use std::hint::black_box;
 

@@ -12,7 +12,7 @@ use strum::IntoStaticStr;
 use engine::job::Pool;
 use engine::job::WorkerId;
 use engine::pipeline::networks::{NetworkError, find_library};
-use reconstruction::prior::onnx::Device;
+use reconstruction::priors::onnx::Device;
 use store::Claimant;
 
 /// The version of the program, with its commit if `make` built it.
@@ -131,6 +131,16 @@ pub struct ServeArguments {
     /// equal share.
     #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
     pub max_jobs: u64,
+
+    /// Jobs of one lab that may wait and run, if there are several labs; `lab set --jobs` sets a limit for one lab
+    /// [default: the value of --max-jobs].
+    #[arg(long, env = "SCI_RECON_LAB_JOBS", value_name = "N")]
+    pub lab_jobs: Option<u64>,
+
+    /// Bytes that one lab may keep, if there are several labs; `lab set --bytes` sets a limit for one lab
+    /// [default: half of the disk].
+    #[arg(long, env = "SCI_RECON_LAB_BYTES", value_name = "BYTES", value_parser = bytes)]
+    pub lab_bytes: Option<u64>,
 
     /// Hours for which unused and incomplete uploads are kept.
     #[arg(long, env = "SCI_RECON_UPLOAD_HOURS", value_name = "HOURS", default_value_t = 72)]

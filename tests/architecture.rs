@@ -26,7 +26,7 @@ const SOURCES: [&str; 7] = [
 
 /// Crates and modules that only these files and folders may name.
 const OWNERS: &[(&str, &[&str])] = &[
-    ("ort", &["crates/reconstruction/src/prior/onnx.rs"]),
+    ("ort", &["crates/reconstruction/src/priors/onnx.rs"]),
     ("sqlx", &["crates/store/src/"]),
     ("axum", &["src/http/", "src/cli/serve.rs"]),
     ("async_nats", &["crates/workers/src/nats/"]),
@@ -37,7 +37,7 @@ const OWNERS: &[(&str, &[&str])] = &[
 const WITHOUT_FILES: (&[&str], &[&str], &[&str]) = (
     &["crates/reconstruction/src/", "crates/optics/src/"],
     &["std::fs", "std::path"],
-    &["crates/reconstruction/src/prior/onnx.rs"],
+    &["crates/reconstruction/src/priors/onnx.rs"],
 );
 
 /// A module's path from the crate's root.

@@ -190,8 +190,8 @@ class Case:
         least, greatest = APERTURE_CONTRAST
         self.unfamiliar = contrast < greatest and (contrast < least or gradient - contrast < APERTURE_SHARPNESS)
         # The default's pilot shrinks changes along time; gap-tv has none.
-        stages = about['pilot']['stages'] if about.get('pilot') else []
-        self.shrunk = any((stage.get('rest_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
+        stages = [decided['stage'] for decided in about['pilot']['stages']] if about.get('pilot') else []
+        self.shrunk = any((stage.get('static_shrinkage') or stage.get('temporal_shrinkage', 0)) > SHRUNK for stage in stages)
 
     def set_evidence(self, evidence):
         self.signs = torch.tensor([self.white, *evidence['signs']], dtype=torch.float32)

@@ -13,7 +13,7 @@ use crate::cli::error::Result;
 use engine::job::{Algorithm, InvalidField, Mosaic, Sequence};
 use engine::pipeline::NetworkSource;
 use formats::Axes;
-use reconstruction::prior::onnx::Device;
+use reconstruction::priors::onnx::Device;
 use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
 use strum::{VariantArray, VariantNames};
@@ -75,7 +75,7 @@ impl ScheduleArguments {
             return Err(CliError::Input(format!("the schedule does not fit: {misfit}")));
         }
         Ok(match self.iterations {
-            Some(count) => schedule.filled().with_iterations(count as usize),
+            Some(count) => schedule.with_iterations(count as usize),
             None => schedule,
         })
     }
@@ -219,7 +219,7 @@ mod tests {
         };
         assert!(message("gap-tv", "{").contains("schedule.json"));
         let sigma = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5}]}"#;
-        assert!(message("pnp-tv-fastdvdnet", sigma).contains("/stages/0/sigma"));
+        assert!(message("pnp-tv-fastdvdnet", sigma).contains("missing field `sigma`"));
         let deep = r#"{"stages": [{"prior": "fastdvdnet", "iterations": 5, "sigma": [0.2, 0.1]}]}"#;
         assert!(message("gap-tv", deep).contains("use the algorithm pnp-fastdvdnet"));
     }

@@ -109,10 +109,11 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
             store.entitle(lab, entitlement).await?;
         }
     }
-    let mut rows = Vec::new();
+    let (mut rows, costs) = (Vec::new(), store.cost_left_by_lab().await?);
     for row in store.labs().await? {
         let bytes = store.lab_bytes(&row.lab).await?;
-        rows.push((row, bytes));
+        let cost_left = costs.get(&row.lab).copied().unwrap_or_default();
+        rows.push((row, bytes, cost_left));
     }
     Ok(table(&rows))
 }
@@ -134,14 +135,14 @@ async fn uploads(store: &Store, lab: &Lab) -> Result<String> {
     }
 }
 
-fn table(labs: &[(LabRow, u64)]) -> String {
+fn table(labs: &[(LabRow, u64, f64)]) -> String {
     let head = format!(
         "{:40}  {:>8}  {:>8}  {:>8}  {:>16}  {:>16}  {:>16}",
         "lab", "share", "jobs", "of", "bytes", "of", "CPU seconds left"
     );
     let limit = |limit: Option<u64>| limit.map_or_else(|| "none".into(), |limit| limit.to_string());
-    let line = |(row, bytes): &(LabRow, u64)| {
-        let LabRow { lab, share, max_bytes, max_jobs, jobs, cost_left } = row;
+    let line = |(row, bytes, cost_left): &(LabRow, u64, f64)| {
+        let LabRow { lab, share, max_bytes, max_jobs, jobs } = row;
         format!(
             "{:40}  {share:>8}  {jobs:>8}  {:>8}  {bytes:>16}  {:>16}  {cost_left:>16.0}",
             lab.as_str(),

@@ -41,6 +41,7 @@ async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreErro
     // 1. Remove the remains of crashes.
     store.advance_generation().await?;
     store.dir().sweep_tmp()?;
+    store.finish_removals().await?;
     let orphans = store.quarantine_orphans(false).await?;
     store.empty_quarantine(store.ago(DAY * settings.quarantine_days).await?).await?;
     let full = store.dir().disk()?.0 < settings.low_water_bytes.max(settings.min_free_bytes);
@@ -64,6 +65,10 @@ async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreErro
         let old = store.ago(MIN_AGE).await?;
         unused = store.collect(old).await?;
         jobs += store.remove_jobs(old, settings.low_water_bytes).await?;
+    }
+    // 4. Keep a reserve, so that the service can start on a full disk.
+    if let Err(error) = store.dir().keep_reserve(settings.min_free_bytes) {
+        tracing::warn!(%error, "there is no reserve for a start on a full disk");
     }
     if orphans + uploads + jobs + unused > 0 {
         tracing::info!(orphans, uploads, jobs, unused, "cleaned up");

@@ -24,7 +24,7 @@ use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION}
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
-use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord};
+use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
 use engine::pipeline::scale::white;
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
@@ -444,6 +444,7 @@ struct Report {
     psnr_db_by_snapshot: Vec<f64>,
     ssim: Option<f64>,
     seconds: f64,
+    iterations: usize,
     denoiser_passes: usize,
     tv_iterations: usize,
     cpu_seconds: f64,
@@ -487,6 +488,7 @@ impl Report {
             psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
             ssim: quality.as_ref().and_then(|quality| quality.ssim),
             seconds: run.seconds.unwrap_or_default(),
+            iterations: summary.iterations,
             denoiser_passes: summary.denoiser_passes,
             tv_iterations: summary.tv_iterations,
             cpu_seconds: run.cost.cpu_seconds,
@@ -521,16 +523,16 @@ impl Report {
         ))?;
         print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
-        for stage in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
+        for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(
                 "{}: {} of {} iterations ({}), error at held-out pixels {:.4} to {:.4}{}",
-                stage.prior.name(),
-                stage.iterations,
-                stage.planned,
-                stage.end,
-                stage.error_before,
-                stage.error_after,
-                stage.fates().iter().map(|fate| format!(", {fate}")).collect::<String>()
+                decided.stage.prior.name(),
+                decided.stage.iterations,
+                decided.planned.iterations,
+                decided.end,
+                decided.error_before,
+                decided.error_after,
+                changes(decided)
             ))?;
         }
         for joint in self.pilot.iter().flat_map(|pilot| &pilot.joints) {

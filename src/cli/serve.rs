@@ -65,9 +65,13 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     settings.check(store.is_open().await?)?;
     // 2. Clean up after an earlier server.
     let swept = store.dir().sweep_tmp()?;
+    store.finish_removals().await?;
     store.quarantine_orphans(accept_database).await?;
     store.forget_workers(Duration::from_secs(60)).await?;
-    // 3. Announce the address. Signals are handled from before, because the reader may send one at once.
+    let half = store.dir().disk()?.1 / 2;
+    let lab_jobs = settings.lab_jobs.unwrap_or(settings.max_jobs);
+    store.set_default_limits(settings.lab_bytes.unwrap_or(half), lab_jobs).await?;
+    // 3. Announce the address. The reader may send a signal at once, so signals are handled first.
     let signal = stop_signal().map_err(io("listen for signals"))?;
     let listener = TcpListener::bind(settings.listen)
         .await

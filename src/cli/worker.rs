@@ -17,7 +17,7 @@ use crate::config::VERSION;
 use crate::config::WorkerArguments;
 use engine::job::WorkerId;
 use engine::pipeline::NetworkSource;
-use reconstruction::prior::onnx::Device;
+use reconstruction::priors::onnx::Device;
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
 use workers::nats::{ClusterError, Program, Remote, RemoteSettings};

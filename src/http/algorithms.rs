@@ -35,7 +35,7 @@ pub(super) async fn list() -> Json<ListBody> {
                 .into_iter()
                 .map(|which| networks::carried(which).name)
                 .collect(),
-            priors: name.priors().iter().map(|prior| prior.name()).collect(),
+            priors: name.priors().iter().map(|prior| prior.as_str()).collect(),
             planned_iterations: schedule.planned_iterations(),
             planned_passes: schedule.planned_passes(),
             schedule,

@@ -289,12 +289,13 @@ export async function network(page, checks, url, deep, plain) {
   checks.that(cells[0].includes("fastdvdnet") && cells[1] === "none", `the table names the networks: ${cells}`);
 }
 
-/** Reads the decisions of a job's pilot; `stage` is its record in the manifest. */
-export async function decided(page, checks, stage) {
+/** Reads the decisions of a job's pilot; `decision` is its record of a stage in the manifest. */
+export async function decided(page, checks, decision) {
   const card = await page.waitForSelector("section[aria-label='How it was made']:has-text('Pilot, tv')", { timeout: 30_000 });
   const text = await card.textContent();
-  const expected = `temporal total variation ${stage.temporal_weight === 0 ? "omitted" : "kept"}, hold-out error 1 to ${Number(stage.error_after.toPrecision(3))}`;
-  checks.that(stage.planned_temporal_weight > 0 && text.includes(expected), `the card shows the pilot's decisions: ${text}`);
+  const change = decision.stage.temporal_weight === 0 ? "temporal weight omitted" : "as planned";
+  const expected = `${change}, hold-out error 1 to ${Number(decision.error_after.toPrecision(3))}`;
+  checks.that(decision.planned.temporal_weight > 0 && text.includes(expected), `the card shows the pilot's decisions: ${text}`);
 }
 
 /** Submits the sample on an empty service, without typing. */

@@ -51,10 +51,11 @@ class Image:
     def __init__(self, repository, program):
         self.environment = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"}
         self.users, self.folders, self.copies, self.health = {"root": 0}, [], [], None
+        self.packages = []
         built = {"/out/": [repository / "runtime", program]}
         for name, rest in instructions((repository / "docker/Dockerfile").read_text()):
             if name == "FROM":
-                require(rest == "debian:bookworm-slim", f"this script does not know the base image {rest}")
+                require(re.fullmatch(r"debian:12\.\d+-slim", rest), f"this script does not know the base image {rest}")
             elif name == "RUN":
                 for command in rest.split("&&"):
                     self.run(shlex.split(command))
@@ -71,10 +72,12 @@ class Image:
             elif name == "HEALTHCHECK":
                 self.health = json.loads(rest[rest.index("CMD") + 3:])
             else:
-                require(name in ("VOLUME", "EXPOSE", "STOPSIGNAL", "CMD"), f"{name} is not known here")
+                require(name in ("VOLUME", "EXPOSE", "STOPSIGNAL", "CMD", "LABEL"), f"{name} is not known here")
 
     def run(self, words):
-        if words[0] == "useradd":
+        if words[0] in ("apt-get", "rm"):
+            self.packages += words[words.index("--no-install-recommends") + 1 :] if "install" in words else []
+        elif words[0] == "useradd":
             self.users[words[-1]] = int(words[words.index("--uid") + 1])
         else:
             require(words[:3] == ["install", "-d", "-o"], f"RUN {words} is not known here")
@@ -103,6 +106,9 @@ class Image:
             place = root / str(library).strip("/")
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(library, place)
+        for package in self.packages:
+            require(package == "ca-certificates", f"this script does not know the package {package}")
+            shutil.copytree("/etc/ssl/certs", root / "etc/ssl/certs", symlinks=False, ignore_dangling_symlinks=True)
         for folder, uid in self.folders:
             place = root / folder.strip("/")
             place.mkdir()

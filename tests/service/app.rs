@@ -277,11 +277,20 @@ impl TestApp {
 /// Path of a Python with the packages of tests/judges/requirements.txt. Calls [`skip`] if there is none.
 #[track_caller]
 pub fn judges() -> Option<String> {
-    let python = std::env::var("SCI_RECON_JUDGES").ok();
+    python("SCI_RECON_JUDGES", "tests/judges/requirements.txt")
+}
+
+/// Path of a Python with the packages of research/training/requirements.txt. Calls [`skip`] if there is none.
+#[track_caller]
+pub fn training() -> Option<String> {
+    python("SCI_RECON_TRAINING", "research/training/requirements.txt")
+}
+
+#[track_caller]
+fn python(variable: &str, requirements: &str) -> Option<String> {
+    let python = std::env::var(variable).ok();
     if python.is_none() {
-        skip(
-            "SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt: run `make judges`",
-        );
+        skip(&format!("{variable} names no Python with {requirements}: run `make test`"));
     }
     python
 }

@@ -97,6 +97,7 @@ fn a_simulated_snapshot_is_reconstructed() {
             "psnr_db_by_snapshot",
             "ssim",
             "seconds",
+            "iterations",
             "denoiser_passes",
             "tv_iterations",
             "cpu_seconds",

@@ -6,9 +6,9 @@ use std::path::PathBuf;
 
 use ndarray::{Array3, ArrayView3, s};
 use rand::{Rng, SeedableRng};
-use reconstruction::prior::network::ClipDenoiser;
-use reconstruction::prior::onnx::{Device, Runtime};
-use reconstruction::prior::{CHANNELS, Denoiser, Network, Networks};
+use reconstruction::priors::network::ClipDenoiser;
+use reconstruction::priors::onnx::{Device, Runtime};
+use reconstruction::priors::{CHANNELS, Denoiser, Network, Networks};
 use sci_recon_engine::pipeline::networks::{self, NetworkSource, WarmNetworks};
 
 /// Path of libonnxruntime, or none after a message. With `CI=true` in the environment, the test fails instead.

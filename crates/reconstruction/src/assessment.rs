@@ -1,10 +1,9 @@
-//! How near frames come to the truth, told without it.
+//! The quality model: predicts the error of frames without the true ones.
 //!
-//! A lab has no truth. What can be seen are the frames themselves: how much changes in them from pixel to pixel
-//! and from frame to frame, how far the priors have moved them since total variation, what the denoiser's own first
-//! layers see in them, how well the masks can tell frames apart, and the [`super::signs`] of pixels
-//! that were held out. Block by block the expected error follows from these by a small network that was fitted to
-//! simulated snapshots of many scenes; `docs/BENCHMARKS.md` states how well it does on others.
+//! A lab has no true frames, but several features correlate with the error: texture and temporal changes of the frames,
+//! their distance from those after total variation, activations of the denoiser's first layers, the contrast of the
+//! masks, and estimates from hold-out pixels ([`super::signs`]). Small networks predict the error of each block from them.
+//! They were fitted to simulated snapshots of many scenes. `docs/BENCHMARKS.md` states their error on other scenes.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,15 +17,17 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result, shape_text};
 use super::motion::Steps;
-pub use super::prior::BLOCK;
-use super::prior::{CHANNELS, Encoder};
-use super::schedule::{Method, Schedule, Stage};
-use super::sensing::SensingOperator;
+use super::operator::SensingOperator;
+pub use super::priors::BLOCK;
+use super::priors::nonlocal::NonlocalSpec;
+use super::priors::registry::PriorSpec;
+use super::priors::{CHANNELS, Encoder};
+use super::schedule::{Method, Schedule};
 use super::signs::Signs;
+use super::stage::Stage;
 
-/// What is seen of a block of a frame, each the decimal logarithm of an energy or of a ratio: of the frames
-/// of the result, and of those that total variation alone had left, where other priors followed. Nothing
-/// betrays frames that are wrong as much as motion that does not explain how they change.
+/// Features of a block of a frame, each the decimal logarithm of an energy or a ratio. The last nine belong to the frames
+/// after total variation, if other priors followed. Temporal changes that no motion explains indicate an error best.
 pub const FEATURES: [&str; 26] = [
     "gradient",
     "curvature",
@@ -56,23 +57,25 @@ pub const FEATURES: [&str; 26] = [
     "change in time beside other frames after total variation",
 ];
 
-/// How many are seen of the frames of a clip by themselves, and the first ones of the other kinds.
-const OF_CLIP: usize = 9;
-const OF_RESULT: usize = 9;
-const OF_WHOLE: usize = 14;
-const OF_EARLY: usize = 17;
+/// Number of features computed from a clip alone.
+const CLIP_FEATURES: usize = 9;
+/// Index of the first feature of the result beyond those of its clip.
+const RESULT: usize = 9;
+/// Index of the first feature of the whole frame.
+const WHOLE: usize = 14;
+/// Index of the first feature of the frames after total variation.
+const EARLY: usize = 17;
 
-/// Below this, energies are rounding.
+/// Energies below this are rounding errors.
 const FLOOR: f32 = 1e-7;
 
-/// Rows and columns of blocks of a picture of `height` x `width` pixels; those at the far edges may be smaller.
+/// Rows and columns of blocks of a picture of `height` x `width` pixels. Blocks at the far edges may be smaller.
 pub fn blocks(height: usize, width: usize) -> (usize, usize) {
     (height.div_ceil(BLOCK), width.div_ceil(BLOCK))
 }
 
-/// What is seen of each block of each frame \[features, S B, rows, columns\], of the frames \[S B,H,W\] of a
-/// reconstruction and those that total variation alone had left, if other priors followed; all on the scale
-/// on which the scene is on \[0,1\].
+/// Features of each block \[features, S B, rows, columns\] of the frames \[S B,H,W\] of a reconstruction. `early` are the
+/// frames after total variation, if other priors followed. All are on the scale on which the scene is on \[0,1\].
 pub fn features(
     op: &SensingOperator,
     early: Option<ArrayView3<'_, f32>>,
@@ -82,11 +85,11 @@ pub fn features(
     let (rows, columns) = blocks(height, width);
     let ratio = op.masks().len_of(Axis(0));
     let mut all = Array4::zeros((FEATURES.len(), count, rows, columns));
-    of_clip(frames, ratio, all.slice_mut(s![..OF_CLIP, .., .., ..]));
+    clip_features(frames, ratio, all.slice_mut(s![..CLIP_FEATURES, .., .., ..]));
     if let Some(early) = early {
-        of_clip(early, ratio, all.slice_mut(s![OF_EARLY..OF_EARLY + OF_CLIP, .., .., ..]));
+        clip_features(early, ratio, all.slice_mut(s![EARLY..EARLY + CLIP_FEATURES, .., .., ..]));
     }
-    let (contrast, roughness) = of_masks(op);
+    let (contrast, mask_gradient) = mask_features(op);
     let ratio = (ratio as f32).log10();
     for (k, frame) in frames.outer_iter().enumerate() {
         let early = early.map(|early| early.index_axis_move(Axis(0), k));
@@ -94,49 +97,53 @@ pub fn features(
             early.map_or(0.0, |early| (frame[[i, j]] - early[[i, j]]).powi(2))
         });
         let brightness = over_blocks((height, width), |i, j| frame[[i, j]].powi(2));
-        let of_block = [
+        let result_features = [
             distance.mapv(logarithm),
             brightness.mapv(logarithm),
             contrast.clone(),
-            roughness.clone(),
+            mask_gradient.clone(),
         ];
-        for (index, value) in of_block.into_iter().enumerate() {
-            all.slice_mut(s![OF_RESULT + index, k, .., ..]).assign(&value);
+        for (index, value) in result_features.into_iter().enumerate() {
+            all.slice_mut(s![RESULT + index, k, .., ..]).assign(&value);
         }
-        all.slice_mut(s![OF_RESULT + 4, k, .., ..]).fill(ratio);
+        all.slice_mut(s![RESULT + 4, k, .., ..]).fill(ratio);
         let whole = |feature: usize| {
-            let of_blocks = all.slice(s![feature, k, .., ..]).mapv(|energy| 10f32.powf(energy));
-            logarithm(of_blocks.mean().unwrap_or(0.0))
+            let energies = all.slice(s![feature, k, .., ..]).mapv(|energy| 10f32.powf(energy));
+            logarithm(energies.mean().unwrap_or(0.0))
         };
-        for (index, value) in [whole(0), whole(2), whole(OF_RESULT)].into_iter().enumerate() {
-            all.slice_mut(s![OF_WHOLE + index, k, .., ..]).fill(value);
+        for (index, value) in [whole(0), whole(2), whole(RESULT)].into_iter().enumerate() {
+            all.slice_mut(s![WHOLE + index, k, .., ..]).fill(value);
         }
     }
     all
 }
 
-/// The same, followed by what the encoder sees of the blocks of the result, if there is one
-/// \[features and [`CHANNELS`], S B, rows, columns\].
-/// Errors: those of the encoder.
+/// As [`features`], followed by the encoder's features of the result, if there is an encoder: \[features and
+/// [`CHANNELS`], S B, rows, columns\].
+///
+/// # Errors
+/// The encoder fails.
 pub fn encoded_features(
     op: &SensingOperator,
     early: Option<ArrayView3<'_, f32>>,
     frames: ArrayView3<'_, f32>,
     encoder: Option<&mut dyn Encoder>,
 ) -> Result<Array4<f32>> {
-    let seen = features(op, early, frames);
-    let Some(encoder) = encoder else { return Ok(seen) };
+    let features = features(op, early, frames);
+    let Some(encoder) = encoder else { return Ok(features) };
     let encoded = encoder.encode(frames)?;
-    concatenate(Axis(0), &[seen.view(), encoded.view()]).map_err(|_| ReconError::Shape {
-        what: "what the encoder gave",
+    concatenate(Axis(0), &[features.view(), encoded.view()]).map_err(|_| ReconError::Shape {
+        what: "the encoder's output",
         found: shape_text(encoded.shape()),
-        expected: shape_text(&[&[CHANNELS], &seen.shape()[1..]].concat()),
+        expected: shape_text(&[&[CHANNELS], &features.shape()[1..]].concat()),
     })
 }
 
-/// What is seen of a result, followed by what is seen of the first run of its last stage and by the decimal logarithm of
-/// the mean squared distance between the frames of both \[2 times as many and 1, S B, rows, columns\].
-/// Errors: sizes that disagree.
+/// Features of the result of a stage that was run twice: those of the result, those of the first run, and the decimal
+/// logarithm of the mean squared distance between the frames of both \[2 x features + 1, S B, rows, columns\].
+///
+/// # Errors
+/// Sizes that disagree.
 pub(super) fn with_first_run(
     result: &Array4<f32>,
     first: &Array4<f32>,
@@ -151,14 +158,15 @@ pub(super) fn with_first_run(
     }
     let all = concatenate(Axis(0), &[result.view(), first.view(), distance.view()]);
     all.map_err(|_| ReconError::Shape {
-        what: "what is seen of a stage's first run",
+        what: "the features of a stage's first run",
         found: shape_text(first.shape()),
         expected: shape_text(result.shape()),
     })
 }
 
-/// What is seen of the frames of snapshots of `ratio` frames by themselves, into \[features, S B, rows, columns\].
-fn of_clip(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f32>) {
+/// Writes the features that follow from a clip alone into `all` \[features, S B, rows, columns\]. A snapshot has `ratio`
+/// frames.
+fn clip_features(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f32>) {
     let (count, height, width) = clip.dim();
     for first in (0..count).step_by(ratio) {
         let snapshot = first..count.min(first + ratio);
@@ -168,17 +176,18 @@ fn of_clip(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f
             mean.scaled_add(1.0 / frames, &clip.index_axis(Axis(0), k));
         }
         let energies: Vec<Array2<Energies>> =
-            snapshot.clone().map(|k| Energies::of_blocks(clip, k, mean.view())).collect();
-        let of_mean = over_blocks((height, width), |i, j| gradient(mean.view(), i, j));
-        for ((row, column), of_mean) in of_mean.indexed_iter() {
+            snapshot.clone().map(|k| Energies::in_blocks(clip, k, mean.view())).collect();
+        let mean_gradients = over_blocks((height, width), |i, j| gradient(mean.view(), i, j));
+        for ((row, column), mean_gradient) in mean_gradients.indexed_iter() {
             let here = |k: usize| &energies[k - first][[row, column]];
-            let beside = |energy: fn(&Energies) -> f32| {
+            let snapshot_mean = |energy: fn(&Energies) -> f32| {
                 snapshot.clone().map(|k| energy(here(k))).sum::<f32>() / frames
             };
-            let (gradients, changes) = (beside(Energies::gradient), beside(|e| e.change));
+            let (gradients, changes) =
+                (snapshot_mean(Energies::gradient), snapshot_mean(|e| e.change));
             for k in snapshot.clone() {
                 let energies = here(k);
-                let (speed, rest) = energies.motion();
+                let (speed, unexplained) = energies.motion();
                 let (gradient, change) =
                     (logarithm(energies.gradient()), logarithm(energies.change));
                 let values = [
@@ -186,9 +195,9 @@ fn of_clip(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f
                     logarithm(energies.curvature),
                     change,
                     logarithm(energies.variance),
-                    logarithm(*of_mean),
+                    logarithm(*mean_gradient),
                     speed,
-                    rest,
+                    unexplained,
                     gradient - logarithm(gradients),
                     change - logarithm(changes),
                 ];
@@ -198,25 +207,25 @@ fn of_clip(clip: ArrayView3<'_, f32>, ratio: usize, mut all: ArrayViewMut4<'_, f
     }
 }
 
-/// Energies of a block of a frame, in the mean over its pixels.
+/// Energies of a block of a frame: means over its pixels.
 #[derive(Debug, Clone, Copy, Default)]
 struct Energies {
     steps: Steps,
     curvature: f32,
-    /// Of the steps to the frames beside.
+    /// Energy of the differences to the frames before and after.
     change: f32,
-    /// Of what differs from the mean over time.
+    /// Energy of the deviation from the mean over time.
     variance: f32,
 }
 
-/// The square of the least motion that is told from rest, in pixels a frame, and the least share of the change that is
-/// told from none.
-const REST: f32 = 1e-4;
-const LEFT: f32 = 1e-3;
+/// Smallest squared motion that is distinguished from none, in pixels per frame.
+const MIN_SQUARED_SPEED: f32 = 1e-4;
+/// Smallest unexplained share of a temporal change that is distinguished from none.
+const MIN_UNEXPLAINED: f32 = 1e-3;
 
 impl Energies {
-    /// Of the blocks of frame `k`, whose snapshot has this mean over time.
-    fn of_blocks(clip: ArrayView3<'_, f32>, k: usize, mean: ArrayView2<'_, f32>) -> Array2<Self> {
+    /// Energies of the blocks of frame `k`; `mean` is its snapshot's mean over time.
+    fn in_blocks(clip: ArrayView3<'_, f32>, k: usize, mean: ArrayView2<'_, f32>) -> Array2<Self> {
         let (count, height, width) = clip.dim();
         let frame = clip.index_axis(Axis(0), k);
         let before = k.checked_sub(1).map(|k| clip.index_axis(Axis(0), k));
@@ -260,20 +269,23 @@ impl Energies {
         0.5 * (self.steps.down + self.steps.right)
     }
 
-    /// Logarithms of the squared speed of the motion that explains the slope along time best, and of the share of the
-    /// slope that it leaves.
+    /// Logarithms of the squared speed of the motion that explains the slope along time best, and of the share that it
+    /// leaves unexplained.
     fn motion(&self) -> (f32, f32) {
         let ((down, right), share) = self.steps.motion();
-        ((down * down + right * right + REST).log10(), (share + LEFT).log10())
+        (
+            (down * down + right * right + MIN_SQUARED_SPEED).log10(),
+            (share + MIN_UNEXPLAINED).log10(),
+        )
     }
 }
 
-/// The part of the gram diagonal that changes from mask to mask, and the energy of the masks' gradient, both
-/// relative to the masks' energy, of each block.
-fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
+/// Logarithms, for each block, of the part of the Gram diagonal that changes from mask to mask, and of the energy of the
+/// masks' gradient. Both are relative to the masks' energy.
+fn mask_features(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
     let masks = op.masks();
     let (_, height, width) = masks.dim();
-    let (gram, steady) = (op.gram(), op.steady_gram());
+    let (gram, steady) = (op.gram(), op.static_gram());
     let energy = over_blocks((height, width), |i, j| gram[[i, j]]);
     let steady = over_blocks((height, width), |i, j| steady[[i, j]]);
     let steps = over_blocks((height, width), |i, j| {
@@ -285,18 +297,19 @@ fn of_masks(op: &SensingOperator) -> (Array2<f32>, Array2<f32>) {
     (share(&(&energy - &steady)), share(&steps))
 }
 
-/// Decimal logarithms: between these lies the contrast of the hybrid coded aperture, whose gradient is so far above it, at
-/// least. Behind masks of more contrast, sharp or not, predictions are as good as behind independent pixels.
+/// Decimal logarithm of the mask contrast of the hybrid coded aperture. Behind masks of higher contrast, sharp or blurred,
+/// predictions are as good as behind independent pixels.
 const APERTURE_CONTRAST: Range<f32> = -1.6..-1.0;
+/// Smallest distance of the hybrid aperture's mask gradient above its contrast, in decimal logarithms.
 const APERTURE_SHARPNESS: f32 = 0.28;
 
-/// Whether predictions are uncertain behind these masks, by what is seen of them in [`features`]: masks that are blurred, or
-/// let light through closed pixels, until they are as much alike as those of the hybrid coded aperture, or more.
+/// True if predictions are uncertain behind the masks of these [`features`]. Such masks are blurred, or leak light through
+/// closed pixels, until they are at least as highly correlated as those of the hybrid coded aperture.
 pub fn unfamiliar_masks(features: &Array4<f32>) -> bool {
-    let of_blocks = |feature: usize| features.slice(s![OF_RESULT + feature, 0, .., ..]);
-    // Of a block that no light reaches there is nothing to tell.
-    let lit = of_blocks(2).mapv(|contrast| f32::from(u8::from(contrast > logarithm(0.0))));
-    let mean = |feature: usize| (&of_blocks(feature) * &lit).sum() / lit.sum();
+    let in_blocks = |feature: usize| features.slice(s![RESULT + feature, 0, .., ..]);
+    // A block that no light reaches has no contrast.
+    let lit = in_blocks(2).mapv(|contrast| f32::from(u8::from(contrast > logarithm(0.0))));
+    let mean = |feature: usize| (&in_blocks(feature) * &lit).sum() / lit.sum();
     let (contrast, sharpness) = (mean(2), mean(3) - mean(2));
     let known = contrast >= APERTURE_CONTRAST.end
         || contrast >= APERTURE_CONTRAST.start && sharpness >= APERTURE_SHARPNESS;
@@ -307,7 +320,7 @@ fn logarithm(energy: f32) -> f32 {
     energy.max(FLOOR).log10()
 }
 
-/// Half of the squared steps to the next pixel of both axes.
+/// Half of the squared differences to the next pixels along both axes.
 fn gradient(frame: ArrayView2<'_, f32>, i: usize, j: usize) -> f32 {
     let (height, width) = frame.dim();
     let here = frame[[i, j]];
@@ -316,7 +329,7 @@ fn gradient(frame: ArrayView2<'_, f32>, i: usize, j: usize) -> f32 {
     0.5 * (down * down + right * right)
 }
 
-/// Half of the squared second differences of both axes.
+/// Half of the squared second differences along both axes.
 fn curvature(frame: ArrayView2<'_, f32>, i: usize, j: usize) -> f32 {
     let (height, width) = frame.dim();
     let here = 2.0 * frame[[i, j]];
@@ -335,7 +348,7 @@ fn pixels_of(
     (of(row, height), of(column, width))
 }
 
-/// The means of a value over the pixels of each block \[rows, columns\].
+/// Means of a value over the pixels of each block \[rows, columns\].
 fn over_blocks(
     (height, width): (usize, usize),
     value: impl Fn(usize, usize) -> f32,
@@ -348,83 +361,82 @@ fn over_blocks(
     })
 }
 
-/// What a piece of a measurement tells of the error of all of it: by pixels that were held out there, and by
-/// what is seen of its frames, each in the mean over its blocks. Signs tell of frames like these.
+/// Hold-out evidence, from a crop of a measurement, of the error of the whole.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evidence {
-    /// What the held-out pixels tell.
+    /// Error estimates from the hold-out pixels.
     pub signs: Signs,
-    /// Values of [`FEATURES`].
+    /// Values of [`FEATURES`], means over the blocks of the crop.
     pub features: Vec<f32>,
-    /// The same of the first run of a stage that is run twice.
+    /// Evidence of the first run of a stage that is run twice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub first: Option<Box<Evidence>>,
 }
 
 impl Evidence {
-    /// Of signs and features \[features, B, rows, columns\] of the same piece.
-    pub(super) fn new(signs: Signs, seen: &Array4<f32>) -> Self {
-        let mean = |of_feature: ArrayView3<'_, f32>| of_feature.mean().unwrap_or(0.0);
-        Self { signs, features: seen.outer_iter().map(mean).collect(), first: None }
+    /// Evidence from signs and features \[features, B, rows, columns\] of the same crop.
+    pub(super) fn new(signs: Signs, features: &Array4<f32>) -> Self {
+        let mean = |values: ArrayView3<'_, f32>| values.mean().unwrap_or(0.0);
+        Self { signs, features: features.outer_iter().map(mean).collect(), first: None }
     }
 }
 
-/// What errors are predicted by: `assessment.json`, which `research/training/assessment.py` fits. The mean of some
-/// networks of a few neurons, of what is seen of a block, of its means over the blocks around and over these
-/// in all frames, of the white level, of the evidence, and of what the encoder sees of the block.
+/// A quality model from `assessment.json`, which `research/training/assessment.py` fits.
+///
+/// It averages small networks. Their inputs are the features of a block, their means over the blocks around it, in its
+/// frame and in all frames, the evidence, the white level, and the encoder's features of the block.
 #[derive(Debug, Deserialize)]
 pub struct Model {
     features: Scaling,
     signs: Scaling,
-    /// Of results that a network has had a part in.
+    /// The encoder's part, for results of schedules with a network.
     encoding: Option<Encoding>,
     networks: Vec<Vec<Layer>>,
-    /// What is added to the predicted PSNR for the ends of the interval in which four of five true values lie,
-    /// in dB.
+    /// Ends of the interval that contains four of five true values, in dB relative to the predicted PSNR.
     pub interval: [f64; 2],
-    /// Where [`unfamiliar_masks`] says so.
+    /// The correction behind [`unfamiliar_masks`].
     pub unfamiliar: Unfamiliar,
 }
 
-/// What is different behind masks that predictions are uncertain behind.
+/// Correction of a prediction behind unfamiliar masks.
 #[derive(Debug, Deserialize)]
 pub struct Unfamiliar {
-    /// What is added to the predicted PSNR, in dB.
+    /// Correction of the predicted PSNR in dB.
     pub offset: f32,
-    /// As that of the model.
+    /// The interval in place of the model's.
     pub interval: [f64; 2],
 }
 
-/// Inputs are shifted, scaled and bounded first.
+/// Shift and scale of inputs, which are bounded afterwards.
 #[derive(Debug, Deserialize)]
 struct Scaling {
     mean: Vec<f32>,
     scale: Vec<f32>,
 }
 
-/// Principal components of what the encoder sees: of each channel a weight for each of them. What they give is bounded.
+/// Principal components of the encoder's features: for each channel a weight in each component. Their values are bounded.
 #[derive(Debug, Deserialize)]
 struct Encoding {
     mean: Vec<f32>,
     components: Vec<Vec<f32>>,
 }
 
-/// Neurons: of each input a weight for each of them.
+/// A layer of neurons: for each input a weight in each neuron.
 #[derive(Debug, Deserialize)]
 struct Layer {
     weights: Vec<Vec<f32>>,
     bias: Vec<f32>,
 }
 
-/// Shrinkage along time, in units of `sigma`, above which frames have a model of their own: where masks are much
-/// alike, motion that was shrunk away may leave nothing behind that looks wrong.
-const SHRUNK: f32 = 1.0;
+/// Temporal shrinkage, in units of `sigma`, above which a separate model predicts the error. Behind highly correlated masks
+/// it may remove motion without leaving a trace.
+const STRONG_SHRINKAGE: f32 = 1.0;
 
-/// The model of frames that were shrunk less.
-const LITTLE_SHRUNK: &str = "pnp-tv-fastdvdnet";
+/// Name of the model of weakly shrunk frames.
+const WEAKLY_SHRUNK: &str = "pnp-tv-fastdvdnet";
 
-/// Inputs further from the mean than in any fit, in their scale, count as that far.
-const FARTHEST: f32 = 3.0;
+/// Largest deviation of an input from its mean, in units of its scale. Fits contain no larger ones.
+const MAX_DEVIATION: f32 = 3.0;
 
 static MODELS: LazyLock<BTreeMap<String, Model>> = LazyLock::new(|| {
     #[allow(clippy::expect_used)] // a test reads it
@@ -433,36 +445,39 @@ static MODELS: LazyLock<BTreeMap<String, Model>> = LazyLock::new(|| {
 });
 
 impl Model {
-    /// The model that was fitted to results of such schedules, as they were run, if there is one: of total
-    /// variation alone, or of total variation with what may follow in the default schedule, little shrunk along
-    /// time or much.
+    /// The model for results of a schedule as it was run, if there is one. There are models for total variation alone, and
+    /// for total variation followed by priors of the default schedule, with weak or strong temporal shrinkage.
     pub fn of(schedule: &Schedule) -> Option<&'static Self> {
         if schedule.method != Method::Gap {
             return None;
         }
-        let first = schedule.stages.first()?.prior.name();
+        let (first, rest) = schedule.stages.split_first()?;
         let known = |stage: &Stage| {
-            ["fastdvdnet", "fastdvdnet-int8", "nonlocal"].contains(&stage.prior.name())
+            use PriorSpec::{Fastdvdnet, FastdvdnetInt8, Nonlocal};
+            matches!(stage.prior, Fastdvdnet(_) | FastdvdnetInt8(_) | Nonlocal(_))
         };
-        let shrunk = |stage: &Stage| {
-            let most = stage.rest_shrinkage.or(stage.temporal_shrinkage);
-            most.is_some_and(|level| level > SHRUNK)
-        };
-        let rest = &schedule.stages[1..];
-        match (first, rest.iter().all(known), rest.is_empty()) {
-            ("tv", true, true) => MODELS.get("gap-tv"),
-            ("tv", true, false) if rest.iter().any(shrunk) => {
-                MODELS.get("pnp-tv-fastdvdnet, shrunk")
-            }
-            ("tv", true, false) => MODELS.get(LITTLE_SHRUNK),
-            _ => None,
+        if !matches!(first.prior, PriorSpec::Tv(_)) || !rest.iter().all(known) {
+            return None;
         }
+        let strongly_shrunk = |stage: &Stage| {
+            let nonlocal = stage.prior.nonlocal();
+            let level = |nonlocal: &NonlocalSpec| {
+                nonlocal.static_shrinkage.unwrap_or(nonlocal.temporal_shrinkage)
+            };
+            nonlocal.is_some_and(|nonlocal| level(nonlocal) > STRONG_SHRINKAGE)
+        };
+        MODELS.get(match rest {
+            [] => "gap-tv",
+            _ if rest.iter().any(strongly_shrunk) => "pnp-tv-fastdvdnet, shrunk",
+            _ => WEAKLY_SHRUNK,
+        })
     }
 
-    /// The decimal logarithm of the expected squared error of each block \[S B, rows, columns\], from what is
-    /// seen of them ([`encoded_features`]), and of the frames of the first run of a stage that was run twice.
-    /// Without evidence signs count as in the mean of the fit, and the features of the whole stand for those of the
-    /// piece; without an encoder its components count as in the mean. `white` is the scene's white level.
+    /// Decimal logarithm of the expected squared error of each block \[S B, rows, columns\]. `features` are those of
+    /// [`encoded_features`], or for a stage that was run twice those of both runs. `white` is the scene's white level.
+    ///
+    /// Without evidence the signs take their means in the fit, and the features of the whole picture replace those of the
+    /// crop. Without an encoder its components take their means.
     pub fn log_errors(
         &self,
         features: &Array4<f32>,
@@ -475,14 +490,14 @@ impl Model {
         }
         let (result, others) = features.view().split_at(Axis(0), all / 2);
         let (first, distance) = others.split_at(Axis(0), all / 2);
-        let told = self.log_errors_of_one(result, evidence, white);
-        let Some(model) = MODELS.get(LITTLE_SHRUNK) else { return told };
+        let log_errors = self.log_errors_of_one(result, evidence, white);
+        let Some(model) = MODELS.get(WEAKLY_SHRUNK) else { return log_errors };
         let evidence = evidence.and_then(|evidence| evidence.first.as_deref());
-        let of_first = model.log_errors_of_one(first, evidence, white);
-        apart(&told, &of_first, distance.index_axis(Axis(0), 0))
+        let first = model.log_errors_of_one(first, evidence, white);
+        combine_runs(&log_errors, &first, distance.index_axis(Axis(0), 0))
     }
 
-    /// The same from what is seen of one result.
+    /// As [`Model::log_errors`], from the features of a single run.
     fn log_errors_of_one(
         &self,
         features: ArrayView4<'_, f32>,
@@ -491,100 +506,104 @@ impl Model {
     ) -> Array3<f32> {
         let (_, frames, rows, columns) = features.dim();
         let encoded = features.slice(s![FEATURES.len().., .., .., ..]);
-        let mut seen = features.slice(s![..FEATURES.len(), .., .., ..]).to_owned();
-        for mut of_block in seen.lanes_mut(Axis(0)) {
-            let scaled = self.features.of(of_block.to_vec());
-            of_block.assign(&Array1::from(scaled));
+        let mut own = features.slice(s![..FEATURES.len(), .., .., ..]).to_owned();
+        for mut block in own.lanes_mut(Axis(0)) {
+            let scaled = self.features.of(block.to_vec());
+            block.assign(&Array1::from(scaled));
         }
-        let around = around(&seen);
-        let always = around.sum_axis(Axis(1)) / frames as f32;
+        let neighbourhood = neighbourhood_means(&own);
+        let over_time = neighbourhood.sum_axis(Axis(1)) / frames as f32;
         let blocks = (frames * rows * columns) as f32;
-        let mut known = vec![20.0 * white.log10()];
-        let mut rest: Vec<f32> = match evidence {
+        let mut signs = vec![20.0 * white.log10()];
+        let mut shared: Vec<f32> = match evidence {
             Some(evidence) => {
-                known.extend(evidence.signs.0);
+                signs.extend(evidence.signs.0);
                 self.features.of(evidence.features.clone())
             }
             None => {
-                known.extend(&self.signs.mean[1..]);
-                seen.outer_iter().map(|of_feature| of_feature.sum() / blocks).collect()
+                signs.extend(&self.signs.mean[1..]);
+                own.outer_iter().map(|feature| feature.sum() / blocks).collect()
             }
         };
-        rest.extend(self.signs.of(known));
+        shared.extend(self.signs.of(signs));
         Array3::from_shape_fn((frames, rows, columns), |(k, row, column)| {
-            let mut inputs = seen.slice(s![.., k, row, column]).to_vec();
-            inputs.extend(around.slice(s![.., k, row, column]));
-            inputs.extend(always.slice(s![.., row, column]));
-            inputs.extend(&rest);
+            let mut inputs = own.slice(s![.., k, row, column]).to_vec();
+            inputs.extend(neighbourhood.slice(s![.., k, row, column]));
+            inputs.extend(over_time.slice(s![.., row, column]));
+            inputs.extend(&shared);
             if let Some(encoding) = &self.encoding {
                 inputs.extend(encoding.of(encoded.slice(s![.., k, row, column])));
             }
-            let told = self.networks.iter().map(|layers| output(layers, &inputs));
-            told.sum::<f32>() / self.networks.len() as f32
+            let outputs = self.networks.iter().map(|layers| output(layers, &inputs));
+            outputs.sum::<f32>() / self.networks.len() as f32
         })
     }
 }
 
-/// From so many decibels on that the error of the first run's frames is expected to be above their distance from the
-/// result's, they moved; within so many there is doubt. Found on 75 simulated scenes.
-const MOVES: f32 = 3.0;
-const DOUBT: f32 = 0.3;
-/// The least share of the first run's error that its second run leaves where something moves.
-const LEAST: f32 = 0.1;
+/// Excess, in dB, of the first run's expected error over the squared distance of both runs, above which the scene moved.
+/// Determined on 75 simulated scenes.
+const MOTION_DB: f32 = 3.0;
+/// Width of the transition around [`MOTION_DB`], in dB.
+const MOTION_WIDTH_DB: f32 = 0.3;
+/// Smallest share of the first run's error that remains in the result where something moves.
+const MIN_SHARE: f32 = 0.1;
 
-/// What the result of a stage that was run twice is expected to be off by, by what it is by itself, `told`, by the errors
-/// of its first run, which shrank little, and by the distance of both results; all logarithms \[S B, rows, columns\].
+/// Expected error of a stage that was run twice, from the predictions for both runs and from their distance; all are
+/// logarithms \[S B, rows, columns\].
 ///
-/// What the second run has taken away was error where the scene is at rest: then the first run's frames are as far from
-/// the result's as from the truth. Where it was motion, they are further from the truth than that, by what both results
-/// have wrong; and frames from which motion was not shrunk away show that they are.
-fn apart(told: &Array3<f32>, of_first: &Array3<f32>, distance: ArrayView3<'_, f32>) -> Array3<f32> {
+/// In a static scene the second run removes error, so the first run is as far from the result as from the true frames.
+/// Where it removes motion, the first run's error exceeds the distance by the error that both runs share. The weakly shrunk
+/// frames of the first run show that error.
+fn combine_runs(
+    result: &Array3<f32>,
+    first: &Array3<f32>,
+    distance: ArrayView3<'_, f32>,
+) -> Array3<f32> {
     let energy = |logs: ArrayView3<'_, f32>| logs.iter().map(|log| 10f32.powf(*log)).sum::<f32>();
-    let further = 10.0 * (energy(of_first.view()) / energy(distance)).log10();
-    let share = 1.0 / (1.0 + (-(further - MOVES) / DOUBT).exp());
-    Zip::from(told).and(of_first).and(distance).map_collect(|told, first, distance| {
+    let excess = 10.0 * (energy(first.view()) / energy(distance)).log10();
+    let share = 1.0 / (1.0 + (-(excess - MOTION_DB) / MOTION_WIDTH_DB).exp());
+    Zip::from(result).and(first).and(distance).map_collect(|result, first, distance| {
         let error = 10f32.powf(*first);
-        let left = (error - 10f32.powf(*distance)).max(LEAST * error).log10();
-        share * left + (1.0 - share) * told
+        let remaining = (error - 10f32.powf(*distance)).max(MIN_SHARE * error).log10();
+        share * remaining + (1.0 - share) * result
     })
 }
 
-/// The means over each block and those that touch it, of the same frame.
-fn around(seen: &Array4<f32>) -> Array4<f32> {
-    let (_, _, rows, columns) = seen.dim();
-    let beside = |at: usize, length: usize| at.saturating_sub(1)..length.min(at + 2);
-    Array4::from_shape_fn(seen.dim(), |(feature, k, row, column)| {
-        let place = s![feature, k, beside(row, rows), beside(column, columns)];
-        seen.slice(place).mean().unwrap_or(0.0)
+/// Means over each block and the blocks that touch it, in the same frame.
+fn neighbourhood_means(features: &Array4<f32>) -> Array4<f32> {
+    let (_, _, rows, columns) = features.dim();
+    let adjacent = |at: usize, length: usize| at.saturating_sub(1)..length.min(at + 2);
+    Array4::from_shape_fn(features.dim(), |(feature, k, row, column)| {
+        let place = s![feature, k, adjacent(row, rows), adjacent(column, columns)];
+        features.slice(place).mean().unwrap_or(0.0)
     })
 }
 
 impl Scaling {
     fn of(&self, values: Vec<f32>) -> Vec<f32> {
         let scaled = values.iter().zip(self.mean.iter().zip(&self.scale));
-        scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-FARTHEST, FARTHEST)).collect()
+        scaled.map(|(x, (mean, s))| ((x - mean) / s).clamp(-MAX_DEVIATION, MAX_DEVIATION)).collect()
     }
 }
 
 impl Encoding {
-    /// The components; all 0, as in the mean, where the encoder has seen nothing.
+    /// The components; without the encoder's features all are 0, their mean.
     fn of(&self, encoded: ArrayView1<'_, f32>) -> Vec<f32> {
         let mut values = vec![0.0; self.components.first().map_or(0, Vec::len)];
-        let moved = encoded.iter().zip(&self.mean).map(|(x, mean)| x - mean);
-        add_weighted(&mut values, moved, &self.components);
-        values.iter().map(|value| value.clamp(-FARTHEST, FARTHEST)).collect()
+        let shifted = encoded.iter().zip(&self.mean).map(|(x, mean)| x - mean);
+        add_weighted(&mut values, shifted, &self.components);
+        values.iter().map(|value| value.clamp(-MAX_DEVIATION, MAX_DEVIATION)).collect()
     }
 }
 
-/// Adds to each sum all inputs by their weights for it, sum beside sum: that vectorises, and is the same on
-/// every machine.
+/// Adds all weighted inputs to each sum. The sums are side by side, which vectorises and is the same on every machine.
 fn add_weighted(sums: &mut [f32], inputs: impl Iterator<Item = f32>, weights: &[Vec<f32>]) {
     for (input, weights) in inputs.zip(weights) {
         sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight * input);
     }
 }
 
-/// What the last of some layers gives.
+/// Output of the last layer.
 fn output(layers: &[Layer], inputs: &[f32]) -> f32 {
     let outputs = layers.iter().enumerate().fold(inputs.to_vec(), |inputs, (index, layer)| {
         layer.outputs(&inputs, index + 1 < layers.len())
@@ -593,7 +612,7 @@ fn output(layers: &[Layer], inputs: &[f32]) -> f32 {
 }
 
 impl Layer {
-    /// `W x + b`, and of all layers but the last its product with its sigmoid.
+    /// `W x + b`; an inner layer multiplies it by its sigmoid (SiLU).
     fn outputs(&self, inputs: &[f32], inner: bool) -> Vec<f32> {
         let mut sums = self.bias.clone();
         add_weighted(&mut sums, inputs.iter().copied(), &self.weights);
@@ -607,13 +626,13 @@ impl Layer {
 #[cfg(test)]
 mod tests {
     use super::{
-        Evidence, FEATURES, MODELS, Model, OF_CLIP, OF_EARLY, apart, around, encoded_features,
-        features, unfamiliar_masks, with_first_run,
+        CLIP_FEATURES, EARLY, Evidence, FEATURES, MODELS, Model, combine_runs, encoded_features,
+        features, neighbourhood_means, unfamiliar_masks, with_first_run,
     };
     use crate::error::ReconError;
-    use crate::prior::{CHANNELS, Encoder};
+    use crate::operator::SensingOperator;
+    use crate::priors::{CHANNELS, Encoder};
     use crate::schedule::Schedule;
-    use crate::sensing::SensingOperator;
     use crate::signs::{SIGNS, Signs};
     use ndarray::{Array3, Array4, ArrayView3, s};
     use optics::{iid_masks, random_squares, soften};
@@ -624,47 +643,47 @@ mod tests {
     }
 
     #[test]
-    fn features_are_means_over_blocks_and_those_at_the_edge_are_smaller() {
+    fn features_are_means_over_blocks() {
         let masks = Array3::from_shape_fn((4, 40, 36), |(k, _, _)| if k == 0 { 1.0 } else { 0.0 });
         let op = SensingOperator::new(masks).unwrap();
         let early = ramp() - 0.1;
-        let seen = features(&op, Some(early.view()), ramp().view());
-        assert_eq!(seen.dim(), (FEATURES.len(), 4, 3, 3));
-        let near = |feature: usize, at: (usize, usize, usize), energy: f32| {
-            let found = seen[[feature, at.0, at.1, at.2]];
+        let features = features(&op, Some(early.view()), ramp().view());
+        assert_eq!(features.dim(), (FEATURES.len(), 4, 3, 3));
+        let assert_energy = |feature: usize, at: (usize, usize, usize), energy: f32| {
+            let found = features[[feature, at.0, at.1, at.2]];
             assert!((found - energy.log10()).abs() < 1e-3, "{}: {found}", FEATURES[feature]);
         };
         // Half of a squared step; the last column of the picture has no next one.
-        near(0, (1, 0, 0), 0.5 * 1e-4);
-        near(0, (1, 2, 2), 0.5 * 1e-4 * 0.75);
-        near(2, (0, 1, 1), 4e-4);
-        near(2, (2, 1, 1), 4e-4);
-        // 0.02 times -1.5, -0.5, 0.5 and 1.5 from the mean over time, whose gradient is that of each frame.
-        near(3, (0, 0, 0), 9e-4);
-        near(4, (1, 0, 0), 0.5 * 1e-4);
-        // A ramp of 0.01 a column that brightens by 0.02 a frame moves by two columns a frame, but where the
-        // last column has no next one.
-        assert!((seen[[5, 2, 0, 0]] - 4f32.log10()).abs() < 0.02, "{}", seen[[5, 2, 0, 0]]);
-        assert!(seen[[6, 2, 0, 0]] < -1.8 && seen[[6, 2, 0, 2]] > -1.0, "{seen:?}");
-        near(7, (2, 1, 0), 1.0);
-        near(8, (2, 1, 0), 1.0);
-        near(9, (3, 2, 0), 1e-2);
-        // One mask of four is open: 1 - 4 * (1/4)^2 of the gram differs from mask to mask.
-        near(11, (0, 0, 0), 0.75);
-        near(13, (0, 0, 0), 4.0);
-        assert!(seen.slice(s![12, .., .., ..]).iter().all(|&gradient| gradient == -7.0));
-        // The frames before are as far from each other as those of the result.
-        for (feature, name) in FEATURES.iter().enumerate().take(OF_CLIP) {
-            let early = seen.slice(s![OF_EARLY + feature, .., .., ..]);
-            let difference = &early - &seen.slice(s![feature, .., .., ..]);
+        assert_energy(0, (1, 0, 0), 0.5 * 1e-4);
+        assert_energy(0, (1, 2, 2), 0.5 * 1e-4 * 0.75);
+        assert_energy(2, (0, 1, 1), 4e-4);
+        assert_energy(2, (2, 1, 1), 4e-4);
+        // The frames deviate from their mean by 0.02 times -1.5, -0.5, 0.5 and 1.5, and all have its gradient.
+        assert_energy(3, (0, 0, 0), 9e-4);
+        assert_energy(4, (1, 0, 0), 0.5 * 1e-4);
+        // A ramp of 0.01 per column that brightens by 0.02 per frame moves by two columns per frame. The last column has no
+        // gradient.
+        assert!((features[[5, 2, 0, 0]] - 4f32.log10()).abs() < 0.02, "{}", features[[5, 2, 0, 0]]);
+        assert!(features[[6, 2, 0, 0]] < -1.8 && features[[6, 2, 0, 2]] > -1.0, "{features:?}");
+        assert_energy(7, (2, 1, 0), 1.0);
+        assert_energy(8, (2, 1, 0), 1.0);
+        assert_energy(9, (3, 2, 0), 1e-2);
+        // One mask of four is open, so the share 1 - 4 (1/4)^2 of the Gram diagonal changes from mask to mask.
+        assert_energy(11, (0, 0, 0), 0.75);
+        assert_energy(13, (0, 0, 0), 4.0);
+        assert!(features.slice(s![12, .., .., ..]).iter().all(|&gradient| gradient == -7.0));
+        // The early frames change as much as those of the result.
+        for (feature, name) in FEATURES.iter().enumerate().take(CLIP_FEATURES) {
+            let early = features.slice(s![EARLY + feature, .., .., ..]);
+            let difference = &early - &features.slice(s![feature, .., .., ..]);
             assert!(difference.iter().all(|d| d.abs() < 1e-3), "{name}");
         }
     }
 
-    /// An encoder to which all blocks look the same.
-    struct Alike(Vec<f32>);
+    /// An encoder with the same features for all blocks.
+    struct Constant(Vec<f32>);
 
-    impl Encoder for Alike {
+    impl Encoder for Constant {
         fn encode(&mut self, frames: ArrayView3<'_, f32>) -> Result<Array4<f32>, ReconError> {
             let (count, height, width) = frames.dim();
             let size = (self.0.len(), count, height.div_ceil(16), width.div_ceil(16));
@@ -673,23 +692,27 @@ mod tests {
     }
 
     #[test]
-    fn what_the_encoder_sees_moves_the_prediction_and_without_it_counts_as_in_the_mean() {
+    fn a_missing_encoder_is_replaced_by_its_mean() {
         let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
         let model = Model::of(&Schedule::pnp_tv_fastdvdnet()).unwrap();
-        let see = |values: Option<Vec<f32>>| {
-            let mut encoder = values.map(Alike);
+        let encoded = |values: Option<Vec<f32>>| {
+            let mut encoder = values.map(Constant);
             let encoder = encoder.as_mut().map(|encoder| encoder as &mut dyn Encoder);
             encoded_features(&op, Some(ramp().view()), ramp().view(), encoder)
         };
-        let told = |values| model.log_errors(&see(values).unwrap(), None, 1.0);
+        let log_errors = |values| model.log_errors(&encoded(values).unwrap(), None, 1.0);
         let mean = model.encoding.as_ref().unwrap().mean.clone();
-        assert_eq!(told(None), told(Some(mean.clone())));
-        assert_ne!(told(None), told(Some(mean.iter().map(|value| value + 1.0).collect())));
-        assert_eq!(see(Some(mean)).unwrap().len_of(ndarray::Axis(0)), FEATURES.len() + CHANNELS);
+        assert_eq!(log_errors(None), log_errors(Some(mean.clone())));
+        let other = mean.iter().map(|value| value + 1.0).collect();
+        assert_ne!(log_errors(None), log_errors(Some(other)));
+        assert_eq!(
+            encoded(Some(mean)).unwrap().len_of(ndarray::Axis(0)),
+            FEATURES.len() + CHANNELS
+        );
     }
 
     #[test]
-    fn results_of_known_schedules_have_a_model_and_no_others() {
+    fn only_known_schedules_have_a_model() {
         assert_eq!(MODELS.len(), 3);
         let has = |schedule: Schedule| Model::of(&schedule).is_some();
         assert!(has(Schedule::gap_tv()) && has(Schedule::pnp_tv_fastdvdnet()));
@@ -728,72 +751,79 @@ mod tests {
     }
 
     #[test]
-    fn frames_whose_changes_were_shrunk_far_have_a_model_of_their_own() {
+    fn strongly_shrunk_frames_have_a_separate_model() {
         let mut schedule = Schedule::pnp_tv_fastdvdnet();
         let low = |schedule: &Schedule| Model::of(schedule).unwrap().interval[0];
         let planned = low(&schedule);
-        let stage = schedule.stages.last_mut().unwrap();
-        stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
-        assert!(low(&schedule) < planned, "it knows less");
+        let nonlocal = schedule.stages.last_mut().unwrap().prior.nonlocal_mut().unwrap();
+        nonlocal.static_shrinkage = Some(4.0 * nonlocal.temporal_shrinkage);
+        assert!(low(&schedule) < planned, "its interval is wider");
     }
 
     #[test]
-    fn what_a_second_run_has_shrunk_away_was_motion_or_error() {
-        let of = |log: f32| Array3::from_elem((2, 1, 3), log);
-        let told = |first, distance: f32| apart(&of(-4.0), &of(first), of(distance).view());
-        let near = |found: Array3<f32>, log: f32| found.iter().all(|f| (f - log).abs() < 0.01);
-        assert!(near(told(-3.0, -3.0), -4.0), "error: the result is what it looks like");
-        let left = (10f32.powf(-2.0) - 10f32.powf(-3.0)).log10();
-        assert!(near(told(-2.0, -3.0), left), "motion: that, and what both have wrong");
-        let mut distance = of(-4.0);
+    fn a_second_run_removes_motion_or_error() {
+        let uniform = |log: f32| Array3::from_elem((2, 1, 3), log);
+        let combined = |first, distance: f32| {
+            combine_runs(&uniform(-4.0), &uniform(first), uniform(distance).view())
+        };
+        let is_close = |logs: Array3<f32>, log: f32| logs.iter().all(|f| (f - log).abs() < 0.01);
+        assert!(is_close(combined(-3.0, -3.0), -4.0), "error: the prediction for the result holds");
+        let remaining = (10f32.powf(-2.0) - 10f32.powf(-3.0)).log10();
+        assert!(
+            is_close(combined(-2.0, -3.0), remaining),
+            "motion: the error that both runs share"
+        );
+        let mut distance = uniform(-4.0);
         distance[[0, 0, 0]] = -2.0;
-        let found = apart(&of(-4.0), &of(-2.0), distance.view());
-        assert!((found[[0, 0, 0]] + 3.0).abs() < 0.01, "never nothing: {found}");
+        let found = combine_runs(&uniform(-4.0), &uniform(-2.0), distance.view());
+        assert!((found[[0, 0, 0]] + 3.0).abs() < 0.01, "at least the smallest share: {found}");
     }
 
     #[test]
-    fn frames_of_a_first_run_are_told_by_the_other_model() {
+    fn a_first_run_is_predicted_by_the_model_of_weak_shrinkage() {
         let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
         let mut ripple = ramp();
         for ((k, i, j), value) in ripple.indexed_iter_mut() {
             *value += 0.1 * ((i * j + k) as f32).sin();
         }
-        let see = |frames: &Array3<f32>| features(&op, Some(ramp().view()), frames.view());
-        let (result, first) = (see(&ramp()), see(&ripple));
+        let features_of = |frames: &Array3<f32>| features(&op, Some(ramp().view()), frames.view());
+        let (result, first) = (features_of(&ramp()), features_of(&ripple));
         let mut schedule = Schedule::pnp_tv_fastdvdnet();
-        let little = Model::of(&schedule).unwrap();
-        let stage = schedule.stages.last_mut().unwrap();
-        stage.rest_shrinkage = stage.temporal_shrinkage.map(|level| 4.0 * level);
-        let much = Model::of(&schedule).unwrap();
+        let weak = Model::of(&schedule).unwrap();
+        let nonlocal = schedule.stages.last_mut().unwrap().prior.nonlocal_mut().unwrap();
+        nonlocal.static_shrinkage = Some(4.0 * nonlocal.temporal_shrinkage);
+        let strong = Model::of(&schedule).unwrap();
         let with = |frames: &Array3<f32>| {
             let frames = (ramp(), frames.clone());
             with_first_run(&result, &first, (frames.0.view(), frames.1.view())).unwrap()
         };
-        let alone = much.log_errors(&result, None, 1.0);
-        let apart_far = with(&(ramp() + 1.0));
-        assert_eq!(much.log_errors(&apart_far, None, 1.0), alone, "far apart: at rest");
-        let told = much.log_errors(&with(&(ramp() + 1e-3)), None, 1.0);
-        let of_first = little.log_errors(&first, None, 1.0);
-        let furthest = (&told - &of_first).iter().fold(0.0, |most: f32, d| most.max(d.abs()));
-        assert!(furthest < 0.02, "near each other, and off: {furthest}");
+        let alone = strong.log_errors(&result, None, 1.0);
+        let distant = with(&(ramp() + 1.0));
+        assert_eq!(strong.log_errors(&distant, None, 1.0), alone, "large distance: a static scene");
+        let moving = strong.log_errors(&with(&(ramp() + 1e-3)), None, 1.0);
+        let of_first_run = weak.log_errors(&first, None, 1.0);
+        let difference =
+            (&moving - &of_first_run).iter().fold(0.0, |largest: f32, d| largest.max(d.abs()));
+        assert!(difference < 0.02, "small distance, large error: {difference}");
         let evidence = Evidence::new(Signs([-10.0; SIGNS.len()]), &result);
         let first = Some(Box::new(evidence.clone()));
-        let seen = with(&(ramp() + 1e-3));
-        let known = much.log_errors(&seen, Some(&Evidence { first, ..evidence.clone() }), 1.0);
-        assert_ne!(known, much.log_errors(&seen, Some(&evidence), 1.0));
+        let features = with(&(ramp() + 1e-3));
+        let known =
+            strong.log_errors(&features, Some(&Evidence { first, ..evidence.clone() }), 1.0);
+        assert_ne!(known, strong.log_errors(&features, Some(&evidence), 1.0));
     }
 
     #[test]
-    fn blocks_at_the_edge_have_fewer_around_them() {
-        let seen =
+    fn blocks_at_the_edge_have_fewer_neighbours() {
+        let features =
             Array4::from_shape_fn((1, 2, 3, 4), |(_, k, i, j)| (100 * k + 10 * i + j) as f32);
-        let around = around(&seen);
-        assert_eq!((around[[0, 0, 0, 0]], around[[0, 1, 1, 2]]), (5.5, 112.0));
-        assert_eq!((around[[0, 0, 2, 1]], around[[0, 1, 2, 3]]), (16.0, 117.5));
+        let means = neighbourhood_means(&features);
+        assert_eq!((means[[0, 0, 0, 0]], means[[0, 1, 1, 2]]), (5.5, 112.0));
+        assert_eq!((means[[0, 0, 2, 1]], means[[0, 1, 2, 3]]), (16.0, 117.5));
     }
 
     #[test]
-    fn masks_that_predictions_are_uncertain_behind_are_told_apart() {
+    fn blurred_and_leaking_masks_are_unfamiliar() {
         let unfamiliar = |masks: Array3<f32>| {
             let frames = Array3::zeros(masks.raw_dim());
             let op = SensingOperator::new(masks).unwrap();
@@ -818,9 +848,9 @@ mod tests {
         assert!(softened(squares(), 0.0, 0.4));
     }
 
-    /// Fine moving texture of a tenth, and of a hundredth, that the priors have moved by a fifth.
+    /// Fine moving texture of two amplitudes. The priors have changed both by a fifth.
     #[test]
-    fn more_texture_lets_expect_more_error() {
+    fn more_texture_raises_the_expected_error() {
         let op = SensingOperator::new(iid_masks(4, 48, 48, 1).unwrap()).unwrap();
         let error = |schedule: &Schedule, texture: f32| {
             let frame = |(k, i, j): (usize, usize, usize)| {
@@ -831,8 +861,8 @@ mod tests {
             let early = frames.mapv(|x| 0.5 + 0.8 * (x - 0.5));
             let deep = schedule.stages.len() > 1;
             let early = deep.then(|| early.view());
-            let seen = features(&op, early, frames.view());
-            Model::of(schedule).unwrap().log_errors(&seen, None, 1.0)[[1, 1, 1]]
+            let features = features(&op, early, frames.view());
+            Model::of(schedule).unwrap().log_errors(&features, None, 1.0)[[1, 1, 1]]
         };
         for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
             let (much, little) = (error(&schedule, 0.1), error(&schedule, 0.01));
@@ -840,15 +870,14 @@ mod tests {
         }
     }
 
-    /// What held-out pixels say of the error moves the prediction.
     #[test]
-    fn a_larger_held_out_error_lets_expect_more_error() {
+    fn a_larger_hold_out_error_raises_the_expected_error() {
         let op = SensingOperator::new(iid_masks(4, 40, 36, 1).unwrap()).unwrap();
-        let seen = features(&op, Some(ramp().view()), ramp().view());
+        let features = features(&op, Some(ramp().view()), ramp().view());
         for model in MODELS.values() {
             let error = |decibels: f32| {
-                let evidence = Evidence::new(Signs([decibels; SIGNS.len()]), &seen);
-                model.log_errors(&seen, Some(&evidence), 1.0).mean().unwrap()
+                let evidence = Evidence::new(Signs([decibels; SIGNS.len()]), &features);
+                model.log_errors(&features, Some(&evidence), 1.0).mean().unwrap()
             };
             assert!(error(-20.0) > error(-35.0), "{}, {}", error(-20.0), error(-35.0));
         }

@@ -1,12 +1,13 @@
-//! What can go wrong in the core.
+//! Errors of the reconstruction core.
+
+use std::borrow::Cow;
 
 use thiserror::Error;
 
-/// What the functions of this folder give.
+/// Result of a fallible function of this crate.
 pub type Result<T, E = ReconError> = std::result::Result<T, E>;
 
-/// An error of the reconstruction core. Each message says what is wrong, where, and what
-/// would be right.
+/// An error of the reconstruction core. Each message says what is wrong and what to do.
 #[derive(Debug, Error)]
 pub enum ReconError {
     /// Arrays that must agree in size do not.
@@ -23,11 +24,11 @@ pub enum ReconError {
     #[error("{name} is {value}; it must be {range}")]
     Parameter {
         /// The parameter's name.
-        name: &'static str,
+        name: Cow<'static, str>,
         /// Its value.
         value: String,
-        /// The values that are allowed.
-        range: &'static str,
+        /// The allowed values.
+        range: Cow<'static, str>,
     },
     /// The masks carry no light at all.
     #[error("every mask value is 0 in all {frames} frames: nothing can be reconstructed")]
@@ -41,7 +42,7 @@ pub enum ReconError {
     /// ONNX Runtime is missing, refused the device, or failed.
     #[error("{0}")]
     Runtime(String),
-    /// The iteration left the finite numbers.
+    /// The frames are no longer finite.
     #[error("the reconstruction diverged at iteration {iteration} of {planned}")]
     Diverged {
         /// One-based number of the iteration.

@@ -1,7 +1,7 @@
-//! End-to-end networks (the BIRNAT kind): a measurement and its masks go in, frames come out.
+//! End-to-end networks (such as BIRNAT): a measurement and its masks go in, frames come out.
 //!
-//! Such a network is trained for one set of masks. It knows nothing of schedules or priors, so all
-//! that can be checked before it runs is what it takes and gives.
+//! Such a network is trained for one set of masks, and has no schedule or priors. Only its inputs and outputs can be
+//! checked before it runs.
 
 use std::fmt;
 
@@ -9,18 +9,18 @@ use ndarray::{Array3, ArrayView2, ArrayView3};
 
 use super::error::{ReconError, Result, shape_text};
 
-/// A tensor that a network takes or gives.
+/// An input or output of a network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TensorInfo {
     /// Its name.
     pub name: String,
-    /// Type of its elements, such as `float32`.
+    /// Element type, such as `float32`.
     pub element: String,
-    /// Its sides; none for one that may have any length.
+    /// Side lengths; none for any length.
     pub sides: Vec<Option<usize>>,
 }
 
-/// All that a network takes and gives.
+/// Inputs and outputs of a network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Interface {
     /// The inputs.
@@ -29,30 +29,34 @@ pub struct Interface {
     pub outputs: Vec<TensorInfo>,
 }
 
-/// Which pictures a network takes.
+/// Picture sizes that a network takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PictureSize {
-    /// Those of the masks' size only: they can't be cut into tiles.
+    /// The size of the masks only, so the picture cannot be tiled.
     Fixed,
-    /// Those of any size.
+    /// Any size.
     Free,
 }
 
 /// A loaded end-to-end network.
 pub trait SnapshotNetwork {
-    /// The frames \[B,H,W\] behind measurement `y` \[H,W\] through `masks` \[B,H,W\], where
-    /// `y = sum_k C_k x_k` with frames `x_k` on \[0,1\]. All in standard layout.
-    /// Errors: the network fails, or gives something else than B finite frames.
+    /// The frames \[B,H,W\] of measurement `y` \[H,W\] through `masks` \[B,H,W\], where `y = sum_k C_k x_k` with
+    /// frames `x_k` on \[0,1\]. All arrays are in standard layout.
+    ///
+    /// # Errors
+    /// The network fails, or its output is not B finite frames.
     fn frames(&mut self, y: ArrayView2<'_, f32>, masks: ArrayView3<'_, f32>)
     -> Result<Array3<f32>>;
 }
 
-/// Refuses frames \[B,H,W\] that no network should give.
-/// Errors: [`ReconError::Shape`]: some values are not finite.
+/// Refuses frames \[B,H,W\] that are not finite.
+///
+/// # Errors
+/// [`ReconError::Shape`]: some values are not finite.
 pub fn all_finite(frames: &Array3<f32>) -> Result<()> {
     let Some(value) = frames.iter().find(|value| !value.is_finite()) else { return Ok(()) };
     Err(ReconError::Shape {
-        what: "what the network gave",
+        what: "the network's output",
         found: format!("{value} among others"),
         expected: format!("1x{} of finite numbers", shape_text(frames.shape())),
     })
@@ -66,9 +70,11 @@ pub const MASKS: &str = "masks";
 pub const FRAMES: &str = "frames";
 
 impl Interface {
-    /// Checks that the network takes a measurement through `frames` masks of `height` x `width`
-    /// pixels and gives as many frames, all float32, and says whether it takes other sizes, too.
-    /// Errors: [`ReconError::Shape`] with what it has and what is needed.
+    /// Checks that the network takes a measurement through `frames` masks of `height` x `width` pixels and returns as
+    /// many frames, all float32. Returns the picture sizes that it takes.
+    ///
+    /// # Errors
+    /// [`ReconError::Shape`] with the actual and the required tensors.
     pub fn check(&self, frames: usize, height: usize, width: usize) -> Result<PictureSize> {
         let names = |tensors: &[TensorInfo]| {
             let mut names: Vec<&str> = tensors.iter().map(|tensor| tensor.name.as_str()).collect();
@@ -154,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_told_with_what_would() {
+    fn a_misfit_is_reported_with_the_required_tensor() {
         let message = |network: &Interface| network.check(4, 48, 64).unwrap_err().to_string();
         let text = message(&network(8, 48, 64));
         assert!(text.contains("masks") && text.contains("[1,8,48,64]"), "{text}");

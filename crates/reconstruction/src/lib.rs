@@ -1,30 +1,43 @@
 //! The reconstruction core: arrays in, arrays out.
 //!
-//! A snapshot `y = sum_k C_k x_k` of `B` frames, or a run of them (see [`sequence`]), goes through a
-//! [`sensing::SensingOperator`]; [`solver::reconstruct`] alternates its projection with the priors that a
-//! [`schedule::Schedule`] names. A [`learned`] network does without both. All arrays are `f32` with axes
-//! (frame, row, column); frames and masks live on \[0,1\].
+//! A snapshot `y = sum_k C_k x_k` of `B` frames, or a run of snapshots (see [`sequence`]), has a sensing operator
+//! ([`operator`]). [`solver::reconstruct`] alternates its projection with the [`priors`] of a [`schedule`]. The iteration
+//! itself, Algorithm 1 of the paper, is in `gap.rs`. A [`learned`] network does without both. All arrays are `f32` with axes
+//! (frame, row, column); frames and masks are on \[0,1\].
 
 #![warn(missing_docs)]
 
+mod admm;
 pub mod assessment;
+mod bounds;
+pub mod crop;
 mod defaults;
 pub mod error;
-mod held_out;
+pub mod evidence;
+mod fields;
+mod gap;
+mod hold_out;
+mod iterate;
 pub mod joints;
 pub mod learned;
 pub mod metrics;
 pub mod motion;
+pub mod operator;
 pub mod pilot;
 pub mod preview;
-pub mod prior;
-mod rest;
+pub mod priors;
+pub mod progress;
+pub mod projection;
+#[cfg(test)]
+mod reference;
 pub mod scale;
 pub mod schedule;
-pub mod sensing;
 pub mod sequence;
 pub mod signs;
 pub mod solver;
+pub mod stage;
+mod static_regions;
 pub mod tile;
+mod trial;
 
 pub use error::ReconError;

@@ -1,11 +1,10 @@
-//! PSNR and SSIM as the field computes them: mean over the frames, nothing clipped, data
-//! range 1.
+//! PSNR and SSIM by the conventions of the field: mean over the frames, no clipping, data range 1.
 
 use ndarray::{ArrayView2, ArrayView3};
 
 use super::error::{ReconError, Result, shape_text};
 
-/// Side of SSIM's uniform window: smaller frames have no SSIM.
+/// Side of SSIM's uniform window; smaller frames have no SSIM.
 pub const WINDOW: usize = 7;
 
 /// Mean over the frames of `10 log10(1 / MSE)` in dB, of frames \[B,H,W\] on \[0,1\].
@@ -62,7 +61,7 @@ fn ssim_frame(a: ArrayView2<'_, f32>, b: ArrayView2<'_, f32>) -> f64 {
         let (x, y) = (f64::from(a[[i, j]]), f64::from(b[[i, j]]));
         [x, y, x * x, y * y, x * y]
     };
-    // Vertical sums of WINDOW rows by column, moved down a row at a time.
+    // Vertical sums of WINDOW rows for each column, moved down row by row.
     let mut columns = vec![[0.0; 5]; width];
     let (mut total, mut count) = (0.0, 0usize);
     for i in 0..height {

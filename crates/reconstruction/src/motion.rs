@@ -1,27 +1,27 @@
-//! How a picture moves, told from reconstructed frames.
+//! Motion estimation from reconstructed frames (Lucas and Kanade, 1981).
 //!
-//! What moves fast comes out smooth, and looks as good as a smooth scene. Its coarse structure survives, and how that
-//! moves from frame to frame tells the motion: frames are averaged over cells of some pixels, and of each window the one
-//! motion is found that explains the change best (Lucas and Kanade, 1981).
+//! Fast motion is reconstructed blurred, and then looks as good as a smooth scene. But coarse structure survives. So
+//! frames are averaged over cells, and the motion of a window of cells is the one that explains its temporal change
+//! best.
 
 use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 
-/// Side of the cells in pixels: motion by much more than that from frame to frame is told wrongly.
+/// Side of the cells in pixels. Motion by much more than this from frame to frame is estimated wrongly.
 const CELL: usize = 8;
 /// Side of the windows in cells.
 const WINDOW: usize = 16;
-/// Cells to each side that the motion of a cell is told from.
+/// Radius, in cells, of the window from which the motion of a cell is estimated.
 const REACH: usize = 4;
-/// The share of the change that a motion explains at the least, else there is none.
+/// Smallest share of the change that a motion must explain.
 const EXPLAINED: f32 = 0.1;
-/// The share of the gradient's energy that is taken to be along an edge, where nothing is known of a motion.
+/// Share of the gradient's energy that is treated as along an edge, where motion cannot be observed.
 const EDGE: f32 = 0.01;
-/// Below this, energies are rounding.
+/// Energies below this are rounding errors.
 const FLOOR: f32 = 1e-7;
 
-/// Energies of the steps to the next row and column and of the slope along time, and their products.
+/// Energies of the spatial differences and of the temporal slope, and their products.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Steps {
     pub down: f32,
@@ -53,83 +53,89 @@ impl Steps {
         }
     }
 
-    /// The motion that explains the slope best, in steps down and to the right, and the share of the slope that it
-    /// leaves. These are of means over pixels.
+    /// The motion that explains the slope best, in differences down and to the right, and the share of the slope that
+    /// it leaves unexplained. The energies are means over pixels.
     pub(super) fn motion(&self) -> ((f32, f32), f32) {
         let ridge = EDGE * (self.down + self.right) + FLOOR;
         let (down, right) = (self.down + ridge, self.right + ridge);
         let determinant = down * right - self.both * self.both;
         let rows = (self.both * self.slope_right - right * self.slope_down) / determinant;
         let columns = (self.both * self.slope_down - down * self.slope_right) / determinant;
-        let rest = (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
-        ((rows, columns), rest / self.slope.max(FLOOR))
+        let unexplained =
+            (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
+        ((rows, columns), unexplained / self.slope.max(FLOOR))
     }
 }
 
-/// The speed of the fastest window of frames \[K,H,W\], whose white level this is, in pixels a frame.
+/// Speed of the fastest window of frames \[K,H,W\] with this white level, in pixels per frame.
 pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
     let coarse = averaged(frames) / white;
     let (count, rows, columns) = coarse.dim();
     if count < 2 || rows < 3 || columns < 3 {
         return 0.0;
     }
-    // Windows are larger where the sides are no multiples, and none is smaller but in a smaller picture.
+    // Windows grow where a side is not a multiple, and shrink only in a smaller picture.
     let parts = |length: usize| (length / WINDOW).max(1);
     let range = |part: usize, length: usize| {
         part * length / parts(length)..(part + 1) * length / parts(length)
     };
-    let mut most = 0.0f32;
+    let mut fastest = 0.0f32;
     for row in 0..parts(rows) {
         for column in 0..parts(columns) {
             let window = coarse.slice(s![.., range(row, rows), range(column, columns)]);
-            let ((down, right), rest) = steps(window).motion();
-            if rest <= 1.0 - EXPLAINED {
-                most = most.max(down.hypot(right) * CELL as f32);
+            let ((down, right), unexplained) = steps(window).motion();
+            if unexplained <= 1.0 - EXPLAINED {
+                fastest = fastest.max(down.hypot(right) * CELL as f32);
             }
         }
     }
-    most
+    fastest
 }
 
-/// How each part of a clip moves, in pixels from frame to frame.
+/// Motion of each part of a clip, in pixels per frame.
 #[derive(Debug)]
 pub(super) struct Motion {
-    /// Down and to the right, of each cell; what lies beyond the last one has that one's. A clip too small or too short is one
-    /// cell at rest.
+    /// Motion down and to the right of each cell. Pixels beyond the last cell take its motion. A clip that is too
+    /// small or too short is one static cell.
     of_cells: Array2<(f32, f32)>,
 }
 
 impl Motion {
-    /// Of frames \[K,H,W\]. A cell has the motion of the [`REACH`] cells around it, or that of the whole picture, or none:
-    /// the one that leaves the least difference between the frames near the cell. So where Lucas and Kanade's motion is
-    /// wrong (periodic texture, more than a cell from frame to frame) there is none.
+    /// No motion anywhere.
+    pub(super) fn none() -> Self {
+        Self { of_cells: Array2::default((1, 1)) }
+    }
+
+    /// Estimates the motion of frames \[K,H,W\]. A cell takes the motion of the [`REACH`] cells around it, the global
+    /// motion or none: the one with the smallest frame difference near the cell. A wrong estimate
+    /// (periodic texture, more than a cell per frame) therefore gives no motion.
     pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
         let coarse = averaged(frames);
         let (count, rows, columns) = coarse.dim();
         if count < 2 || rows < 3 || columns < 3 {
-            return Self { of_cells: Array2::default((1, 1)) };
+            return Self::none();
         }
-        let told = |window: ArrayView3<'_, f32>| {
+        let estimate = |window: ArrayView3<'_, f32>| {
             let ((down, right), _) = steps(window).motion();
-            let most = down.abs().max(right.abs());
-            (most <= 1.0).then_some((down * CELL as f32, right * CELL as f32))
+            let cells = down.abs().max(right.abs());
+            (cells <= 1.0).then_some((down * CELL as f32, right * CELL as f32))
         };
-        let whole = told(coarse.view());
-        // At least three cells: fewer have no gradient.
-        let near = |at: usize, reach: usize, length: usize| {
+        let whole = estimate(coarse.view());
+        // At least three cells, because fewer have no gradient.
+        let around = |at: usize, reach: usize, length: usize| {
             let start = at.saturating_sub(reach).min(length - 3);
             start..(at + reach + 1).clamp(start + 3, length)
         };
         let of_cells = Array2::from_shape_fn((rows, columns), |(row, column)| {
-            let around = s![.., near(row, REACH, rows), near(column, REACH, columns)];
+            let window = s![.., around(row, REACH, rows), around(column, REACH, columns)];
             let pixels = |cells: Range<usize>| cells.start * CELL..cells.end * CELL;
-            let area = (pixels(near(row, 1, rows)), pixels(near(column, 1, columns)));
+            let area = (pixels(around(row, 1, rows)), pixels(around(column, 1, columns)));
             let mut best = (0.0, 0.0);
-            let mut least = difference(frames, &area, best);
-            for motion in [told(coarse.slice(around)), whole].into_iter().flatten() {
-                let left = difference(frames, &area, motion);
-                if left < least {
-                    (best, least) = (motion, left);
+            let mut smallest = difference(frames, &area, best);
+            for motion in [estimate(coarse.slice(window)), whole].into_iter().flatten() {
+                let difference = difference(frames, &area, motion);
+                if difference < smallest {
+                    (best, smallest) = (motion, difference);
                 }
             }
             best
@@ -137,22 +143,22 @@ impl Motion {
         Self { of_cells }
     }
 
-    /// At this pixel.
+    /// The motion at this pixel.
     pub(super) fn at(&self, row: usize, column: usize) -> (f32, f32) {
         let (rows, columns) = self.of_cells.dim();
         self.of_cells[[(row / CELL).min(rows - 1), (column / CELL).min(columns - 1)]]
     }
 }
 
-/// Mean squared difference of these rows and columns of each frame \[K,H,W\] from those of the next one to which a motion
-/// leads; infinite where it leads outside.
+/// Mean squared difference between these rows and columns of each frame \[K,H,W\] and those of the next frame
+/// displaced by a motion; infinite if the motion leads outside.
 fn difference(
     frames: ArrayView3<'_, f32>,
     (rows, columns): &(Range<usize>, Range<usize>),
     (down, right): (f32, f32),
 ) -> f32 {
     let (count, height, width) = frames.dim();
-    // Here and in the next frame, as far as both are inside.
+    // The ranges in this and the next frame, as far as both are inside.
     let ranges = |range: &Range<usize>, by: f32, length: usize| {
         let by = by.round() as isize;
         let start = (range.start as isize).max(-by);
@@ -174,7 +180,7 @@ fn difference(
     sum / pixels as f32
 }
 
-/// Means over cells \[K, H / CELL, W / CELL\], without what is left at the far edges.
+/// Means over cells \[K, H / CELL, W / CELL\]. Incomplete cells at the far edges are dropped.
 fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
     let (count, height, width) = frames.dim();
     Array3::from_shape_fn((count, height / CELL, width / CELL), |(k, row, column)| {
@@ -183,7 +189,7 @@ fn averaged(frames: ArrayView3<'_, f32>) -> Array3<f32> {
     })
 }
 
-/// In the mean over a window, by central differences in the middle between two frames.
+/// Mean energies of a window, by central differences halfway between two frames.
 fn steps(window: ArrayView3<'_, f32>) -> Steps {
     let (count, rows, columns) = window.dim();
     let mut sums = Steps::default();
@@ -207,7 +213,7 @@ mod tests {
     use super::{Motion, fastest};
     use ndarray::{Array3, s};
 
-    /// Coarse and fine texture that moves by so many rows and columns a frame.
+    /// Coarse and fine texture that moves by `rows` and `columns` pixels per frame.
     fn moving(rows: f32, columns: f32) -> Array3<f32> {
         Array3::from_shape_fn((8, 160, 300), |(k, i, j)| {
             let (i, j) = (i as f32 - rows * k as f32, j as f32 - columns * k as f32);
@@ -217,16 +223,16 @@ mod tests {
     }
 
     #[test]
-    fn the_speed_of_coarse_structure_is_found() {
+    fn the_speed_of_coarse_structure_is_estimated() {
         for (rows, columns) in [(0.0, 0.0), (0.0, 3.0), (-2.0, 2.0), (6.0, 8.0), (10.0, 0.0)] {
-            let (expected, told) =
+            let (expected, speed) =
                 (f32::hypot(rows, columns), fastest(moving(rows, columns).view(), 1.0));
-            assert!((told - expected).abs() < 0.25 * expected + 0.1, "{rows}, {columns}: {told}");
+            assert!((speed - expected).abs() < 0.25 * expected + 0.1, "{rows}, {columns}: {speed}");
         }
     }
 
     #[test]
-    fn a_part_that_moves_is_seen_beside_one_at_rest_and_a_light_that_changes_is_no_motion() {
+    fn a_moving_part_is_detected_and_changing_light_is_no_motion() {
         let mut frames = moving(0.0, 0.0);
         frames.slice_mut(s![.., .., 150..]).assign(&moving(0.0, 9.0).slice(s![.., .., 150..]));
         assert!(fastest(frames.view(), 1.0) > 6.0, "{}", fastest(frames.view(), 1.0));
@@ -250,7 +256,7 @@ mod tests {
                 "{at:?}: {down}, {right}"
             );
         }
-        // Of a single frame, and of frames too small for cells, nothing is known.
+        // A single frame, and frames too small for cells, have no estimate.
         for frames in [frames.slice(s![..1, .., ..]), frames.slice(s![.., ..20, ..])] {
             assert_eq!(Motion::of(frames).at(10, 200), (0.0, 0.0));
         }

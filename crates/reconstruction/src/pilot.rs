@@ -1,516 +1,369 @@
-//! How far along its schedule a reconstruction should go, found out on a piece of the measurement.
+//! The pilot: adapts a schedule to a measurement by hold-out validation on a crop (cross-validation for compressed
+//! sensing: Ward 2009).
 //!
-//! Without the truth, only the measurement can judge. One in fourteen of the piece's pixels is
-//! kept from the solver, and after each iteration what the frames say about these pixels is compared
-//! with what was measured there (cross-validation). That error falls as long as the frames get
-//! better and rises when the solver begins to fit noise or the network to invent. It also rises where
-//! a prior takes over at a level far above the error that is left, and falls again with the level: so
-//! the whole stage is run, and judged by its end.
+//! Without the true frames, only the measurement can judge. One in fourteen pixels of the crop is hidden from the solver.
+//! After each iteration the frames predict these pixels, and the squared error of the prediction is the hold-out error. It
+//! falls while the frames improve, and rises when the solver begins to fit noise or the network to hallucinate. It also
+//! rises at the start of a stage whose noise level is far above the remaining error, and falls again with that level. So a
+//! stage is run to its end before it is judged.
+//!
+//! Stage by stage, the candidates of a small grid ([`GRID`]) replace the planned settings where their smallest hold-out error
+//! is significantly smaller. The last stage then ends early where its error is smallest.
 
-use std::ops::Range;
+use std::ops::ControlFlow;
 
-use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
-
-use super::assessment::{Evidence, features};
-use super::error::{ReconError, Result};
-use super::held_out::HeldOut;
-use super::prior::Networks;
-use super::rest;
-use super::schedule::{MAX_STATIC_VARIANCE, Schedule, Stage};
-use super::sensing::SensingOperator;
-use super::signs::Signs;
-use super::solver::{self, Observer, Run};
+use ndarray::{Array3, ArrayView3};
+use serde::{Deserialize, Serialize};
 use strum::Display;
 
-/// Side of the piece that the pilot is run on: a tenth of a tile.
-pub const SIDE: usize = 96;
+use super::assessment::Evidence;
+use super::error::{ReconError, Result};
+use super::evidence;
+use super::gap::{Solver, run_stage};
+use super::hold_out::{HoldOut, t_statistic};
+use super::operator::SensingOperator;
+use super::priors::Networks;
+use super::progress::Observer;
+use super::projection::Problem;
+use super::schedule::{Heuristic, Schedule};
+use super::stage::{MAX_STATIC_VARIANCE, Stage};
+use super::trial::{Trial, is_strong, temporal_shrinkage};
 
-/// The last iteration whose error comes this near to the least is the end. Where the error hardly changes any
-/// more, the frames often still get better: in doubt the schedule goes on.
-const SLACK: f64 = 0.005;
+/// A candidate that trails by this t-statistic after half of its iterations is abandoned.
+const ABANDON_T: f64 = 2.0;
 
-/// How much greater than the least the error after the last iteration may be, in standard errors of the
-/// difference, for the whole plan to be run: one that has really turned loses far more by going on than this
-/// can tell.
-const CHANCE: f64 = 1.5;
-
-/// What is behind by so many standard errors is clearly behind: a variant of a stage, from half of its
-/// iterations on, is given up then.
-const CLEAR: f64 = 2.0;
-
-/// Correlation of the temporal changes under weak and under strong shrinkage. Below this value the scene counts as
-/// static. Swept on 224 simulated scenes (`research/NOTEBOOK.md`): 27 of 33 static ones and 8 of 191 others are below.
-const MOTION: f32 = 0.45;
-
-/// Side in pixels of the squares over which a scene without texture and motion is even.
-const EVEN: usize = 8;
-
-/// The rows and columns of the piece: of all that lie side by side in a measurement `y` \[H,W\], the one with
-/// most texture and motion. An even part would tell nothing, and where it is bright its measurement varies as
-/// much as any: by the sum of the masks, `light` \[H,W\], alone. So that counts which `y = light x`, with one
-/// `x` for each square of the piece, leaves of the measurement's energy.
-pub fn piece(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> (Range<usize>, Range<usize>) {
-    let (height, width) = y.dim();
-    let starts = |length: usize| {
-        let last = length.saturating_sub(SIDE);
-        (0..last).step_by(SIDE).chain([last])
-    };
-    let window =
-        |row: usize, column: usize| (row..height.min(row + SIDE), column..width.min(column + SIDE));
-    let uneven = |(rows, columns): &(Range<usize>, Range<usize>)| {
-        let window = s![rows.clone(), columns.clone()];
-        let (light, y) = (light.slice(window), y.slice(window));
-        let squares =
-            light.exact_chunks((EVEN, EVEN)).into_iter().zip(y.exact_chunks((EVEN, EVEN)));
-        squares.map(|(light, y)| left(light, y)).sum::<f64>()
-    };
-    starts(height)
-        .flat_map(|row| starts(width).map(move |column| window(row, column)))
-        .max_by(|a, b| uneven(a).total_cmp(&uneven(b)))
-        .unwrap_or((0..height, 0..width))
+/// Settings that are tried in place of the planned ones.
+struct Candidate {
+    heuristic: Heuristic,
+    /// Factor of the planned value; for the noise term the value, in units of the variance of the slowest change.
+    value: f32,
+    after: Condition,
 }
 
-/// `min_x ||y - light x||^2`.
-fn left(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> f64 {
-    let (mut yy, mut ly, mut ll) = (0.0, 0.0, 0.0);
-    for (&light, &y) in light.iter().zip(y) {
-        let (light, y) = (f64::from(light), f64::from(y));
-        yy += y * y;
-        ly += light * y;
-        ll += light * light;
+/// Outcome of a heuristic's first candidate for which a candidate is tried.
+#[derive(Clone, Copy, PartialEq)]
+enum Condition {
+    /// The candidate is a first one.
+    Any,
+    Accepted,
+    Rejected,
+    /// Rejected, but not abandoned.
+    NarrowlyRejected,
+}
+
+const fn candidate(heuristic: Heuristic, value: f32, after: Condition) -> Candidate {
+    Candidate { heuristic, value, after }
+}
+
+/// The candidates, in the order of their trial.
+const GRID: [Candidate; 9] = [
+    candidate(Heuristic::TemporalVariation, 0.0, Condition::Any),
+    candidate(Heuristic::TemporalShrinkage, 4.0, Condition::Any),
+    candidate(Heuristic::TemporalShrinkage, 8.0, Condition::Accepted),
+    candidate(Heuristic::TemporalShrinkage, 2.0, Condition::NarrowlyRejected),
+    candidate(Heuristic::StaticVariance, 2.0, Condition::Any),
+    candidate(Heuristic::StaticVariance, 0.0, Condition::Any),
+    candidate(Heuristic::NoiseTerm, 1.0, Condition::Any),
+    candidate(Heuristic::NoiseTerm, 3.0, Condition::Accepted),
+    candidate(Heuristic::NoiseTerm, 0.3, Condition::Rejected),
+];
+
+impl Candidate {
+    /// True if the planned stage has the setting that the candidate changes.
+    fn applies_to(&self, planned: &Stage) -> bool {
+        let projection = planned.projection;
+        match self.heuristic {
+            Heuristic::TemporalVariation => {
+                planned.prior.tv().is_some_and(|tv| tv.temporal_weight > 0.0)
+            }
+            Heuristic::TemporalShrinkage => temporal_shrinkage(planned) > 0.0,
+            Heuristic::StaticVariance => projection.static_variance.is_some(),
+            Heuristic::NoiseTerm => {
+                projection.static_variance.is_some() && projection.gamma.is_none()
+            }
+            Heuristic::EarlyStopping | Heuristic::StaticScene | Heuristic::StaticRegions => false,
+        }
     }
-    if ll > 0.0 { yy - ly * ly / ll } else { yy }
+
+    /// The stage to be tried in place of the best one, if the candidate can be better.
+    fn apply(&self, planned: &Stage, best: &Trial, op: &SensingOperator) -> Option<Stage> {
+        let mut stage = best.stage.clone();
+        match self.heuristic {
+            _ if !self.applies_to(planned) => return None,
+            Heuristic::TemporalVariation => stage.prior.tv_mut()?.temporal_weight *= self.value,
+            Heuristic::TemporalShrinkage => {
+                stage.prior.nonlocal_mut()?.temporal_shrinkage =
+                    self.value * temporal_shrinkage(planned);
+            }
+            // For masks of high contrast the planned value is the largest useful one.
+            Heuristic::StaticVariance if self.value > 1.0 && op.has_high_contrast() => return None,
+            Heuristic::StaticVariance => {
+                let variance = self.value * planned.projection.static_variance?;
+                stage.projection.static_variance =
+                    (variance > 0.0).then_some(variance.min(MAX_STATIC_VARIANCE));
+            }
+            // Noise raises the error long before the stage ends. Without noise a term only costs.
+            Heuristic::NoiseTerm
+                if self.after != Condition::Accepted
+                    && best.best_iteration() * 10 > planned.iterations * 9 =>
+            {
+                return None;
+            }
+            _ => stage.projection.gamma = Some(self.value),
+        }
+        Some(stage)
+    }
 }
 
-/// What was found out about a stage.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StageFinding {
-    /// Iterations that pay; 0 for a stage that is better left out.
-    pub iterations: usize,
-    /// Weight of the total variation along time, if it pays; else 0.
-    pub temporal_weight: f32,
-    /// Shrinkage of changes along time; 0 in a stage that has none.
-    pub temporal_shrinkage: f32,
-    /// The same where nothing moves, if four times as much or more pays.
-    pub rest_shrinkage: Option<f32>,
-    /// Whether all is taken to be at rest then.
-    pub rest_everywhere: bool,
-    /// Static variance of the projection, if one pays.
-    pub static_variance: Option<f32>,
-    /// Noise term of the projection, where it is not the schedule's.
-    pub gamma: Option<f32>,
-    /// Error at the held-out pixels before the stage: `||y - Hv|| / ||y||` over them.
-    pub before: f64,
-    /// The same after so many iterations.
-    pub after: f64,
-    /// Why no more.
+/// Decisions of the pilot on one stage, with their evidence.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Decided {
+    /// The planned stage.
+    pub planned: Stage,
+    /// The decided stage; with 0 iterations it is left out.
+    pub stage: Stage,
+    /// Hold-out error before the stage, `||y - Hv|| / ||y||` over the hold-out pixels.
+    pub error_before: f64,
+    /// Hold-out error after the decided iterations.
+    pub error_after: f64,
+    /// Reason for the number of iterations.
     pub end: StageEnd,
 }
 
-/// Why a stage has as many iterations as it has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
-#[strum(serialize_all = "snake_case")]
+/// Reason for a stage's number of iterations.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize)]
+#[strum(serialize_all = "kebab-case")]
+#[serde(rename_all = "kebab-case")]
 pub enum StageEnd {
-    /// Its number is fixed.
+    /// The number is fixed.
     Fixed,
-    /// All that may be were done, and paid.
-    #[strum(serialize = "max-iterations")]
-    Planned,
-    /// What followed, to the end of the schedule, raised the error.
+    /// The full stage is run.
+    MaxIterations,
+    /// The remaining iterations raise the error.
     Converged,
-    /// The iteration left the finite numbers soon after.
+    /// The frames are soon after no longer finite.
     Diverged,
 }
 
-/// Runs `schedule` on a piece of a measurement, both on the scale on which the scene is on \[0,1\],
-/// and tells where it should end. Stages of total variation alone, which cost next to nothing, are taken
-/// as they are, but for their part along time: it is left out if the stage's error is less without.
-/// With what it tells of the error of the frames.
-/// Errors: as [`super::solver::reconstruct`].
-pub fn run(
+/// The decisions of a pilot.
+#[derive(Debug)]
+pub struct Decisions {
+    /// One for each stage of the schedule.
+    pub stages: Vec<Decided>,
+    /// Hold-out evidence of the error of the decided schedule's frames.
+    pub evidence: Option<Evidence>,
+}
+
+/// Adapts `schedule` to the crop `y` \[1,H,W\] of a measurement, on the scale on which the scene is on \[0,1\].
+///
+/// # Errors
+/// As [`super::solver::reconstruct`].
+pub fn decide(
     whole: &SensingOperator,
     y: ArrayView3<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-) -> Result<(Vec<StageFinding>, Option<Evidence>)> {
+) -> Result<Decisions> {
     schedule.validate()?;
-    let held_out = HeldOut::of(whole, 0);
-    let op = whole.clone().without(&held_out.pixels);
-    let mut run = Run::new(&op, y, schedule, &mut *networks);
-    let mut courses: Vec<Course> = Vec::with_capacity(schedule.stages.len());
-    let mut early = None;
-    // The frames of the last stage before they were shrunk four times as much.
-    let mut first = None;
-    for (index, stage) in schedule.stages.iter().enumerate() {
-        let mut watch = Watch { op: &op, y, held_out: &held_out, index, observer: &mut *observer };
-        let start = run.state();
-        first = None;
-        let once = stage.run_once();
-        let mut course = watch.stage(&once, None, &mut run)?;
-        for variant in VARIANTS {
-            let Some(variant) = variant(&op, &once, &course) else { continue };
-            let end = run.state();
-            run.restore(start.clone());
-            let found = watch.stage(&variant, Some(&course), &mut run)?;
-            if found.surpasses(&course) {
-                let at_rest = course.at_rest || found.stills(&course);
-                let taken = Course { at_rest, ..found };
-                let before = std::mem::replace(&mut course, taken);
-                if fourfold(course.shrinkage(), before.shrinkage()) {
-                    first = before.best;
-                }
-            } else {
-                course.last_given_up = found.given_up;
-                run.restore(end);
-            }
-        }
-        let diverged = course.diverged;
-        courses.push(course);
-        early.get_or_insert_with(|| run.frames().to_owned());
+    let hold_out = HoldOut::draw(whole, 0);
+    let op = whole.clone().without(&hold_out.pixels);
+    let y_owned = y.as_standard_layout().into_owned();
+    let mut solver = Solver::new(Problem { operator: &op, y: &y_owned }, schedule, networks);
+    let mut judge = Judge { op: &op, y, hold_out: &hold_out, observer };
+    let mut trials: Vec<Trial> = Vec::with_capacity(schedule.stages.len());
+    let (mut early, mut weakly_shrunk) = (None, None);
+    for (index, planned) in schedule.stages.iter().enumerate() {
+        let (trial, weak) = judge.choose(&mut solver, schedule, index, planned)?;
+        weakly_shrunk = weak;
+        early.get_or_insert_with(|| solver.frames().clone());
+        let diverged = trial.diverged;
+        trials.push(trial);
         if diverged {
             break;
         }
     }
-    let last = courses.iter().rev().find_map(|course| course.best.as_ref());
+    let last = trials.iter().rev().find_map(|trial| trial.best_frames.as_ref());
     let evidence = early.as_ref().zip(last).and_then(|(early, last)| {
-        let tell = |frames: &Array3<f32>| {
-            tell((whole, &op, y), &held_out, schedule, (early.view(), frames.view()))
-        };
-        let first = first.as_ref().and_then(tell).map(Box::new);
-        Some(Evidence { first, ..tell(last)? })
+        let measurement = evidence::HeldOutMeasurement { whole, op: &op, y, hold_out: &hold_out };
+        let evidence = |frames: &Array3<f32>| measurement.evidence(schedule, early, frames);
+        let first = weakly_shrunk.as_ref().and_then(evidence).map(Box::new);
+        Some(Evidence { first, ..evidence(last)? })
     });
-    Ok((judge(schedule, &courses), evidence))
+    Ok(Decisions { stages: conclude(schedule, &trials), evidence })
 }
 
-/// What the first snapshot tells of the error of a fixed schedule's frames, on the piece of it that [`piece`]
-/// gives, and both on the scale on which the scene is on \[0,1\]; none if no light reaches it, or the
-/// iteration diverges. Costs a run of the schedule on that piece.
-/// Errors: as [`super::solver::reconstruct`].
-pub fn evidence(
-    op: &SensingOperator,
-    y: ArrayView3<'_, f32>,
-    schedule: &Schedule,
-    networks: &mut dyn Networks,
-) -> Result<Option<Evidence>> {
-    let light = op.masks().sum_axis(Axis(0));
-    let (rows, columns) = piece(light.view(), y.index_axis(Axis(0), 0));
-    let masks = op.masks().slice(s![.., rows.clone(), columns.clone()]).to_owned();
-    let whole = match SensingOperator::new(masks) {
-        Err(ReconError::DarkMasks { .. }) => return Ok(None),
-        other => other?,
-    };
-    let held_out = HeldOut::of(&whole, 0);
-    let op = whole.clone().without(&held_out.pixels);
-    let y = y.slice(s![..1, rows, columns]);
-    let mut early: Option<Array3<f32>> = None;
-    let solved = solver::stages((&op, y), schedule, networks, &mut (), |_, run| {
-        early.get_or_insert_with(|| run.frames().to_owned());
-    });
-    let outcome = match solved {
-        // Nothing is told then; whether the frames themselves diverge is the solver's to say.
-        Err(ReconError::Diverged { .. }) => return Ok(None),
-        other => other?,
-    };
-    let early = early.as_ref().unwrap_or(&outcome.frames).view();
-    Ok(tell((&whole, &op, y), &held_out, schedule, (early, outcome.frames.view())))
+/// Runs stages and measures their hold-out errors.
+struct Judge<'a> {
+    op: &'a SensingOperator,
+    y: ArrayView3<'a, f32>,
+    hold_out: &'a HoldOut,
+    observer: &'a mut dyn Observer,
 }
 
-/// What the frames of a piece, after the first stage and at the end, tell: by `y` at the held-out pixels,
-/// which the operator `op` lacks, and by themselves.
-fn tell(
-    (whole, op, y): (&SensingOperator, &SensingOperator, ArrayView3<'_, f32>),
-    held_out: &HeldOut,
-    schedule: &Schedule,
-    (early, last): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
-) -> Option<Evidence> {
-    let signs = Signs::of((op, y), held_out, early, last)?;
-    let early = (schedule.stages.len() > 1).then_some(early);
-    Some(Evidence::new(signs, &features(whole, early, last)))
-}
-
-/// What a stage, as planned, may be instead of what was taken last.
-type Variant = fn(&SensingOperator, &Stage, &Course) -> Option<Stage>;
-
-/// One after the other is run, and taken if it is better.
-const VARIANTS: [Variant; 7] = [
-    without_time,
-    with_fourfold_shrinkage,
-    with_other_shrinkage,
-    with_more_variance,
-    without_variance,
-    with_noise,
-    with_other_noise,
-];
-
-fn without_time(_: &SensingOperator, planned: &Stage, _: &Course) -> Option<Stage> {
-    let weighs = planned.temporal_weight.is_some_and(|weight| weight > 0.0);
-    weighs.then(|| Stage { temporal_weight: None, ..planned.clone() })
-}
-
-fn shrunk(planned: &Stage) -> Option<f32> {
-    planned.temporal_shrinkage.filter(|shrinkage| *shrinkage > 0.0)
-}
-
-/// For scenes at rest, or with a background that is.
-fn with_fourfold_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    let fourfold = Some(4.0 * shrunk(planned)?);
-    Some(Stage { temporal_shrinkage: fourfold, ..taken.stage.clone() })
-}
-
-/// Still more, if that was taken; else less, unless that was clearly worse.
-fn with_other_shrinkage(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    let as_planned = taken.stage.temporal_shrinkage == planned.temporal_shrinkage;
-    if as_planned && taken.last_given_up {
-        return None;
+impl Judge<'_> {
+    /// Tries the planned stage and the candidates. The solver then stands after the best trial, which is returned with the
+    /// weakly shrunk frames, if strong shrinkage was accepted and static regions are to be blended.
+    fn choose(
+        &mut self,
+        solver: &mut Solver<'_>,
+        schedule: &Schedule,
+        index: usize,
+        planned: &Stage,
+    ) -> Result<(Trial, Option<Array3<f32>>)> {
+        let start = solver.iterate.snapshot();
+        let planned = planned.without_static_regions();
+        let mut best = self.run(solver, index, &planned, None)?;
+        let mut weakly_shrunk = None;
+        let mut first: Option<(Heuristic, Condition)> = None;
+        for candidate in GRID.iter().filter(|candidate| schedule.has(candidate.heuristic)) {
+            let own = first.filter(|(heuristic, _)| *heuristic == candidate.heuristic);
+            if !candidate.after.holds(own.map(|(_, outcome)| outcome)) {
+                continue;
+            }
+            let Some(stage) = candidate.apply(&planned, &best, self.op) else { continue };
+            let end = solver.iterate.snapshot();
+            solver.iterate.restore(start.snapshot());
+            let trial = self.run(solver, index, &stage, Some(&best))?;
+            let outcome = match trial.is_better_than(&best, schedule) {
+                true => Condition::Accepted,
+                false if trial.abandoned => Condition::Rejected,
+                false => Condition::NarrowlyRejected,
+            };
+            if candidate.after == Condition::Any {
+                first = Some((candidate.heuristic, outcome));
+            }
+            if outcome != Condition::Accepted {
+                solver.iterate.restore(end);
+                continue;
+            }
+            let is_static = best.is_static || trial.indicates_static_scene(&best, schedule);
+            let replaced = std::mem::replace(&mut best, Trial { is_static, ..trial });
+            if is_strong(best.shrinkage(), replaced.shrinkage()) {
+                weakly_shrunk = replaced.best_frames;
+            }
+        }
+        Ok((best, weakly_shrunk.filter(|_| schedule.has(Heuristic::StaticRegions))))
     }
-    let times = if as_planned { 2.0 } else { 8.0 };
-    Some(Stage { temporal_shrinkage: Some(times * shrunk(planned)?), ..taken.stage.clone() })
-}
 
-/// Where masks differ much it is at its bound.
-fn with_more_variance(op: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    if op.differ_much() {
-        return None;
-    }
-    let double = (2.0 * planned.static_variance?).min(MAX_STATIC_VARIANCE);
-    Some(Stage { static_variance: Some(double), ..taken.stage.clone() })
-}
-
-fn without_variance(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    planned.static_variance?;
-    Some(Stage { static_variance: None, ..taken.stage.clone() })
-}
-
-/// Noise terms in units of the variance of the error's slowest change. Less changes nothing.
-const NOISE: [f32; 3] = [0.3, 1.0, 3.0];
-
-/// Noise makes the error rise long before the stage ends. Without noise, a term only costs.
-fn with_noise(_: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    let supposes = planned.static_variance.is_some() && planned.gamma.is_none();
-    let early = taken.turn() * 10 <= planned.iterations * 9;
-    (supposes && early).then(|| Stage { gamma: Some(NOISE[1]), ..taken.stage.clone() })
-}
-
-/// More, if that was taken; else, if it was tried, less.
-fn with_other_noise(op: &SensingOperator, planned: &Stage, taken: &Course) -> Option<Stage> {
-    if planned.gamma.is_none() && taken.stage.gamma.is_some() {
-        return Some(Stage { gamma: Some(NOISE[2]), ..taken.stage.clone() });
-    }
-    Some(Stage { gamma: Some(NOISE[0]), ..with_noise(op, planned, taken)? })
-}
-
-impl Schedule {
-    /// The most that a pilot of it may cost, CPU-nanoseconds per voxel of the piece.
-    pub fn pilot_ns_per_voxel(&self) -> f64 {
-        // As many as `VARIANTS` may ask for.
-        let runs = |stage: &Stage| {
-            1 + usize::from(stage.temporal_weight.is_some())
-                + 2 * usize::from(shrunk(stage).is_some())
-                + stage.static_variance.map_or(0, |_| 2 + usize::from(stage.gamma.is_none()) * 2)
+    /// Runs a stage to its end, unless it clearly trails `rival`, the best trial so far. A stage without a noise level is
+    /// measured after its last iteration only.
+    fn run(
+        &mut self,
+        solver: &mut Solver<'_>,
+        index: usize,
+        stage: &Stage,
+        rival: Option<&Trial>,
+    ) -> Result<Trial> {
+        let fixed = stage.prior.sigma().is_none();
+        let norm = self.hold_out.norm(self.y);
+        let mut trial = Trial::new(stage.clone());
+        let measure = |frames: ArrayView3<'_, f32>, is_last: bool| {
+            if fixed && !is_last {
+                return ControlFlow::Continue(());
+            }
+            let squares = self.hold_out.residuals(self.op, self.y, frames);
+            let done = trial.errors.len() + 1;
+            let rivals = rival.filter(|_| !fixed).and_then(|rival| rival.squares.get(done - 1));
+            let trails = rivals.is_some_and(|rivals| t_statistic(&squares, rivals) > ABANDON_T);
+            trial.add((squares.iter().sum::<f64>() / norm).sqrt(), squares, frames);
+            trial.abandoned = trails && 2 * done >= stage.iterations;
+            if trial.abandoned { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         };
-        self.stages.iter().map(|stage| stage.planned_ns() * runs(stage) as f64).sum()
-    }
-}
-
-/// The errors of a stage on its way.
-struct Course {
-    /// As it was run.
-    stage: Stage,
-    /// After each iteration; of a stage without a level after the last one alone.
-    errors: Vec<f64>,
-    /// `(y - Hv)^2` of each held-out pixel, likewise.
-    squares: Vec<Vec<f64>>,
-    /// The frames where the error was least.
-    best: Option<Array3<f32>>,
-    /// The frames after the last iteration.
-    last: Option<Array3<f32>>,
-    /// Whether the next iteration left the finite numbers.
-    diverged: bool,
-    /// Whether it was clearly behind what it was to surpass, and not run to its end.
-    given_up: bool,
-    /// Whether the last variant was given up for it.
-    last_given_up: bool,
-    /// Whether shrinkage has left little of what changed.
-    at_rest: bool,
-}
-
-/// Whether a shrinkage along time is four times another one or more.
-fn fourfold(own: f32, others: f32) -> bool {
-    others > 0.0 && own >= 4.0 * others
-}
-
-impl Course {
-    /// Where the frames predict the held-out pixels best.
-    fn least(&self) -> f64 {
-        self.errors.iter().copied().fold(f64::INFINITY, f64::min)
-    }
-
-    /// Iterations up to where the error is least.
-    fn turn(&self) -> usize {
-        let least = self.least();
-        self.errors.iter().position(|error| *error == least).map_or(0, |index| index + 1)
-    }
-
-    /// `(y - Hv)^2` of each held-out pixel there.
-    fn least_squares(&self) -> &[f64] {
-        self.turn().checked_sub(1).map_or(&[], |index| &self.squares[index])
-    }
-
-    /// Iterations up to where the error is about least; all, if after the last one it is not greater by more
-    /// than chance.
-    fn paid(&self) -> usize {
-        let all_done = !self.diverged && self.errors.len() == self.stage.iterations;
-        let last = self.squares.last().map_or(&[][..], Vec::as_slice);
-        if all_done && excess(last, self.least_squares()) <= CHANCE {
-            return self.errors.len();
+        // A stage with a noise level is judged at its full length.
+        let tolerance = if fixed { stage.tolerance } else { 0.0 };
+        let run = Stage { tolerance, ..stage.clone() };
+        match run_stage(solver, (index, &run), &mut *self.observer, measure) {
+            Err(ReconError::Diverged { .. }) if !fixed => trial.diverged = true,
+            other => {
+                other?;
+                trial.last_frames = Some(solver.frames().clone());
+            }
         }
-        let near = self.least() * (1.0 + SLACK);
-        self.errors.iter().rposition(|error| *error <= near).map_or(0, |index| index + 1)
-    }
-
-    /// The frames there. With noise the error may be least after the first iteration, which shrinks little.
-    fn end(&self) -> Option<&Array3<f32>> {
-        if self.paid() == self.errors.len() { self.last.as_ref() } else { self.best.as_ref() }
-    }
-
-    fn shrinkage(&self) -> f32 {
-        self.stage.temporal_shrinkage.unwrap_or(0.0)
-    }
-
-    /// Whether it has four times the shrinkage of another, and little of what changed there.
-    fn stills(&self, other: &Self) -> bool {
-        let (own, others) = (self.shrinkage(), other.shrinkage());
-        let frames = self.end().zip(other.end());
-        let frames = frames.filter(|_| fourfold(own, others));
-        frames.is_some_and(|(own, others)| rest::correlation(own, others) < MOTION)
-    }
-
-    /// Whether its least error is below that of another by more than chance: by more than the standard error of
-    /// the mean difference. Where noise outweighs the frames' error, few pixels could tell anything.
-    ///
-    /// A static variance gives up changes for what frames have in common, of which a measurement tells more
-    /// than it counts in the frames: so for another one the difference must be thrice as clear. What fourfold
-    /// shrinkage of changes spares a scene at rest hardly shows in a measurement: where it has left little of what
-    /// changed, it is enough not to be clearly worse, also for still more.
-    fn surpasses(&self, other: &Self) -> bool {
-        if self.given_up {
-            return false;
-        }
-        let (own_squares, others_squares) = (self.least_squares(), other.least_squares());
-        if own_squares.is_empty() || others_squares.is_empty() {
-            return self.least() < other.least();
-        }
-        let (own, others) = (self.shrinkage(), other.shrinkage());
-        let errors = if self.stage.static_variance != other.stage.static_variance {
-            3.0
-        } else if self.stills(other) || own > others && other.at_rest {
-            -1.5
-        } else {
-            1.0
-        };
-        excess(others_squares, own_squares) > errors
+        Ok(trial)
     }
 }
 
-/// By how many standard errors of the mean difference one thing's squared errors at the held-out pixels are
-/// greater than another's.
-fn excess(one: &[f64], other: &[f64]) -> f64 {
-    let differences = || one.iter().zip(other).map(|(one, other)| one - other);
-    let count = one.len() as f64;
-    let mean = differences().sum::<f64>() / count;
-    let variance = differences().map(|difference| (difference - mean).powi(2)).sum::<f64>() / count;
-    if variance > 0.0 { mean / (variance / count).sqrt() } else { 0.0 }
+impl Condition {
+    /// True if a candidate with this condition is tried after this outcome of the first one.
+    fn holds(self, outcome: Option<Self>) -> bool {
+        match self {
+            Self::Any => true,
+            Self::Accepted | Self::NarrowlyRejected => outcome == Some(self),
+            Self::Rejected => outcome.is_some_and(|outcome| outcome != Self::Accepted),
+        }
+    }
 }
 
-/// Ends the last stage with a level where its own error is about least. Those before it run as planned: what
-/// follows builds on them, and their errors on so small a piece can't tell how. Stages that were not reached
-/// are left out.
-fn judge(schedule: &Schedule, courses: &[Course]) -> Vec<StageFinding> {
-    let last = schedule.stages.iter().rposition(|stage| stage.sigma.is_some());
-    let mut before = 1.0;
-    let finding = |(index, stage): (usize, &Stage)| {
-        let course = courses.get(index);
-        let errors = course.map_or(&[][..], |course| &course.errors);
-        let done = match course {
-            Some(course) if last == Some(index) => course.paid(),
+/// The decisions that follow from the trials. Early stopping ends the last stage with a noise level; earlier stages run as
+/// planned, because later ones depend on them in a way that a small crop does not show. A stage after one that diverged is
+/// left out.
+fn conclude(schedule: &Schedule, trials: &[Trial]) -> Vec<Decided> {
+    let last = schedule.stages.iter().rposition(|stage| stage.prior.sigma().is_some());
+    let last = last.filter(|_| schedule.has(Heuristic::EarlyStopping));
+    let mut error_before = 1.0;
+    let decide = |(index, planned): (usize, &Stage)| {
+        let trial = trials.get(index);
+        let errors = trial.map_or(&[][..], |trial| &trial.errors);
+        let done = match trial {
+            Some(trial) if last == Some(index) => trial.early_stopping_iteration(),
             _ => errors.len(),
         };
-        let diverged = course.is_none_or(|course| course.diverged) && done == errors.len();
-        let (iterations, end) = match (stage.sigma.is_none(), diverged) {
-            (true, _) => (stage.iterations, StageEnd::Fixed),
+        let error_after = errors[..done].last().copied().unwrap_or(error_before);
+        let fixed = planned.prior.sigma().is_none();
+        let diverged = trial.is_none_or(|trial| trial.diverged) && done == errors.len();
+        let (iterations, end) = match (fixed && trial.is_some(), diverged) {
+            (true, _) => (planned.iterations, StageEnd::Fixed),
             (false, true) => (done, StageEnd::Diverged),
-            (false, false) if done < stage.iterations => (done, StageEnd::Converged),
-            (false, false) => (done, StageEnd::Planned),
+            (false, false) if done < planned.iterations => (done, StageEnd::Converged),
+            (false, false) => (done, StageEnd::MaxIterations),
         };
-        let after = errors[..done].last().copied().unwrap_or(before);
-        let temporal_weight = course.and_then(|course| course.stage.temporal_weight).unwrap_or(0.0);
-        let shrinkage = course.map_or(0.0, Course::shrinkage);
-        let planned = stage.temporal_shrinkage.unwrap_or(0.0);
-        let rest_shrinkage = fourfold(shrinkage, planned).then_some(shrinkage);
-        let temporal_shrinkage = if rest_shrinkage.is_some() { planned } else { shrinkage };
-        // Something may move elsewhere in the picture; what, the first iterations don't tell.
-        let rest_everywhere = rest_shrinkage.is_some() && 2 * done < stage.iterations;
-        let static_variance = course.and_then(|course| course.stage.static_variance);
-        let gamma = course.and_then(|course| course.stage.gamma);
-        let before = std::mem::replace(&mut before, after);
-        StageFinding {
-            iterations,
-            temporal_weight,
-            temporal_shrinkage,
-            rest_shrinkage,
-            rest_everywhere,
-            static_variance,
-            gamma,
-            before,
-            after,
-            end,
-        }
+        // The planned noise levels, and the settings of the best trial.
+        let mut stage = trial.map_or(planned, |trial| &trial.stage).shortened(iterations);
+        let early = 2 * done < planned.iterations;
+        restrict_to_static_regions(&mut stage, planned, early, schedule);
+        let error_before = std::mem::replace(&mut error_before, error_after);
+        Decided { planned: planned.clone(), stage, error_before, error_after, end }
     };
-    schedule.stages.iter().enumerate().map(finding).collect()
+    schedule.stages.iter().enumerate().map(decide).collect()
 }
 
-/// What becomes of a stage.
-#[derive(Debug, Clone, Copy)]
-pub struct Decision {
-    /// So many iterations of it.
-    pub iterations: usize,
-    /// The weight of its total variation along time; 0 for none.
-    pub temporal_weight: f32,
-    /// Its shrinkage of changes along time; 0 for none.
-    pub temporal_shrinkage: f32,
-    /// The same where nothing moves, if it is another.
-    pub rest_shrinkage: Option<f32>,
-    /// Whether all is taken to be at rest then.
-    pub rest_everywhere: bool,
-    /// The static variance of its projection.
-    pub static_variance: Option<f32>,
-    /// The noise term of its projection.
-    pub gamma: Option<f32>,
+/// Restricts strong shrinkage to static regions, because something outside of the crop may move. The first iterations do not
+/// show what does, so a stage that stops `early` treats the whole picture as static.
+fn restrict_to_static_regions(
+    stage: &mut Stage,
+    planned: &Stage,
+    early: bool,
+    schedule: &Schedule,
+) {
+    let Some(nonlocal) = stage.prior.nonlocal_mut() else { return };
+    let weak = temporal_shrinkage(planned);
+    let strong = nonlocal.temporal_shrinkage;
+    if is_strong(strong, weak) && schedule.has(Heuristic::StaticRegions) {
+        nonlocal.temporal_shrinkage = weak;
+        nonlocal.static_shrinkage = Some(strong);
+        nonlocal.all_static = early;
+    }
 }
 
 impl Schedule {
-    /// The fixed schedule that the pilot has decided on, stage by stage: levels fall as they did, but end
-    /// earlier. A stage of no iterations is left out, unless no other is left.
-    pub fn decided(&self, decisions: &[Decision]) -> Self {
-        let stage = |(stage, decision): (&Stage, &Decision)| {
-            let &Decision { iterations, temporal_weight, temporal_shrinkage, .. } = decision;
-            let last = stage.sigma_at(iterations.checked_sub(1)?);
-            let sigma = stage.sigma.zip(last).map(|([first, _], last)| [first, last]);
-            let positive = |value: f32| (value > 0.0).then_some(value);
-            Some(Stage {
-                iterations,
-                temporal_weight: positive(temporal_weight),
-                temporal_shrinkage: positive(temporal_shrinkage),
-                rest_shrinkage: decision.rest_shrinkage,
-                rest_everywhere: decision.rest_everywhere,
-                static_variance: decision.static_variance,
-                gamma: decision.gamma,
-                sigma,
-                ..stage.clone()
-            })
+    /// Largest cost of a pilot, CPU-nanoseconds per voxel of the crop.
+    pub fn pilot_ns_per_voxel(&self) -> f64 {
+        // One of two candidates with opposite conditions is tried.
+        let tried = |candidate: &&Candidate| {
+            matches!(candidate.after, Condition::Any | Condition::Accepted)
+                && self.has(candidate.heuristic)
         };
-        let mut stages: Vec<Stage> = self.stages.iter().zip(decisions).filter_map(stage).collect();
+        let trials = |stage: &Stage| {
+            1 + GRID.iter().filter(tried).filter(|candidate| candidate.applies_to(stage)).count()
+        };
+        self.stages.iter().map(|stage| stage.planned_ns() * trials(stage) as f64).sum()
+    }
+
+    /// The fixed schedule that a pilot decided on. A stage without iterations is left out, unless no other remains.
+    pub fn decided(&self, decisions: &[Decided]) -> Self {
+        let stages = decisions.iter().map(|decided| decided.stage.clone());
+        let mut stages: Vec<Stage> = stages.filter(|stage| stage.iterations > 0).collect();
         if stages.is_empty() {
             stages.clone_from(&self.stages);
         }
@@ -518,97 +371,34 @@ impl Schedule {
     }
 }
 
-struct Watch<'a, 'b> {
-    op: &'a SensingOperator,
-    y: ArrayView3<'a, f32>,
-    held_out: &'a HeldOut,
-    index: usize,
-    observer: &'b mut dyn Observer,
-}
-
-impl Watch<'_, '_> {
-    /// Runs a stage to its end, unless it is clearly behind `rival`, the best of it so far.
-    fn stage(
-        &mut self,
-        stage: &Stage,
-        rival: Option<&Course>,
-        run: &mut Run<'_>,
-    ) -> Result<Course> {
-        let fixed = stage.sigma.is_none();
-        let mut course = Course {
-            stage: stage.clone(),
-            errors: vec![],
-            squares: vec![],
-            best: None,
-            last: None,
-            diverged: false,
-            given_up: false,
-            last_given_up: false,
-            at_rest: false,
-        };
-        let (mut least, norm) = (f64::INFINITY, self.held_out.norm(self.y));
-        run.enter(stage);
-        for done in 1..=stage.iterations {
-            let step = match run.iterate(stage, done - 1) {
-                Err(ReconError::Diverged { .. }) if !fixed => {
-                    course.diverged = true;
-                    break;
-                }
-                other => other?,
-            };
-            run.tell((self.index, stage), done - 1, &step, &mut *self.observer)?;
-            let last = done == stage.iterations || step.change < stage.tolerance;
-            if !fixed || last {
-                let squares = self.held_out.residuals(self.op, self.y, run.frames());
-                let error = (squares.iter().sum::<f64>() / norm).sqrt();
-                let rivals = rival.filter(|_| !fixed).and_then(|rival| rival.squares.get(done - 1));
-                let behind = rivals.is_some_and(|rivals| excess(&squares, rivals) > CLEAR);
-                course.errors.push(error);
-                course.squares.push(squares);
-                if error < least {
-                    least = error;
-                    course.best = Some(run.frames().to_owned());
-                }
-                if behind && 2 * done >= stage.iterations {
-                    course.given_up = true;
-                    break;
-                }
-            }
-            if fixed && last {
-                break;
-            }
-        }
-        course.last = (!course.diverged).then(|| run.frames().to_owned());
-        Ok(course)
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::{Course, Decision, StageEnd, StageFinding, judge, piece, run};
+    use super::{Decided, StageEnd, Trial, conclude, decide};
     use crate::ReconError;
-    use crate::prior::{Denoiser, Network, Networks};
-    use crate::schedule::{Schedule, Stage};
-    use crate::sensing::SensingOperator;
+    use crate::operator::SensingOperator;
+    use crate::priors::nonlocal::NonlocalSpec;
+    use crate::priors::{Denoiser, Network, Networks};
+    use crate::schedule::{Heuristic, Schedule};
     use crate::solver::{Control, Observer, Progress};
-    use ndarray::{Array2, Array3, Axis, s};
+    use crate::stage::Stage;
+    use ndarray::{Array2, Array3, Axis};
     use optics::{iid_masks, measure};
     use rand::{Rng, SeedableRng};
     use std::ops::Range;
 
-    /// Goes to the truth in some passes, counted from 1, and away from it in the others.
-    struct Moody {
+    /// Moves towards the true frames in some iterations, counted from 1, and away from them in the others.
+    struct Unreliable {
         truth: Array3<f32>,
         good: Range<usize>,
-        passes: usize,
-        /// What it does to the frames in the others.
+        iterations: usize,
+        /// Factor of the frames in the others.
         harm: f32,
     }
 
-    impl Denoiser for Moody {
+    impl Denoiser for Unreliable {
         fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
-            self.passes += 1;
-            match self.good.contains(&self.passes) {
+            self.iterations += 1;
+            match self.good.contains(&self.iterations) {
                 true => frames.zip_mut_with(&self.truth, |x, &truth| *x += 0.3 * (truth - *x)),
                 false => frames.mapv_inplace(|x| x * self.harm),
             }
@@ -616,13 +406,13 @@ mod tests {
         }
     }
 
-    impl Networks for Moody {
+    impl Networks for Unreliable {
         fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
             Ok(self)
         }
     }
 
-    fn find(planned: usize, good: Range<usize>, harm: f32) -> (Schedule, Vec<StageFinding>) {
+    fn pilot(planned: usize, good: Range<usize>, harm: f32) -> (Schedule, Vec<Decided>) {
         let masks = iid_masks(4, 48, 48, 3).unwrap();
         let truth = Array3::from_shape_fn((4, 48, 48), |(k, i, j)| {
             0.5 + 0.4 * ((i + 3 * k) as f32 * 0.4).sin() * (j as f32 * 0.3).cos()
@@ -631,52 +421,72 @@ mod tests {
         let op = SensingOperator::new(masks).unwrap();
         let mut schedule = Schedule::pnp_ffdnet();
         schedule.stages[1].iterations = planned;
-        // So that each pass helps.
-        schedule.stages[1].memory = 0.0;
-        let mut network = Moody { truth, good, passes: 0, harm };
-        let (found, _) = run(&op, y.view(), &schedule, &mut network, &mut ()).unwrap();
-        (schedule, found)
-    }
-
-    fn iterations(iterations: usize) -> Decision {
-        Decision {
-            iterations,
-            temporal_weight: 0.0,
-            temporal_shrinkage: 0.0,
-            rest_shrinkage: None,
-            rest_everywhere: false,
-            static_variance: None,
-            gamma: None,
-        }
+        // So that each iteration helps.
+        schedule.stages[1].projection.memory = 0.0;
+        let mut network = Unreliable { truth, good, iterations: 0, harm };
+        let decisions = decide(&op, y.view(), &schedule, &mut network, &mut ()).unwrap();
+        (schedule, decisions.stages)
     }
 
     #[test]
-    fn passes_that_harm_are_left_out() {
-        let (schedule, found) = find(60, 1..10, 0.7);
-        assert_eq!((found[0].iterations, found[0].end), (60, StageEnd::Fixed));
-        assert_eq!((found[1].iterations, found[1].end), (9, StageEnd::Converged));
-        assert!(found[1].after < 0.5 * found[1].before && found[1].before == found[0].after);
-        let decisions: Vec<_> = found.iter().map(|stage| iterations(stage.iterations)).collect();
-        let decided = schedule.decided(&decisions);
+    fn iterations_that_harm_are_left_out() {
+        let (schedule, stages) = pilot(60, 1..10, 0.7);
+        assert_eq!((stages[0].stage.iterations, stages[0].end), (60, StageEnd::Fixed));
+        assert_eq!((stages[1].stage.iterations, stages[1].end), (9, StageEnd::Converged));
+        assert!(stages[1].error_after < 0.5 * stages[1].error_before);
+        assert_eq!(stages[1].error_before, stages[0].error_after);
+        let decided = schedule.decided(&stages);
         assert!(!decided.adaptive);
         let level = |schedule: &Schedule, index| schedule.stages[1].sigma_at(index);
         assert_eq!(level(&decided, 0), level(&schedule, 0));
         let (last, planned) = (level(&decided, 8).unwrap(), level(&schedule, 8).unwrap());
-        assert!((last - planned).abs() < 1e-6, "levels fall as they were planned");
+        assert!((last - planned).abs() < 1e-6, "levels fall as planned");
     }
 
     #[test]
-    fn all_passes_that_help_are_kept() {
-        let (_, found) = find(6, 1..7, 1.0);
-        assert_eq!((found[1].iterations, found[1].end), (6, StageEnd::Planned));
+    fn iterations_that_help_are_kept() {
+        let (_, stages) = pilot(6, 1..7, 1.0);
+        assert_eq!((stages[1].stage.iterations, stages[1].end), (6, StageEnd::MaxIterations));
     }
 
-    /// A level far above the error that is left harms at first.
+    /// A noise level far above the remaining error harms at first.
     #[test]
-    fn a_stage_is_judged_by_its_end_not_by_its_first_passes() {
-        let (_, found) = find(60, 30..61, 0.7);
-        assert_eq!((found[1].iterations, found[1].end), (60, StageEnd::Planned));
-        assert!(found[1].after < 0.5 * found[1].before);
+    fn a_stage_is_judged_by_its_end_not_by_its_start() {
+        let (_, stages) = pilot(60, 30..61, 0.7);
+        assert_eq!((stages[1].stage.iterations, stages[1].end), (60, StageEnd::MaxIterations));
+        assert!(stages[1].error_after < 0.5 * stages[1].error_before);
+    }
+
+    /// Adapts the default schedule of the nonlocal prior to a scene of 6 frames, and returns its nonlocal stage.
+    fn nonlocal_stage(schedule: &Schedule, truth: &Array3<f32>) -> Stage {
+        let masks = iid_masks(6, 64, 64, 3).unwrap();
+        let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+        let op = SensingOperator::new(masks).unwrap();
+        let mut decisions = decide(&op, y.view(), schedule, &mut (), &mut ()).unwrap();
+        decisions.stages.remove(1).stage
+    }
+
+    fn nonlocal(stage: &Stage) -> NonlocalSpec {
+        stage.prior.nonlocal().unwrap().clone()
+    }
+
+    fn drifting_wave(speed: f32) -> Array3<f32> {
+        Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
+            0.5 + 0.4 * ((i as f32 + speed * k as f32) * 0.3).sin() * (j as f32 * 0.2).cos()
+        })
+    }
+
+    fn still_texture() -> Array3<f32> {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        // Too fine for the filter of groups.
+        let texture = Array2::from_shape_simple_fn((64, 64), || random.random::<f32>());
+        Array3::from_shape_fn((6, 64, 64), |(_, i, j)| texture[[i, j]])
+    }
+
+    fn short_nonlocal_schedule() -> Schedule {
+        let mut schedule = Schedule::pnp_nonlocal();
+        schedule.stages[1].iterations = 20;
+        schedule
     }
 
     #[test]
@@ -689,113 +499,121 @@ mod tests {
             });
             let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
             let op = SensingOperator::new(masks.clone()).unwrap();
-            run(&op, y.view(), &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().0[0]
-                .temporal_weight
+            let schedule = Schedule::gap_tv3d();
+            let decisions = decide(&op, y.view(), &schedule, &mut (), &mut ()).unwrap();
+            decisions.stages[0].stage.prior.tv().unwrap().temporal_weight
         };
-        let asked = Schedule::gap_tv3d().stages[0].temporal_weight;
-        assert_eq!((Some(weight(false)), weight(true)), (asked, 0.0));
+        let planned = Schedule::gap_tv3d().stages[0].prior.tv().unwrap().temporal_weight;
+        assert_eq!((weight(false), weight(true)), (planned, 0.0));
     }
 
-    /// In a still scene all of the error is common to the frames.
+    /// In a static scene the whole error is static.
     #[test]
     fn a_static_variance_that_is_too_small_is_not_kept() {
-        let masks = iid_masks(6, 64, 64, 3).unwrap();
-        let op = SensingOperator::new(masks.clone()).unwrap();
-        let mut schedule = Schedule::pnp_nonlocal();
-        schedule.stages[1].iterations = 20;
-        let mut found = |motion: f32, planned: f32| {
-            let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
-                0.5 + 0.4 * ((i as f32 + motion * k as f32) * 0.3).sin() * (j as f32 * 0.2).cos()
-            });
-            let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
-            schedule.stages[1].static_variance = Some(planned);
-            run(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().0[1].static_variance
+        let mut schedule = short_nonlocal_schedule();
+        let mut decided = |speed: f32, planned: f32| {
+            schedule.stages[1].projection.static_variance = Some(planned);
+            nonlocal_stage(&schedule, &drifting_wave(speed)).projection.static_variance
         };
-        assert_eq!(found(2.0, 0.5), Some(0.5));
-        assert_ne!(found(0.0, 0.05), Some(0.05));
+        assert_eq!(decided(2.0, 0.5), Some(0.5));
+        assert_ne!(decided(0.0, 0.05), Some(0.05));
     }
 
     #[test]
-    fn changes_are_shrunk_more_where_nothing_moves() {
-        let masks = iid_masks(6, 64, 64, 3).unwrap();
-        let op = SensingOperator::new(masks.clone()).unwrap();
-        let mut schedule = Schedule::pnp_nonlocal();
-        schedule.stages[1].iterations = 20;
-        let planned = schedule.stages[1].temporal_shrinkage.unwrap();
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
-        // Too fine for the filter of groups.
-        let texture = Array2::from_shape_simple_fn((64, 64), || random.random::<f32>());
-        let wave = |i: usize, j: usize| 0.5 + 0.4 * (i as f32 * 0.3).sin() * (j as f32 * 0.2).cos();
-        let found = |truth: Array3<f32>| {
-            let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
-            let found = run(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().0[1];
-            found.rest_shrinkage.unwrap_or(found.temporal_shrinkage)
-        };
-        let still = found(Array3::from_shape_fn((6, 64, 64), |(_, i, j)| texture[[i, j]]));
-        let moving = found(Array3::from_shape_fn((6, 64, 64), |(k, i, j)| wave(i + 2 * k, j)));
-        assert!(still >= 4.0 * planned && moving <= planned, "{still} {moving}");
+    fn static_scenes_are_strongly_shrunk_and_moving_ones_are_not() {
+        let schedule = short_nonlocal_schedule();
+        let planned = nonlocal(&schedule.stages[1]).temporal_shrinkage;
+        let still = nonlocal(&nonlocal_stage(&schedule, &still_texture()));
+        assert_eq!(still.temporal_shrinkage, planned);
+        assert!(still.static_shrinkage.is_some_and(|strong| strong >= 4.0 * planned), "{still:?}");
+        let moving = nonlocal(&nonlocal_stage(&schedule, &drifting_wave(2.0)));
+        assert!(moving.static_shrinkage.is_none() && moving.temporal_shrinkage <= planned);
     }
 
-    /// A course whose four frames change by `changes`, and whose error at the held-out pixels is `behind`
-    /// standard errors greater than that of one of another `side`.
-    fn course(shrinkage: f32, changes: [f32; 4], (side, behind): (usize, f64)) -> Course {
-        let planned = Schedule::pnp_nonlocal().stages[1].clone();
+    #[test]
+    fn heuristics_can_be_disabled_one_by_one() {
+        use Heuristic::{EarlyStopping, StaticRegions, TemporalShrinkage};
+        let decided = |disabled: Vec<Heuristic>| {
+            let schedule = Schedule { disabled, ..short_nonlocal_schedule() };
+            (schedule.pilot_ns_per_voxel(), nonlocal_stage(&schedule, &still_texture()))
+        };
+        let (cost, _) = decided(vec![]);
+        let (cheaper, unshrunk) = decided(vec![TemporalShrinkage, EarlyStopping]);
+        let planned = nonlocal(&short_nonlocal_schedule().stages[1]);
+        assert_eq!(nonlocal(&unshrunk).temporal_shrinkage, planned.temporal_shrinkage);
+        assert_eq!((nonlocal(&unshrunk).static_shrinkage, unshrunk.iterations), (None, 20));
+        assert!(cheaper < cost, "fewer candidates are tried");
+        let (same, everywhere) = decided(vec![StaticRegions]);
+        assert!(nonlocal(&everywhere).temporal_shrinkage >= 4.0 * planned.temporal_shrinkage);
+        assert_eq!((nonlocal(&everywhere).static_shrinkage, same), (None, cost));
+    }
+
+    /// A trial whose four frames change by `changes`, and whose hold-out error is `behind` standard errors greater than that
+    /// of a trial with the other `side`.
+    fn trial(shrinkage: f32, changes: [f32; 4], (side, behind): (usize, f64)) -> Trial {
+        let mut stage = Schedule::pnp_nonlocal().stages[1].clone();
+        stage.prior.nonlocal_mut().unwrap().temporal_shrinkage = shrinkage;
         let square = |pixel: usize| ((pixel + side) % 2) as f64 + behind / 10.0;
         let frames = Array3::from_shape_fn((4, 8, 8), |(k, i, _)| i as f32 + changes[k]);
-        Course {
-            stage: Stage { temporal_shrinkage: Some(shrinkage), ..planned },
+        Trial {
             errors: vec![1.0],
             squares: vec![(0..100).map(square).collect()],
-            best: Some(frames.clone()),
-            last: Some(frames),
-            diverged: false,
-            given_up: false,
-            last_given_up: false,
-            at_rest: false,
+            best_frames: Some(frames.clone()),
+            last_frames: Some(frames),
+            ..Trial::new(stage)
         }
     }
 
     #[test]
-    fn changes_of_which_shrinkage_leaves_nothing_were_no_motion() {
-        let planned = course(0.35, [1.0, -1.0, 1.0, -1.0], (0, 0.0));
-        let fourfold = |changes, behind| course(1.4, changes, (1, behind));
+    fn changes_that_strong_shrinkage_removes_were_no_motion() {
+        let schedule = Schedule::pnp_nonlocal();
+        let planned = trial(0.35, [1.0, -1.0, 1.0, -1.0], (0, 0.0));
+        let strong = |changes, behind| trial(1.4, changes, (1, behind));
+        let is_better = |one: &Trial, other: &Trial| one.is_better_than(other, &schedule);
         let (others, fewer) = ([0.1, 0.1, -0.1, -0.1], [0.1, -0.1, 0.1, -0.1]);
-        assert!(fourfold(others, 1.0).surpasses(&planned), "what changed was not in the scene");
-        assert!(fourfold([0.0; 4], 1.0).surpasses(&planned), "nothing is left");
-        assert!(!fourfold(others, 2.0).surpasses(&planned), "it is clearly worse");
-        assert!(!fourfold(fewer, 1.0).surpasses(&planned), "what is left was there before");
-        // With noise the error may be least before shrinkage has had any effect.
-        let early = Course { best: planned.best.clone(), ..fourfold(others, 1.0) };
-        assert!(early.surpasses(&planned), "the frames at the end tell");
-        // So it is for still more shrinkage.
-        let taken = Course { at_rest: true, ..fourfold(others, 1.0) };
-        let eightfold = |behind| course(2.8, [0.0; 4], (0, behind));
-        assert!(eightfold(2.0).surpasses(&taken) && !eightfold(3.0).surpasses(&taken));
-        let moving = Course { at_rest: false, ..taken };
-        assert!(!eightfold(0.5).surpasses(&moving), "by more than chance where something moves");
+        assert!(is_better(&strong(others, 1.0), &planned), "the changes were not in the scene");
+        assert!(is_better(&strong([0.0; 4], 1.0), &planned), "no change remains");
+        assert!(!is_better(&strong(others, 2.0), &planned), "it is clearly worse");
+        assert!(
+            !is_better(&strong(fewer, 1.0), &planned),
+            "the remaining changes existed before shrinkage"
+        );
+        let disabled = vec![Heuristic::StaticScene];
+        let without = Schedule { disabled, ..schedule.clone() };
+        assert!(!strong(others, 1.0).is_better_than(&planned, &without));
+        // With noise the error may be smallest before shrinkage has had any effect.
+        let early = Trial { best_frames: planned.best_frames.clone(), ..strong(others, 1.0) };
+        assert!(is_better(&early, &planned), "the frames at the end decide");
+        // This applies to eightfold shrinkage too.
+        let best = Trial { is_static: true, ..strong(others, 1.0) };
+        let eightfold = |behind| trial(2.8, [0.0; 4], (0, behind));
+        assert!(is_better(&eightfold(2.0), &best) && !is_better(&eightfold(3.0), &best));
+        let moving = Trial { is_static: false, ..best };
+        assert!(!is_better(&eightfold(0.5), &moving), "significantly, where something moves");
     }
 
     #[test]
-    fn a_stage_that_ends_early_does_not_tell_what_moves() {
+    fn a_stage_that_ends_early_treats_the_whole_picture_as_static() {
         let mut schedule = Schedule::pnp_nonlocal();
-        let planned = schedule.stages[1].temporal_shrinkage.unwrap();
-        let tv = schedule.stages[0].clone();
-        let before = || Course { stage: tv.clone(), ..course(0.0, [0.0; 4], (0, 0.0)) };
-        let mut found = |iterations, shrinkage| {
+        let planned = nonlocal(&schedule.stages[1]).temporal_shrinkage;
+        let tv = Trial { errors: vec![1.0], ..Trial::new(schedule.stages[0].clone()) };
+        let mut trials = [tv, Trial::new(schedule.stages[1].clone())];
+        let mut decided = |iterations, shrinkage| {
             schedule.stages[1].iterations = iterations;
-            let taken = Course { diverged: true, ..course(shrinkage, [0.0; 4], (0, 0.0)) };
-            let found = judge(&schedule, &[before(), taken])[1];
-            assert_eq!(found.iterations, 1);
-            (found.temporal_shrinkage, found.rest_shrinkage, found.rest_everywhere)
+            trials[1] = Trial { diverged: true, ..trial(shrinkage, [0.0; 4], (0, 0.0)) };
+            let decided = conclude(&schedule, &trials).remove(1).stage;
+            assert_eq!(decided.iterations, 1);
+            let decided = nonlocal(&decided);
+            (decided.temporal_shrinkage, decided.static_shrinkage, decided.all_static)
         };
-        let fourfold = 4.0 * planned;
-        assert_eq!(found(2, fourfold), (planned, Some(fourfold), false));
-        assert_eq!(found(3, fourfold), (planned, Some(fourfold), true));
-        assert_eq!(found(3, 2.0 * planned), (2.0 * planned, None, false));
+        let strong = 4.0 * planned;
+        assert_eq!(decided(2, strong), (planned, Some(strong), false));
+        assert_eq!(decided(3, strong), (planned, Some(strong), true));
+        assert_eq!(decided(3, 2.0 * planned), (2.0 * planned, None, false));
     }
 
     #[test]
-    fn a_variant_that_is_clearly_behind_is_given_up() {
+    fn a_candidate_that_clearly_trails_is_abandoned() {
         struct Steps(usize);
         impl Observer for Steps {
             fn iteration(&mut self, progress: &Progress) -> Control {
@@ -804,69 +622,46 @@ mod tests {
             }
         }
         let masks = iid_masks(6, 64, 64, 3).unwrap();
-        let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
-            0.5 + 0.4 * ((i + 2 * k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
-        });
-        let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+        let y = measure(masks.view(), drifting_wave(2.0).view()).unwrap().insert_axis(Axis(0));
         let op = SensingOperator::new(masks).unwrap();
-        let mut schedule = Schedule::pnp_nonlocal();
-        schedule.stages[1].iterations = 20;
-        schedule.stages[1].static_variance = None;
+        let mut schedule = short_nonlocal_schedule();
+        schedule.stages[1].projection.static_variance = None;
         let mut steps = Steps(0);
-        run(&op, y.view(), &schedule, &mut (), &mut steps).unwrap();
-        assert_eq!(steps.0, 30, "the plan, and half of four times the shrinkage");
+        decide(&op, y.view(), &schedule, &mut (), &mut steps).unwrap();
+        assert_eq!(steps.0, 30, "the planned stage, and half of one with strong shrinkage");
     }
 
     #[test]
-    fn a_noise_term_is_found_where_there_is_noise() {
+    fn noise_brings_a_noise_term() {
         let masks = iid_masks(6, 64, 64, 3).unwrap();
-        let truth = Array3::from_shape_fn((6, 64, 64), |(k, i, j)| {
-            0.5 + 0.4 * ((i + 2 * k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
-        });
-        let y = measure(masks.view(), truth.view()).unwrap().insert_axis(Axis(0));
+        let y = measure(masks.view(), drifting_wave(2.0).view()).unwrap().insert_axis(Axis(0));
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(3);
         let noise = y.mapv(|_| (0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0);
         let op = SensingOperator::new(masks).unwrap();
-        let found = |schedule: &Schedule, sigma: f32| {
+        let gamma = |schedule: &Schedule, sigma: f32| {
             let y = &y + &(sigma * &noise);
-            run(&op, y.view(), schedule, &mut (), &mut ()).unwrap().0[1].gamma
+            let decisions = decide(&op, y.view(), schedule, &mut (), &mut ()).unwrap();
+            decisions.stages[1].stage.projection.gamma
         };
         let mut schedule = Schedule::pnp_nonlocal();
-        assert_eq!(found(&schedule, 0.0), None);
-        assert!(found(&schedule, 0.2).is_some_and(|gamma| gamma > 0.0));
-        schedule.stages[1].gamma = Some(0.1);
-        assert_eq!(found(&schedule, 0.2), Some(0.1), "what a schedule states is kept");
+        assert_eq!(gamma(&schedule, 0.0), None);
+        assert!(gamma(&schedule, 0.2).is_some_and(|gamma| gamma > 0.0));
+        schedule.stages[1].projection.gamma = Some(0.1);
+        assert_eq!(gamma(&schedule, 0.2), Some(0.1), "a stated term is kept");
     }
 
     #[test]
     fn divergence_ends_the_stage_before_it() {
-        let (schedule, found) = find(60, 1..6, f32::INFINITY);
-        assert_eq!((found[1].iterations, found[1].end), (5, StageEnd::Diverged));
-        let (_, none) = find(60, 1..1, f32::INFINITY);
-        assert_eq!((none[1].iterations, none[1].end), (0, StageEnd::Diverged));
+        let (schedule, mut stages) = pilot(60, 1..6, f32::INFINITY);
+        assert_eq!((stages[1].stage.iterations, stages[1].end), (5, StageEnd::Diverged));
+        let (_, none) = pilot(60, 1..1, f32::INFINITY);
+        assert_eq!((none[1].stage.iterations, none[1].end), (0, StageEnd::Diverged));
         assert_eq!(
-            schedule.decided(&[60, 0].map(iterations)).stages.len(),
+            schedule.decided(&none).stages.len(),
             1,
-            "a stage of none is left out"
+            "a stage without iterations is left out"
         );
-        assert_eq!(
-            schedule.decided(&[0, 0].map(iterations)).stages.len(),
-            2,
-            "but not all of them"
-        );
-    }
-
-    #[test]
-    fn the_piece_has_the_greatest_contrast_and_lies_inside() {
-        let mut y = Array2::zeros((200, 300));
-        y.slice_mut(s![150.., 250..]).assign(&Array2::from_shape_fn((50, 50), |(i, _)| i as f32));
-        let light = Array2::ones((200, 300));
-        assert_eq!(piece(light.view(), y.view()), (104..200, 204..300));
-        // Where it is bright and even the measurement varies more, by the masks alone.
-        let light = Array2::from_shape_fn((200, 300), |(i, j)| ((7 * i + 11 * j) % 5) as f32);
-        y.slice_mut(s![..96, ..96]).assign(&(100.0 * &light.slice(s![..96, ..96])));
-        assert_eq!(piece(light.view(), y.view()), (104..200, 204..300));
-        let nothing = Array2::zeros((40, 60));
-        assert_eq!(piece(nothing.view(), nothing.view()), (0..40, 0..60));
+        stages.iter_mut().for_each(|decided| decided.stage.iterations = 0);
+        assert_eq!(schedule.decided(&stages).stages.len(), 2, "but not all stages");
     }
 }

@@ -1,32 +1,32 @@
-//! A coarse reconstruction in a second or so, to be looked at while the real one is made.
+//! A coarse reconstruction in about a second, for display while the full one runs.
 //!
-//! Over a block of `s` x `s` pixels a frame is taken as even: its `s^2` pixels are then equations
-//! `y_p = sum_k C_kp x_k` for `B` unknowns, more than enough of them, and least squares solve them.
-//! Summing masks and measurement over the block first (binning) would leave one equation of the many:
-//! on street (Cr 10, independent masks, `s` = 7) total variation then gives 21.8 dB, this 28.4 dB.
+//! Within a block of `s` x `s` pixels each frame is taken as flat. The `s^2` pixels are then equations `y_p = sum_k
+//! C_kp x_k` for `B` unknowns, which least squares solve. Summing masks and measurement over the block first
+//! (binning) would leave a single equation: on street (Cr 10, independent masks, `s` = 7) total variation then
+//! reaches 21.8 dB, this method 28.4 dB.
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 
 use super::error::{ReconError, Result, shape_text};
-use super::prior::tv::TotalVariation;
+use super::operator::SensingOperator;
+use super::priors::tv::TotalVariation;
 use super::schedule::Schedule;
-use super::sensing::SensingOperator;
 use super::solver;
 
-/// Voxels that total variation does in a second or two; pictures of more are done by blocks.
+/// Number of voxels that total variation solves in a second or two; larger pictures are solved by blocks.
 pub const WHOLE: usize = 8 << 20;
-/// Iterations where a picture is done whole.
+/// Iterations for a picture that is not divided into blocks.
 const ITERATIONS: usize = 40;
-/// The longer side of a preview by blocks, about.
+/// Approximate longer side of a preview by blocks, in pixels.
 const LONGER_SIDE: usize = 640;
 /// Weight of the deviation from the block's mean over all frames, in units of the masks' squares.
 const RIDGE: f32 = 1.0;
 /// Total variation after the blocks: weight on the \[0,1\] scale, and dual updates.
 const SMOOTHING: (f32, usize) = (0.05, 4);
-/// Values of a register, or two.
+/// Number of values in a register, or two.
 const LANES: usize = 16;
 
-/// Side of the blocks for frames of this size; 1 where the picture is small enough to be done whole.
+/// Side of the blocks for frames of this size; 1 for a picture that is not divided.
 pub fn block(frames: usize, height: usize, width: usize) -> usize {
     if frames * height * width <= WHOLE {
         return 1;
@@ -36,9 +36,11 @@ pub fn block(frames: usize, height: usize, width: usize) -> usize {
     enough.max(height.max(width).div_ceil(LONGER_SIDE))
 }
 
-/// Frames of a small picture, by a few iterations of GAP-TV. `y` \[S,H,W\] is on the scale on which
-/// the scene is on \[0,1\].
-/// Errors: as [`solver::reconstruct`].
+/// Frames of a small picture, by a few iterations of GAP-TV. `y` \[S,H,W\] is on the scale on which the scene is on
+/// \[0,1\].
+///
+/// # Errors
+/// As [`solver::reconstruct`].
 pub fn whole(op: &SensingOperator, y: ArrayView3<'_, f32>) -> Result<Array3<f32>> {
     let schedule = Schedule::gap_tv().with_iterations(ITERATIONS);
     Ok(solver::reconstruct(op, y, &schedule, &mut (), &mut ())?.frames)
@@ -51,30 +53,32 @@ pub struct Blocks {
     frames: usize,
     /// Masks of the block \[B, pixels\], rounded up to whole registers with zeros.
     masks: Vec<f32>,
-    /// What is left of the measurement.
-    rest: Vec<f32>,
+    /// Residual of the measurement.
+    residual: Vec<f32>,
     /// Lower triangle of the normal matrix \[B,B\], and then its Cholesky factor.
     normal: Vec<f32>,
     solution: Vec<f32>,
 }
 
 impl Blocks {
-    /// For blocks of `side` x `side` pixels of `frames` frames.
+    /// A solver for blocks of `side` x `side` pixels of `frames` frames.
     pub fn new(frames: usize, side: usize) -> Self {
         let pixels = (side * side).next_multiple_of(LANES);
         Self {
             side,
             frames,
             masks: vec![0.0; frames * pixels],
-            rest: vec![0.0; pixels],
+            residual: vec![0.0; pixels],
             normal: vec![0.0; frames * frames],
             solution: vec![0.0; frames],
         }
     }
 
-    /// One row of blocks: masks \[B,h,W\] and measurement \[h,W\] of at most `side` rows give frames
-    /// \[B, W / side rounded up\]. The last block may be narrower.
-    /// Errors: sizes that disagree.
+    /// Solves one row of blocks: masks \[B,h,W\] and measurement \[h,W\] of at most `side` rows give frames \[B, W /
+    /// side rounded up\]. The last block may be narrower.
+    ///
+    /// # Errors
+    /// Sizes that disagree.
     pub fn row(
         &mut self,
         masks: ArrayView3<'_, f32>,
@@ -99,10 +103,10 @@ impl Blocks {
     }
 
     fn gather(&mut self, masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) {
-        let pixels = self.rest.len();
+        let pixels = self.residual.len();
         self.masks.fill(0.0);
-        self.rest.fill(0.0);
-        self.rest.iter_mut().zip(y).for_each(|(rest, &y)| *rest = y);
+        self.residual.fill(0.0);
+        self.residual.iter_mut().zip(y).for_each(|(residual, &y)| *residual = y);
         for (line, mask) in self.masks.chunks_exact_mut(pixels).zip(masks.outer_iter()) {
             line.iter_mut().zip(mask).for_each(|(value, &c)| *value = c);
         }
@@ -110,11 +114,11 @@ impl Blocks {
 
     /// `x = m + (C C^T + ridge)^-1 C (y - C^T m)` with the block's mean `m` of all frames.
     fn solve(&mut self) {
-        let (frames, pixels) = (self.frames, self.rest.len());
+        let (frames, pixels) = (self.frames, self.residual.len());
         let light: f32 = self.masks.iter().sum();
-        let mean = if light > 0.0 { self.rest.iter().sum::<f32>() / light } else { 0.0 };
+        let mean = if light > 0.0 { self.residual.iter().sum::<f32>() / light } else { 0.0 };
         for mask in self.masks.chunks_exact(pixels) {
-            self.rest.iter_mut().zip(mask).for_each(|(rest, &c)| *rest -= c * mean);
+            self.residual.iter_mut().zip(mask).for_each(|(residual, &c)| *residual -= c * mean);
         }
         let mask = |k: usize| &self.masks[k * pixels..(k + 1) * pixels];
         for i in 0..frames {
@@ -122,7 +126,7 @@ impl Blocks {
                 self.normal[i * frames + j] = dot(mask(i), mask(j));
             }
             self.normal[i * frames + i] += RIDGE;
-            self.solution[i] = dot(mask(i), &self.rest);
+            self.solution[i] = dot(mask(i), &self.residual);
         }
         cholesky(&mut self.normal, &mut self.solution);
         self.solution.iter_mut().for_each(|value| *value += mean);
@@ -146,16 +150,15 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
     sums.iter().sum()
 }
 
-/// Solves `A x = b` in place of `b` for a positive definite `A`, of which the lower triangle is
-/// given and lost.
+/// Solves `A x = b` in place of `b` for a positive definite `A`, given by its lower triangle, which is overwritten.
 fn cholesky(a: &mut [f32], b: &mut [f32]) {
     let n = b.len();
     for i in 0..n {
         for j in 0..=i {
             let known: f32 = (0..j).map(|k| a[i * n + k] * a[j * n + k]).sum();
-            let rest = a[i * n + j] - known;
+            let remainder = a[i * n + j] - known;
             // The ridge keeps the diagonal above 0.
-            a[i * n + j] = if i == j { rest.sqrt() } else { rest / a[j * n + j] };
+            a[i * n + j] = if i == j { remainder.sqrt() } else { remainder / a[j * n + j] };
         }
     }
     for i in 0..n {
@@ -175,7 +178,7 @@ mod tests {
     use optics::{iid_masks, measure};
 
     #[test]
-    fn large_pictures_are_done_by_blocks_with_equations_enough() {
+    fn large_pictures_are_solved_by_blocks_with_enough_equations() {
         assert_eq!(block(10, 256, 256), 1);
         assert_eq!(block(10, 3200, 3200), 5);
         assert_eq!(block(30, 3200, 3200), 8);
@@ -183,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn even_blocks_come_back_and_the_last_may_be_narrower() {
+    fn flat_blocks_are_recovered_and_the_last_may_be_narrower() {
         let (side, frames) = (6, 8);
         let masks = iid_masks(frames, 12, 27, 5).unwrap();
         let truth = Array3::from_shape_fn((frames, 12, 27), |(k, i, j)| {

@@ -1,31 +1,33 @@
-//! The factor that brings a scene to \[0,1\] for the denoiser.
+//! The scale that brings a scene to \[0,1\] for the denoiser.
 
 use ndarray::{Array2, ArrayView2};
 
 use super::error::{ReconError, Result, shape_text};
 
-/// Share of the pixels that lie at or below the scene's white.
+/// Share of the pixels that lie at or below the white level.
 const WHITE_QUANTILE: f64 = 0.995;
 
 /// Estimates the white level of a scene from its masks and one measurement.
 ///
-/// `y / sum_k C_k` is a mean of the frames at each pixel, weighted by the masks. Its upper
-/// quantile over the pixels is the scene's white: robust against hot pixels, and taken once
-/// from the whole picture, before tiling, so that all tiles share it.
+/// At each pixel `y / sum_k C_k` is a mean of the frames, weighted by the masks. The white level is its upper
+/// quantile over the pixels: robust against hot pixels, and estimated once for the whole picture, so that all tiles
+/// share it.
 #[derive(Debug)]
 pub struct ScaleEstimator {
     light: Array2<f32>,
 }
 
 impl ScaleEstimator {
-    /// For masks of this sum \[H,W\].
+    /// An estimator for masks with the sum `light` \[H,W\].
     pub fn new(light: Array2<f32>) -> Self {
         Self { light }
     }
 
-    /// The white level of the scene behind measurement `y` \[H,W\]: divide measurement (and
-    /// so frames) by it before reconstruction, multiply frames by it after.
-    /// Errors: sizes that differ, or a measurement without light.
+    /// White level of the scene behind measurement `y` \[H,W\]. The measurement is divided by it before reconstruction,
+    /// and the frames are multiplied by it afterwards.
+    ///
+    /// # Errors
+    /// Sizes that differ, or a measurement without light.
     pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
         if y.dim() != self.light.dim() {
             return Err(ReconError::Shape {
@@ -34,7 +36,7 @@ impl ScaleEstimator {
                 expected: shape_text(self.light.shape()),
             });
         }
-        // Pixels with little light have a ratio of noise by almost nothing.
+        // Pixels with little light have a ratio of noise to almost nothing.
         let floor = 0.25 * self.light.mean().unwrap_or(0.0);
         let lit = y.iter().zip(&self.light).filter(|&(_, &light)| light > floor);
         let mut ratios: Vec<f32> = lit.map(|(&y, &light)| y / light).collect();
@@ -47,9 +49,9 @@ impl ScaleEstimator {
             return Ok(white);
         }
         Err(ReconError::Parameter {
-            name: "the measurement's white level",
+            name: "the measurement's white level".into(),
             value: white.to_string(),
-            range: "above 0: the measurement holds no light (is the dark frame too bright?)",
+            range: "above 0: the measurement holds no light (is the dark frame too bright?)".into(),
         })
     }
 }

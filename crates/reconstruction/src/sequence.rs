@@ -1,17 +1,16 @@
-//! Snapshots of a sequence together: cut into runs that overlap in time as tiles do in space. Pure
-//! arithmetic.
+//! Joint reconstruction of a sequence: its snapshots are cut into runs that overlap in time as tiles do in space.
+//! Pure arithmetic.
 //!
-//! The frames of a run are solved as one clip. What follows a cut or a jump of the scene does not belong
-//! to the same clip: a joint between two snapshots may be taken apart, and the runs that hold it are then
-//! solved in pieces.
+//! The frames of a run are solved as one clip. A cut or jump of the scene separates clips: the joint between two
+//! snapshots can be cut, and the runs that contain it are then solved in pieces.
 
 use std::ops::Range;
 
 use super::error::{ReconError, Result};
 use super::tile::{parts, weights};
 
-/// How the snapshots of a sequence are cut into runs. It depends on their number and the parameters alone,
-/// never on the number of workers.
+/// The runs of a sequence. They depend on the number of snapshots and the parameters alone, never on the number of
+/// workers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SequencePlan {
     runs: Vec<Range<usize>>,
@@ -20,47 +19,49 @@ pub struct SequencePlan {
 /// Snapshots of a run that are solved as one clip.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Piece {
-    /// The index of its run.
+    /// Index of the run.
     pub run: usize,
-    /// Its snapshots, by their index in the measurement.
+    /// The snapshots, by their index in the measurement.
     pub snapshots: Range<usize>,
 }
 
-/// What the frames of a snapshot take from one run.
+/// Contribution of one run to the frames of a snapshot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunShare {
-    /// The index of the run.
+    /// Index of the run.
     pub run: usize,
-    /// The place of the snapshot in the run.
+    /// Position of the snapshot in the run.
     pub place: usize,
-    /// The weight of each of its frames \[B\]; over all runs they add up to 1.
+    /// Weight of each frame \[B\]; over all runs they add up to 1.
     pub weights: Vec<f32>,
 }
 
 impl RunShare {
-    /// The index, among the frames of the run, of frame `k` of the snapshot.
+    /// Index of frame `k` of the snapshot among the frames of the run.
     pub fn frame(&self, k: usize) -> usize {
         self.place * self.weights.len() + k
     }
 }
 
 impl SequencePlan {
-    /// Cuts snapshots, given by their indices in the measurement, into as few runs of at most `length` as
-    /// share at least `overlap` snapshots with each neighbour, and makes them as short as that allows.
-    /// Errors: a length of 0, or an overlap that is not below it.
+    /// Cuts snapshots, given by their indices in the measurement, into as few and as short runs as possible, of at
+    /// most `length` snapshots and with at least `overlap` in common with each neighbour.
+    ///
+    /// # Errors
+    /// A length of 0, or an overlap that is not below it.
     pub fn new(snapshots: Range<usize>, length: usize, overlap: usize) -> Result<Self> {
         if snapshots.is_empty() || length == 0 {
             return Err(ReconError::Parameter {
-                name: "the length of a run",
+                name: "the length of a run".into(),
                 value: length.min(snapshots.len()).to_string(),
-                range: "at least 1 snapshot",
+                range: "at least 1 snapshot".into(),
             });
         }
         if overlap >= length {
             return Err(ReconError::Parameter {
-                name: "the overlap of runs",
+                name: "the overlap of runs".into(),
                 value: overlap.to_string(),
-                range: "less than the length of a run",
+                range: "less than the length of a run".into(),
             });
         }
         let first = snapshots.start;
@@ -69,7 +70,7 @@ impl SequencePlan {
         Ok(Self { runs: runs.into_iter().map(|run| first + run.start..first + run.end).collect() })
     }
 
-    /// Each snapshot alone.
+    /// A plan with each snapshot alone.
     pub fn separate(snapshots: Range<usize>) -> Self {
         Self { runs: snapshots.map(|snapshot| snapshot..snapshot + 1).collect() }
     }
@@ -79,7 +80,7 @@ impl SequencePlan {
         &self.runs
     }
 
-    /// The joints that runs hold: `j` is the one between the snapshots `j` and `j + 1`.
+    /// The joints inside runs: `j` is the one between the snapshots `j` and `j + 1`.
     pub fn joints(&self) -> Vec<usize> {
         let mut joints: Vec<usize> =
             self.runs.iter().flat_map(|run| run.start..run.end - 1).collect();
@@ -88,26 +89,26 @@ impl SequencePlan {
         joints
     }
 
-    /// What is solved where the joints in `cuts` are taken apart, in the order of the runs. A piece that is
-    /// part of another run's piece is left to that run: it has nothing to add.
+    /// The pieces to be solved if the joints in `cuts` are cut, in the order of the runs. A piece inside another
+    /// run's piece is left out, because it adds nothing.
     pub fn pieces(&self, cuts: &[usize]) -> Vec<Piece> {
         let mut pieces = Vec::with_capacity(self.runs.len());
         for run in 0..self.runs.len() {
             for snapshots in self.split(run, cuts) {
-                // Runs stand in order: those that meet this one are its neighbours.
+                // Runs are in order, so those that overlap this one are its neighbours.
                 let meets = |other: &usize| {
                     let other = &self.runs[*other];
                     other.start < snapshots.end && snapshots.start < other.end
                 };
                 let before = (0..run).rev().take_while(meets);
                 let after = (run + 1..self.runs.len()).take_while(meets);
-                let left_to = |other: usize| {
+                let is_covered_by = |other: usize| {
                     self.split(other, cuts).into_iter().any(|larger| {
                         let within = larger.start <= snapshots.start && snapshots.end <= larger.end;
                         within && (larger != snapshots || other < run)
                     })
                 };
-                if !before.chain(after).any(left_to) {
+                if !before.chain(after).any(is_covered_by) {
                     pieces.push(Piece { run, snapshots });
                 }
             }
@@ -115,7 +116,7 @@ impl SequencePlan {
         pieces
     }
 
-    /// A run, taken apart.
+    /// The snapshots of a run, split at the cuts.
     fn split(&self, run: usize, cuts: &[usize]) -> Vec<Range<usize>> {
         let run = &self.runs[run];
         let mut split = Vec::new();
@@ -129,10 +130,10 @@ impl SequencePlan {
         split
     }
 
-    /// What the `frames` frames of a snapshot take from each run, where the joints in `cuts` are taken apart.
-    /// Over the frames that two runs share the weights change as a squared sine.
+    /// Contributions of the runs to the `frames` frames of a snapshot, with the joints in `cuts` cut. Over the frames
+    /// that two runs share, the weights change as a squared sine.
     pub fn shares(&self, snapshot: usize, cuts: &[usize], frames: usize) -> Vec<RunShare> {
-        // The snapshots that are not cut off from this one.
+        // The snapshots that no cut separates from this one.
         let (Some(first), Some(last)) = (self.runs.first(), self.runs.last()) else {
             return Vec::new();
         };
@@ -188,14 +189,14 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cut_leaves_of_an_overlap_is_done_once() {
+    fn an_overlap_that_is_cut_is_solved_once() {
         let plan = SequencePlan::new(0..7, 4, 1).unwrap();
         let pieces = |cuts: &[usize]| -> Vec<_> {
             plan.pieces(cuts).into_iter().map(|Piece { run, snapshots }| (run, snapshots)).collect()
         };
         assert_eq!(pieces(&[]), [(0, 0..4), (1, 3..7)]);
         assert_eq!(pieces(&[1]), [(0, 0..2), (0, 2..4), (1, 3..7)]);
-        // Before the shared snapshot, and behind it.
+        // Cuts before and after the shared snapshot.
         assert_eq!(pieces(&[2]), [(0, 0..3), (1, 3..7)]);
         assert_eq!(pieces(&[3]), [(0, 0..4), (1, 4..7)]);
         let all: Vec<usize> = (0..6).collect();

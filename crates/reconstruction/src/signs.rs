@@ -1,29 +1,28 @@
-//! What pixels that the solver did not see tell of the error of its frames.
+//! Error estimates from the hold-out pixels of a reconstruction.
 //!
-//! At a held-out pixel `y - Hv = sum_k C_k e_k + n` of the frames' errors `e` and the noise `n`. The pixel's
-//! masks had no part in `v`, so that `E (y - Hv)^2 = a S + b D + sigma^2`, with the variances `a` of what the
-//! errors have in common and `b` of their changes (cosines along time), and the gram's two parts, `S` of what
-//! the masks have in common and `D`. These parts differ from pixel to pixel: a fit tells `a`, `b` and
-//! `sigma^2` apart, and `(a + (B - 1) b) / B` is the mean squared error of the frames. Errors are larger in
-//! some places than in others, so `a` and `b` are multiples of what is seen nearby: of the residuals of other
-//! held-out pixels, and of the frames' texture and motion.
+//! At a hold-out pixel `y - Hv = sum_k C_k e_k + n` with the frames' errors `e` and the noise `n`. The masks at that
+//! pixel had no influence on `v`, so `E (y - Hv)^2 = a S + b D + sigma^2`. Here `a` is the variance of the static
+//! part of the errors and `b` that of their changes (DCT along time); `S` is the static part of the Gram diagonal and
+//! `D` the remainder. `S` and `D` differ from pixel to pixel, so a fit separates `a`, `b` and `sigma^2`. Then `(a +
+//! (B - 1) b) / B` is the mean squared error of the frames. Errors vary in space: `a` and `b` are multiples of local
+//! estimates, from the residuals of other hold-out pixels and from texture and motion.
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
 
-use super::held_out::HeldOut;
-use super::sensing::SensingOperator;
+use super::hold_out::HoldOut;
+use super::operator::SensingOperator;
 
-/// What is told, in dB, of the mean square of a voxel.
+/// The estimates, each in dB of the mean square of a voxel.
 pub const SIGNS: [&str; 8] = [
     "residual after the first stage",
     "residual of the frames",
-    "error, by residuals and texture nearby",
-    "what the frames have in common of it",
-    "error, by residuals nearby, if there is no noise",
-    "error, by texture nearby",
-    "residual where there is least texture",
-    "residual where there is most texture",
+    "error, by local residuals and texture",
+    "static part of the error",
+    "error, by local residuals, without noise",
+    "error, by local texture",
+    "residual of the pixels with the least texture",
+    "residual of the pixels with the most texture",
 ];
 
 /// Values of [`SIGNS`].
@@ -31,48 +30,49 @@ pub const SIGNS: [&str; 8] = [
 #[serde(transparent)]
 pub struct Signs(pub [f32; SIGNS.len()]);
 
-/// Below this, squares are rounding.
+/// Squares below this are rounding errors.
 const FLOOR: f64 = 1e-7;
-/// Standard deviation, in pixels, of the weights of residuals nearby.
-const NEARBY: f64 = 3.0;
-/// The weight of the mean of all residuals among them.
-const FAR: f64 = 0.1;
-/// Texture is that of a square of so many pixels to each side.
-const REACH: usize = 3;
-/// The share of pixels that have least texture, and that have most.
-const QUIET: f64 = 0.2;
-/// Steps of the fit, after which nothing changes any more.
+/// Standard deviation of the weights of surrounding residuals, in pixels.
+const WEIGHT_RADIUS: f64 = 3.0;
+/// Weight of the mean of all residuals.
+const MEAN_WEIGHT: f64 = 0.1;
+/// Radius of the square over which texture is measured, in pixels.
+const TEXTURE_RADIUS: usize = 3;
+/// Share of the pixels with the least, and with the most, texture.
+const EXTREME_SHARE: f64 = 0.2;
+/// Number of steps of the fit, after which it no longer changes.
 const STEPS: usize = 150;
 
 impl Signs {
-    /// Of one snapshot `y` \[1,H,W\] at the pixels that were held out of its reconstruction: `early` are the
-    /// frames \[B,H,W\] after the first stage, `last` those at its end, all on the scale on which the scene
-    /// is on \[0,1\]. None if no pixel was held out.
+    /// Estimates for one snapshot `y` \[1,H,W\] from its hold-out pixels: `early` are the frames \[B,H,W\] after the
+    /// first stage, `last` those at the end, all on the scale on which the scene is on \[0,1\]. None without hold-out
+    /// pixels.
     pub(super) fn of(
         (op, y): (&SensingOperator, ArrayView3<'_, f32>),
-        held_out: &HeldOut,
+        hold_out: &HoldOut,
         early: ArrayView3<'_, f32>,
         last: ArrayView3<'_, f32>,
     ) -> Option<Self> {
-        let count = held_out.pixels.len() as f64;
-        if held_out.pixels.is_empty() {
+        let count = hold_out.pixels.len() as f64;
+        if hold_out.pixels.is_empty() {
             return None;
         }
-        let residuals = held_out.residuals(op, y, last);
+        let residuals = hold_out.residuals(op, y, last);
         let gram = op.gram();
-        let common = op.steady_gram();
+        let static_gram = op.static_gram();
         let at = |image: &dyn Fn((usize, usize)) -> f64| -> Vec<f64> {
-            held_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
+            hold_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
         };
-        let shared = at(&|p| f64::from(common[p]));
-        let changing = at(&|p| f64::from((gram[p] - common[p]).max(0.0)));
+        let shared = at(&|p| f64::from(static_gram[p]));
+        let changing = at(&|p| f64::from((gram[p] - static_gram[p]).max(0.0)));
         let mean_gram = at(&|p| f64::from(gram[p])).iter().sum::<f64>() / count;
         let texture = texture(last);
         let texture = at(&|p| texture[p]);
 
-        let near = nearby(held_out, &residuals);
-        let rough = scaled(texture.iter().map(|texture| texture.sqrt()));
-        let both = scaled(near.iter().zip(&rough).map(|(near, rough)| (near * rough).sqrt()));
+        let local = local_residuals(hold_out, &residuals);
+        let textured = scaled(texture.iter().map(|texture| texture.sqrt()));
+        let both = local.iter().zip(&textured).map(|(local, textured)| (local * textured).sqrt());
+        let both = scaled(both);
         let frames = last.len_of(Axis(0)) as f64;
         let error = |scale: &[f64], noise: bool| {
             let times = |part: &[f64]| part.iter().zip(scale).map(|(part, s)| part * s).collect();
@@ -83,21 +83,21 @@ impl Signs {
             let variances = variances(&residuals, &parts);
             ((variances[0] + (frames - 1.0) * variances[1]) / frames, variances[0] / frames)
         };
-        let first = held_out.residuals(op, y, early);
+        let first = hold_out.residuals(op, y, early);
         let mean = |squares: &[f64]| squares.iter().sum::<f64>() / squares.len() as f64 / mean_gram;
-        let [quiet, loud] = extremes(&texture, &residuals);
-        let (told, common) = error(&both, true);
-        let told = [
+        let [smooth, busy] = extremes(&texture, &residuals);
+        let (both_errors, static_error) = error(&both, true);
+        let squares = [
             mean(&first),
             mean(&residuals),
-            told,
-            common,
-            error(&near, false).0,
-            error(&rough, true).0,
-            quiet / mean_gram,
-            loud / mean_gram,
+            both_errors,
+            static_error,
+            error(&local, false).0,
+            error(&textured, true).0,
+            smooth / mean_gram,
+            busy / mean_gram,
         ];
-        Some(Self(told.map(|square| (10.0 * square.max(FLOOR).log10()) as f32)))
+        Some(Self(squares.map(|square| (10.0 * square.max(FLOOR).log10()) as f32)))
     }
 }
 
@@ -109,26 +109,26 @@ fn scaled(values: impl Iterator<Item = f64>) -> Vec<f64> {
     values
 }
 
-/// The weighted mean of the residuals around each pixel without its own, in units of the mean of all.
-fn nearby(held_out: &HeldOut, residuals: &[f64]) -> Vec<f64> {
+/// Weighted mean of the residuals around each pixel, without the pixel, in units of the mean of all.
+fn local_residuals(hold_out: &HoldOut, residuals: &[f64]) -> Vec<f64> {
     let mean = residuals.iter().sum::<f64>() / residuals.len() as f64;
     let around = |(index, &(_, i, j)): (usize, &(usize, usize, usize))| {
-        let (mut sum, mut weights) = (FAR * mean, FAR);
-        for (other, &(_, row, column)) in held_out.pixels.iter().enumerate() {
+        let (mut sum, mut weights) = (MEAN_WEIGHT * mean, MEAN_WEIGHT);
+        for (other, &(_, row, column)) in hold_out.pixels.iter().enumerate() {
             let distance = (i.abs_diff(row).pow(2) + j.abs_diff(column).pow(2)) as f64;
-            if other != index && distance < (4.0 * NEARBY).powi(2) {
-                let weight = (-0.5 * distance / NEARBY.powi(2)).exp();
+            if other != index && distance < (4.0 * WEIGHT_RADIUS).powi(2) {
+                let weight = (-0.5 * distance / WEIGHT_RADIUS.powi(2)).exp();
                 sum += weight * residuals[other];
                 weights += weight;
             }
         }
         sum / weights
     };
-    scaled(held_out.pixels.iter().enumerate().map(around))
+    scaled(hold_out.pixels.iter().enumerate().map(around))
 }
 
-/// Squared steps from pixel to pixel and from frame to frame, in the mean over the frames and a square around
-/// each pixel \[H,W\].
+/// Squared differences from pixel to pixel and from frame to frame, averaged over the frames and a square around each
+/// pixel \[H,W\].
 fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
     let (count, height, width) = frames.dim();
     let mut steps = Array2::<f64>::zeros((height, width));
@@ -144,24 +144,23 @@ fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
         }
     }
     Array2::from_shape_fn((height, width), |(i, j)| {
-        let rows = i.saturating_sub(REACH)..height.min(i + REACH + 1);
-        let columns = j.saturating_sub(REACH)..width.min(j + REACH + 1);
+        let rows = i.saturating_sub(TEXTURE_RADIUS)..height.min(i + TEXTURE_RADIUS + 1);
+        let columns = j.saturating_sub(TEXTURE_RADIUS)..width.min(j + TEXTURE_RADIUS + 1);
         steps.slice(s![rows, columns]).mean().unwrap_or(0.0)
     })
 }
 
-/// The mean square where there is least texture, and where there is most.
+/// Mean squares where there is the least texture, and where there is the most.
 fn extremes(texture: &[f64], squares: &[f64]) -> [f64; 2] {
     let mut order: Vec<usize> = (0..texture.len()).collect();
     order.sort_by(|a, b| texture[*a].total_cmp(&texture[*b]));
-    let count = ((texture.len() as f64 * QUIET) as usize).max(1);
+    let count = ((texture.len() as f64 * EXTREME_SHARE) as usize).max(1);
     let mean = |of: &[usize]| of.iter().map(|index| squares[*index]).sum::<f64>() / count as f64;
     [mean(&order[..count]), mean(&order[order.len() - count..])]
 }
 
-/// The factors, none below 0, of parts whose sum is the expectation of each square: the most likely ones
-/// where these are squares of Gaussian numbers, by multiplicative steps (Févotte, Bertin and Durrieu, Neural
-/// Computation 2009).
+/// Non-negative factors of parts that add up to the expected square of each value: the maximum-likelihood ones for
+/// Gaussian values, by multiplicative updates (Févotte, Bertin and Durrieu, Neural Computation 2009).
 fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
     let mean = squares.iter().sum::<f64>() / squares.len() as f64;
     let all = parts.iter().flatten().sum::<f64>() / squares.len() as f64;
@@ -186,8 +185,8 @@ fn variances(squares: &[f64], parts: &[Vec<f64>]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::{Signs, variances};
-    use crate::held_out::HeldOut;
-    use crate::sensing::SensingOperator;
+    use crate::hold_out::HoldOut;
+    use crate::operator::SensingOperator;
     use ndarray::Array3;
     use optics::iid_masks;
     use rand::{Rng, SeedableRng};
@@ -198,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn variances_of_parts_are_found() {
+    fn variances_of_parts_are_estimated() {
         let mut random = random();
         let parts: Vec<Vec<f64>> =
             (0..2).map(|_| (0..20_000).map(|_| random.random::<f64>()).collect()).collect();
@@ -215,34 +214,34 @@ mod tests {
 
     /// Errors of a known size where there is texture, in the left half, with noise everywhere and without.
     #[test]
-    fn the_error_of_frames_is_told_from_noise() {
+    fn the_error_of_frames_is_distinguished_from_noise() {
         let (frames, side) = (8, 192);
         let masks = iid_masks(frames, side, side, 3).unwrap();
         let op = SensingOperator::new(masks).unwrap();
-        let held_out = HeldOut::of(&op, 0);
-        let left = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
+        let hold_out = HoldOut::draw(&op, 0);
+        let texture = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
         let truth = Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
-            0.5 + 0.2 * left(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+            0.5 + 0.2 * texture(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
         });
         for (error, noise) in [(0.03f32, 0.0f32), (0.03, 0.06), (0.1, 0.06)] {
             let mut random = random();
             let mut normal = |deviation: f32| deviation * random.sample::<f32, _>(StandardNormal);
             let mut found = truth.clone();
-            found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * left(j));
+            found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * texture(j));
             let y = op.forward(truth.view()).unwrap().mapv(|y| y + normal(noise));
-            let told = Signs::of((&op, y.view()), &held_out, found.view(), found.view()).unwrap();
+            let signs = Signs::of((&op, y.view()), &hold_out, found.view(), found.view()).unwrap();
             let decibels = |square: f32| 10.0 * square.log10();
             let expected = decibels(error.powi(2) / 2.0);
-            let Signs([early, late, both, _, without_noise, by_texture, quiet, _]) = told;
+            let Signs([early, late, both, _, without_noise, by_texture, smooth, _]) = signs;
             assert_eq!(early, late);
-            assert!((by_texture - expected).abs() < 2.5, "{error}, {noise}: {told:?}");
-            assert!((both - expected).abs() < 4.0, "{error}, {noise}: {told:?}");
+            assert!((by_texture - expected).abs() < 2.5, "{error}, {noise}: {signs:?}");
+            assert!((both - expected).abs() < 4.0, "{error}, {noise}: {signs:?}");
             if noise == 0.0 {
-                assert!(quiet < expected - 10.0, "{told:?}");
+                assert!(smooth < expected - 10.0, "{signs:?}");
             } else {
                 // Half of the pixels are open.
-                assert!((quiet - decibels(noise.powi(2) / 4.0)).abs() < 1.5, "{told:?}");
-                assert!(without_noise > expected + 2.0, "noise is taken for an error: {told:?}");
+                assert!((smooth - decibels(noise.powi(2) / 4.0)).abs() < 1.5, "{signs:?}");
+                assert!(without_noise > expected + 2.0, "noise is taken for an error: {signs:?}");
             }
         }
     }

@@ -7,26 +7,24 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result};
 
-/// A window of a picture: all pixels of these rows and columns, or every second one, which are those of one
-/// colour of a mosaic.
+/// A window of a picture: all pixels of some rows and columns, or every second one, as for one colour of a mosaic.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Window {
-    /// From the first row to the one behind the last.
+    /// Rows in the picture.
     pub rows: Range<usize>,
-    /// From the first column to the one behind the last.
+    /// Columns in the picture.
     pub columns: Range<usize>,
-    /// 1 for all pixels, 2 for every second one of each axis.
+    /// Step between pixels: 1, or 2 for a sub-image of a mosaic.
     pub step: usize,
 }
 
 impl Window {
-    /// All pixels of a picture.
+    /// A window of all pixels of a picture.
     pub fn whole(height: usize, width: usize) -> Self {
         Self { rows: 0..height, columns: 0..width, step: 1 }
     }
 
-    /// The window of a picture that is this window, given in its own pixels, of the sub-image which begins at
-    /// this row and column and has every second pixel.
+    /// The window of a picture that corresponds to a window of the sub-image with every second pixel from `first` on.
     pub fn of_plane(
         rows: Range<usize>,
         columns: Range<usize>,
@@ -38,7 +36,7 @@ impl Window {
         Self { rows: place(rows, row), columns: place(columns, column), step: 2 }
     }
 
-    /// Its pixels of a frame \[H,W\] of the whole picture.
+    /// The pixels of the window in a frame \[H,W\] of the whole picture.
     pub fn of<'a, T>(&self, frame: ArrayView2<'a, T>) -> ArrayView2<'a, T> {
         let step = self.step.cast_signed();
         frame.slice_move(s![self.rows.clone();step, self.columns.clone();step])
@@ -50,58 +48,57 @@ impl Window {
 pub struct Tile {
     /// Position in the plan.
     pub index: usize,
-    /// The row of its first pixel in the picture.
+    /// Row of the first pixel in the picture.
     pub row: usize,
-    /// The column of its first pixel in the picture.
+    /// Column of the first pixel in the picture.
     pub column: usize,
-    /// Rows that it has.
+    /// Number of rows.
     pub height: usize,
-    /// Columns that it has.
+    /// Number of columns.
     pub width: usize,
-    /// 1 for all pixels of its place, 2 for every second one of each axis.
+    /// Step between pixels: 1, or 2 for a sub-image of a mosaic.
     pub step: usize,
 }
 
 impl Tile {
-    /// Its pixels in the picture.
+    /// The window of the tile in the picture.
     pub fn window(&self) -> Window {
         let span = |first: usize, count: usize| first..first + (count - 1) * self.step + 1;
         let (rows, columns) = (span(self.row, self.height), span(self.column, self.width));
         Window { rows, columns, step: self.step }
     }
 
-    /// The place in the picture that it has a part in: row, column, height and width in pixels.
+    /// The area of the picture to which the tile contributes: row, column, height and width in pixels.
     pub fn place(&self) -> [usize; 4] {
         let step = self.step;
         let cell = |first: usize| first / step * step;
         [cell(self.row), cell(self.column), self.height * step, self.width * step]
     }
 
-    /// Which sub-image of a mosaic it belongs to, from 0 to 3 as they stand in a cell of 2x2 pixels, row by
-    /// row; none for the picture of a grey sensor.
+    /// Index of its sub-image of a mosaic, from 0 to 3 in the order of a cell of 2x2 pixels, row by row; none for a
+    /// grey sensor.
     pub fn plane(&self) -> Option<usize> {
         (self.step == 2).then_some(self.row % 2 * 2 + self.column % 2)
     }
 }
 
-/// Sides of tiles are multiples of this, where the picture allows it: networks halve them twice.
+/// Divisor of the sides of tiles, where the picture allows it: networks halve them twice.
 const MULTIPLE: usize = 8;
 
-/// How a picture is cut. It depends on the picture's size and the parameters alone, never on
-/// the number of workers.
+/// The tiles of a picture. They depend on its size and the parameters alone, never on the number of workers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TilePlan {
     height: usize,
     width: usize,
     size: usize,
     overlap: usize,
-    /// 1, or 2 for the sub-images of a mosaic, which are cut alike.
+    /// 1, or 2 for the sub-images of a mosaic, which have the same tiles.
     step: usize,
     rows: Vec<Span>,
     columns: Vec<Span>,
 }
 
-/// A stretch of one axis with its blending weights, which add up to 1 over all spans.
+/// A section of one axis with its blending weights, which add up to 1 over all spans.
 #[derive(Debug, Clone, PartialEq)]
 struct Span {
     start: usize,
@@ -109,10 +106,11 @@ struct Span {
 }
 
 impl TilePlan {
-    /// Cuts `height` x `width` pixels into as few tiles of at most `size` x `size` as share at least
-    /// `overlap` pixels with each neighbour, and makes these tiles as small as that allows. A side that fits
-    /// into one tile is not cut.
-    /// Errors: `size` below 16 or above 8192, or `overlap` of more than half of `size`.
+    /// Cuts `height` x `width` pixels into as few and as small tiles as possible, of at most `size` x `size` and with
+    /// at least `overlap` pixels in common with each neighbour. A side that fits into one tile is not cut.
+    ///
+    /// # Errors
+    /// `size` below 16 or above 8192, or `overlap` above half of `size`.
     pub fn new(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
         if height == 0 || width == 0 {
             return Err(ReconError::Shape {
@@ -123,26 +121,27 @@ impl TilePlan {
         }
         if !(16..=8192).contains(&size) {
             return Err(ReconError::Parameter {
-                name: "tile size",
+                name: "tile size".into(),
                 value: size.to_string(),
-                range: "from 16 to 8192 pixels",
+                range: "from 16 to 8192 pixels".into(),
             });
         }
         if overlap * 2 > size {
             return Err(ReconError::Parameter {
-                name: "tile overlap",
+                name: "tile overlap".into(),
                 value: overlap.to_string(),
-                range: "at most half of the tile size",
+                range: "at most half of the tile size".into(),
             });
         }
         let (rows, columns) = (spans(height, size, overlap), spans(width, size, overlap));
         Ok(Self { height, width, size, overlap, step: 1, rows, columns })
     }
 
-    /// Cuts each of the four sub-images of a mosaic of `height` x `width` pixels, as [`Self::new`] cuts a
-    /// picture of their size: `size` and `overlap` are in their pixels. Tiles of the same place follow one
-    /// another.
-    /// Errors: as [`Self::new`]; an odd side.
+    /// Cuts each of the four sub-images of a mosaic of `height` x `width` pixels, as [`Self::new`] cuts a picture of
+    /// their size: `size` and `overlap` are in their pixels. Tiles at the same place are consecutive.
+    ///
+    /// # Errors
+    /// As [`Self::new`]; an odd side.
     pub fn of_mosaic(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
         if !height.is_multiple_of(2) || !width.is_multiple_of(2) {
             return Err(ReconError::Shape {
@@ -165,7 +164,7 @@ impl TilePlan {
         self.size
     }
 
-    /// Least overlap of neighbours.
+    /// Smallest overlap of neighbours.
     pub fn overlap(&self) -> usize {
         self.overlap
     }
@@ -175,12 +174,12 @@ impl TilePlan {
         self.planes() * self.rows.len() * self.columns.len()
     }
 
-    /// Sub-images that are cut: 1, or 4 of a mosaic.
+    /// Number of sub-images: 1, or 4 for a mosaic.
     fn planes(&self) -> usize {
         self.step * self.step
     }
 
-    /// The indices of the spans of a tile.
+    /// Indices of the spans of a tile.
     fn position(&self, index: usize) -> (usize, usize) {
         let place = index / self.planes();
         (place / self.columns.len(), place % self.columns.len())
@@ -191,12 +190,12 @@ impl TilePlan {
         false
     }
 
-    /// Pixels of its largest tile.
+    /// Number of pixels of the largest tile.
     pub fn largest(&self) -> usize {
         self.tiles().map(|tile| tile.height * tile.width).max().unwrap_or(0)
     }
 
-    /// The tile at `index`, row by row; none past the end.
+    /// The tile at `index`, row by row; none beyond the last one.
     pub fn tile(&self, index: usize) -> Option<Tile> {
         let (row, column) = self.position(index);
         let (row, column) = (self.rows.get(row)?, self.columns.get(column)?);
@@ -236,7 +235,7 @@ impl TilePlan {
     }
 }
 
-/// Cuts an axis into as few spans as possible, as even as possible, and gives each its weights.
+/// Cuts an axis into as few and as equal spans as possible, with their weights.
 fn spans(length: usize, size: usize, overlap: usize) -> Vec<Span> {
     let size = size.min(length);
     let parts = parts(length, size, overlap.min(size / 2), MULTIPLE);
@@ -245,9 +244,9 @@ fn spans(length: usize, size: usize, overlap: usize) -> Vec<Span> {
     spans.map(|(part, weights)| Span { start: part.start, weights }).collect()
 }
 
-/// As few parts of 0 to `length` as possible of at most `size`, which share at least `overlap`, less than
-/// `size`, with their neighbours, as even as possible, and as short as that allows, in multiples of
-/// `multiple` where `size` is none.
+/// Cuts 0 to `length` into as few parts as possible of at most `size`, with at least `overlap` (less than `size`) in
+/// common with their neighbours. They are equally spaced and as short as possible, in multiples of `multiple` unless
+/// `size` is not one.
 pub(super) fn parts(
     length: usize,
     size: usize,
@@ -255,15 +254,15 @@ pub(super) fn parts(
     multiple: usize,
 ) -> Vec<Range<usize>> {
     let count = 1 + length.saturating_sub(size).div_ceil((size - overlap).max(1));
-    // No more is shared than was asked for: what is shared is computed twice.
+    // The smallest possible overlap, because shared pixels are computed twice.
     let least = (length + (count - 1) * overlap).div_ceil(count);
     let size = least.next_multiple_of(multiple).min(size);
     let start = |k: usize| if k == 0 { 0 } else { k * (length - size) / (count - 1) };
     (0..count).map(|k| start(k)..start(k) + size).collect()
 }
 
-/// The weights of parts that cover 0 to `length`, in order of their starts: they rise as a squared sine over
-/// what a part shares with its neighbour, and add up to 1 everywhere.
+/// Weights of parts that cover 0 to `length`, in order of their starts. They rise as a squared sine over the overlap
+/// with a neighbour, and add up to 1 everywhere.
 pub(super) fn weights(parts: &[Range<usize>], length: usize) -> Vec<Vec<f32>> {
     let mut weights: Vec<Vec<f32>> = (0..parts.len())
         .map(|k| {
@@ -368,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_is_shared_than_was_asked_for() {
+    fn the_overlap_is_not_larger_than_requested() {
         for (length, size, overlap, count, side) in
             [(1024, 256, 32, 5, 232), (3200, 256, 32, 15, 248), (3200, 384, 16, 9, 376)]
         {

@@ -50,10 +50,14 @@ impl From<StoreError> for CheckError {
         let refused = |code| Self::Refused(Refusal::new(code, error.to_string()));
         match &error {
             StoreError::Quota { .. } => refused(RefusalCode::QuotaExceeded),
-            StoreError::NoRoom { .. } => refused(RefusalCode::InsufficientStorage),
+            StoreError::NoRoom { .. } | StoreError::NoShare { .. } => {
+                refused(RefusalCode::InsufficientStorage)
+            }
             StoreError::Damaged { .. } => refused(RefusalCode::UploadDamaged),
-            full if full.is_disk_full() => Self::Refused(Refusal::disk_full()),
-            _ => Self::Failed(TaskError::Transport(error.into())),
+            _ => match error.disk_trouble() {
+                Some(trouble) => Self::Refused(Refusal::disk_trouble(trouble)),
+                None => Self::Failed(TaskError::Transport(error.into())),
+            },
         }
     }
 }

@@ -158,8 +158,8 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        let (location, light) = (WorkerPlace::default(), self.claimant == Claimant::Light);
-        Ok(self.store.worker_started(self.worker, std::process::id(), &location, light).await?)
+        let (location, takes) = (WorkerPlace::default(), self.claimant.takes());
+        Ok(self.store.worker_started(self.worker, std::process::id(), &location, takes).await?)
     }
 
     async fn report_alive(&self) -> Result<(), TransportError> {

@@ -58,9 +58,9 @@ pub(super) fn perform(
         }
         TaskInput::Pilot { arrays, snapshots, white, schedule, runs, mosaic } => {
             let y = arrays.snapshot(snapshots.first).map_err(PipelineError::from)?;
-            let window = pilot::window(arrays.light(monitor)?.view(), y.view(), mosaic);
+            let crop = pilot::choose_crop(arrays.light(monitor)?.view(), y.view(), mosaic);
             let first = snapshots.first as usize;
-            let task = Pilot { first, window: &window, schedule: &schedule, runs: &runs };
+            let task = Pilot { first, crop: &crop, schedule: &schedule, runs: &runs };
             engines.models.only(None, monitor)?;
             let networks = &mut engines.networks;
             let record = run_pilot(&arrays, white, (snapshots, &task), networks, monitor)?;
@@ -186,7 +186,7 @@ fn run_pilot(
     monitor: &Monitor,
 ) -> Result<Option<PilotRecord>, PipelineError> {
     let SnapshotRange { first, count } = snapshots;
-    let input = arrays.window(first..first + count, task.window, white)?;
+    let input = arrays.window(first..first + count, task.crop, white)?;
     Ok(pilot::decide(input, task, networks, &mut monitor.observe(task.schedule.clone()))?)
 }
 

@@ -299,8 +299,8 @@ impl<T: Transport> Worker<T> {
     }
 
     async fn failed(&self, lease: &Lease, error: &TaskError) {
-        if error.is_disk_full() {
-            tracing::warn!(%error, "the task waits until the disk has room");
+        if error.disk_trouble().is_some() {
+            tracing::warn!(%error, "the task waits until its results can be written to the disk");
             let reason = without_paths(&error.to_string());
             return log_failure(self.transport.postpone(lease, &reason).await);
         }

@@ -22,7 +22,7 @@ use engine::pipeline::manifest::{JobTasks, Recipe};
 use engine::pipeline::movie::MovieTask;
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::tile::TileInput;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 use reconstruction::assessment::Evidence;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
@@ -73,7 +73,7 @@ pub trait Transport: Clone + Send + 'static {
     /// Reports a failure, and whether another attempt may succeed.
     async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError>;
 
-    /// Returns a task to the queue with a pause, because the disk is full.
+    /// Returns a task to the queue with a pause, because the disk can't be written.
     async fn postpone(&self, lease: &Lease, reason: &str) -> Result<(), TransportError> {
         self.fail(lease, reason, true).await
     }
@@ -221,17 +221,16 @@ pub enum TaskError {
 }
 
 impl TaskError {
-    /// True if the disk was full. The task is then retried when there is room.
-    pub(super) fn is_disk_full(&self) -> bool {
+    /// The condition of the disk that caused the error, if there is one. The task is retried when the condition has ended.
+    pub(super) fn disk_trouble(&self) -> Option<DiskTrouble> {
         match self {
-            Self::Pipeline(error) => error.is_disk_full(),
-            Self::Intake(IntakeError::Format { source, .. }) => source.is_disk_full(),
-            Self::Intake(_) => false,
+            Self::Pipeline(error) => error.disk_trouble(),
+            Self::Intake(IntakeError::Format { source, .. }) => source.disk_trouble(),
+            Self::Intake(_) => None,
             Self::Transport(error) => {
-                let store =
-                    error.downcast_ref::<StoreError>().is_some_and(StoreError::is_disk_full);
+                let store = error.downcast_ref::<StoreError>().and_then(StoreError::disk_trouble);
                 let format = error.downcast_ref::<FormatError>();
-                store || format.is_some_and(FormatError::is_disk_full)
+                store.or_else(|| format.and_then(FormatError::disk_trouble))
             }
         }
     }

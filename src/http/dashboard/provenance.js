@@ -64,9 +64,7 @@ export function ran(job, content) {
   const [planned, decided] = [iterationsOf(job.schedule), iterationsOf(schedule)];
   if (decided === 0) return "one pass of the model per tile";
   if (summary.stop_reason === "converged") {
-    // The manifest does not count the iterations of the nonlocal prior.
-    const counted = !schedule.stages.some((stage) => stage.prior === "nonlocal");
-    return counted ? `${summary.tv_iterations + summary.denoiser_passes} of at most ${planned} iterations per tile, until convergence` : `converged within ${decided} iterations per tile`;
+    return `${summary.iterations} of at most ${planned} iterations per tile, until convergence`;
   }
   return `${decided} of at most ${planned} iterations per tile${decided < planned ? "; the pilot predicted no gain from the others" : ""}`;
 }
@@ -79,19 +77,20 @@ export function networks(content) {
 /** The pilot's decisions on the stages of an adaptive schedule, with their reasons. */
 function pilot(content) {
   const why = { "max-iterations": "as planned", converged: "more would raise the error", diverged: "more would diverge" };
-  const row = (stage) => {
-    const decided = [
-      why[stage.end] && `${stage.iterations} of ${stage.planned} iterations (${why[stage.end]})`,
-      stage.planned_temporal_shrinkage > 0 && `temporal shrinkage ${stage.temporal_shrinkage > 0 ? figure(stage.temporal_shrinkage) : "omitted"}`,
-      stage.rest_shrinkage != null && `shrinkage ${figure(stage.rest_shrinkage)} ${stage.rest_everywhere ? "because the scene is static" : "in static regions"}`,
-      stage.planned_static_variance && `static variance ${stage.static_variance ?? "omitted"}`,
-      stage.gamma != null && `noise term ${stage.gamma}`,
-      stage.planned_temporal_weight > 0 && `temporal total variation ${stage.temporal_weight > 0 ? "kept" : "omitted"}`,
-    ].filter(Boolean);
-    const error = `hold-out error ${figure(stage.error_before)} to ${figure(stage.error_after)}`;
-    return decided.length > 0 && [`Pilot, ${stage.prior}`, [...decided, error].join(", ")];
+  const row = ({ planned, stage, end, error_before: before, error_after: after }) => {
+    const decided = [why[end] && `${stage.iterations} of ${planned.iterations} iterations (${why[end]})`, ...changes(planned, stage)].filter(Boolean);
+    const error = `hold-out error ${figure(before)} to ${figure(after)}`;
+    return [`Pilot, ${stage.prior}`, `${decided.join(", ") || "as planned"}, ${error}`];
   };
-  return (content.pilot?.stages ?? []).map(row).filter(Boolean);
+  return (content.pilot?.stages ?? []).map(row);
+}
+
+/** The settings of a stage that the pilot changed, by their names in the schedule. */
+export function changes(planned, stage) {
+  const own = ["iterations", "sigma"];
+  const changed = Object.keys(stage).filter((name) => !own.includes(name) && stage[name] !== planned[name]);
+  const value = (setting) => (typeof setting === "number" ? figure(setting) : setting);
+  return changed.map((name) => `${name.replaceAll("_", " ")} ${stage[name] ? value(stage[name]) : "omitted"}`);
 }
 
 /** Snapshots that were reconstructed jointly, and the hold-out errors behind the decision. */

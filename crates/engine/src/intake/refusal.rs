@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 
 use super::IntakeError;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 
 /// Codes of refusals, a subset of the codes of the HTTP interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr)]
@@ -55,8 +55,17 @@ impl Refusal {
         Self::new(RefusalCode::TimedOut, detail)
     }
 
-    pub fn disk_full() -> Self {
-        Self::new(RefusalCode::InsufficientStorage, "the disk of the service is full")
+    /// The refusal of a file that can't be stored in this state of the disk.
+    pub fn disk_trouble(trouble: DiskTrouble) -> Self {
+        match trouble {
+            DiskTrouble::Full => {
+                Self::new(RefusalCode::InsufficientStorage, "the disk of the service is full")
+            }
+            DiskTrouble::ReadOnly => Self::new(
+                RefusalCode::Unavailable,
+                "the disk of the service is read-only; try again later",
+            ),
+        }
     }
 }
 
@@ -65,8 +74,8 @@ impl TryFrom<FormatError> for Refusal {
     type Error = FormatError;
 
     fn try_from(error: FormatError) -> Result<Self, FormatError> {
-        if error.is_disk_full() {
-            return Ok(Self::disk_full());
+        if let Some(trouble) = error.disk_trouble() {
+            return Ok(Self::disk_trouble(trouble));
         }
         if matches!(&error, FormatError::Io { source, .. } if source.kind() == ErrorKind::TimedOut)
         {

@@ -4,11 +4,7 @@ use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
 
 use super::shape::TileSpec;
-use reconstruction::prior::Prior;
-use reconstruction::prior::network::{FASTDVDNET, FASTDVDNET_INT8, FFDNET};
-use reconstruction::prior::nonlocal::NONLOCAL;
-use reconstruction::prior::registry::TV_FASTDVDNET;
-use reconstruction::prior::tv::TV;
+use reconstruction::priors::registry::PriorName;
 use reconstruction::schedule::Schedule;
 
 /// A reconstruction algorithm.
@@ -87,15 +83,14 @@ impl Algorithm {
     }
 
     /// The priors that a schedule of this algorithm may use.
-    pub fn priors(self) -> &'static [&'static dyn Prior] {
+    pub fn priors(self) -> &'static [PriorName] {
+        use PriorName::{Fastdvdnet, FastdvdnetInt8, Ffdnet, Nonlocal, Tv, TvFastdvdnet};
         match self {
-            Self::GapTv | Self::GapTv3d | Self::AdmmTv => &[&TV],
-            Self::PnpNonlocal => &[&TV, &NONLOCAL],
-            Self::PnpFfdnet => &[&TV, &FFDNET],
-            Self::PnpFastdvdnet => &[&TV, &FASTDVDNET_INT8, &FASTDVDNET],
-            Self::PnpTvFastdvdnet => {
-                &[&TV, &FASTDVDNET_INT8, &FASTDVDNET, &TV_FASTDVDNET, &NONLOCAL]
-            }
+            Self::GapTv | Self::GapTv3d | Self::AdmmTv => &[Tv],
+            Self::PnpNonlocal => &[Tv, Nonlocal],
+            Self::PnpFfdnet => &[Tv, Ffdnet],
+            Self::PnpFastdvdnet => &[Tv, FastdvdnetInt8, Fastdvdnet],
+            Self::PnpTvFastdvdnet => &[Tv, FastdvdnetInt8, Fastdvdnet, TvFastdvdnet, Nonlocal],
             Self::Learned => &[],
         }
     }
@@ -104,7 +99,8 @@ impl Algorithm {
     /// match what its stages do.
     pub fn misfit(self, schedule: &Schedule) -> Option<String> {
         let priors = self.priors();
-        let unsupported = schedule.stages.iter().find(|stage| !priors.contains(&stage.prior))?;
+        let unsupported =
+            schedule.stages.iter().find(|stage| !priors.contains(&stage.prior.name()))?;
         let accepts = |other: &&Self| other.misfit(schedule).is_none();
         // Algorithms are ordered by the priors they support, so a suitable one comes later.
         let alternative =

@@ -2,7 +2,8 @@
 
 use super::{JobModel, JobSpec};
 use reconstruction::preview;
-use reconstruction::prior::Memory;
+use reconstruction::priors::WorkingSet;
+use reconstruction::priors::nonlocal::NonlocalSpec;
 use reconstruction::schedule::Method;
 
 /// The program, its thread stacks and, for schedules with a network, ONNX Runtime and the weights.
@@ -78,15 +79,17 @@ impl JobSpec {
         if self.schedule.stages.iter().any(|stage| stage.momentum > 0.0) {
             per_voxel += START_BYTES_PER_VOXEL;
         }
-        let may_rerun = self.schedule.stages.iter().any(|stage| stage.temporal_shrinkage.is_some());
+        let shrinks = |nonlocal: &NonlocalSpec| nonlocal.temporal_shrinkage > 0.0;
+        let may_rerun =
+            self.schedule.stages.iter().any(|stage| stage.prior.nonlocal().is_some_and(shrinks));
         if may_rerun && !self.schedule.needs_network() {
             per_voxel += RERUN_BYTES_PER_VOXEL;
         }
         // The arrays of a prior are freed after its stage, but networks stay loaded.
         let largest = |with_network: bool| {
-            let priors = self.schedule.stages.iter().map(|stage| stage.prior);
+            let priors = self.schedule.stages.iter().map(|stage| &stage.prior);
             let needs = priors.filter(|prior| prior.network().is_some() == with_network);
-            needs.map(|prior| prior.memory()).fold(Memory::default(), Memory::most)
+            needs.map(|prior| prior.working_set()).fold(WorkingSet::default(), WorkingSet::max)
         };
         let (plain, network) = (largest(false), largest(true));
         per_voxel += plain.per_voxel + network.per_voxel;

@@ -6,7 +6,7 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
 use super::request::JobSpec;
 use super::shape::SceneShape;
 use super::text::Sha256;
-use reconstruction::{ReconError, joints, pilot, preview};
+use reconstruction::{ReconError, crop, joints, preview};
 
 /// CPU seconds per voxel that is read (measured).
 const READ_S: f64 = 12e-9;
@@ -142,15 +142,18 @@ impl JobSpec {
         tasks.extend(snapshots.map(|snapshot| (TaskKind::Preview { snapshot }, preview)));
         let joints = runs.joints().len() as f64;
         if self.schedule.adaptive || joints > 0.0 {
-            let voxels = pixels.min((pilot::SIDE * pilot::SIDE) as f64) * frames;
+            let voxels = pixels.min((crop::SIDE * crop::SIDE) as f64) * frames;
             let schedule_s = if self.schedule.adaptive {
                 self.schedule.pilot_ns_per_voxel() * 1e-9
             } else {
                 0.0
             };
             // Each joint compares both snapshots together with the second one alone.
-            let joints_s =
-                if joints > 0.0 { (3.0 * joints + 1.0) / joints::SHORTER as f64 } else { 0.0 };
+            let joints_s = if joints > 0.0 {
+                (3.0 * joints + 1.0) / joints::ITERATION_DIVISOR as f64
+            } else {
+                0.0
+            };
             // The pilot follows the preview of the first snapshot; the other previews can wait.
             tasks.insert(2, (TaskKind::Pilot, voxels * (schedule_s + per_voxel * joints_s)));
         }

@@ -12,9 +12,9 @@ use sha2::Digest;
 
 use crate::job::{JobSpec, Label, Schedule, Sha256};
 use reconstruction::ReconError;
-use reconstruction::prior::network::{ClipDenoiser, ClipEncoder};
-use reconstruction::prior::onnx::{Device, EndToEndNetwork, Runtime};
-use reconstruction::prior::{Denoiser, Encoder, Network, Networks};
+use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
+use reconstruction::priors::onnx::{Device, EndToEndNetwork, Runtime};
+use reconstruction::priors::{Denoiser, Encoder, Network, Networks};
 
 /// A network embedded in the program as ONNX files, so that only libonnxruntime has to be installed.
 #[derive(Debug, Clone, Copy)]
@@ -365,8 +365,8 @@ mod tests {
         find_near, version_in,
     };
     use crate::job::{Algorithm, Sha256};
-    use reconstruction::prior::Network;
-    use reconstruction::prior::onnx::Device;
+    use reconstruction::priors::Network;
+    use reconstruction::priors::onnx::Device;
 
     #[test]
     fn the_version_is_read_from_the_symbols() {

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 
 use super::error::{PipelineError, Result};
 use crate::job::{TaskProgress, TaskStage};
+use reconstruction::priors::Family;
 use reconstruction::schedule::Schedule;
 use reconstruction::solver::{Control, Observer, Progress};
 
@@ -97,7 +98,7 @@ struct MonitorObserver<'a> {
 
 impl Observer for MonitorObserver<'_> {
     fn iteration(&mut self, progress: &Progress) -> Control {
-        self.passes += u32::from(progress.deep);
+        self.passes += u32::from(progress.family == Family::Learned);
         {
             let history = &self.monitor.history;
             let mut history = history.lock().unwrap_or_else(PoisonError::into_inner);
@@ -105,7 +106,7 @@ impl Observer for MonitorObserver<'_> {
             history.1 = true;
         }
         self.monitor.set_progress(TaskProgress {
-            stage: stage(progress),
+            stage: stage(progress.family),
             iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),
             passes: self.passes,
             fraction: self.part.start
@@ -122,11 +123,12 @@ impl Observer for MonitorObserver<'_> {
     }
 }
 
-fn stage(progress: &Progress) -> TaskStage {
-    match (progress.deep, progress.sigma) {
-        (true, _) => TaskStage::Deep,
-        (false, Some(_)) => TaskStage::Nonlocal,
-        (false, None) => TaskStage::Tv,
+/// The stage of a task that iterations with a prior of this family belong to.
+fn stage(family: Family) -> TaskStage {
+    match family {
+        Family::TotalVariation => TaskStage::Tv,
+        Family::Learned => TaskStage::Deep,
+        Family::Nonlocal => TaskStage::Nonlocal,
     }
 }
 
@@ -237,9 +239,8 @@ fn rounded(value: f32) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use super::{History, POINTS, ShareDone, is_history, stage};
-    use reconstruction::prior::SIGMA;
-    use reconstruction::prior::registry::PRIORS;
+    use super::{History, POINTS, ShareDone, is_history};
+    use reconstruction::priors::Family;
     use reconstruction::schedule::Schedule;
     use reconstruction::solver::Progress;
     use serde_json::Value;
@@ -256,7 +257,7 @@ mod tests {
                 residual,
                 change,
                 sigma,
-                deep: false,
+                family: Family::TotalVariation,
             });
         }
         serde_json::from_str(&history.to_json()).unwrap()
@@ -311,7 +312,7 @@ mod tests {
             residual: 0.1,
             change: 0.1,
             sigma: None,
-            deep: stage > 0,
+            family: if stage > 0 { Family::Learned } else { Family::TotalVariation },
         };
         let first = share.after(&at(0, 1));
         // The stage of total variation ended after three iterations.
@@ -323,17 +324,5 @@ mod tests {
         }
         assert!(first < 0.01);
         assert!((last - 1.0).abs() < 1e-9, "{last}");
-    }
-
-    #[test]
-    fn the_stage_of_the_progress_follows_the_prior() {
-        for prior in PRIORS {
-            let (deep, sigma) = (prior.network().is_some(), prior.takes(&SIGMA).then_some(0.1));
-            let (residual, change) = (0.1, 0.1);
-            let progress =
-                Progress { stage: 0, done: 1, planned: 2, residual, change, sigma, deep };
-            let expected = if deep { "deep" } else { prior.name() };
-            assert_eq!(stage(&progress).to_string(), expected);
-        }
     }
 }

@@ -1,12 +1,12 @@
 //! Records of a job's tasks, for later tasks and for the manifests.
 
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
 use super::assessment::TileAssessment;
 use crate::job::{Assessment, ResultFile, Timestamp};
 use reconstruction::assessment::Evidence;
-use reconstruction::pilot::Decision;
-use reconstruction::prior::Prior;
+use reconstruction::pilot::Decided;
 use reconstruction::schedule::Schedule;
 use reconstruction::solver::Outcome;
 
@@ -17,7 +17,7 @@ pub struct PreparedRecord {
     pub white: f32,
 }
 
-/// The pilot's decisions for a job.
+/// The decisions of a job's pilot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PilotRecord {
     pub snapshot: usize,
@@ -25,31 +25,20 @@ pub struct PilotRecord {
     pub column: usize,
     pub height: usize,
     pub width: usize,
-    /// The stages of the requested schedule. Empty for a fixed schedule.
-    pub stages: Vec<StageRecord>,
+    /// The decided stages. Empty for a fixed schedule.
+    pub stages: Vec<Decided>,
     /// The decisions on the joints between consecutive snapshots.
     #[serde(default)]
     pub joints: Vec<JointRecord>,
-    /// Evidence on the error of an adaptive schedule's frames.
+    /// Hold-out evidence of the error of an adaptive schedule's frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
 }
 
 impl PilotRecord {
+    /// The schedule that the pilot has decided. Returns a fixed schedule unchanged.
     pub fn decide(&self, schedule: &Schedule) -> Schedule {
-        if self.stages.is_empty() {
-            return schedule.clone();
-        }
-        let decision = |stage: &StageRecord| Decision {
-            iterations: stage.iterations,
-            temporal_weight: stage.temporal_weight,
-            temporal_shrinkage: stage.temporal_shrinkage,
-            rest_shrinkage: stage.rest_shrinkage,
-            rest_everywhere: stage.rest_everywhere,
-            static_variance: stage.static_variance,
-            gamma: stage.gamma,
-        };
-        schedule.decided(&self.stages.iter().map(decision).collect::<Vec<_>>())
+        if self.stages.is_empty() { schedule.clone() } else { schedule.decided(&self.stages) }
     }
 
     /// The snapshots after which the sequence is cut.
@@ -73,77 +62,37 @@ pub struct JointRecord {
     pub error_together: Option<f64>,
 }
 
-/// The pilot's decision on a stage.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct StageRecord {
-    pub prior: &'static dyn Prior,
-    /// Largest number of iterations in the requested schedule.
-    pub planned: usize,
-    /// Chosen number of iterations.
-    pub iterations: usize,
-    /// Requested weight of the temporal total variation; 0 for none.
-    #[serde(default)]
-    pub planned_temporal_weight: f32,
-    /// Chosen weight of the temporal total variation: the requested one, or 0.
-    #[serde(default)]
-    pub temporal_weight: f32,
-    /// Requested temporal shrinkage; 0 for none.
-    #[serde(default)]
-    pub planned_temporal_shrinkage: f32,
-    /// Chosen temporal shrinkage; 0 for none.
-    #[serde(default)]
-    pub temporal_shrinkage: f32,
-    /// Chosen temporal shrinkage of static regions, at least four times the requested one. `None` if it does not help.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rest_shrinkage: Option<f32>,
-    /// True if the whole scene is treated as static.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub rest_everywhere: bool,
-    /// Requested static variance of the projection.
-    #[serde(default)]
-    pub planned_static_variance: Option<f32>,
-    /// Chosen static variance of the projection.
-    #[serde(default)]
-    pub static_variance: Option<f32>,
-    /// Chosen noise term of the projection. `None` if it is that of the schedule.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub gamma: Option<f32>,
-    /// Reason of the end: `fixed`, `max-iterations`, `converged` or `diverged`.
-    pub end: String,
-    /// Hold-out error before the stage, relative to the measurement.
-    pub error_before: f64,
-    /// Hold-out error after the stage, relative to the measurement.
-    pub error_after: f64,
-}
-
-impl StageRecord {
-    /// Describes the decisions on temporal total variation, temporal shrinkage, static variance and noise term.
-    pub fn fates(&self) -> Vec<String> {
-        let kept = if self.temporal_weight > 0.0 { "kept" } else { "left out" };
-        let along_time = (self.planned_temporal_weight > 0.0)
-            .then(|| format!("total variation along time {kept}"));
-        let changes =
-            (self.planned_temporal_shrinkage > 0.0).then(|| match self.temporal_shrinkage {
-                0.0 => "shrinkage along time left out".into(),
-                shrinkage => format!("shrinkage along time {shrinkage}"),
-            });
-        let rest = self.rest_shrinkage.map(|level| match self.rest_everywhere {
-            true => format!("shrinkage {level}, as the scene is static"),
-            false => format!("shrinkage in static regions {level}"),
-        });
-        let variance = self.planned_static_variance.map(|_| match self.static_variance {
-            Some(variance) => format!("static variance {variance}"),
-            None => "static variance left out".into(),
-        });
-        let noise = self.gamma.map(|gamma| format!("noise term {gamma}"));
-        along_time.into_iter().chain(changes).chain(rest).chain(variance).chain(noise).collect()
-    }
+/// Lists the settings that a pilot has changed. Each has a leading comma, such as `, gamma 1`.
+pub fn changes(decided: &Decided) -> String {
+    let fields = |stage| match serde_json::to_value(stage) {
+        Ok(Value::Object(fields)) => fields,
+        _ => Map::new(),
+    };
+    let (planned, stage) = (fields(&decided.planned), fields(&decided.stage));
+    let changed = stage.iter().filter(|(name, value)| {
+        !["iterations", "sigma"].contains(&name.as_str()) && planned.get(*name) != Some(*value)
+    });
+    let text = |(name, value): (&String, &Value)| {
+        let name = name.replace('_', " ");
+        match value {
+            Value::Null => format!(", {name} left out"),
+            Value::Number(number) if number.as_f64() == Some(0.0) => format!(", {name} left out"),
+            Value::Number(number) => {
+                format!(", {name} {}", number.as_f64().unwrap_or_default() as f32)
+            }
+            value => format!(", {name} {value}"),
+        }
+    };
+    changed.map(text).collect()
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TileRecord {
-    /// Iterations whose prior had a total-variation part.
+    /// Iterations of all stages.
+    pub iterations: usize,
+    /// Iterations with total variation.
     pub tv_iterations: usize,
+    /// Iterations with a network.
     pub denoiser_passes: usize,
     /// `||y - H v|| / ||y||` of the tile's frames.
     pub residual: f32,
@@ -154,6 +103,7 @@ pub struct TileRecord {
 impl From<&Outcome> for TileRecord {
     fn from(outcome: &Outcome) -> Self {
         Self {
+            iterations: outcome.iterations,
             tv_iterations: outcome.tv_iterations,
             denoiser_passes: outcome.denoiser_passes,
             residual: outcome.residual,
@@ -223,9 +173,11 @@ impl RunRecord {
 /// Summary of a snapshot's tiles.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Largest value of the tiles.
+    /// Largest number of any tile.
+    pub iterations: usize,
+    /// Largest number of any tile.
     pub tv_iterations: usize,
-    /// Largest value of the tiles.
+    /// Largest number of any tile.
     pub denoiser_passes: usize,
     /// Largest value of the tiles.
     pub residual: f32,
@@ -237,6 +189,7 @@ impl Summary {
     pub fn of(tiles: &[TileRecord]) -> Self {
         let converged = tiles.iter().all(|tile| tile.stop_reason == "converged");
         Self {
+            iterations: tiles.iter().map(|tile| tile.iterations).max().unwrap_or(0),
             tv_iterations: tiles.iter().map(|tile| tile.tv_iterations).max().unwrap_or(0),
             denoiser_passes: tiles.iter().map(|tile| tile.denoiser_passes).max().unwrap_or(0),
             residual: tiles.iter().map(|tile| tile.residual).fold(0.0, f32::max),
@@ -258,11 +211,35 @@ pub struct SnapshotRecord {
 
 #[cfg(test)]
 mod tests {
-    use super::{Summary, TileRecord};
+    use super::{Decided, Schedule, Summary, TileRecord, changes};
+    use reconstruction::pilot::StageEnd;
+    use reconstruction::stage::Stage;
 
     fn record(residual: f32, stop_reason: &str, passes: usize) -> TileRecord {
         let stop_reason = stop_reason.to_owned();
-        TileRecord { tv_iterations: 40, denoiser_passes: passes, residual, stop_reason }
+        let iterations = 40 + passes;
+        TileRecord { iterations, tv_iterations: 40, denoiser_passes: passes, residual, stop_reason }
+    }
+
+    #[test]
+    fn changes_of_a_pilot_are_named() {
+        let planned = Schedule::pnp_nonlocal().stages[1].clone();
+        let mut stage = planned.clone();
+        stage.iterations = 12;
+        let decided = |stage: &Stage| Decided {
+            planned: planned.clone(),
+            stage: stage.clone(),
+            error_before: 0.1,
+            error_after: 0.05,
+            end: StageEnd::Converged,
+        };
+        assert_eq!(changes(&decided(&stage)), "");
+        stage.prior.nonlocal_mut().unwrap().static_shrinkage = Some(1.4);
+        (stage.projection.static_variance, stage.projection.gamma) = (None, Some(0.3));
+        assert_eq!(
+            changes(&decided(&stage)),
+            ", gamma 0.3, static shrinkage 1.4, static variance left out"
+        );
     }
 
     #[test]
@@ -270,6 +247,7 @@ mod tests {
         let tiles = [record(0.01, "converged", 20), record(0.03, "max-iterations", 24)];
         let summary = Summary::of(&tiles);
         assert_eq!((summary.denoiser_passes, summary.residual), (24, 0.03));
+        assert_eq!(summary.iterations, 64);
         assert_eq!(summary.stop_reason, "max-iterations");
         assert_eq!(Summary::of(&tiles[..1]).stop_reason, "converged");
     }

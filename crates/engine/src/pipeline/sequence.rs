@@ -132,11 +132,11 @@ pub fn solve(
     if let Solver::Schedule(schedule) = input.solver {
         let light = input.masks.sum_axis(Axis(0));
         let first = input.measurement.index_axis(Axis(0), 0);
-        let window = pilot::window(light.view(), first, input.mosaic);
+        let crop = pilot::choose_crop(light.view(), first, input.mosaic);
         let mut networks = WarmNetworks::new(network.clone());
-        let piece = input.window(input.snapshots(), window.clone(), Vec::new());
-        let task = pilot::Pilot { first: input.first, window: &window, schedule, runs: input.runs };
-        pilot = pilot::decide(piece, &task, &mut networks, &mut ())?;
+        let window = input.window(input.snapshots(), crop.clone(), Vec::new());
+        let task = pilot::Pilot { first: input.first, crop: &crop, schedule, runs: input.runs };
+        pilot = pilot::decide(window, &task, &mut networks, &mut ())?;
     }
     let decided = match (&pilot, input.solver) {
         (Some(pilot), Solver::Schedule(schedule)) => Some(pilot.decide(schedule)),
@@ -244,7 +244,7 @@ mod tests {
     use ndarray::{Array2, Array3, Axis};
     use optics::{iid_masks, measure};
     use reconstruction::ReconError;
-    use reconstruction::prior::onnx::Device;
+    use reconstruction::priors::onnx::Device;
     use reconstruction::schedule::Schedule;
     use reconstruction::sequence::SequencePlan;
     use reconstruction::tile::TilePlan;

@@ -5,13 +5,14 @@ use std::ops::Range;
 use ndarray::{Array3, Array4, ArrayView3, Axis, s};
 
 use super::residual::residual;
+use reconstruction::ReconError;
 use reconstruction::assessment::Model;
+use reconstruction::evidence;
 use reconstruction::learned::SnapshotNetwork;
-use reconstruction::prior::Networks;
+use reconstruction::operator::SensingOperator;
+use reconstruction::priors::Networks;
 use reconstruction::schedule::Schedule;
-use reconstruction::sensing::SensingOperator;
 use reconstruction::solver::{self, Observer, Outcome, StopReason};
-use reconstruction::{ReconError, pilot};
 
 /// The input of a tile.
 #[derive(Debug, Clone)]
@@ -36,9 +37,9 @@ impl TileInput {
     ) -> Result<Option<(SensingOperator, Array3<f32>)>, ReconError> {
         if !(self.white.is_finite() && self.white > 0.0) {
             return Err(ReconError::Parameter {
-                name: "white level",
+                name: "white level".into(),
                 value: self.white.to_string(),
-                range: "a finite number above 0",
+                range: "a finite number above 0".into(),
             });
         }
         let snapshots = self.y.dim().0;
@@ -75,6 +76,7 @@ impl TileInput {
         let (pieces, measured) = (self.pieces.clone(), self.y.clone());
         let mut combined = Outcome {
             frames: Array3::zeros((self.y.dim().0 * frames, height, width)),
+            iterations: 0,
             tv_iterations: 0,
             denoiser_passes: 0,
             residual: 0.0,
@@ -103,6 +105,7 @@ impl TileInput {
                 let range = s![.., piece.start * frames..piece.end * frames, .., ..];
                 combined.features.get_or_insert_with(zeros).slice_mut(range).assign(&part);
             }
+            combined.iterations = combined.iterations.max(outcome.iterations);
             combined.tv_iterations = combined.tv_iterations.max(outcome.tv_iterations);
             combined.denoiser_passes = combined.denoiser_passes.max(outcome.denoiser_passes);
             if outcome.stop_reason == StopReason::MaxIterations {
@@ -143,7 +146,7 @@ pub fn reconstruct_tile(
                 ..=MAX_EVIDENCE_ITERATIONS => schedule.clone(),
                 _ => schedule.clone().with_iterations(MAX_EVIDENCE_ITERATIONS),
             };
-            evidence = pilot::evidence(op, y, &bounded, networks)?;
+            evidence = evidence::collect(op, y, &bounded, networks)?;
         }
         solver::reconstruct_assessed(op, y, schedule, networks, observer)
     })?;
@@ -163,6 +166,7 @@ pub fn run_network(
             features: None,
             evidence: None,
             frames: network.frames(y.index_axis(Axis(0), 0), op.masks())?,
+            iterations: 0,
             tv_iterations: 0,
             denoiser_passes: 1,
             // `solve_pieces` computes the residual of the whole tile.

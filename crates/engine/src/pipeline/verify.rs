@@ -10,7 +10,7 @@ use super::tile::TileInput;
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use reconstruction::ReconError;
-use reconstruction::sensing::SensingOperator;
+use reconstruction::operator::SensingOperator;
 
 /// Largest frame value, in units of the white level or of the largest value after one projection.
 ///

@@ -6,7 +6,7 @@ use serde_json::Value;
 use crate::transport::TileTask;
 use engine::job::{JobId, Sha256, TaskId, TaskProgress, WorkerId};
 use engine::pipeline::networks::ModelRecord;
-use reconstruction::prior::Network;
+use reconstruction::priors::Network;
 
 /// A tile to be computed.
 #[derive(Debug, Clone, Serialize, Deserialize)]

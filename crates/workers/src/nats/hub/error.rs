@@ -25,7 +25,7 @@ impl EventError {
     /// True if the event may be the cause. False if a disk or a message server has failed.
     pub fn is_of_event(&self) -> bool {
         match self {
-            Self::Store(error) => !error.is_disk_full(),
+            Self::Store(error) => error.disk_trouble().is_none(),
             Self::Thread(_) | Self::Tile(_) => true,
             Self::Cluster(_) | Self::Write(_) | Self::Fetch(_) => false,
         }

@@ -9,6 +9,10 @@ use engine::job::{Pool, TaskId, WorkerId};
 /// A worker that was silent for longer counts as dead. Idle workers send a sign of life every 5 seconds.
 const MAX_SILENCE: Duration = Duration::from_secs(15);
 
+/// Largest number of living workers in a pool. An introduction costs its sender nothing, but takes a row in the store and
+/// space in answers.
+pub const MAX_WORKERS: usize = 2000;
+
 /// The workers on other machines.
 #[derive(Debug, Default)]
 pub struct Presence {
@@ -30,6 +34,13 @@ struct Sign {
 }
 
 impl Presence {
+    /// True if a worker may join a pool: it is known there, or the pool has fewer than [`MAX_WORKERS`] living workers.
+    pub fn has_room(&self, worker: WorkerId, pool: &Pool) -> bool {
+        let is_alive = |sign: &&Sign| sign.pool == *pool && sign.at.elapsed() < MAX_SILENCE;
+        self.workers.get(&worker).is_some_and(|sign| sign.pool == *pool)
+            || self.workers.values().filter(is_alive).count() < MAX_WORKERS
+    }
+
     /// Records that a worker introduced itself. A worker of another pool can't take over its identifier.
     pub fn join(&mut self, worker: WorkerId, pool: &Pool) {
         if self.workers.get(&worker).is_some_and(|sign| sign.pool != *pool) {
@@ -121,5 +132,28 @@ impl Presence {
             }
         }
         (alive, tiles)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MAX_WORKERS, Pool, Presence, WorkerId};
+
+    #[test]
+    fn a_pool_takes_a_limited_number_of_workers() {
+        let (gpu, cpu): (Pool, Pool) = ("gpu".parse().unwrap(), "cpu".parse().unwrap());
+        let mut presence = Presence::default();
+        let first = WorkerId::new();
+        presence.join(first, &gpu);
+        for _ in 1..MAX_WORKERS {
+            let worker = WorkerId::new();
+            assert!(presence.has_room(worker, &gpu));
+            presence.join(worker, &gpu);
+        }
+        assert!(!presence.has_room(WorkerId::new(), &gpu));
+        assert!(presence.has_room(first, &gpu), "it is one of them");
+        assert!(presence.has_room(WorkerId::new(), &cpu));
+        assert!(presence.leave(first, &gpu));
+        assert!(presence.has_room(WorkerId::new(), &gpu));
     }
 }

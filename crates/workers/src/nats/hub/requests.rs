@@ -13,13 +13,14 @@ use super::accept::is_possible;
 use super::core::{Core, lock};
 use super::error::EventError;
 use super::figures;
+use super::presence::MAX_WORKERS;
 use crate::nats::connection::ClusterError;
 use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Notice, TileBeat, Want};
 use crate::nats::names;
 use engine::job::Pool;
 use engine::pipeline::progress::is_history;
 use reconstruction::schedule::MAX_ITERATIONS;
-use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
+use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace, WorkerTakes};
 
 /// Time between two transactions that record signs of life.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -158,6 +159,11 @@ impl Core {
             tracing::warn!(%worker, host, reason, "a worker is refused");
             return Some(HelloAnswer::Refused(reason));
         }
+        if !lock(&self.presence).has_room(worker, pool) {
+            tracing::warn!(%worker, host, %pool, "a worker is refused: its pool is full");
+            let reason = format!("the pool is full: it has {MAX_WORKERS} workers");
+            return Some(HelloAnswer::Refused(reason));
+        }
         if let Err(error) = self.connection.make_pool(pool, self.ack_wait).await {
             tracing::error!(%error, "the consumer of a pool can't be created");
             return None;
@@ -167,7 +173,8 @@ impl Core {
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        if let Err(error) = self.store.worker_started(worker, pid, &location, false).await {
+        let started = self.store.worker_started(worker, pid, &location, WorkerTakes::All);
+        if let Err(error) = started.await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
         }

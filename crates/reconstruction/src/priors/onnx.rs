@@ -1,0 +1,247 @@
+//! ONNX Runtime. No other file uses `ort`.
+
+use std::path::Path;
+use std::sync::OnceLock;
+
+use ndarray::{Array3, ArrayView2, ArrayView3, ArrayView4, Axis};
+use ort::environment::Environment;
+use ort::ep::CUDA;
+use ort::session::Session;
+use ort::session::builder::GraphOptimizationLevel;
+use ort::value::{Outlet, Tensor, TensorElementType, TensorRef, ValueType};
+
+use crate::error::{ReconError, Result, shape_text};
+use crate::learned::{
+    FRAMES, Interface, MASKS, MEASUREMENT, SnapshotNetwork, TensorInfo, all_finite,
+};
+
+/// Where a network runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Device {
+    /// The processor, one thread a session.
+    #[default]
+    Cpu,
+    /// The CUDA device with this number.
+    Cuda(i32),
+}
+
+impl Device {
+    /// Reads `cpu` or `cuda:N`.
+    pub fn parse(text: &str) -> Result<Self> {
+        let cuda = text.strip_prefix("cuda:").and_then(|number| number.parse().ok());
+        match (text, cuda) {
+            ("cpu", _) => Ok(Self::Cpu),
+            (_, Some(number)) if number >= 0 => Ok(Self::Cuda(number)),
+            _ => Err(ReconError::Parameter {
+                name: "device".into(),
+                value: format!("{text:?}"),
+                range: "cpu or cuda:N (cuda:0 is the first GPU)".into(),
+            }),
+        }
+    }
+
+    /// Name of the execution provider, for records.
+    pub fn provider(self) -> &'static str {
+        match self {
+            Self::Cpu => "CPUExecutionProvider",
+            Self::Cuda(_) => "CUDAExecutionProvider",
+        }
+    }
+}
+
+/// The loaded libonnxruntime, and the device of its sessions.
+#[derive(Debug, Clone)]
+pub struct Runtime {
+    environment: Environment,
+    device: Device,
+}
+
+/// Folder of external weights of a network. Our networks have none. Without this setting, an uploaded network could
+/// name any file below the working folder.
+const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
+const NOWHERE: &str = "/dev/null/nowhere";
+
+/// The library can be loaded once per process; the first outcome stays.
+static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
+
+impl Runtime {
+    /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`.
+    ///
+    /// # Errors
+    /// The library is missing or too old. If the device is unavailable, loading a network fails; there is no silent
+    /// fallback.
+    pub fn open(library: &Path, device: Device) -> Result<Self> {
+        let loaded = ENVIRONMENT.get_or_init(|| {
+            let builder = ort::init_from(library).map_err(|error| {
+                format!(
+                    "libonnxruntime can't be loaded from {}: {error}; fetch it with \
+                     scripts/fetch-onnxruntime.sh or name it with --onnxruntime",
+                    library.display()
+                )
+            })?;
+            let builder = builder.with_name("sci-recon").with_telemetry(false);
+            builder.build().map_err(|error| format!("ONNX Runtime does not start: {error}"))
+        });
+        match loaded {
+            Ok(environment) => Ok(Self { environment: environment.clone(), device }),
+            Err(message) => Err(ReconError::Runtime(message.clone())),
+        }
+    }
+
+    /// The device that sessions run on.
+    pub fn device(&self) -> Device {
+        self.device
+    }
+
+    /// Description of the library's build, for records.
+    pub fn build_info(&self) -> &'static str {
+        ort::info()
+    }
+
+    fn session(&self, name: &str, model: &[u8]) -> Result<Session> {
+        let failed = |error: String| {
+            ReconError::Runtime(format!(
+                "the network {name} can't be loaded on {}: {error}",
+                self.device.provider()
+            ))
+        };
+        let build = || -> Result<Session, String> {
+            let text = |error: ort::Error<ort::session::builder::SessionBuilder>| error.to_string();
+            let mut builder = Session::builder(&self.environment)
+                .map_err(|error| error.to_string())?
+                .with_optimization_level(GraphOptimizationLevel::All)
+                .map_err(text)?
+                .with_intra_threads(1)
+                .map_err(text)?
+                .with_inter_threads(1)
+                .map_err(text)?
+                .with_config_entry(WEIGHTS_FOLDER, NOWHERE)
+                .map_err(text)?;
+            if let Device::Cuda(number) = self.device {
+                let cuda = CUDA::default().with_device_id(number).build().error_on_failure();
+                builder = builder.with_execution_providers([cuda]).map_err(text)?;
+                builder = builder.with_disable_cpu_fallback().map_err(text)?;
+            }
+            builder.commit_from_memory(model).map_err(|error| error.to_string())
+        };
+        build().map_err(failed)
+    }
+}
+
+/// A network that maps a clip and a noise level to a clip.
+pub struct ClipNetwork {
+    name: String,
+    session: Session,
+}
+
+impl ClipNetwork {
+    /// Loads a network with inputs `frames` \[n+2,1,H,W\] and `sigma` (a number) and one
+    /// output \[n,..\].
+    pub fn load(runtime: &Runtime, name: &str, model: &[u8]) -> Result<Self> {
+        let session = runtime.session(name, model)?;
+        let inputs: Vec<&str> = session.inputs().iter().map(|input| input.name()).collect();
+        if inputs != ["frames", "sigma"] || session.outputs().len() != 1 {
+            return Err(ReconError::Runtime(format!(
+                "the network {name} has inputs {inputs:?} and {} outputs; it must have \
+                 [\"frames\", \"sigma\"] and 1",
+                session.outputs().len()
+            )));
+        }
+        Ok(Self { name: name.to_string(), session })
+    }
+
+    /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes the output for the n middle ones.
+    pub fn run(
+        &mut self,
+        frames: ArrayView4<'_, f32>,
+        sigma: f32,
+        output: &mut [f32],
+    ) -> Result<()> {
+        let Self { name, session } = self;
+        let failed = |error: ort::Error| ReconError::Runtime(format!("network {name}: {error}"));
+        let frames = TensorRef::from_array_view(frames).map_err(failed)?;
+        let sigma = Tensor::from_array(ndarray::arr0(sigma)).map_err(failed)?;
+        let outputs = session.run(ort::inputs![frames, sigma]).map_err(failed)?;
+        let (shape, values) = outputs[0].try_extract_tensor::<f32>().map_err(failed)?;
+        if values.len() != output.len() {
+            return Err(ReconError::Runtime(format!(
+                "network {name} gave {shape} where {} values were expected",
+                output.len()
+            )));
+        }
+        output.copy_from_slice(values);
+        Ok(())
+    }
+}
+
+/// A network that maps a measurement and its masks to frames.
+pub struct EndToEndNetwork {
+    session: Session,
+}
+
+impl EndToEndNetwork {
+    /// Loads a network; [`Self::interface`] describes its inputs and outputs.
+    ///
+    /// # Errors
+    /// [`ReconError::Runtime`]: ONNX Runtime refuses the network.
+    pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self> {
+        Ok(Self { session: runtime.session("of the file", model)? })
+    }
+
+    /// Inputs and outputs of the network.
+    pub fn interface(&self) -> Interface {
+        let tensors = |outlets: &[Outlet]| outlets.iter().map(tensor).collect();
+        Interface {
+            inputs: tensors(self.session.inputs()),
+            outputs: tensors(self.session.outputs()),
+        }
+    }
+}
+
+impl SnapshotNetwork for EndToEndNetwork {
+    fn frames(
+        &mut self,
+        y: ArrayView2<'_, f32>,
+        masks: ArrayView3<'_, f32>,
+    ) -> Result<Array3<f32>> {
+        let failed = |error: ort::Error| ReconError::Runtime(format!("the network: {error}"));
+        let measurement = y.insert_axis(Axis(0)).insert_axis(Axis(0));
+        let measurement = TensorRef::from_array_view(measurement).map_err(failed)?;
+        let stack = TensorRef::from_array_view(masks.insert_axis(Axis(0))).map_err(failed)?;
+        let outputs = self
+            .session
+            .run(ort::inputs![MEASUREMENT => measurement, MASKS => stack])
+            .map_err(failed)?;
+        let (shape, values) = outputs[FRAMES].try_extract_tensor::<f32>().map_err(failed)?;
+        let frames = Array3::from_shape_vec(masks.raw_dim(), values.to_vec());
+        let frames = frames.map_err(|_| ReconError::Shape {
+            what: "the network's output",
+            found: shape.to_string(),
+            expected: format!("1x{}", shape_text(masks.shape())),
+        })?;
+        all_finite(&frames)?;
+        Ok(frames)
+    }
+}
+
+fn tensor(outlet: &Outlet) -> TensorInfo {
+    let name = outlet.name().to_owned();
+    match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => TensorInfo {
+            name,
+            element: element(*ty),
+            // -1 means any length.
+            sides: shape.iter().map(|&side| usize::try_from(side).ok()).collect(),
+        },
+        other => TensorInfo { name, element: format!("{other:?}"), sides: Vec::new() },
+    }
+}
+
+/// Name of the type in ONNX and NumPy.
+fn element(element: TensorElementType) -> String {
+    match element {
+        TensorElementType::Float32 => "float32".to_owned(),
+        TensorElementType::Float64 => "float64".to_owned(),
+        other => format!("{other:?}").to_lowercase(),
+    }
+}

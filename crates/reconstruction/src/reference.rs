@@ -1,0 +1,152 @@
+//! A slow, readable solver's parts, for the tests of GAP and ADMM.
+
+use crate::ReconError;
+use crate::operator::{
+    DECAY, HIGH_CONTRAST, INDEPENDENT_CONTRAST, MAX_OPPOSITION, MIN_STATIC_SHARE,
+    MIN_STATIC_VARIANCE, REFERENCE_RATIO, SensingOperator,
+};
+use crate::priors::{Denoiser, Network, Networks};
+use crate::schedule::Schedule;
+use crate::solver::reconstruct;
+use ndarray::Array3;
+use rand::{Rng, SeedableRng};
+use serde_json::json;
+use std::f64::consts::PI;
+
+/// A small random problem, with a denoiser that pulls every voxel towards a grey.
+pub(crate) struct Problem {
+    pub(crate) schedule: Schedule,
+    masks: Array3<f32>,
+    /// [S,H,W].
+    y: Array3<f32>,
+}
+
+const GREY: f64 = 0.4;
+const PULL: f64 = 0.25;
+
+struct Pull;
+
+impl Denoiser for Pull {
+    fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {
+        frames.mapv_inplace(|x| x + PULL as f32 * (GREY as f32 - x));
+        Ok(())
+    }
+}
+
+impl Networks for Pull {
+    fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser, ReconError> {
+        Ok(self)
+    }
+}
+
+impl Problem {
+    pub(crate) fn random(seed: u64, method: &str) -> Self {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        let size = (rng.random_range(1..5), rng.random_range(1..8), rng.random_range(1..40));
+        let masks = Array3::from_shape_simple_fn(size, || 0.2 + 0.8 * rng.random::<f32>());
+        let snapshots = rng.random_range(1..4);
+        let y = (snapshots, size.1, size.2);
+        let y = Array3::from_shape_simple_fn(y, || 2.0 * rng.random::<f32>());
+        let memory: f32 = rng.random();
+        let variance = rng.random::<bool>().then(|| rng.random_range(0.1..1.0f32));
+        let stage = json!({"prior": "ffdnet", "iterations": 7, "sigma": [0.1, 0.1],
+            "memory": memory, "momentum": 0.5 * rng.random::<f32>(), "static_variance": variance,
+            "gamma": rng.random::<bool>().then(|| 0.5 * rng.random::<f32>())});
+        let schedule = json!({"method": method, "accelerated": rng.random::<bool>(),
+            "gamma": 0.3 * rng.random::<f32>(), "stages": [stage]});
+        Self { schedule: serde_json::from_value(schedule).unwrap(), masks, y }
+    }
+
+    /// The solver's frames.
+    pub(crate) fn solve(&self) -> Array3<f32> {
+        let op = SensingOperator::new(self.masks.clone()).unwrap();
+        let op = op.over(self.y.dim().0).unwrap();
+        reconstruct(&op, self.y.view(), &self.schedule, &mut Pull, &mut ()).unwrap().frames
+    }
+
+    pub(crate) fn pixels(&self) -> usize {
+        self.y.len()
+    }
+
+    pub(crate) fn zeros(&self) -> Vec<f64> {
+        vec![0.0; self.y.dim().0 * self.masks.len()]
+    }
+
+    pub(crate) fn denoise(&self, x: &mut [f64]) {
+        x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
+    }
+
+    /// `P(w)` along the masks, or along `R C` (cosine by cosine, and bounded), with the target `y` or, accelerated,
+    /// `y1 = y + memory (y1 - H w)`.
+    pub(crate) fn project(&self, w: &[f64], y1: &mut [f64]) -> Vec<f64> {
+        let plane = self.masks.dim().1 * self.masks.dim().2;
+        let stage = &self.schedule.stages[0];
+        let projection = stage.projection;
+        let (gamma, memory) = (projection.gamma.unwrap_or(self.schedule.gamma), projection.memory);
+        let mask: Vec<f64> = self.masks.iter().map(|&c| f64::from(c)).collect();
+        // `R C`.
+        let mut direction = mask.clone();
+        if let Some(variance) = projection.static_variance {
+            let frames = self.masks.dim().0;
+            let sum = |pixel: usize, power: i32| -> f64 {
+                (0..frames).map(|k| mask[k * plane + pixel].powi(power)).sum()
+            };
+            let gram: f64 = (0..plane).map(|pixel| sum(pixel, 2)).sum();
+            let steady: f64 = (0..plane).map(|pixel| sum(pixel, 1).powi(2)).sum();
+            let contrast = 1.0 - steady / (frames as f64 * gram);
+            let count = frames as f64;
+            let by_count = (f64::from(REFERENCE_RATIO) / count).sqrt();
+            let independent = f64::from(INDEPENDENT_CONTRAST) * (1.0 - 1.0 / count);
+            let share =
+                (by_count * (contrast / independent).powf(0.9)).max(MIN_STATIC_SHARE.into());
+            let share = share.min(by_count).min((contrast / f64::from(HIGH_CONTRAST)).powf(1.5));
+            let variance = f64::from(variance) * share;
+            let cosine =
+                |m: usize, k: usize| (PI * m as f64 * (k as f64 + 0.5) / frames as f64).cos();
+            direction.fill(0.0);
+            for m in 0..frames {
+                let square: f64 = (0..frames).map(|k| cosine(m, k).powi(2)).sum();
+                let variance = if m == 0 {
+                    variance.max(MIN_STATIC_VARIANCE.into())
+                } else {
+                    (m as f64).powf(-f64::from(DECAY))
+                };
+                for pixel in 0..plane {
+                    let part = |k: usize| cosine(m, k) * mask[k * plane + pixel];
+                    let part = variance / square * (0..frames).map(part).sum::<f64>();
+                    for k in 0..frames {
+                        direction[k * plane + pixel] += cosine(m, k) * part;
+                    }
+                }
+            }
+        }
+        let mut x = w.to_vec();
+        for (p, &y) in self.y.iter().enumerate() {
+            // The snapshot's own frames at this pixel, and the masks there.
+            let (first, pixel) = (p / plane * mask.len(), p % plane);
+            let voxels = || (pixel..mask.len()).step_by(plane);
+            let measured: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
+            let total_of = |part: &dyn Fn(usize) -> f64| -> f64 {
+                voxels().map(|voxel| mask[voxel] * part(voxel)).sum::<f64>() + f64::from(gamma)
+            };
+            let least = -f64::from(MAX_OPPOSITION) * total_of(&|voxel| direction[voxel]);
+            let bounded = |voxel: usize| direction[voxel].max(least / mask[voxel]);
+            let total = total_of(&bounded);
+            let mut target = f64::from(y);
+            if self.schedule.accelerated {
+                y1[p] = target + f64::from(memory) * (y1[p] - measured);
+                target = y1[p];
+            }
+            for voxel in voxels() {
+                x[first + voxel] += bounded(voxel) * (target - measured) / total;
+            }
+        }
+        x
+    }
+}
+
+/// Largest difference between two clips.
+pub(crate) fn max_difference(frames: &Array3<f32>, reference: &[f64]) -> f64 {
+    let pairs = frames.iter().zip(reference);
+    pairs.map(|(&a, b)| (f64::from(a) - b).abs()).fold(0.0, f64::max)
+}
