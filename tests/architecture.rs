@@ -354,7 +354,7 @@ fn the_check_detects_circles() {
     let files = BTreeMap::from([
         (Module::new(), read("mod a;", Module::new(), "lib", true)),
         file("a", "mod b; mod c; mod d; pub use b::Thing;", true),
-        // An import through the folder's exports, and a path inside an expression.
+        // The file imports through the folder's exports, and names a path in an expression.
         file("a::b", "fn f() { super::c::g(); } pub struct Thing;", false),
         file("a::c", "use crate::a::{Thing, d::{self, h}};", false),
         file("a::d", "use std::fs; #[cfg(test)] mod tests { use super::super::c; }", false),

@@ -258,7 +258,7 @@ async fn a_service_without_tokens_needs_no_session() {
 async fn a_download_ends_with_its_token() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a"]));
-    // Larger than the buffers of a connection.
+    // The file is larger than the buffers of a connection.
     let sha256 = app.upload(vec![3; 40_000_000]).await;
     let path = format!("/v1/blobs/{sha256}/content");
     let mut download = app.request(Method::GET, &path).send().await.unwrap();

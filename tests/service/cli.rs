@@ -1,4 +1,4 @@
-//! The commands that need no server.
+//! Commands that need no server.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -136,7 +136,7 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     assert_eq!(calibration["mosaic"], "grbg");
     let base = format!("/v1/jobs/{job}/snapshots/1");
 
-    // At each of four places, there is one tile per sub-image.
+    // At each of four positions, there is one tile per sub-image.
     let tiles = app.get(&format!("{base}/tiles")).await.expect(200).json();
     let places = tiles["items"].as_array().unwrap().iter().map(|tile| {
         let field = |name: &str| tile[name].as_u64().unwrap();
@@ -209,7 +209,7 @@ async fn a_mosaic_is_reconstructed_in_colour() {
 #[tokio::test]
 async fn workers_and_the_command_line_give_the_same_colours() {
     let lab = Lab::coloured("rggb");
-    // Both snapshots jointly, with a pilot.
+    // The job solves both snapshots jointly, with a pilot.
     let job = |measurement: &str| {
         let mut job = tv(measurement);
         job["algorithm"] = json!("gap-tv3d");
@@ -224,10 +224,10 @@ async fn workers_and_the_command_line_give_the_same_colours() {
     };
     let app = TestApp::with(&["--workers", "2"]).await;
     let (id, ended) = run(&app).await;
-    // Four places with four sub-images each, in one run of both snapshots.
+    // The plan has four positions with four sub-images each, in one run of both snapshots.
     assert_eq!(ended["progress"]["tiles_total"], 16, "{ended:#}");
     let expected = results_of(&app, &id, SNAPSHOTS).await;
-    // Frames, images, stack, array and mosaic of each snapshot.
+    // Each snapshot has frames, images, stack, array and mosaic.
     assert_eq!(expected.len(), SNAPSHOTS * (2 * FRAMES + 3));
 
     let line = [

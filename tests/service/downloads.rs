@@ -84,7 +84,7 @@ pub async fn ask_during_slow_downloads(
     let app = TestApp::with(&["--workers", "0"]).await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
     app.sign_in(&a);
-    // Larger than the buffers of a connection.
+    // The file is larger than the buffers of a connection.
     let sha256 = app.upload(vec![3; 40_000_000]).await;
     app.sign_in(&b);
     let path = format!("/v1/blobs/{sha256}/content");

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use crate::app::TestApp;
 use crate::samples::Scene;
 
-/// Eight tiles in each of two snapshots, each a large part of a second.
+/// A job with eight tiles in each of two snapshots. Each tile takes a large part of a second.
 fn job(measurement: &str) -> Value {
     json!({
         "measurement": measurement,

@@ -61,7 +61,7 @@ async fn concurrent_requests_do_not_exceed_the_limit() {
 async fn prepared_arrays_count_towards_the_quota() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "200000"]));
-    // 8 bits per value, and 32 in the prepared array.
+    // A value has 8 bits in the upload, and 32 in the prepared array.
     let masks = [npy_header("|u1", &[8, 96, 96]), vec![200; 8 * 96 * 96]].concat();
     let answer = app.calibrate(masks.clone()).await;
     let detail = answer.problem(507, "quota_exceeded");

@@ -193,7 +193,7 @@ async fn a_large_file_comes_from_a_slow_disk() {
 #[tokio::test]
 #[ignore = "minutes; run by make load"]
 async fn large_jobs_in_a_long_queue_do_not_slow_answers() {
-    // 729 tiles each.
+    // Each job has 729 tiles.
     let scene = Scene { frames: 4, height: 440, width: 440, snapshots: 1 };
     long_queue("load_large_jobs", scene, setting("SCI_RECON_LOAD_LARGE", 800)).await;
 }

@@ -76,7 +76,7 @@ async fn images_show_the_frames_unchanged() {
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
     app.get(&format!("{pictures}/difference-2")).await.expect(200);
 
-    // Images of masks and measurement.
+    // Masks and measurement have images too.
     let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
     let masks = format!("/v1/calibrations/{}/pictures", calibration.as_str().unwrap());
     for name in ["mask-4", "mean", "gram", "dead"] {

@@ -77,7 +77,7 @@ async fn a_job_reconstructs_the_scene() {
         let listed = app.get(&base).await.expect(200).json();
         assert_eq!(listed["ready"], true);
         let files = listed["files"].as_array().unwrap();
-        // EXR and PNG of each frame, the stack, the array, the manifest.
+        // The files are EXR and PNG of each frame, the stack, the array and the manifest.
         assert_eq!(files.len(), 4 + 4 + 4);
         for file in files {
             let answer = app.get(file["href"].as_str().unwrap()).await.expect(200);

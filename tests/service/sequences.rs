@@ -10,7 +10,7 @@ use crate::samples::Scene;
 
 const SCENE: Scene = Scene { frames: 4, height: 48, width: 64, snapshots: 7 };
 
-/// Two tiles in each of two runs.
+/// A job with two tiles in each of two runs.
 fn job(measurement: &str, iterations: u32) -> Value {
     json!({
         "measurement": measurement,

@@ -111,7 +111,7 @@ async fn random_kills_lose_and_change_nothing() {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = tempfile::tempdir().unwrap();
     let mut app = TestApp::with(&["--workers", "2", "--max-jobs", "10000"]).await;
-    // The expected results, without any kill.
+    // Computes the expected results without kills.
     let lab = Lab::new("");
     let captures = lab.send(&app).await;
     let undisturbed = app.calibrate_captures(&captures).await;

@@ -46,7 +46,7 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     assert_eq!(manifest["run"]["job"], job);
     let job_manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
     assert_eq!(job_manifest["content"]["snapshots"][0]["summary"], content["summary"]);
-    // Prepare, preview, six tiles, assemble, manifest.
+    // The tasks are prepare, preview, six tiles, assemble and manifest.
     assert_eq!(job_manifest["run"]["tasks"], 10);
 
     let folder = tempfile::tempdir().unwrap();

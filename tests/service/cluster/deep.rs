@@ -19,7 +19,7 @@ async fn networks_give_the_same_bytes_on_other_machines() {
     let Some(nats) = Nats::start(1) else { return };
     let app = TestApp::with(&["--workers", "2"]).await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
-    // Two tiles: a few passes here, and in `make cluster` the default schedule with its pilot.
+    // The job has two tiles. It runs a few passes here, and the default schedule with its pilot in `make cluster`.
     let mut deep = json!({
         "measurement": measurement, "algorithm": "pnp-tv-fastdvdnet", "snapshots": 0,
         "tile": {"size": 48, "overlap": 16},

@@ -23,7 +23,7 @@ use crate::app::TestApp;
 use crate::faults::results;
 use crate::samples::Scene;
 
-/// Sixteen tiles that take a fraction of a second each.
+/// A job with sixteen tiles, which take a fraction of a second each.
 fn job(measurement: &str) -> Value {
     with_iterations(measurement, 700)
 }
@@ -275,11 +275,11 @@ async fn a_worker_of_another_version_is_rejected_with_both_versions() {
         String::from_utf8(answer.unwrap().payload.to_vec()).unwrap()
     };
     assert!(refused.contains("0.0.7") && refused.contains(env!("CARGO_PKG_VERSION")), "{refused}");
-    // The waiting worker is accepted ...
+    // The waiting worker is accepted.
     until("the worker is accepted", || async { workers(&app).await.len() == 1 }).await;
     assert!(waiting.process.is_running());
     drop(app);
-    // ... and a rejected one ends with the reason.
+    // A rejected worker ends with the reason.
     let mut hellos = client.subscribe("sci.v1.hello.other").await.unwrap();
     let url = nats.url();
     let mut unwelcome = RemoteWorker::start(&["--nats", &url, "--pool", "other"]);

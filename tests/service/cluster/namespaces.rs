@@ -201,7 +201,7 @@ async fn the_documented_commands_work_between_two_machines() {
     };
     wait("the worker is connected", has_joined, &heard);
 
-    // A job that gives the same frames as on one machine.
+    // The job must give the same frames as on one machine.
     let masks = machines.upload(&Scene::SMALL.masks());
     let calibration = machines.api("/v1/calibrations", Some(&json!({"masks": masks})));
     let data = machines.upload(&Scene::SMALL.snapshots());
