@@ -1,14 +1,16 @@
 //! `/v1/algorithms`: what can be asked for, with the defaults.
 
-use axum::Json;
+use axum::response::Response;
 use serde::Serialize;
 
+use super::context::RequestContext;
+use super::error::Result;
 use engine::job::{Algorithm, Schedule, TileSpec};
 use engine::pipeline::networks;
 use strum::VariantArray;
 
 #[derive(Debug, Serialize)]
-pub(super) struct AlgorithmBody {
+struct AlgorithmBody {
     name: Algorithm,
     summary: &'static str,
     networks: Vec<&'static str>,
@@ -20,11 +22,11 @@ pub(super) struct AlgorithmBody {
 }
 
 #[derive(Debug, Serialize)]
-pub(super) struct ListBody {
+struct ListBody {
     items: Vec<AlgorithmBody>,
 }
 
-pub(super) async fn list() -> Json<ListBody> {
+pub(super) async fn list(request: RequestContext) -> Result<Response> {
     let show = |name: Algorithm| {
         let schedule = name.default_schedule();
         AlgorithmBody {
@@ -42,5 +44,5 @@ pub(super) async fn list() -> Json<ListBody> {
             tile: name.default_tile(),
         }
     };
-    Json(ListBody { items: Algorithm::VARIANTS.iter().copied().map(show).collect() })
+    request.json(&ListBody { items: Algorithm::VARIANTS.iter().copied().map(show).collect() })
 }

@@ -5,12 +5,14 @@
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::convert::Infallible;
+use std::fmt;
 use std::hash::Hash;
+use std::str::FromStr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::extract::State;
-use axum::http::HeaderName;
+use axum::http::{HeaderMap, HeaderName};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream;
@@ -21,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use engine::job::{CalibrationId, JobId, Lab, MeasurementId, ModelId, ThingId};
+use engine::job::{CalibrationId, JobId, Lab, MeasurementId, ModelId, ThingId, Timestamp};
 use store::{JobMark, Made, RequestMark, Store, StoreError};
 
 /// The longest time between two looks at all jobs.
@@ -35,6 +37,10 @@ const NAMED: usize = 200;
 
 /// Requests of one lab that wait for the end of something at the same time: each holds a connection.
 const WAITERS: usize = 64;
+/// Looks with changes that are remembered for listeners that come back.
+const REMEMBERED: usize = 256;
+/// Time without a listener after which changes are no longer followed.
+const GRACE: Duration = Duration::from_secs(60);
 /// What an event says that does not name all jobs.
 const MORE: &str = "\"more\":true";
 
@@ -74,10 +80,69 @@ fn kind(what: Made) -> Kind {
 
 type Changes = Arc<Told>;
 
+/// The place of changes in the stream. The epoch differs between streams that have a gap between them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Position {
+    epoch: i64,
+    number: u64,
+}
+
+impl fmt::Display for Position {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}-{}", self.epoch, self.number)
+    }
+}
+
+impl FromStr for Position {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let (epoch, number) = text.split_once('-').ok_or(())?;
+        let epoch = epoch.parse().map_err(|_| ())?;
+        Ok(Self { epoch, number: number.parse().map_err(|_| ())? })
+    }
+}
+
+/// The changes of the last minutes, for listeners that come back.
+#[derive(Debug)]
+struct History {
+    /// The position of the last changes.
+    last: Position,
+    changes: VecDeque<Changes>,
+}
+
+impl History {
+    fn new() -> Self {
+        let last = Position { epoch: Timestamp::now().0, number: 0 };
+        Self { last, changes: VecDeque::new() }
+    }
+
+    fn push(&mut self, changes: Changes) -> Position {
+        self.last.number += 1;
+        self.changes.push_back(changes);
+        if self.changes.len() > REMEMBERED {
+            self.changes.pop_front();
+        }
+        self.last
+    }
+
+    /// The changes after a position, each with its own; none if some of them are forgotten.
+    fn since(&self, seen: Position) -> Option<Vec<(Position, Changes)>> {
+        let missed = self.last.number.checked_sub(seen.number)?;
+        let missed = usize::try_from(missed).ok()?;
+        let known = seen.epoch == self.last.epoch && missed <= self.changes.len();
+        let first = self.changes.len().checked_sub(missed).filter(|_| known)?;
+        let numbered = (seen.number + 1..).zip(self.changes.iter().skip(first));
+        let place = |number| Position { number, ..self.last };
+        Some(numbered.map(|(number, changes)| (place(number), changes.clone())).collect())
+    }
+}
+
 /// The stream of changes to which listeners subscribe.
 #[derive(Debug, Clone)]
 pub(super) struct Events {
-    sender: broadcast::Sender<Changes>,
+    sender: broadcast::Sender<(Position, Changes)>,
+    history: Arc<Mutex<History>>,
     places: Places,
     waiters: Waiters,
     closing: CancellationToken,
@@ -87,10 +152,11 @@ impl Events {
     /// Begins to look, until `closing`.
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
-        let looking = look(store, sender.clone());
+        let history = Arc::new(Mutex::new(History::new()));
+        let looking = look(store, sender.clone(), history.clone());
         tokio::spawn(closing.clone().run_until_cancelled_owned(looking));
         let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
-        Self { sender, places, waiters, closing }
+        Self { sender, history, places, waiters, closing }
     }
 }
 
@@ -147,7 +213,7 @@ impl Events {
             while !settled().await? {
                 loop {
                     match receiver.recv().await {
-                        Ok(changes) => {
+                        Ok((_, changes)) => {
                             let text = kind(&changes).get(lab);
                             if text.is_some_and(|text| text.contains(&name) || text.contains(MORE))
                             {
@@ -219,8 +285,13 @@ async fn marks(store: &Store) -> Result<Marks, StoreError> {
     })
 }
 
-async fn look(store: Store, sender: broadcast::Sender<Changes>) {
+async fn look(
+    store: Store,
+    sender: broadcast::Sender<(Position, Changes)>,
+    history: Arc<Mutex<History>>,
+) {
     let mut before: Option<Marks> = None;
+    let mut heard = Instant::now();
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
@@ -234,8 +305,13 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             tokio::time::sleep(LOOK).await;
         }
         let start = Instant::now();
-        if sender.receiver_count() == 0 {
-            before = None;
+        if sender.receiver_count() > 0 {
+            heard = start;
+        } else if heard.elapsed() > GRACE {
+            // Changes are no longer followed, so nobody can go on from here.
+            if before.take().is_some() {
+                *history.lock().unwrap_or_else(PoisonError::into_inner) = History::new();
+            }
             continue;
         }
         // A failing database shows in every other answer, too.
@@ -259,8 +335,12 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             .iter()
             .any(|told| !told.is_empty())
         {
-            // Fails only if the last listener has just gone.
-            let _ = sender.send(told.into());
+            let told: Changes = told.into();
+            // Under the lock, so that a new listener gets each change once.
+            let mut history = history.lock().unwrap_or_else(PoisonError::into_inner);
+            let position = history.push(told.clone());
+            // Fails only if nobody listens at the moment.
+            let _ = sender.send((position, told));
         }
         before = Some(now);
         tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;
@@ -315,18 +395,34 @@ impl<Id: Ord> Change<Id> {
     }
 }
 
-pub(super) async fn listen(State(events): State<Events>, access: Access) -> Result<Response> {
+pub(super) async fn listen(
+    State(events): State<Events>,
+    access: Access,
+    headers: HeaderMap,
+) -> Result<Response> {
     let place = events.places.take(&access.lab).ok_or_else(|| {
         let detail = "all places for listeners are taken, or this lab has its share; poll instead";
         ApiError::new(Code::Unavailable, detail)
     })?;
-    let listener = Listener {
+    let seen = headers.get("last-event-id").and_then(|id| id.to_str().ok()?.parse().ok());
+    let (receiver, last, missed) = {
+        let history = events.history.lock().unwrap_or_else(PoisonError::into_inner);
+        (events.sender.subscribe(), history.last, seen.and_then(|seen| history.since(seen)))
+    };
+    let mut listener = Listener {
         lab: access.lab,
-        receiver: events.sender.subscribe(),
+        receiver,
+        history: events.history.clone(),
         closing: events.closing.clone(),
-        waiting: VecDeque::from([hello()]),
+        waiting: VecDeque::new(),
         _place: place,
     };
+    match missed {
+        Some(missed) => {
+            missed.iter().for_each(|(position, changes)| listener.queue(*position, changes));
+        }
+        None => listener.waiting.push_back(hello(last)),
+    }
     let events = stream::unfold(listener, Listener::next);
     // Proxies must not gather events into larger packets.
     let unbuffered: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
@@ -335,9 +431,10 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
 
 struct Listener {
     lab: Lab,
-    receiver: broadcast::Receiver<Changes>,
+    receiver: broadcast::Receiver<(Position, Changes)>,
+    history: Arc<Mutex<History>>,
     closing: CancellationToken,
-    /// What it is told next.
+    /// Events to send next.
     waiting: VecDeque<Event>,
     _place: Place,
 }
@@ -353,29 +450,67 @@ impl Listener {
                 () = self.closing.cancelled() => return None,
             };
             match received {
-                Ok(changes) => {
-                    let kinds = [
-                        ("jobs", &changes.jobs),
-                        ("calibrations", &changes.calibrations),
-                        ("measurements", &changes.measurements),
-                    ];
-                    for (name, told) in kinds {
-                        let text = told.get(&self.lab);
-                        self.waiting
-                            .extend(text.map(|text| Event::default().event(name).data(text)));
-                    }
-                }
-                // A slow listener has missed some: it must read the list again.
+                Ok((position, changes)) => self.queue(position, &changes),
+                // A slow listener has missed some changes: it must read the lists again.
                 Err(broadcast::error::RecvError::Lagged(_)) => {
-                    self.waiting.push_back(hello());
+                    let last = {
+                        let history = self.history.lock().unwrap_or_else(PoisonError::into_inner);
+                        self.receiver = self.receiver.resubscribe();
+                        history.last
+                    };
+                    self.waiting.push_back(hello(last));
                 }
                 Err(broadcast::error::RecvError::Closed) => return None,
             }
         }
     }
+
+    /// Queues the events of the lab. The last one has the position: a connection that breaks between them gets all
+    /// of them again.
+    fn queue(&mut self, position: Position, changes: &Told) {
+        let kinds = [
+            ("jobs", &changes.jobs),
+            ("calibrations", &changes.calibrations),
+            ("measurements", &changes.measurements),
+        ];
+        let events = kinds.into_iter().filter_map(|(name, told)| {
+            Some(Event::default().event(name).data(told.get(&self.lab)?))
+        });
+        let mut events: Vec<Event> = events.collect();
+        if let Some(last) = events.pop() {
+            events.push(last.id(position.to_string()));
+        }
+        self.waiting.extend(events);
+    }
 }
 
-/// Has a listener read the lists.
-fn hello() -> Event {
-    Event::default().event("hello").data("{}")
+/// Has a listener read the lists, which are at least as new as `position`.
+fn hello(position: Position) -> Event {
+    Event::default().event("hello").data("{}").id(position.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{History, Position, Told};
+
+    #[test]
+    fn a_listener_resumes_or_starts_again() {
+        let mut history = History::new();
+        let start = history.last;
+        for _ in 0..super::REMEMBERED + 2 {
+            history.push(Told::default().into());
+        }
+        let last = history.last;
+        let numbers = |seen| {
+            let since = history.since(seen)?;
+            Some(since.into_iter().map(|(at, _)| at.number).collect::<Vec<_>>())
+        };
+        assert_eq!(numbers(last), Some(vec![]));
+        let two_before = Position { number: last.number - 2, ..last };
+        assert_eq!(numbers(two_before), Some(vec![last.number - 1, last.number]));
+        assert_eq!(numbers(start), None, "some changes are forgotten");
+        assert_eq!(numbers(Position { epoch: last.epoch - 1, ..last }), None);
+        assert_eq!(numbers(Position { number: last.number + 1, ..last }), None);
+        assert_eq!(last.to_string().parse(), Ok(last));
+    }
 }

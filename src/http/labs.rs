@@ -1,16 +1,18 @@
 //! `/v1/labs`: all labs with what they have and may have, for those who look after them.
 
-use axum::Json;
+use axum::http::StatusCode;
+use axum::response::Response;
 use serde::{Deserialize, Serialize};
 
 use super::app::App;
+use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params};
 use engine::job::{InvalidField, Lab};
 use store::{Entitlement, LabRow, LabUse, share_error};
 
 #[derive(Debug, Serialize)]
-pub(super) struct LabBody {
+struct LabBody {
     lab: Lab,
     /// Of the machine, beside the shares of the other labs.
     share: f64,
@@ -38,7 +40,7 @@ struct TakenBody {
 }
 
 #[derive(Debug, Serialize)]
-pub(super) struct ListBody {
+struct ListBody {
     items: Vec<LabBody>,
 }
 
@@ -53,28 +55,29 @@ pub(super) struct Changes {
     jobs: Option<Option<u64>>,
 }
 
-pub(super) async fn list(Caller(app, _): Caller) -> Result<Json<ListBody>> {
+pub(super) async fn list(Caller(app, _): Caller, request: RequestContext) -> Result<Response> {
     let mut items = Vec::new();
     for row in app.store.labs().await? {
-        items.push(body(&app, row).await?);
+        items.push(show_row(&app, row).await?);
     }
-    Ok(Json(ListBody { items }))
+    request.json(&ListBody { items })
 }
 
 pub(super) async fn show(
     Caller(app, _): Caller,
     Params(lab): Params<String>,
-) -> Result<Json<LabBody>> {
-    let row = app.store.lab(&lab).await?;
-    Ok(Json(body(&app, row).await?))
+    request: RequestContext,
+) -> Result<Response> {
+    request.json(&body(&app, &lab).await?)
 }
 
 /// `PATCH /v1/labs/{lab}`.
 pub(super) async fn change(
     Caller(app, _): Caller,
     Params(lab): Params<String>,
+    request: RequestContext,
     Body(changes): Body<Changes>,
-) -> Result<Json<LabBody>> {
+) -> Result<Response> {
     let lab = app.store.lab(&lab).await?.lab;
     let Changes { share, bytes, jobs } = changes;
     let mut errors: Vec<_> =
@@ -87,12 +90,16 @@ pub(super) async fn change(
     if !errors.is_empty() {
         return Err(ApiError::fields(Code::InvalidRequest, errors));
     }
+    let _guard = request.precondition(&app, body(&app, lab.as_str())).await?;
     app.store.entitle(&lab, Entitlement { share, max_bytes: bytes, max_jobs: jobs }).await?;
-    let row = app.store.lab(lab.as_str()).await?;
-    Ok(Json(body(&app, row).await?))
+    changed(StatusCode::OK, &body(&app, lab.as_str()).await?)
 }
 
-async fn body(app: &App, row: LabRow) -> Result<LabBody> {
+async fn body(app: &App, lab: &str) -> Result<LabBody> {
+    show_row(app, app.store.lab(lab).await?).await
+}
+
+async fn show_row(app: &App, row: LabRow) -> Result<LabBody> {
     let bytes = app.store.lab_bytes(&row.lab).await?;
     let of = app.store.lab_use(&row.lab).await?;
     let limits = LimitsBody { bytes: row.max_bytes, jobs: row.max_jobs };

@@ -1,15 +1,16 @@
 //! `/v1/me`: who asks, what is allowed, and what is taken up of it.
 
-use axum::Json;
+use axum::response::Response;
 use serde::Serialize;
 
+use super::context::RequestContext;
 use super::error::Result;
 use super::extract::Caller;
 use engine::job::{Lab, Role, Timestamp, TokenId};
 use store::LabUse;
 
 #[derive(Debug, Serialize)]
-pub(super) struct MeBody {
+struct MeBody {
     lab: Lab,
     role: Role,
     /// None on a service without tokens.
@@ -45,14 +46,14 @@ struct UseBody {
     lab: LabUse,
 }
 
-pub(super) async fn show(Caller(app, access): Caller) -> Result<Json<MeBody>> {
+pub(super) async fn show(Caller(app, access): Caller, request: RequestContext) -> Result<Response> {
     let token_bytes = match access.token {
         Some(token) => Some(app.store.token_bytes(token).await?),
         None => None,
     };
     let lab = app.store.lab_use(&access.lab).await?;
     let entitled = app.store.entitlement(&access.lab).await?;
-    Ok(Json(MeBody {
+    request.json(&MeBody {
         lab: access.lab,
         role: access.role,
         token: access.token,
@@ -66,5 +67,5 @@ pub(super) async fn show(Caller(app, access): Caller) -> Result<Json<MeBody>> {
             worker_memory_bytes: app.settings.worker_memory_bytes,
         },
         taken: UseBody { token_bytes, lab },
-    }))
+    })
 }

@@ -4,11 +4,11 @@ use std::fs::File;
 use std::io;
 use std::path::Path;
 
-use axum::Json;
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
+use super::context::changed;
 use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, hashed_key, idempotency_key};
 use super::intake;
@@ -82,7 +82,8 @@ pub(super) async fn create(
     let key = hashed_key(key, &job)?;
     let (status, job) = jobs::make(&app, &access, job, key).await?;
     let location = [(header::LOCATION, job.place())];
-    Ok((status, location, Json(SampleBody { masks, data, truth, job })).into_response())
+    let body = SampleBody { masks, data, truth, job };
+    Ok((location, changed(status, &body)?).into_response())
 }
 
 fn name() -> Option<Label> {

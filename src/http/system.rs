@@ -1,5 +1,5 @@
 //! What the service is and how it is: `/v1/system` for people, `/livez` and `/readyz` for what watches
-//! it, `/metrics` for Prometheus; and the contract, `/openapi.yaml`.
+//! it, `/metrics` for Prometheus.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -228,9 +228,4 @@ pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
     labs.retain(|figures| access.all_labs || figures.lab == access.lab);
     figures.add_labs(&labs);
     Ok((kind, app.metrics.render() + &figures.into_text()).into_response())
-}
-
-pub(super) async fn contract() -> Response {
-    let kind = [(header::CONTENT_TYPE, "application/yaml")];
-    (kind, include_str!("../../openapi.yaml")).into_response()
 }

@@ -2,7 +2,7 @@
 //!
 //! Checks report a [`Finding`] with a [`FindingCode`] and the numbers of the case. A new finding takes one entry in
 //! this file and the check that reports it. Running the tests with `SCI_RECON_WRITE_FINDINGS=1` then updates the
-//! lists in `docs/DATA.md` and `openapi.yaml`.
+//! lists in `docs/DATA.md` and `src/http/contract.yaml`.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
@@ -379,7 +379,7 @@ mod tests {
 
     use super::FindingCode;
 
-    /// The lines between these two comments in `docs/DATA.md` and `openapi.yaml` are generated.
+    /// The lines between these two comments in `docs/DATA.md` and `src/http/contract.yaml` are generated.
     const BEGIN: &str = "findings: generated from crates/optics/src/finding.rs";
     const END: &str = "findings: end";
 
@@ -418,7 +418,9 @@ mod tests {
 
     #[test]
     fn documents_list_every_code() {
-        for (file, generated) in [("docs/DATA.md", table()), ("openapi.yaml", enumeration())] {
+        for (file, generated) in
+            [("docs/DATA.md", table()), ("src/http/contract.yaml", enumeration())]
+        {
             let path = format!("{}/../../{file}", env!("CARGO_MANIFEST_DIR"));
             let text = std::fs::read_to_string(&path).unwrap();
             let expected = regenerated(&text, &generated);

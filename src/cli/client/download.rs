@@ -38,7 +38,7 @@ impl Client {
     ) -> Result<Fetched> {
         let mut head = self.send(|| self.request(Method::HEAD, href)).await?;
         while head.status() == StatusCode::ACCEPTED {
-            // A movie that a worker makes, now that it is asked for.
+            // A worker is encoding the movie.
             tokio::time::sleep(MADE).await;
             head = self.send(|| self.request(Method::HEAD, href)).await?;
         }

@@ -113,11 +113,11 @@ impl Wanted {
     /// The file of the whole job that is meant: its address below that of the job, and its name.
     fn of_job(self) -> Option<(&'static str, &'static str)> {
         match self {
-            Self::Manifest => Some(("manifest.json", "manifest.json")),
-            Self::SequenceArray => Some(("sequence/frames.npy", "sequence.npy")),
-            Self::SequenceTiff => Some(("sequence/stack.tif", "sequence.tif")),
-            Self::SequenceMovie => Some(("sequence/movie.mp4", "sequence.mp4")),
-            Self::Archive => Some(("results.zip", "results.zip")),
+            Self::Manifest => Some(("exports/manifest", "manifest.json")),
+            Self::SequenceArray => Some(("exports/npy", "sequence.npy")),
+            Self::SequenceTiff => Some(("exports/tiff", "sequence.tif")),
+            Self::SequenceMovie => Some(("exports/mp4", "sequence.mp4")),
+            Self::Archive => Some(("exports/zip", "results.zip")),
             _ => None,
         }
     }
@@ -153,7 +153,7 @@ impl Job {
 impl Client {
     /// A job; answered when it has ended, or after so many seconds.
     pub(in crate::cli) async fn job(&self, id: &str, wait: u32) -> Result<Job> {
-        Job::new(self.get(&format!("/v1/jobs/{id}?wait={wait}")).await?)
+        Job::new(self.get_ended(&format!("/v1/jobs/{id}"), wait).await?)
     }
 
     /// Makes a thing with a key, and waits until its files are checked; gives its identifier.
@@ -161,7 +161,7 @@ impl Client {
         let mut made = self.create(path, body, key).await?;
         let id = id(&made)?;
         while made["state"] == "preparing" {
-            made = self.get(&format!("{path}/{id}?wait=20")).await?;
+            made = self.get_ended(&format!("{path}/{id}"), 20).await?;
         }
         let problem = &made["problem"];
         match problem["status"].as_u64().and_then(|status| u16::try_from(status).ok()) {
@@ -189,19 +189,27 @@ impl Client {
                 let Some(href) = &file.href else { continue };
                 if wanted.iter().any(|wanted| wanted.has(&file.name)) {
                     let path = inside.join(relative(&file.name)?);
-                    files.push((href.clone(), path, Some(file.sha256)));
+                    // Relative to the address of the list.
+                    files.push((format!("{base}/snapshots/{href}"), path, Some(file.sha256)));
                 }
             }
             let made = [
-                (Wanted::StackWithError, "stack.exr?layers=sigma", "stack-sigma.exr"),
-                (Wanted::Tiff, "stack.tif", "stack.tif"),
-                (Wanted::Movie, "movie.mp4", "movie.mp4"),
+                (Wanted::StackWithError, "exr?layers=sigma", "stack-sigma.exr"),
+                (Wanted::Tiff, "tiff", "stack.tif"),
+                (Wanted::Movie, "mp4", "movie.mp4"),
             ];
             for (made, place, name) in made {
                 if wanted.contains(&made) {
-                    files.push((format!("{of_snapshot}/{place}"), inside.join(name), None));
+                    let href = format!("{of_snapshot}/exports/{place}");
+                    files.push((href, inside.join(name), None));
                 }
             }
+            if wanted.contains(&Wanted::Movie) {
+                self.create_movie(&base, Some(snapshot)).await?;
+            }
+        }
+        if wanted.contains(&Wanted::SequenceMovie) {
+            self.create_movie(&base, None).await?;
         }
         for (place, name) in wanted.iter().filter_map(|wanted| wanted.of_job()) {
             files.push((format!("{base}/{place}"), folder.join(name), None));
@@ -213,6 +221,12 @@ impl Client {
             bar.finish_and_clear();
         }
         Ok(files.into_iter().map(|(_, path, _)| path).collect())
+    }
+
+    /// Has the service encode a movie of a snapshot of a job, or of all; it may exist already.
+    async fn create_movie(&self, job: &str, snapshot: Option<u32>) -> Result<()> {
+        let body = serde_json::json!({"format": "mp4", "snapshot": snapshot});
+        self.post(&format!("{job}/exports"), &body).await.map(|_| ())
     }
 
     /// Sends a file, with a bar on a terminal.

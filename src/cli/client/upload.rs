@@ -73,10 +73,10 @@ impl Client {
         });
         let begun = begun.await?;
         let place = begun.headers().get("location").and_then(|place| place.to_str().ok());
-        // Behind a proxy the service's own path is at the end.
-        let path = place.and_then(|place| place.find("/v1/uploads/").map(|at| &place[at..]));
-        let path = path.ok_or_else(|| CliError::Failure("the service names no upload".into()))?;
-        Ok(path.to_owned())
+        // Relative, or below a prefix of a proxy: the identifier is at the end.
+        let id = place.and_then(|place| place.rsplit('/').next()).filter(|id| !id.is_empty());
+        let id = id.ok_or_else(|| CliError::Failure("the service names no upload".into()))?;
+        Ok(format!("/v1/uploads/{id}"))
     }
 
     /// Sends what the service does not have yet.

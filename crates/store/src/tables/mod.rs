@@ -26,6 +26,9 @@ pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
 pub use requests::{Asked, Request, RequestMark};
-pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
+pub use tasks::{
+    FailedTask, FailureCause, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
+    TileState,
+};
 pub use tokens::Token;
 pub use workers::{WorkerPlace, WorkerRow, WorkerTask};

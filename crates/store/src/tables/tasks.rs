@@ -96,6 +96,28 @@ pub struct TileHistory {
 
 from_row!(TileHistory, row => { tile, state, points = row.read::<Json<_>>("history")?.0 });
 
+/// The task for which a job has failed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FailedTask {
+    pub kind: TaskKind,
+    pub cause: FailureCause,
+    /// Attempts that have ended badly.
+    pub attempts: u32,
+}
+
+/// Why the last attempt at a task has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FailureCause {
+    /// The task reported an error.
+    Task,
+    /// Workers were killed for lack of memory.
+    Memory,
+    /// The worker crashed.
+    Crash,
+    /// Workers were killed or fell silent.
+    Loss,
+}
+
 /// What has been done in all by tasks of a kind, those of deleted jobs with them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TaskTotals {
@@ -113,6 +135,29 @@ from_row!(TaskTotals, row => { kind, tasks, seconds, iterations, passes });
 pub type TaskCounts = BTreeMap<(String, TaskState), u64>;
 
 impl Store {
+    /// The task for which a job has failed; none unless it has.
+    pub async fn failed_task(&self, job: JobId) -> Result<Option<FailedTask>> {
+        let row = sql!(
+            "SELECT job, thing, kind, snapshot, snapshots, tile, failures, losses, starved,
+                 (SELECT outcome FROM attempts WHERE task = id AND attempt = tasks.attempt) AS outcome
+             FROM tasks WHERE job = ? AND state = ? ORDER BY id LIMIT 1",
+            [job, TaskState::Failed]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let (failures, losses, starved): (u32, u32, u32) =
+            (row.read("failures")?, row.read("losses")?, row.read("starved")?);
+        let outcome: Option<String> = row.read("outcome")?;
+        let cause = match outcome.as_deref() {
+            Some("crashed") => FailureCause::Crash,
+            Some("lost") if starved > 0 => FailureCause::Memory,
+            Some("lost") => FailureCause::Loss,
+            _ => FailureCause::Task,
+        };
+        Ok(Some(FailedTask { kind: kind(&row)?, cause, attempts: failures + losses + starved }))
+    }
+
     /// The stored preview of a snapshot, while there is one: a prepared array of coarse frames.
     pub async fn preview(&self, job: JobId, snapshot: u32) -> Result<Option<(Sha256, PathBuf)>> {
         let sha256: Option<Sha256> = sql_as!(
