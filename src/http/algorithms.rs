@@ -1,4 +1,4 @@
-//! `/v1/algorithms`: what can be asked for, with the defaults.
+//! `/v1/algorithms`: the algorithms with their defaults.
 
 use axum::response::Response;
 use serde::Serialize;
@@ -9,20 +9,26 @@ use engine::job::{Algorithm, Schedule, TileSpec};
 use engine::pipeline::networks;
 use strum::VariantArray;
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "AlgorithmInfo")]
 struct AlgorithmBody {
     name: Algorithm,
     summary: &'static str,
+    /// Networks of the default schedule.
     networks: Vec<&'static str>,
+    /// Priors that a schedule of this algorithm may name.
     priors: Vec<&'static str>,
     schedule: Schedule,
+    /// Iterations of the default schedule.
     planned_iterations: usize,
+    /// Passes of deep denoisers in the default schedule.
     planned_passes: usize,
     tile: TileSpec,
 }
 
-#[derive(Debug, Serialize)]
-struct ListBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "AlgorithmList")]
+pub(super) struct ListBody {
     items: Vec<AlgorithmBody>,
 }
 

@@ -8,7 +8,7 @@ use super::app::App;
 use super::context::{RequestContext, changed};
 use super::error::{Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{Cursor, Limit, PageBody, Renaming};
+use super::page::{Cursor, Limit, NoQuery, PageBody, Renaming};
 use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
     CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Sha256, Submission, Timestamp,
@@ -25,29 +25,41 @@ pub(super) struct ListQuery {
     created_before: Option<Timestamp>,
 }
 
-/// A calibration as it is shown. What is known of masks is null until they are there.
-#[derive(Debug, Serialize)]
+/// A calibration. Facts about masks are null until the masks are ready.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Calibration")]
 pub(super) struct CalibrationBody {
     id: CalibrationId,
     state: Stage,
-    /// How much of the work is done, in percent.
+    /// Share of the work that is done, in percent.
     percent: f64,
+    /// The failure in words.
     error: Option<String>,
-    /// The same as the problem with which the request would have been answered.
+    /// The failure, as an answer to the request would have stated it.
     problem: Option<Problem>,
     created_at: Timestamp,
     name: Option<Label>,
+    /// The file of the masks.
     masks: Option<Sha256>,
+    /// Format of the file.
     format: Option<String>,
+    /// Type of the samples in the file.
     sample: Option<String>,
+    /// Order of the axes of the array; null for pictures.
     axes: Option<String>,
+    /// Number of masks, the compression ratio B.
     frames: Option<usize>,
     height: Option<usize>,
     width: Option<usize>,
+    /// The stored number that means 1.
     full_scale: Option<f32>,
+    /// Mean of all masks, on [0, 1].
     mask_mean: Option<f64>,
+    /// Pixels that are dark in all masks.
     dead_pixels: Option<u64>,
+    /// Values at or below 0 that were set to 0.
     clipped_negatives: Option<u64>,
+    /// Colours of the pixels of the sensor; null for a grey sensor.
     mosaic: Option<Mosaic>,
 }
 
@@ -159,6 +171,7 @@ pub(super) async fn list(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
     request: RequestContext,
 ) -> Result<Response> {
     let wait = request.wait();

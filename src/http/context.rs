@@ -97,7 +97,7 @@ pub(super) fn changed<T: Serialize>(status: StatusCode, body: &T) -> Result<Resp
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Wait {
     Unstated,
-    /// At most so many seconds.
+    /// The longest wait in seconds.
     Seconds(f64),
     /// The answer comes at once.
     Async,

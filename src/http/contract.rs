@@ -38,11 +38,28 @@ pub(super) async fn json(request: RequestContext) -> Result<Response> {
 mod tests {
     use std::collections::BTreeMap;
 
+    use schemars::generate::SchemaSettings;
+    use serde_json::{Value as Json, json};
     use serde_yaml_ng::{Mapping, Value};
 
     use super::super::access::Rule;
+    use super::super::calibrations::CalibrationBody;
+    use super::super::error::Problem;
+    use super::super::jobs::JobBody;
+    use super::super::measurements::MeasurementBody;
+    use super::super::page::PageBody;
+    use super::super::pictures::SpreadBody;
     use super::super::router::routes;
+    use super::super::{
+        algorithms, events, exports, jobs, labs, me, page, quality, results, samples, session,
+        system, tiles, tus,
+    };
     use super::YAML;
+
+    use engine::job::{
+        CalibrationReport, CalibrationRequest, JobId, JobRequest, MeasurementRequest, ModelRequest,
+    };
+    use store::{Blob, BlobRow, Model, TileHistory};
 
     const PROSE: &str = include_str!("contract.yaml");
     const METHODS: [&str; 7] = ["get", "head", "post", "put", "patch", "delete", "options"];
@@ -229,9 +246,173 @@ mod tests {
         Value::Mapping(ordered)
     }
 
+    /// Schemas by name.
+    type Schemas = BTreeMap<String, Json>;
+
+    macro_rules! schemas_of {
+        ($settings:expr; $($kind:ty),* $(,)?) => {{
+            let settings = $settings.with(|settings| {
+                settings.definitions_path = "/components/schemas".into();
+                settings.meta_schema = None;
+            });
+            let mut generator = settings.into_generator();
+            $(generator.subschema_for::<$kind>();)*
+            let found: Schemas = generator.take_definitions(true).into_iter().collect();
+            found
+        }};
+    }
+
+    /// The bodies of requests, which are closed: an unknown field is refused.
+    fn requests() -> Schemas {
+        let mut schemas = schemas_of! {
+            SchemaSettings::draft2020_12().for_deserialize();
+            CalibrationRequest, MeasurementRequest, ModelRequest, JobRequest, jobs::Changes, labs::Changes,
+            page::Renaming, samples::SampleRequest, exports::movie::ExportRequest,
+        };
+        schemas.values_mut().for_each(|schema| plain(schema, false));
+        schemas
+    }
+
+    /// The bodies of answers, which are open: a later version may add fields and values.
+    fn answers() -> Schemas {
+        let mut schemas = schemas_of! {
+            SchemaSettings::draft2020_12().for_serialize();
+            me::MeBody, session::SessionBody, labs::ListBody, PageBody<BlobRow>, PageBody<tus::UploadBody>,
+            PageBody<CalibrationBody>, CalibrationReport, PageBody<MeasurementBody>, PageBody<Model>,
+            algorithms::ListBody, PageBody<JobBody>, jobs::EstimateBody, samples::SampleBody,
+            exports::movie::ExportBody, PageBody<results::SnapshotBody>, quality::QualityBody, tiles::TilesBody,
+            TileHistory, SpreadBody, events::Change<JobId>, system::SystemBody, system::Readiness,
+            system::Liveness, Problem, Blob, labs::LabBody,
+        };
+        schemas.values_mut().for_each(|schema| plain(schema, true));
+        schemas
+    }
+
+    /// Writes a schema as generators of clients read it best, and opens that of an answer.
+    fn plain(schema: &mut Json, open: bool) {
+        if let Json::Array(items) = schema {
+            items.iter_mut().for_each(|item| plain(item, open));
+        }
+        let Json::Object(fields) = schema else { return };
+        if let Some(variants) = fields.get("oneOf").and_then(constants) {
+            fields.remove("oneOf");
+            let known: Vec<Json> = variants.iter().map(|(name, _)| json!(name)).collect();
+            let explained = variants
+                .iter()
+                .filter_map(|(name, about)| Some(format!("- `{name}`: {}", about.as_ref()?)));
+            let about = fields.get("description").and_then(Json::as_str).unwrap_or_default();
+            let lines: Vec<String> = [about.to_owned()].into_iter().chain(explained).collect();
+            fields.insert("description".into(), lines.join("\n").trim().into());
+            fields.insert("type".into(), "string".into());
+            fields.insert("enum".into(), known.into());
+        }
+        if let Some(value) = fields.remove("const") {
+            fields.insert("enum".into(), json!([value]));
+        }
+        let unsigned = ["uint", "uint8", "uint16", "uint32", "uint64"];
+        if let Some(format) = fields.get("format").and_then(Json::as_str).map(str::to_owned)
+            && unsigned.contains(&format.as_str())
+        {
+            fields.insert("format".into(), "int64".into());
+            fields.entry("minimum").or_insert(json!(0));
+            if format == "uint32" && !open {
+                fields.entry("maximum").or_insert(json!(u32::MAX));
+            }
+        }
+        // The identifier of a document, and rules between fields that generators do not read.
+        for name in ["$id", "title", "allOf"] {
+            fields.remove(name);
+        }
+        if let Some(about) = fields.get("description").and_then(Json::as_str) {
+            let about = prose(about);
+            fields.insert("description".into(), about.into());
+        }
+        if fields.get("default").is_some_and(Json::is_null) {
+            fields.remove("default");
+        }
+        if open {
+            fields
+                .remove("additionalProperties")
+                .filter(|more| more.is_object())
+                .map(|more| fields.insert("additionalProperties".into(), more));
+            if let Some(known) = fields.remove("enum") {
+                fields.insert("x-extensible-enum".into(), known);
+            }
+            // A schedule of `learned` has no stages.
+            fields.remove("minItems");
+        }
+        for (key, inner) in fields.iter_mut() {
+            match (key.as_str(), inner) {
+                ("properties", Json::Object(properties)) => {
+                    properties.values_mut().for_each(|property| plain(property, open));
+                }
+                ("items" | "additionalProperties" | "anyOf" | "oneOf" | "prefixItems", inner) => {
+                    plain(inner, open);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// A doc comment as plain text: without links to code, lines of a paragraph joined.
+    fn prose(about: &str) -> String {
+        let paragraphs = about.split("\n\n").map(|paragraph| {
+            let lines = paragraph.replace("\n- ", "\u{0}- ").replace('\n', " ");
+            lines.replace('\u{0}', "\n")
+        });
+        let text = paragraphs.collect::<Vec<_>>().join("\n\n");
+        let text = text.replace("[`", "`").replace("`]", "`").replace("`None`", "null");
+        text.replace("\\[", "[").replace("\\]", "]")
+    }
+
+    /// The texts, and what they mean, if every variant is one.
+    fn constants(variants: &Json) -> Option<Vec<(String, Option<String>)>> {
+        let mut found = Vec::new();
+        for variant in variants.as_array()? {
+            let about = variant["description"].as_str().map(|about| about.replace('\n', " "));
+            match (&variant["const"], &variant["enum"]) {
+                (Json::String(name), _) => found.push((name.clone(), about)),
+                (_, Json::Array(names)) => {
+                    for name in names {
+                        found.push((name.as_str()?.to_owned(), None));
+                    }
+                }
+                _ => return None,
+            }
+        }
+        Some(found)
+    }
+
+    /// The schemas of all types. If the form in answers differs from the form in requests, its name ends in `Output`.
+    fn derived() -> Schemas {
+        let (mut all, answers) = (requests(), answers());
+        let twice: Vec<String> = answers
+            .iter()
+            .filter(|(name, schema)| all.get(*name).is_some_and(|other| other != *schema))
+            .map(|(name, _)| name.clone())
+            .collect();
+        // A schema that refers to a renamed one differs, too.
+        let text = serde_json::to_string(&answers).unwrap();
+        let renamed = twice.iter().fold(text, |text, name| {
+            let place = |name: &str| format!("\"#/components/schemas/{name}\"");
+            text.replace(&place(name), &place(&format!("{name}Output")))
+        });
+        let answers: Schemas = serde_json::from_str(&renamed).unwrap();
+        for (name, schema) in answers {
+            let name = if twice.contains(&name) { format!("{name}Output") } else { name };
+            all.insert(name, schema);
+        }
+        all
+    }
+
     /// The contract as it follows from prose, routes and types.
     fn assembled() -> String {
         let mut document: Mapping = serde_yaml_ng::from_str(PROSE).unwrap();
+        let components = map(&mut document, "components");
+        for (name, schema) in derived() {
+            let before = map(components, "schemas").insert(name.as_str().into(), value(schema));
+            assert!(before.is_none(), "the prose has the schema {name}, which follows from a type");
+        }
         let rules: BTreeMap<String, Rule> = routes()
             .into_iter()
             .map(|route| (route.path.replace("{*path}", "{path}"), route.rule))

@@ -105,8 +105,13 @@ pub struct ApiError {
     headers: Vec<(HeaderName, HeaderValue)>,
 }
 
+/// Names of all codes.
+fn codes() -> Vec<&'static str> {
+    Code::VARIANTS.iter().map(|code| code.into_str()).collect()
+}
+
 /// The body of an error (RFC 9457).
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
 pub struct Problem {
     /// A name of the code that holds everywhere. The header `Link` of an error leads to a page that explains it.
     r#type: String,
@@ -115,13 +120,16 @@ pub struct Problem {
     /// The fault, its place, and what to do.
     detail: String,
     /// Stable identifier, for programs to rely on.
+    #[schemars(extend("x-extensible-enum" = codes()))]
     code: &'static str,
     /// True if the same request may succeed later.
     retryable: bool,
     /// The request, by its `X-Request-Id`.
     #[serde(skip_serializing_if = "Option::is_none")]
     instance: Option<String>,
-    /// With `invalid_content`, the fault of the file.
+    /// With `invalid_content`, the fault of the file: `unknown_format`, `unsupported_content`, `truncated`, `malformed`,
+    /// `over_limit`, `missing_array`, `axes_ambiguous`, `no_axes`, `invalid_full_scale`, `not_finite`,
+    /// `above_full_scale`, `all_masks_zero`, `mask_frame_zero` or `snapshot_zero`.
     #[serde(skip_serializing_if = "Option::is_none")]
     reason: Option<String>,
     /// JSON pointer to the first of `errors`.

@@ -1,4 +1,4 @@
-//! `/v1/events`: says which jobs, calibrations and measurements have changed, for those who would poll otherwise.
+//! `/v1/events`: names jobs, calibrations and measurements that have changed, in place of polling.
 //!
 //! Workers are other processes, so the server looks at the database once a second, as long as
 //! somebody listens, and compares what it sees with what it saw before.
@@ -44,12 +44,13 @@ const GRACE: Duration = Duration::from_secs(60);
 /// What an event says that does not name all jobs.
 const MORE: &str = "\"more\":true";
 
-/// What listeners are told.
-#[derive(Debug, Serialize)]
-struct Change<Id> {
+/// The data of an event.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Change")]
+pub(super) struct Change<Id> {
     changed: Vec<Id>,
     deleted: Vec<Id>,
-    /// True if there are more than are named: read the list again.
+    /// True if more than these have changed: read the list again.
     more: bool,
 }
 
@@ -291,7 +292,7 @@ async fn look(
     history: Arc<Mutex<History>>,
 ) {
     let mut before: Option<Marks> = None;
-    let mut heard = Instant::now();
+    let mut heard: Option<Instant> = None;
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
@@ -306,8 +307,8 @@ async fn look(
         }
         let start = Instant::now();
         if sender.receiver_count() > 0 {
-            heard = start;
-        } else if heard.elapsed() > GRACE {
+            heard = Some(start);
+        } else if heard.is_none_or(|heard| heard.elapsed() > GRACE) {
             // Changes are no longer followed, so nobody can go on from here.
             if before.take().is_some() {
                 *history.lock().unwrap_or_else(PoisonError::into_inner) = History::new();
@@ -316,7 +317,7 @@ async fn look(
         }
         // A failing database shows in every other answer, too.
         let Ok(now) = marks(&store).await else { continue };
-        let told = match &before {
+        let news = match &before {
             Some(before) => Told {
                 jobs: changes(&before.jobs, &now.jobs),
                 calibrations: changes(&before.calibrations, &now.calibrations),
@@ -331,16 +332,16 @@ async fn look(
                 models: everything(&now.models),
             },
         };
-        if [&told.jobs, &told.calibrations, &told.measurements, &told.models]
+        if [&news.jobs, &news.calibrations, &news.measurements, &news.models]
             .iter()
             .any(|told| !told.is_empty())
         {
-            let told: Changes = told.into();
+            let news: Changes = news.into();
             // Under the lock, so that a new listener gets each change once.
             let mut history = history.lock().unwrap_or_else(PoisonError::into_inner);
-            let position = history.push(told.clone());
+            let position = history.push(news.clone());
             // Fails only if nobody listens at the moment.
-            let _ = sender.send((position, told));
+            let _ = sender.send((position, news));
         }
         before = Some(now);
         tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;

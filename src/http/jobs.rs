@@ -14,7 +14,7 @@ use super::app::App;
 use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{Cursor, Limit, PageBody};
+use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec,
@@ -30,7 +30,8 @@ use store::{
 const LONGEST_PAUSE: f64 = 600.0;
 
 /// A job with its progress.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Job")]
 pub(super) struct JobBody {
     id: JobId,
     lab: Lab,
@@ -43,25 +44,28 @@ pub(super) struct JobBody {
     sequence: Sequence,
     run: RunSpec,
     algorithm: Algorithm,
-    /// The network of `learned`; null for all others.
+    /// The model of algorithm `learned`; null for other algorithms.
     model: Option<ModelId>,
     schedule: Schedule,
     tile: TileSpec,
     priority: i32,
+    /// Findings of the check of the measurement, and `bad_calibration`.
     warnings: Vec<Finding>,
-    /// Why the job has failed, in words.
+    /// The failure in words.
     error: Option<String>,
-    /// Why and where the job has failed.
+    /// The failure with its place.
     problem: Option<JobProblem>,
     created_at: Timestamp,
     started_at: Option<Timestamp>,
     finished_at: Option<Timestamp>,
+    /// Predicted quality of the frames, mean over the snapshots. Null until the job has succeeded, and where no prediction
+    /// is possible: colour sensors, models of users, and schedules without a quality model.
     assessment: Option<Assessment>,
     progress: JobProgress,
 }
 
-/// The reason why a job has failed, with its place.
-#[derive(Debug, Serialize)]
+/// The failure of a job. Codes are `task_failed`, `out_of_memory`, `worker_crashed` and `worker_lost`.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
 struct JobProblem {
     #[serde(flatten)]
     problem: Problem,
@@ -172,28 +176,35 @@ impl FromStr for States {
     }
 }
 
-/// What a user changes of a job: what is left out stays.
+/// Changes of a job. Omitted fields keep their values.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "JobChanges")]
 pub(super) struct Changes {
-    /// Null takes it away.
+    /// Null removes the label.
     #[serde(default, with = "serde_with::rust::double_option")]
+    #[schemars(with = "Option<Label>")]
     label: Option<Option<Label>>,
+    /// From -100 to 100; above 0 with the role admin alone.
+    #[schemars(range(min = -100, max = 100))]
     priority: Option<i32>,
 }
 
-/// What a job would take.
-#[derive(Debug, Serialize)]
+/// Predicted cost of a job.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Estimate")]
 pub(super) struct EstimateBody {
+    /// Tiles of all snapshots.
     tiles: u64,
     tasks: usize,
-    /// Planned processor seconds.
+    /// Planned CPU seconds.
     cpu_seconds: f64,
     #[serde(flatten)]
     forecast: Estimate,
-    /// The most that it writes to the disk.
+    /// Largest number of bytes that the job writes to the disk.
     disk_bytes: u64,
-    /// The most memory that a worker needs.
+    /// Largest memory that a worker needs.
     worker_memory_bytes: u64,
     warnings: Vec<Finding>,
 }
@@ -366,6 +377,7 @@ pub(super) async fn list(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
     request: RequestContext,
 ) -> Result<Response> {
     let wait = request.wait();

@@ -1,4 +1,4 @@
-//! `/v1/labs`: all labs with what they have and may have, for those who look after them.
+//! `/v1/labs`: all labs with their limits and usage, for administrators.
 
 use axum::http::StatusCode;
 use axum::response::Response;
@@ -11,47 +11,59 @@ use super::extract::{Body, Caller, Params};
 use engine::job::{InvalidField, Lab};
 use store::{Entitlement, LabRow, LabUse, share_error};
 
-#[derive(Debug, Serialize)]
-struct LabBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "LabItem")]
+pub(super) struct LabBody {
     lab: Lab,
-    /// Of the machine, beside the shares of the other labs.
+    /// Part of the machine, relative to the shares of other labs.
     share: f64,
     limits: LimitsBody,
     #[serde(rename = "use")]
     taken: TakenBody,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "LabLimits")]
 struct LimitsBody {
-    /// What it may keep here; none: no limit.
+    /// Bytes that the lab may keep; null: no limit.
     bytes: Option<u64>,
-    /// Jobs that may wait and run; none: no limit of its own.
+    /// Jobs that may wait and run; null: no limit.
     jobs: Option<u64>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "LabUsage")]
 struct TakenBody {
-    /// All that it keeps, and what was promised to its jobs.
+    /// Bytes that the lab keeps, with the space promised to its jobs.
     bytes: u64,
     #[serde(flatten)]
     of: LabUse,
-    /// Planned CPU-seconds of its jobs that are left.
+    /// Planned CPU seconds of unfinished jobs.
     cpu_seconds_left: f64,
 }
 
-#[derive(Debug, Serialize)]
-struct ListBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "LabList")]
+pub(super) struct ListBody {
     items: Vec<LabBody>,
 }
 
-/// What a lab is to be entitled to: what is left out stays, null takes a limit away.
+/// Changes of a lab. Omitted fields keep their values; null removes a limit.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "LabChanges")]
 pub(super) struct Changes {
+    /// Part of the machine, relative to the shares of other labs.
+    #[schemars(range(min = 0.001, max = 1000.0))]
     share: Option<f64>,
+    /// Bytes that the lab may keep.
     #[serde(default, with = "serde_with::rust::double_option")]
+    #[schemars(with = "Option<u64>")]
     bytes: Option<Option<u64>>,
+    /// Jobs that may wait and run.
     #[serde(default, with = "serde_with::rust::double_option")]
+    #[schemars(with = "Option<u64>")]
     jobs: Option<Option<u64>>,
 }
 

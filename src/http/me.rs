@@ -1,4 +1,4 @@
-//! `/v1/me`: who asks, what is allowed, and what is taken up of it.
+//! `/v1/me`: identity, limits and usage of the caller.
 
 use axum::response::Response;
 use serde::Serialize;
@@ -9,38 +9,42 @@ use super::extract::Caller;
 use engine::job::{Lab, Role, Timestamp, TokenId};
 use store::LabUse;
 
-#[derive(Debug, Serialize)]
-struct MeBody {
+/// Identity, limits and usage of the caller.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Me")]
+pub(super) struct MeBody {
     lab: Lab,
     role: Role,
-    /// None on a service without tokens.
+    /// Identifier of the token; null on a service without tokens.
     token: Option<TokenId>,
-    /// From when on the token is worth nothing; none: never.
+    /// End of the life of the token; null: never.
     expires_at: Option<Timestamp>,
-    /// True if the data of every lab may be asked for.
+    /// True if the token gives access to all labs.
     all_labs: bool,
     limits: LimitsBody,
     #[serde(rename = "use")]
     taken: UseBody,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "MeLimits")]
 struct LimitsBody {
-    /// Of one upload.
+    /// Largest size of an upload.
     upload_bytes: u64,
-    /// Of uploads that the token may keep; none: no limit.
+    /// Bytes of uploads, with the arrays prepared from them, that the token may keep; null: no limit.
     token_bytes: Option<u64>,
-    /// That the lab may keep; none: no limit.
+    /// Bytes that the lab may keep; null: no limit.
     lab_bytes: Option<u64>,
-    /// Jobs of the lab that may wait and run; none: no limit of its own.
+    /// Jobs of the lab that may wait and run; null: no limit.
     lab_jobs: Option<u64>,
-    /// Memory of a worker: jobs that need more are refused.
+    /// Memory of a worker; jobs that need more are refused.
     worker_memory_bytes: u64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "MeUse")]
 struct UseBody {
-    /// Of uploads that the token keeps or has begun; none without a token.
+    /// Bytes of uploads, with the arrays prepared from them, that the token keeps or has begun; null without a token.
     token_bytes: Option<u64>,
     #[serde(flatten)]
     lab: LabUse,

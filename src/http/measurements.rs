@@ -8,7 +8,7 @@ use super::app::App;
 use super::context::{RequestContext, changed};
 use super::error::{ApiError, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{ListQuery, PageBody, Renaming};
+use super::page::{ListQuery, NoQuery, PageBody, Renaming};
 use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
     CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Sequence, Sha256,
@@ -16,29 +16,38 @@ use engine::job::{
 };
 use store::{Asked, Made, Measurement, Page, Request, StoreError};
 
-/// A measurement as it is shown. What is known of its data is null until they are checked.
-#[derive(Debug, Serialize)]
+/// A measurement. Facts about its data are null until they are checked.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Measurement")]
 pub(super) struct MeasurementBody {
     id: MeasurementId,
     state: Stage,
+    /// The failure in words.
     error: Option<String>,
-    /// The same as the problem with which the request would have been answered.
+    /// The failure, as an answer to the request would have stated it.
     problem: Option<Problem>,
     created_at: Timestamp,
     name: Option<Label>,
     calibration: CalibrationId,
     data: Sha256,
+    /// Format of the file.
     format: Option<String>,
+    /// Type of the samples in the file.
     sample: Option<String>,
+    /// Order of the axes of the array; null for pictures.
     axes: Option<String>,
     snapshots: Option<u32>,
     height: Option<usize>,
     width: Option<usize>,
+    /// The stored number that means 1.
     full_scale: Option<f32>,
+    /// Snapshots per second.
     camera_fps: Option<f64>,
+    /// Exposure of a snapshot in seconds.
     exposure_s: Option<f64>,
     sequence: Option<Sequence>,
     dark: Vec<Sha256>,
+    /// Findings of the check against the calibration. Every job of the measurement repeats them.
     warnings: Vec<Finding>,
 }
 
@@ -149,6 +158,7 @@ pub(super) async fn list(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
     request: RequestContext,
 ) -> Result<Response> {
     let wait = request.wait();

@@ -66,6 +66,11 @@ impl<Id> ListQuery<Id> {
     }
 }
 
+/// The query of a route without parameters.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct NoQuery {}
+
 /// The place in a list after which a page begins. Clients see opaque text.
 #[derive(Debug, Clone, Copy, DeserializeFromStr)]
 pub(super) struct Cursor<T>(pub(super) T);
@@ -80,19 +85,22 @@ impl<T: FromStr> FromStr for Cursor<T> {
     }
 }
 
-/// The body of a request that gives a thing another name, or none.
+/// The new name of a resource; null removes the name.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(extend("required" = ["name"]))]
 pub(super) struct Renaming {
-    /// Needed: that it is left out is more likely to be a mistake.
+    /// Required, because an omitted name is more likely a mistake.
     #[serde(deserialize_with = "Option::deserialize")]
     pub(super) name: Option<Label>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "{T}Page")]
 pub(super) struct PageBody<T> {
     items: Vec<T>,
-    /// What to send as `cursor` for the next page; null on the last one.
+    /// Cursor of the next page; null on the last page.
     next_cursor: Option<String>,
 }
 

@@ -17,7 +17,8 @@ use engine::job::{JobId, JobState, ResultFile};
 use store::{Job, Page, StoreError};
 
 /// A snapshot of a job, with its files.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "SnapshotFiles")]
 pub(super) struct SnapshotBody {
     snapshot: u32,
     /// True once the files exist.
@@ -25,7 +26,8 @@ pub(super) struct SnapshotBody {
     files: Vec<FileBody>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "SnapshotFile")]
 struct FileBody {
     #[serde(flatten)]
     file: ResultFile,

@@ -23,6 +23,7 @@ use store::{RequestKey, StagedBlob, Store};
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
 pub(super) struct SampleRequest {
     #[serde(default = "default_algorithm")]
     algorithm: Algorithm,
@@ -33,11 +34,14 @@ fn default_algorithm() -> Algorithm {
     Algorithm::PnpTvFastdvdnet
 }
 
-#[derive(Debug, Serialize)]
-struct SampleBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Sample")]
+pub(super) struct SampleBody {
+    /// The file of the masks.
     masks: Sha256,
+    /// The file of the measurement.
     data: Sha256,
-    /// The true frames, for the route `quality`.
+    /// The file of the true frames, for `quality`.
     truth: Sha256,
     job: JobBody,
 }

@@ -1,4 +1,4 @@
-//! `/view/session`: a browser shows its token once, and from then on a cookie that no script can read.
+//! `/view/session`: exchanges a token for a cookie that scripts cannot read.
 
 use std::time::Duration;
 
@@ -12,16 +12,18 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, QueryOf};
 use engine::job::{Secret, Timestamp, TokenId};
 
-/// How long a session lasts, if its token lasts as long.
+/// Longest life of a session.
 const LIFE: Duration = Duration::from_secs(7 * 86_400);
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Session")]
 pub(super) struct SessionBody {
     token: TokenId,
     expires_at: Timestamp,
 }
 
-/// The path below which the browser sends the cookie: that of the page, which a proxy may have put below a prefix.
+/// The query of both requests. The browser sends the cookie below `path`, the path of the page, which may lie below a
+/// prefix of a proxy.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SessionQuery {

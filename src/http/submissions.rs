@@ -15,14 +15,16 @@ use store::{Inserted, Made, NewRequest, Request, RequestKey, StoreError};
 /// How long a request waits for a check by default.
 pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 
-/// How far something is that is made of files.
+/// State of a calibration or measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "ResourceState")]
 pub(super) enum Stage {
-    /// Its files are checked, or masks are made of captures.
+    /// Files are being checked, or masks computed from captures.
     Preparing,
     Ready,
-    /// There will be nothing; `error` says why.
+    /// The check failed; `problem` says why.
     Failed,
 }
 

@@ -63,7 +63,7 @@ impl Answer {
         assert_eq!(problem["code"], code, "{text}");
         assert_eq!(problem["status"], status);
         assert_eq!(problem["type"], format!("urn:sci-recon:problem:{code}"));
-        let page = format!("problems/{code}>; rel=\"help\"");
+        let page = format!("{code}>; rel=\"help\"");
         assert!(self.header("link").ends_with(&page), "{:?}", self.headers);
         let request = self.header("x-request-id");
         assert_eq!(problem["instance"], format!("urn:sci-recon:request:{request}"));

@@ -113,8 +113,7 @@ fn the_dashboard_names_every_stage_of_the_contract() {
         std::fs::read_to_string(format!("{}/{path}", env!("CARGO_MANIFEST_DIR"))).unwrap()
     };
     let contract: Value = serde_yaml_ng::from_str(&read("openapi.yaml")).unwrap();
-    let stages =
-        &contract["components"]["schemas"]["Progress"]["properties"]["stage"]["x-extensible-enum"];
+    let stages = &contract["components"]["schemas"]["ProgressStage"]["x-extensible-enum"];
     let script = read("src/http/dashboard/format.js");
     let (_, words) = script.split_once("const words = {").unwrap();
     let (words, _) = words.split_once('}').unwrap();

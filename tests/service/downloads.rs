@@ -257,8 +257,8 @@ async fn a_file_on_a_slow_disk_is_read_once_without_time_limit() {
         format!("{snapshot}/exports/frames/1.exr"),
         format!("{snapshot}/exports/frames/1.png"),
         format!("{snapshot}/exports/zarr/c/0/0/0"),
-        format!("{snapshot}/pictures/frame-1"),
-        format!("{snapshot}/pictures/residual"),
+        format!("/view/jobs/{job}/snapshots/0/pictures/frame-1"),
+        format!("/view/jobs/{job}/snapshots/0/pictures/residual"),
     ];
     let times = join_all(paths.iter().map(|path| head(path))).await;
     let longest = times.iter().fold(0.0, |longest: f64, took| longest.max(*took));

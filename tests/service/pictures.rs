@@ -41,7 +41,7 @@ async fn images_show_the_frames_unchanged() {
     let frames = values(&app.get(&format!("{base}/exports/npy")).await.expect(200).bytes);
     let (height, width) = (Scene::SMALL.height, Scene::SMALL.width);
     let plane = height * width;
-    let pictures = format!("{base}/pictures");
+    let pictures = format!("{base}/pictures").replace("/v1/", "/view/");
 
     // A tile at full resolution has every pixel, on the scale of the window.
     let address = format!("{pictures}/frame-2/tiles/0/0/0?black=0.1&white=0.9");

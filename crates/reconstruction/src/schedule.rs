@@ -572,45 +572,4 @@ mod tests {
             "docs/schedule.schema.json is not up to date: run this test with SCI_RECON_WRITE_SCHEMA=1"
         );
     }
-
-    /// What a schema says of names and numbers, without its prose; references are followed.
-    fn facts(schema: &Value, root: &Value) -> Value {
-        let place = schema["$ref"].as_str().map(|place| place.trim_start_matches('#'));
-        let mut found = place.map_or(json!({}), |place| facts(root.pointer(place).unwrap(), root));
-        for (key, value) in schema.as_object().unwrap() {
-            let plain = || value.as_f64().map_or(value.clone(), Value::from);
-            let (key, value) = match key.as_str() {
-                "properties" => {
-                    let all = value.as_object().unwrap().iter();
-                    (key.as_str(), all.map(|(name, of)| (name.clone(), facts(of, root))).collect())
-                }
-                "items" => ("items", facts(value, root)),
-                "oneOf" => {
-                    let names = value.as_array().unwrap().iter().map(|one| one["const"].clone());
-                    ("enum", names.collect())
-                }
-                // The contract bounds what has no bound, and takes the empty schedule of `learned`.
-                "maximum" if value.as_f64() >= Some(1e30) => continue,
-                "minItems" if value.as_f64() == Some(1.0) => continue,
-                "required" | "enum" | "default" | "minimum" | "maximum" | "exclusiveMinimum"
-                | "exclusiveMaximum" | "minItems" | "maxItems" => (key.as_str(), plain()),
-                _ => continue,
-            };
-            found[key] = value;
-        }
-        found
-    }
-
-    #[test]
-    fn the_contract_says_the_same() {
-        let contract: Value = serde_yaml_ng::from_str(&text("openapi.yaml")).unwrap();
-        let schemas = &contract["components"]["schemas"];
-        let schema = schemars::schema_for!(Schedule).to_value();
-        assert_eq!(facts(&schemas["Schedule"], &contract), facts(&schema, &schema));
-        let names: Vec<_> = PRIORS.iter().map(|prior| prior.name()).collect();
-        assert_eq!(
-            schemas["AlgorithmInfo"]["properties"]["priors"]["items"]["x-extensible-enum"],
-            json!(names)
-        );
-    }
 }

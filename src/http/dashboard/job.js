@@ -130,7 +130,7 @@ async function showFiles(element, { id, state, shape, snapshots: { count } }, sn
   const base = `/v1/jobs/${id}`;
   const { ready, files } = await get(`${base}/snapshots/${snapshot}`, signal);
   // The files' own references are relative to the address of the list.
-  const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: `${base}/snapshots/${file.href}`, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
+  const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href && `${base}/snapshots/${file.href}`, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
   const whole = files.filter((file) => !file.name.includes("/")).sort((one, other) => ORDER.indexOf(one.name) - ORDER.indexOf(other.name));
   const single = files.filter((file) => file.name.includes("/"));
   element.hidden = !ready;

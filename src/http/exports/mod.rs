@@ -6,7 +6,7 @@ mod clip;
 mod composed;
 mod exr;
 mod lines;
-mod movie;
+pub(super) mod movie;
 
 use axum::http::{HeaderMap, Method};
 use axum::response::Response;

@@ -22,6 +22,7 @@ const AGAIN: HeaderValue = HeaderValue::from_static("1");
 /// The body of `POST /v1/jobs/{job}/exports`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
 pub(in crate::http) struct ExportRequest {
     format: CreatedFormat,
     /// The snapshot; by default all snapshots of the job, in order.
@@ -31,13 +32,15 @@ pub(in crate::http) struct ExportRequest {
 /// Formats that a worker makes on request. The service composes all others while a client reads them.
 #[derive(Debug, Clone, Copy, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
 enum CreatedFormat {
     Mp4,
 }
 
 /// An export that a worker makes.
-#[derive(Debug, Serialize)]
-struct ExportBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Export")]
+pub(in crate::http) struct ExportBody {
     state: ExportState,
     /// Share of the work that is done, in percent.
     percent: f64,
@@ -45,6 +48,7 @@ struct ExportBody {
 
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
 enum ExportState {
     /// No worker is free yet.
     Waiting,

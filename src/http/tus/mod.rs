@@ -75,14 +75,17 @@ pub(super) struct ListQuery {
     cursor: Option<Cursor<PartialId>>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Upload")]
 pub(super) struct UploadBody {
     id: PartialId,
-    /// Bytes of the whole file, and those that have come.
+    /// Bytes of the whole file.
     length: u64,
+    /// Bytes received so far.
     received: u64,
+    /// `Upload-Metadata` as the client sent it.
     metadata: String,
-    /// The blob that it has become.
+    /// The blob that the upload has become; null until it is complete.
     sha256: Option<Sha256>,
     expires_at: Timestamp,
 }

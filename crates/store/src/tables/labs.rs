@@ -28,11 +28,12 @@ pub struct LabRow {
 
 from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs, cost_left });
 
-/// What a lab has here.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+/// Usage of a lab.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct LabUse {
-    /// Uploads, and their bytes.
+    /// Uploaded files.
     pub uploads: u64,
+    /// Bytes of the uploaded files.
     pub upload_bytes: u64,
     /// Bytes of the frames, movies and other files of its jobs.
     pub result_bytes: u64,

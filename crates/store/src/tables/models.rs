@@ -12,8 +12,8 @@ use crate::tables::keys::Made;
 use crate::tables::requests;
 use engine::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 
-/// What is known of an end-to-end network when it has been checked.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+/// A checked end-to-end network.
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct NewModel {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
@@ -29,7 +29,7 @@ from_row!(NewModel, row => {
     facts = row.read::<Json<_>>("facts")?.0,
 });
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct Model {
     pub id: ModelId,
     pub created_at: Timestamp,

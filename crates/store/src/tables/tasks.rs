@@ -50,7 +50,8 @@ pub struct TaskRecord {
     pub attempt: u32,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "TileProgress")]
 pub struct TileState {
     /// The first snapshot of its run.
     #[serde(skip)]
@@ -58,14 +59,16 @@ pub struct TileState {
     /// The number of snapshots in its run.
     #[serde(skip)]
     pub snapshots: u32,
+    /// Index of the tile in the plan.
     pub tile: u32,
     pub state: TaskState,
+    /// Activity of the worker.
     pub stage: Option<String>,
     /// Iterations of the attempt that runs or ran last.
     pub iterations: u32,
     /// Deep passes of that attempt.
     pub passes: u32,
-    /// The share of the planned cost that is behind it.
+    /// Share of the planned cost that is done, from 0 to 1.
     pub fraction: f64,
     pub attempts: u32,
     /// `||y - H v|| / ||y||` of a tile that is done.
@@ -85,12 +88,13 @@ from_row!(TileState, row => {
     residual,
 });
 
-/// How the solver went on a tile.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+/// Convergence of the solver on a tile.
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct TileHistory {
     pub tile: u32,
     pub state: TaskState,
-    /// \[iteration, residual, change, sigma or null\], by iteration; many iterations are thinned out.
+    /// The iteration, its residual, the relative change, and sigma or null; at most 129 points.
+    #[schemars(with = "Vec<[Option<f64>; 4]>")]
     pub points: Vec<Value>,
 }
 
